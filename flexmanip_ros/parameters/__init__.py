@@ -1,0 +1,13 @@
+"""Every parameter of the package: the only place of defaults, units, ranges and words."""
+
+from flexmanip_ros.parameters.arm import ArmParameters
+from flexmanip_ros.parameters.excitation import ExcitationParameters
+from flexmanip_ros.parameters.field import Leaf, check, configure, flatten, leaves, parameter
+from flexmanip_ros.parameters.identifier import IdentifierParameters
+from flexmanip_ros.parameters.plant import PlantParameters
+from flexmanip_ros.parameters.trigger import TriggerParameters
+
+__all__ = [
+    'ArmParameters', 'ExcitationParameters', 'IdentifierParameters', 'Leaf', 'PlantParameters',
+    'TriggerParameters', 'check', 'configure', 'flatten', 'leaves', 'parameter',
+]

@@ -1,0 +1,46 @@
+"""The arm: what a user measures or looks up before anything is identified."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flexmanip_ros.parameters.field import check_all, parameter
+
+SMALLEST = 1e-9
+"""Lower bound of quantities that must be positive."""
+
+
+@dataclass(frozen=True)
+class ArmParameters:
+    """Two flexible links, two joints, a mass at the tip (``MODEL`` notation in docs/notation.md)."""
+
+    link_length: tuple[float, ...] = parameter(
+        (3.0, 3.0), 'length of each link', unit='m', low=SMALLEST, size=2)
+    linear_density: tuple[float, ...] = parameter(
+        (5.0, 5.0), 'mass of each link per length', unit='kg/m', low=SMALLEST, size=2)
+    bending_stiffness: tuple[float, ...] = parameter(
+        (5000.0, 5000.0), "Young's modulus times second moment of area of each link", unit='N m^2',
+        low=SMALLEST, size=2)
+    joint_mass: float = parameter(10.0, 'mass at the end of link 1', unit='kg', low=0.0)
+    tip_mass: float = parameter(10.0, 'mass at the end of link 2 before capture', unit='kg', low=0.0)
+    damping_ratio: float = parameter(
+        0.0, "damping of critical at each link's first pinned mode", low=0.0, high=0.99)
+    damping_model: str = parameter(
+        'stiffness', 'how damping grows over the modes: with frequency, or the same for every mode',
+        choices=('stiffness', 'modal'))
+    modes: int = parameter(
+        3, 'assumed modes kappa of each link (`block` takes order / 4 instead)', low=1, high=12)
+    sensor_position: tuple[float, ...] = parameter(
+        (0.5, 0.5), "place of each bend sensor as a fraction of its link's length", low=0.0, high=1.0, size=2)
+    effort_delay: int = parameter(
+        0, 'samples by which effort lags (1: a message reports the torque of the previous interval)',
+        unit='samples', low=0, high=10)
+    torque_convention: str = parameter(
+        'joint', 'joint: torque 2 acts between link 1 and link 2 (a real arm); paper: on link 2 alone',
+        choices=('joint', 'paper'))
+    angle_convention: str = parameter(
+        'encoder', 'encoder: root slopes, joint 2 relative to the tip of link 1; chord: absolute chord angles',
+        choices=('encoder', 'chord'))
+
+    def __post_init__(self) -> None:
+        check_all(self)

@@ -1,0 +1,186 @@
+"""How a parameter is declared: default, words, unit and range, once, on a dataclass field."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+from flexmanip_ros.errors import ParameterError
+
+Config = TypeVar('Config')
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One declared parameter: its dotted name, type (bool, int, float, str or a tuple of one) and words."""
+
+    name: str
+    kind: type
+    is_array: bool
+    default: Any
+    words: str
+    unit: str
+    low: float | None
+    high: float | None
+    choices: tuple[str, ...]
+    size: int | None
+    live: bool
+
+
+def parameter(
+    default: Any,
+    words: str,
+    *,
+    unit: str = '',
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+    size: int | None = None,
+    live: bool = False,
+) -> Any:
+    """Declare a parameter on a frozen dataclass.
+
+    low, high: inclusive bounds (of every element of an array); size: fixed length of an array;
+    live: may be changed while the node runs.
+    """
+    return field(
+        default=default,
+        metadata={
+            'words': words, 'unit': unit, 'low': low, 'high': high,
+            'choices': choices, 'size': size, 'live': live,
+        },
+    )
+
+
+def leaves(cls: type, prefix: str = '') -> tuple[Leaf, ...]:
+    """List every parameter of a configuration class, nested groups flattened with dots."""
+    hints = get_type_hints(cls)
+    found: list[Leaf] = []
+    for item in dataclasses.fields(cls):
+        hint = hints[item.name]
+        if dataclasses.is_dataclass(hint):
+            assert isinstance(hint, type)
+            found.extend(leaves(hint, f'{prefix}{item.name}.'))
+            continue
+        is_array = get_origin(hint) is tuple
+        kind = get_args(hint)[0] if is_array else hint
+        found.append(Leaf(
+            name=prefix + item.name, kind=kind, is_array=is_array, default=item.default, **item.metadata,
+        ))
+    return tuple(found)
+
+
+def configure(cls: type[Config], values: Mapping[str, Any]) -> Config:
+    """Build a configuration from dotted names and values; names not given keep their default.
+
+    Raises ParameterError naming the parameter that is unknown, mistyped, out of range or inconsistent.
+    """
+    declared = {leaf.name: leaf for leaf in leaves(cls)}
+    for name in values:
+        if name not in declared:
+            near = difflib.get_close_matches(name, declared, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f'known are {", ".join(sorted(declared))}'
+            raise ParameterError(f"unknown parameter '{name}'", hint)
+    checked = {name: check(declared[name], value) for name, value in values.items()}
+    return _build(cls, checked, '')
+
+
+def _build(cls: type[Config], values: Mapping[str, Any], prefix: str) -> Config:
+    hints = get_type_hints(cls)
+    arguments: dict[str, Any] = {}
+    for item in dataclasses.fields(cls):  # type: ignore[arg-type]
+        name = prefix + item.name
+        if dataclasses.is_dataclass(hints[item.name]):
+            arguments[item.name] = _build(hints[item.name], values, name + '.')
+        elif name in values:
+            arguments[item.name] = values[name]
+    return cls(**arguments)
+
+
+def flatten(config: Any, prefix: str = '') -> dict[str, Any]:
+    """Return the dotted names and values of a configuration; configure() takes them back."""
+    flat: dict[str, Any] = {}
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        if dataclasses.is_dataclass(value):
+            flat.update(flatten(value, f'{prefix}{item.name}.'))
+        else:
+            flat[prefix + item.name] = value
+    return flat
+
+
+def check_all(config: Any) -> None:
+    """Check every field of a configuration; for use in ``__post_init__`` (groups check themselves)."""
+    for leaf in leaves(type(config)):
+        if '.' not in leaf.name:
+            object.__setattr__(config, leaf.name, check(leaf, getattr(config, leaf.name)))
+
+
+def check(leaf: Leaf, value: Any) -> Any:
+    """Return the value in the declared type, or raise ParameterError naming the parameter."""
+    if not leaf.is_array:
+        return _check_one(leaf, value)
+    if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
+        raise ParameterError(f"parameter '{leaf.name}' is {value!r}", f'give a list of {_plural(leaf)}')
+    items = tuple(_check_one(leaf, item) for item in value)
+    if leaf.kind is str and items == ('',):
+        items = ()  # ROS cannot write an empty list of a known type; [''] stands for it
+    if leaf.size is not None and len(items) != leaf.size:
+        raise ParameterError(
+            f"parameter '{leaf.name}' has {len(items)} elements", f'give {leaf.size} {_plural(leaf)}')
+    return items
+
+
+def _check_one(leaf: Leaf, value: Any) -> Any:
+    converted = _convert(leaf.kind, value)
+    if converted is None:
+        raise ParameterError(
+            f"parameter '{leaf.name}' is {value!r}", f'give {_plural(leaf) if leaf.is_array else _singular(leaf)}')
+    if isinstance(converted, float) and math.isnan(converted):
+        raise ParameterError(f"parameter '{leaf.name}' is not a number", f'give {_range_words(leaf)}')
+    if leaf.choices and converted not in leaf.choices:
+        raise ParameterError(
+            f"parameter '{leaf.name}' is {converted!r}", f'choose one of {", ".join(leaf.choices)}')
+    below = leaf.low is not None and converted < leaf.low
+    above = leaf.high is not None and converted > leaf.high
+    if below or above:
+        raise ParameterError(f"parameter '{leaf.name}' is {converted!r}{_unit(leaf)}", f'give {_range_words(leaf)}')
+    return converted
+
+
+def _convert(kind: type, value: Any) -> Any:
+    if kind is bool or isinstance(value, bool):
+        return value if kind is bool and isinstance(value, bool) else None
+    if kind is float and isinstance(value, (int, float)):
+        return float(value)
+    if kind is int and isinstance(value, int):
+        return value
+    if kind is str and isinstance(value, str):
+        return value
+    if hasattr(value, 'item'):  # a numpy scalar
+        return _convert(kind, value.item())
+    return None
+
+
+def _unit(leaf: Leaf) -> str:
+    return f' {leaf.unit}' if leaf.unit else ''
+
+
+def _singular(leaf: Leaf) -> str:
+    names = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'a text'}
+    return names[leaf.kind]
+
+
+def _plural(leaf: Leaf) -> str:
+    names = {bool: 'true/false values', int: 'whole numbers', float: 'numbers', str: 'texts'}
+    return names[leaf.kind]
+
+
+def _range_words(leaf: Leaf) -> str:
+    low = '-inf' if leaf.low is None else f'{leaf.low:g}'
+    high = 'inf' if leaf.high is None else f'{leaf.high:g}'
+    return f'a value from {low} to {high}{_unit(leaf)}'

@@ -1,0 +1,75 @@
+"""Parameters of the recursive subspace identifier (node ``rpbsid_identifier``, program ``identify_bag``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.parameters.arm import ArmParameters
+from flexmanip_ros.parameters.field import check_all, parameter
+
+FIELDS = ('position', 'velocity', 'effort')
+
+
+@dataclass(frozen=True)
+class IdentifierParameters:
+    """What to identify, with which memory, and how the payload is read from it."""
+
+    inputs: tuple[str, ...] = parameter(
+        ('joint1/effort', 'joint2/effort'), 'input signals, each NAME/FIELD of JointState')
+    outputs: tuple[str, ...] = parameter(
+        ('link1_bend/position', 'link2_bend/position', 'link1_bend/velocity', 'link2_bend/velocity'),
+        'output signals, each NAME/FIELD of JointState')
+    angles: tuple[str, ...] = parameter(
+        ('joint1/position', 'joint2/position'), "the configuration of the arm; [''] when there is none")
+    order: int = parameter(4, 'order n of the model', low=1, high=60)
+    past_window: int = parameter(10, 'past window p', unit='samples', low=1, high=200)
+    future_window: int = parameter(5, 'future window f', unit='samples', low=1, high=200)
+    forgetting_factor: tuple[float, ...] = parameter(
+        (0.99, 0.99, 0.99), 'forgetting factors beta 1..3 of the three least squares', low=0.5, high=1.0, size=3)
+    regularization: tuple[float, ...] = parameter(
+        (0.1, 0.1, 0.1), 'regularization alpha 1..3 on internally scaled signals', low=1e-12, high=1e12, size=3)
+    direct_feedthrough: bool = parameter(False, 'identify D instead of holding it at zero')
+    restart_on_event: bool = parameter(
+        True, 'restart the covariances of the least squares at a capture or release')
+    payload_method: str = parameter(
+        'structured', 'how the payload is read', choices=('none', 'block', 'structured'))
+    publish_rate: float = parameter(
+        50.0, 'estimates a second, on the grid of the stamps', unit='Hz', low=0.01, high=10000.0)
+    gap_factor: float = parameter(
+        2.5, 'a step between stamps longer than this many sample times is a gap', low=1.1, high=1000.0)
+    max_time_jump: float = parameter(
+        1.0, 'a jump back of the stamps by more than this resets the identifier', unit='s', low=0.001)
+    rewind_time: float = parameter(
+        0.2, 'samples kept so that a late event is applied at its own stamp', unit='s', low=0.0, high=10.0)
+    payload_frame: str = parameter('link2_tip', 'frame_id of the published payload')
+    arm: ArmParameters = field(default_factory=ArmParameters)
+
+    def __post_init__(self) -> None:
+        check_all(self)
+        for group in ('inputs', 'outputs', 'angles'):
+            _check_signals(group, getattr(self, group))
+        for group in ('inputs', 'outputs'):
+            if not getattr(self, group):
+                raise ParameterError(f"parameter '{group}' is empty", 'name at least one NAME/FIELD')
+        if self.angles and len(self.angles) != 2:
+            raise ParameterError(
+                f"parameter 'angles' names {len(self.angles)} signals", "name two, or [''] for none")
+        if self.future_window > self.past_window:
+            raise ParameterError(
+                f"parameter 'future_window' is {self.future_window}",
+                f'it cannot exceed past_window ({self.past_window})')
+        if self.future_window * len(self.outputs) < self.order:
+            raise ParameterError(
+                f"parameter 'order' is {self.order}",
+                f'it cannot exceed future_window x outputs ({self.future_window * len(self.outputs)})')
+
+
+def _check_signals(group: str, names: tuple[str, ...]) -> None:
+    for name in names:
+        joint, _, what = name.rpartition('/')
+        if not joint or what not in FIELDS:
+            raise ParameterError(
+                f"parameter '{group}' names '{name}'", f'write NAME/FIELD with FIELD one of {", ".join(FIELDS)}')
+    if len(set(names)) != len(names):
+        raise ParameterError(f"parameter '{group}' names a signal twice", 'name each signal once')

@@ -1,0 +1,25 @@
+"""Parameters of the event source (node ``capture_trigger``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flexmanip_ros.parameters.field import check_all, parameter
+
+
+@dataclass(frozen=True)
+class TriggerParameters:
+    """When a capture or release is announced."""
+
+    mode: str = parameter(
+        'service', 'service: on request; time: at set times after the first sample; auto: found in the signals',
+        choices=('service', 'time', 'auto'))
+    capture_time: float = parameter(
+        3.0, 'capture this long after the first sample (mode time); negative: never', unit='s', low=-1.0)
+    release_time: float = parameter(
+        -1.0, 'release this long after the first sample (mode time); negative: never', unit='s', low=-1.0)
+    lead_time: float = parameter(
+        0.05, 'an event at a set time is announced this long before its stamp', unit='s', low=0.0, high=10.0)
+
+    def __post_init__(self) -> None:
+        check_all(self)

@@ -1,0 +1,135 @@
+"""The values that travel through the package. Immutable; arrays inside are never written to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class EventKind(Enum):
+    """What happened at the end of the arm; the value is the ``frame_id`` on the wire."""
+
+    CAPTURE = 'capture'
+    RELEASE = 'release'
+
+
+class CaptureEvent(NamedTuple):
+    """The arm took or let go of an object at ``stamp_ns``; that stamp is the first after the jump."""
+
+    stamp_ns: int
+    kind: EventKind
+
+
+@dataclass(frozen=True, eq=False)
+class JointRecord:
+    """One JointState as it was published: names and whatever of the three arrays it carried.
+
+    position: (j,) [rad or m], velocity: (j,) or (0,), effort: (j,) or (0,) [N m].
+    """
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    position: Array
+    velocity: Array
+    effort: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One instant of the configured signals, in JointState units.
+
+    u: (r,) inputs held from ``stamp_ns`` on [N m]; y: (m,) outputs [m, m/s, rad, ...];
+    angles: (2,) measured configuration [rad], or (0,) when none is configured.
+    """
+
+    stamp_ns: int
+    u: Array
+    y: Array
+    angles: Array
+
+
+class Status(Enum):
+    """What an estimate is worth. The value is the sentence a user reads."""
+
+    WARMING_UP = 'not enough samples yet'
+    TRACKING = 'tracking'
+    POORLY_EXCITED = 'the signals carry too little information; move the arm or raise the torque'
+    ILL_CONDITIONED = 'the regression is nearly singular; lower the order or the past window'
+    SAMPLE_GAP = 'samples are missing; the regressor window restarted'
+    INCONSISTENT = 'the residuals do not fit the model; the interval was widened'
+    NO_PAYLOAD_METHOD = 'no payload is estimated (payload_method: none)'
+    UNOBSERVABLE = 'these signals cannot give a payload'
+    DIVERGED = 'numbers left the finite range; the estimator restarted'
+
+
+@dataclass(frozen=True, eq=False)
+class StateSpace:
+    """x(k+1) = A x + B u + K e, y = C x + D u + e, one step of ``dt`` seconds (paper eqs. 22-23).
+
+    A: (n, n), B: (n, r), C: (m, n), D: (m, r), K: (n, m), in JointState units.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    K: Array
+    dt: float
+
+    @property
+    def order(self) -> int:
+        """Number of states n."""
+        return int(self.A.shape[0])
+
+
+class Mode(NamedTuple):
+    """One oscillation: damped frequency [Hz], damping ratio [-], and their standard deviations (nan: unknown)."""
+
+    frequency_hz: float
+    damping_ratio: float
+    frequency_std_hz: float = float('nan')
+    damping_ratio_std: float = float('nan')
+
+
+@dataclass(frozen=True, eq=False)
+class Payload:
+    """What the arm holds.
+
+    mass, std, lower, upper: [kg], the last two a 95 % interval; consistency: normalised residual
+    power (1 = noise only); com: (3,) [m] and inertia: (6,) ixx ixy ixz iyy iyz izz [kg m^2] about
+    the centre of mass, in the frame of the tip.
+    """
+
+    mass: float
+    std: float
+    lower: float
+    upper: float
+    consistency: float
+    status: Status
+    com: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    inertia: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Everything published at one stamp. ``model`` and ``payload`` are None until there is one."""
+
+    stamp_ns: int
+    status: Status
+    model: StateSpace | None
+    modes: tuple[Mode, ...]
+    payload: Payload | None
+    excitation: float = float('nan')
+    """Smallest over largest eigenvalue of the regressor information, on scaled signals [-]."""
+    condition: float = float('nan')
+    """Condition number of the state regression [-]."""
+    singular_values: Array | None = None
+    """Singular values of observability x controllability, for the choice of the order."""
+    innovation_power: float = float('nan')
+    """Mean squared innovation over the variance expected [-]."""
