@@ -45,13 +45,15 @@ class Sample:
     """One instant of the configured signals, in JointState units.
 
     u: (r,) inputs held from ``stamp_ns`` on [N m]; y: (m,) outputs [m, m/s, rad, ...];
-    angles: (2,) measured configuration [rad], or (0,) when none is configured.
+    angles: (2,) measured configuration [rad], or (0,) when none is configured;
+    gap: the sample before this one is missing, so no regressor may reach back over it.
     """
 
     stamp_ns: int
     u: Array
     y: Array
     angles: Array
+    gap: bool = False
 
 
 class Status(Enum):
@@ -89,7 +91,7 @@ class StateSpace:
 
 
 class Mode(NamedTuple):
-    """One oscillation: damped frequency [Hz], damping ratio [-], and their standard deviations (nan: unknown)."""
+    """One oscillation: damped frequency [Hz], damping ratio [-], standard deviations (nan: unknown)."""
 
     frequency_hz: float
     damping_ratio: float

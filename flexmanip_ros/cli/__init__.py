@@ -1,0 +1,1 @@
+"""The programs that need no ROS running."""

@@ -1,0 +1,1 @@
+"""Recursive and batch predictor-based subspace identification."""

@@ -1,0 +1,1 @@
+"""Bags, tables, parameter files and reports."""

@@ -138,8 +138,8 @@ def check(leaf: Leaf, value: Any) -> Any:
 def _check_one(leaf: Leaf, value: Any) -> Any:
     converted = _convert(leaf.kind, value)
     if converted is None:
-        raise ParameterError(
-            f"parameter '{leaf.name}' is {value!r}", f'give {_plural(leaf) if leaf.is_array else _singular(leaf)}')
+        wanted = _plural(leaf) if leaf.is_array else _singular(leaf)
+        raise ParameterError(f"parameter '{leaf.name}' is {value!r}", f'give {wanted}')
     if isinstance(converted, float) and math.isnan(converted):
         raise ParameterError(f"parameter '{leaf.name}' is not a number", f'give {_range_words(leaf)}')
     if leaf.choices and converted not in leaf.choices:
@@ -148,7 +148,8 @@ def _check_one(leaf: Leaf, value: Any) -> Any:
     below = leaf.low is not None and converted < leaf.low
     above = leaf.high is not None and converted > leaf.high
     if below or above:
-        raise ParameterError(f"parameter '{leaf.name}' is {converted!r}{_unit(leaf)}", f'give {_range_words(leaf)}')
+        raise ParameterError(
+            f"parameter '{leaf.name}' is {converted!r}{_unit(leaf)}", f'give {_range_words(leaf)}')
     return converted
 
 

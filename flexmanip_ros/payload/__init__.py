@@ -1,0 +1,1 @@
+"""What the arm holds, from an identified model or from its dynamics."""

@@ -1,0 +1,1 @@
+"""The simulated arm: dynamics, linearization, capture, sensors, torques."""

@@ -1,0 +1,1 @@
+"""The nodes: each converts, makes one core call and publishes."""
