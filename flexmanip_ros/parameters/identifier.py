@@ -37,11 +37,15 @@ class IdentifierParameters:
     publish_rate: float = parameter(
         50.0, 'estimates a second, on the grid of the stamps', unit='Hz', low=0.01, high=10000.0)
     gap_factor: float = parameter(
-        2.5, 'a step between stamps longer than this many sample times is a gap', low=1.1, high=1000.0)
+        1.5, 'a step between stamps this many times longer or shorter than the sample time is a gap',
+        low=1.05, high=1000.0)
     max_time_jump: float = parameter(
         1.0, 'a jump back of the stamps by more than this resets the identifier', unit='s', low=0.001)
     rewind_time: float = parameter(
         0.2, 'samples kept so that a late event is applied at its own stamp', unit='s', low=0.0, high=10.0)
+    event_merge_time: float = parameter(
+        0.1, 'a second event of the same kind within this time of the first is the same event', unit='s',
+        low=0.0, high=60.0)
     payload_frame: str = parameter('link2_tip', 'frame_id of the published payload')
     arm: ArmParameters = field(default_factory=ArmParameters)
 

@@ -1,0 +1,104 @@
+"""Where the configured signals stand in a message: matched by name, in any order, extra joints ignored."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.types import Array, JointRecord
+
+_SHRINKABLE = IdentifierParameters().outputs
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Index and field of each signal for messages that carry exactly ``names``."""
+
+    names: tuple[str, ...]
+    outputs: tuple[str, ...]
+    """Output signals in use: the configured ones, or those of the default set that are there."""
+    u: tuple[tuple[str, int], ...]
+    y: tuple[tuple[str, int], ...]
+    angles: tuple[tuple[str, int], ...]
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why a message cannot be used: a counter's name, and the sentence for the user."""
+
+    reason: str
+    problem: str
+    remedy: str
+
+
+def resolve(
+    config: IdentifierParameters, record: JointRecord, outputs: tuple[str, ...] | None = None
+) -> Channels | Refusal:
+    """Find every configured signal in a record.
+
+    outputs: the signals settled on by an earlier record; None lets the default outputs shrink to what
+    this one carries (velocities are never invented). A signal set by the user and missing is refused.
+    """
+    fault = wrong_size(record)
+    if fault is not None:
+        return fault
+    wanted = config.outputs if outputs is None else outputs
+    if outputs is None and config.outputs == _SHRINKABLE:
+        wanted = tuple(name for name in wanted if _find(name, record) is not None) or wanted
+    groups: list[tuple[tuple[str, int], ...]] = []
+    needs_angles = config.payload_method != 'none'
+    for group, names in (('inputs', config.inputs), ('outputs', wanted),
+                         ('angles', config.angles if needs_angles else ())):
+        places = []
+        for name in names:
+            place = _find(name, record)
+            if place is None:
+                return _missing(group, name, record)
+            places.append(place)
+        groups.append(tuple(places))
+    return Channels(record.names, wanted, groups[0], groups[1], groups[2])
+
+
+def wrong_size(record: JointRecord) -> Refusal | None:
+    """Refuse a record whose arrays have neither the length of its names nor zero."""
+    count = len(record.names)
+    for field in ('position', 'velocity', 'effort'):
+        size = getattr(record, field).size
+        if size not in (0, count):
+            return Refusal(
+                'unequal_sizes', f"a JointState has {count} names but {size} values in '{field}'",
+                'make the publisher fill every array for every name, or leave it empty')
+    if len(set(record.names)) != count:
+        return Refusal('unequal_sizes', 'a JointState names a joint twice', 'publish each joint once')
+    return None
+
+
+def extract(places: tuple[tuple[str, int], ...], record: JointRecord) -> Array:
+    """Return the values at the given places: (len(places),)."""
+    return np.array([getattr(record, field)[index] for field, index in places], dtype=np.float64)
+
+
+def finite(values: Array) -> bool:
+    """Tell whether every value is finite; the sum is enough and cheap."""
+    return math.isfinite(float(values.sum()))
+
+
+def _find(signal: str, record: JointRecord) -> tuple[str, int] | None:
+    joint, _, field = signal.rpartition('/')
+    if joint not in record.names or getattr(record, field).size == 0:
+        return None
+    return field, record.names.index(joint)
+
+
+def _missing(group: str, signal: str, record: JointRecord) -> Refusal:
+    joint, _, field = signal.rpartition('/')
+    if joint not in record.names:
+        return Refusal(
+            'missing_signal', f"'{signal}' of parameter '{group}' is not in the messages",
+            f'the joints there are: {", ".join(record.names) or "none"}; set {group} to match')
+    return Refusal(
+        'missing_signal', f"'{signal}' of parameter '{group}': the messages carry no {field}",
+        f'set {group} to the fields that are there')
