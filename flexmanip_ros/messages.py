@@ -1,0 +1,150 @@
+"""The layout of everything published, as plain values: the live node and a bag written offline share it.
+
+Nothing here knows ROS. ``ros/conversions`` and ``io/bag_writer`` each turn these values into their own
+message classes, so both carry the same numbers.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from flexmanip_ros.errors import SignalError
+from flexmanip_ros.types import Array, Estimate, Mode, Payload, StateSpace
+
+MODEL = 'model'
+MODES = 'modes'
+PAYLOAD_MASS = 'payload_mass'
+PAYLOAD_ESTIMATE = 'payload_estimate'
+PAYLOAD = 'payload'
+ROWS = re.compile(r'^rows: state=(\d+) output=(\d+) dt=(\S+)$')
+COLUMNS = re.compile(r'^columns: state=(\d+) input=(\d+) innovation=(\d+)$')
+
+
+class Dimension(NamedTuple):
+    """One dimension of a Float64MultiArray."""
+
+    label: str
+    size: int
+    stride: int
+
+
+class LabelledArray(NamedTuple):
+    """A Float64MultiArray: ``data`` flat and row-major, ``dimensions`` outermost first, data_offset 0."""
+
+    dimensions: tuple[Dimension, ...]
+    data: Array
+
+
+class Inertia(NamedTuple):
+    """An InertiaStamped in ``frame_id``.
+
+    mass: [kg], com: (3,) [m], inertia: ixx ixy ixz iyy iyz izz [kg m^2] about the centre of mass.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    mass: float
+    com: tuple[float, float, float]
+    inertia: tuple[float, float, float, float, float, float]
+
+
+class DiagnosticStatus(NamedTuple):
+    """One entry of a DiagnosticArray; level 0 OK, 1 WARN, 2 ERROR, 3 STALE."""
+
+    level: int
+    name: str
+    message: str
+    hardware_id: str
+    values: tuple[tuple[str, str], ...]
+
+
+class Diagnostics(NamedTuple):
+    """A DiagnosticArray."""
+
+    stamp_ns: int
+    statuses: tuple[DiagnosticStatus, ...]
+
+
+def _matrix(rows: str, columns: str, values: Array) -> LabelledArray:
+    height, width = values.shape
+    dimensions = (Dimension(rows, height, height * width), Dimension(columns, width, width))
+    return LabelledArray(dimensions, np.ascontiguousarray(values, dtype=np.float64).ravel())
+
+
+def model_matrix(model: StateSpace) -> LabelledArray:
+    """Return [[A, B, K], [C, D, I]] (n + m, n + r + m) with its sizes and sample time in the labels."""
+    n, r, m = model.order, model.B.shape[1], model.C.shape[0]
+    values = np.block([[model.A, model.B, model.K], [model.C, model.D, np.eye(m)]])
+    return _matrix(f'rows: state={n} output={m} dt={model.dt!r}',
+                   f'columns: state={n} input={r} innovation={m}', values)
+
+
+def read_model(matrix: LabelledArray) -> StateSpace:
+    """Return the model in a ``~/model`` message; SignalError when labels and sizes do not agree."""
+    labels = [dimension.label for dimension in matrix.dimensions]
+    rows = ROWS.match(labels[0]) if len(labels) == 2 else None
+    columns = COLUMNS.match(labels[1]) if len(labels) == 2 else None
+    if rows is None or columns is None:
+        raise SignalError(f'a model message is labelled {labels}',
+                          'subscribe to the ~/model of rpbsid_identifier')
+    n, m, r = int(rows[1]), int(rows[2]), int(columns[2])
+    data = np.asarray(matrix.data, dtype=np.float64)
+    if (int(columns[1]), int(columns[3])) != (n, m) or data.size != (n + m) * (n + r + m):
+        raise SignalError(f'a model message holds {data.size} values for {labels}',
+                          f'(n + m)(n + r + m) = {(n + m) * (n + r + m)} are expected')
+    block = data.reshape(n + m, n + r + m)
+    A, B, K = block[:n, :n], block[:n, n:n + r], block[:n, n + r:]
+    return StateSpace(A, B, block[n:, :n], block[n:, n:n + r], K, float(rows[3]))
+
+
+def modes_matrix(modes: tuple[Mode, ...]) -> LabelledArray:
+    """Return one mode a row in rising frequency: damped frequency [Hz], damping ratio."""
+    rows = sorted((mode.frequency_hz, mode.damping_ratio) for mode in modes
+                  if math.isfinite(mode.frequency_hz) and math.isfinite(mode.damping_ratio))
+    values = np.array(rows, dtype=np.float64).reshape(len(rows), 2)
+    return _matrix('modes', 'frequency_hz damping_ratio', values)
+
+
+def payload_row(payload: Payload) -> LabelledArray:
+    """Return mass, standard deviation, lower 95 %, upper 95 % [kg], consistency."""
+    values = np.array([payload.mass, payload.std, payload.lower, payload.upper, payload.consistency])
+    return LabelledArray((Dimension('mass std lower95 upper95 consistency', 5, 5),), values)
+
+
+def inertia(payload: Payload, stamp_ns: int, frame_id: str) -> Inertia:
+    """Return the payload as a robot driver takes it."""
+    return Inertia(stamp_ns, frame_id, payload.mass, payload.com, payload.inertia)
+
+
+Value = LabelledArray | Inertia | float
+
+
+def outgoing(estimate: Estimate, frame_id: str) -> Iterator[tuple[str, Value]]:
+    """Yield (topic below the node's name, value) of everything an estimate publishes.
+
+    Never a NaN; an interval without bound is said as infinite, and then no driver is told a payload.
+    """
+    model = estimate.model
+    if model is not None and all(np.isfinite(part).all() for part in model_parts(model)):
+        yield MODEL, model_matrix(model)
+        yield MODES, modes_matrix(estimate.modes)
+    payload = estimate.payload
+    if payload is None or not math.isfinite(payload.mass):
+        return
+    row = payload_row(payload)
+    if np.isnan(row.data).any():
+        return
+    yield PAYLOAD_MASS, payload.mass
+    yield PAYLOAD_ESTIMATE, row
+    if np.isfinite((payload.std, *payload.com, *payload.inertia)).all():
+        yield PAYLOAD, inertia(payload, estimate.stamp_ns, frame_id)
+
+
+def model_parts(model: StateSpace) -> tuple[Array, ...]:
+    """Return A, B, C, D, K."""
+    return model.A, model.B, model.C, model.D, model.K
