@@ -1,0 +1,148 @@
+"""ROS parameter files and ``name=value`` overrides -> dotted names and values."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.parameters.field import configure
+
+Config = TypeVar('Config')
+STANDARD = re.compile(r'^(use_sim_time|start_type_description_service|qos_overrides\..*)$')
+"""Parameters that every ROS node has; they mean nothing offline."""
+LARGEST_FILE = 1 << 20
+"""Bytes; a parameter file is a page of text."""
+
+
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]
+    """Safe YAML as ROS reads it: 1e-3 is a number, a name twice is a mistake, aliases are not understood."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.events.AliasEvent):
+            mark = self.peek_event().start_mark
+            raise yaml.composer.ComposerError(None, None, 'ROS parameter files have no aliases (*name)', mark)
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key.value, str) and key.value in seen:
+                problem = f"'{key.value}' is given twice"
+                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+            seen.add(str(key.value))
+        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
+        return mapping
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: list(resolvers) for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()}
+_Loader.add_implicit_resolver(
+    'tag:yaml.org,2002:float', re.compile(r'^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$'), list('-+.0123456789'))
+
+
+def _load(text: str, what: str) -> Any:
+    try:
+        return yaml.load(text, _Loader)
+    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as err:
+        reason = getattr(err, 'problem', None) or str(err) or type(err).__name__
+        mark = getattr(err, 'problem_mark', None)
+        place = f' in line {mark.line + 1}' if mark is not None else ''
+        raise ParameterError(f'{what} is not valid YAML{place}: {reason}', 'correct that line') from err
+
+
+def read(path: str | Path, node: str) -> dict[str, Any]:
+    """Return the parameters a file gives to ``node``, nested groups flattened with dots.
+
+    Sections named ``/**``, ``node``, ``/ns/node`` or with wildcards apply, later ones win; sections of other
+    nodes are left alone. Raises ParameterError naming the file.
+    """
+    where = f"parameter file '{path}'"
+    try:
+        if Path(path).stat().st_size > LARGEST_FILE:
+            raise ParameterError(f'{where} is larger than 1 MiB', 'give a ROS parameter file')
+        text = Path(path).read_text(encoding='utf-8')
+    except FileNotFoundError as err:
+        raise ParameterError(f'{where} does not exist', 'check the path') from err
+    except (OSError, ValueError) as err:
+        reason = getattr(err, 'strerror', None) or 'it is not UTF-8 text'
+        raise ParameterError(f'{where} cannot be read: {reason}', 'give a readable YAML file') from err
+    document = _load(text, where)
+    if document is None:
+        return {}
+    sections = dict(_sections(document, '', where))
+    if not sections:
+        raise ParameterError(f"{where} has no 'ros__parameters'",
+                             f"write '{node}: {{ros__parameters: {{...}}}}'")
+    chosen = [name for name in sections if _applies(name, node)]
+    if not chosen:
+        near = difflib.get_close_matches(node, [name.rpartition('/')[2] for name in sections], n=1)
+        hint = f" ('{near[0]}' is close)" if near else ''
+        raise ParameterError(f"{where} is for {', '.join(sorted(sections))}, not for {node}{hint}",
+                             f"add a section '{node}' or '/**'")
+    values: dict[str, Any] = {}
+    for name in chosen:
+        flat = _flatten(sections[name], '', where)
+        values.update((key, value) for key, value in flat.items() if not STANDARD.match(key))
+    return values
+
+
+def _sections(tree: Any, prefix: str, where: str) -> Iterable[tuple[str, Any]]:
+    if not isinstance(tree, Mapping):
+        raise ParameterError(f'{where} has {tree!r:.60} in place of a node',
+                             "write 'NODE: {ros__parameters: {...}}'")
+    for key, value in tree.items():
+        name = f'{prefix}/{key}'.replace('//', '/') if prefix else str(key)
+        if isinstance(value, Mapping) and 'ros__parameters' in value:
+            yield name, value['ros__parameters'] or {}
+        elif isinstance(value, Mapping) and any(isinstance(below, Mapping) for below in value.values()):
+            yield from _sections({k: v for k, v in value.items() if isinstance(v, Mapping)}, name, where)
+
+
+def _applies(section: str, node: str) -> bool:
+    last = section.rpartition('/')[2]
+    return last in (node, '*', '**')
+
+
+def _flatten(tree: Any, prefix: str, where: str) -> dict[str, Any]:
+    if not isinstance(tree, Mapping):
+        raise ParameterError(f"{where}: 'ros__parameters' is {tree!r:.60}", 'list the parameters below it')
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        name = f'{prefix}{key}'
+        below = _flatten(value, name + '.', where) if isinstance(value, Mapping) else {name: value}
+        for known, item in below.items():
+            if known in flat:
+                raise ParameterError(f"{where} gives '{known}' twice", 'keep one of them')
+            flat[known] = item
+    return flat
+
+
+def parse_overrides(items: Iterable[str]) -> dict[str, Any]:
+    """Return the names and values of ``name=value`` texts; the value is YAML. Later ones win."""
+    values: dict[str, Any] = {}
+    for item in items:
+        name, equals, text = item.partition('=')
+        if not equals or not name.strip():
+            raise ParameterError(f"--set got '{item}'", 'write name=value, for example --set order=4')
+        values[name.strip()] = _load(text, f'the value of --set {name.strip()}')
+    return values
+
+
+def load(cls: type[Config], node: str, path: str | Path | None, overrides: Iterable[str] = ()) -> Config:
+    """Return the configuration of ``node`` from a parameter file (or none) and ``name=value`` overrides."""
+    from_file = {} if path is None else read(path, node)
+    from_line = parse_overrides(overrides)
+    if path is not None:
+        try:
+            return configure(cls, {**from_file, **from_line})
+        except ParameterError as err:
+            if any(f"'{name}'" in err.problem for name in from_line):
+                raise
+            raise ParameterError(f"{err.problem} in parameter file '{path}'", err.remedy) from err
+    return configure(cls, from_line)
