@@ -23,6 +23,13 @@ class ArmParameters:
         low=SMALLEST, size=2)
     joint_mass: float = parameter(10.0, 'mass at the end of link 1', unit='kg', low=0.0)
     tip_mass: float = parameter(10.0, 'mass at the end of link 2 before capture', unit='kg', low=0.0)
+    hub_inertia: tuple[float, ...] = parameter(
+        (0.0, 0.0), "rotary inertia of each joint's hub, turning with the root of its link", unit='kg m^2',
+        low=0.0, size=2)
+    joint_inertia: float = parameter(
+        0.0, 'rotary inertia of the mass at the end of link 1, turning with it', unit='kg m^2', low=0.0)
+    tip_inertia: float = parameter(
+        0.0, 'rotary inertia of the tip mass, turning with the end of link 2', unit='kg m^2', low=0.0)
     damping_ratio: float = parameter(
         0.0, "damping of critical at each link's first pinned mode", low=0.0, high=0.99)
     damping_model: str = parameter(
@@ -30,6 +37,10 @@ class ArmParameters:
         choices=('stiffness', 'modal'))
     modes: int = parameter(
         3, 'assumed modes kappa of each link (`block` takes order / 4 instead)', low=1, high=12)
+    shortening: bool = parameter(
+        True, 'keep the shortening of a bent link to second order (the paper: false)')
+    slope_correction: bool = parameter(
+        True, 'add the truncated modes quasi-statically to the encoder angles (the paper: false)')
     sensor_position: tuple[float, ...] = parameter(
         (0.5, 0.5), "place of each bend sensor as a fraction of its link's length", low=0.0, high=1.0, size=2)
     effort_delay: int = parameter(
@@ -39,7 +50,7 @@ class ArmParameters:
         'joint', 'joint: torque 2 acts between link 1 and link 2 (a real arm); paper: on link 2 alone',
         choices=('joint', 'paper'))
     angle_convention: str = parameter(
-        'encoder', 'encoder: root slopes, joint 2 relative to the tip of link 1; chord: absolute chord angles',
+        'encoder', 'encoder: root slopes, joint 2 relative to the tip of link 1; chord: absolute chords',
         choices=('encoder', 'chord'))
 
     def __post_init__(self) -> None:

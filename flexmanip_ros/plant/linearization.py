@@ -1,0 +1,157 @@
+"""The arm near a working point at rest: block matrices, vibration model, exact discretization.
+
+Closed forms at zero bending (paper eqs. 12-21), for any number of modes a link and both torque
+conventions. The working point that moves is in ``working_point.py``; the nonlinear arm in
+``manipulator.py``.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, expm
+
+from flexmanip_ros.errors import ModelError
+from flexmanip_ros.parameters.arm import ArmParameters
+from flexmanip_ros.types import Array
+
+
+class Blocks(NamedTuple):
+    """Mass, stiffness and input matrices with q = [theta; eta], k modes a link (paper eqs. 12-14).
+
+    Ma: (2, 2), Mb: (2, 2k), Mc: (2k, 2k), Kc: (2k, 2k), B_theta: (2, 2), B_eta: (2k, 2), in SI units.
+    """
+
+    Ma: Array
+    Mb: Array
+    Mc: Array
+    Kc: Array
+    B_theta: Array
+    B_eta: Array
+
+
+def root_slopes(arm: ArmParameters, kappa: int) -> Array:
+    """Slopes phi'(0) of each link's sine shapes, (2, kappa) [1/m]."""
+    j = np.arange(1, kappa + 1)
+    return np.pi * j / np.asarray(arm.link_length)[:, None]
+
+
+def tip_slopes(arm: ArmParameters, kappa: int) -> Array:
+    """Slopes phi'(L) of each link's sine shapes, (2, kappa) [1/m]."""
+    j = np.arange(1, kappa + 1)
+    return root_slopes(arm, kappa) * np.where(j % 2, -1.0, 1.0)
+
+
+def blocks(arm: ArmParameters, theta: Array, payload_mass: float = 0.0, kappa: int | None = None) -> Blocks:
+    """Return the block matrices at chord angles theta (2,) [rad], eta = 0, for a point-mass payload [kg].
+
+    Raises ModelError when theta or the payload is not finite or kappa is below 1.
+    """
+    k = arm.modes if kappa is None else kappa
+    theta = _checked(theta, payload_mass, k)
+    (L1, L2), (rho1, rho2) = arm.link_length, arm.linear_density
+    m_o = arm.tip_mass + payload_mass
+    c = float(np.cos(theta[1] - theta[0]))
+    j = np.arange(1, k + 1)
+    sign = np.where(j % 2, -1.0, 1.0)  # cos(j pi)
+    J_hub1, J_hub2 = arm.hub_inertia
+    root, tip = root_slopes(arm, k), tip_slopes(arm, k)
+
+    Ma = np.empty((2, 2))
+    Ma[0, 0] = rho1 * L1**3 / 3 + (arm.joint_mass + rho2 * L2 + m_o) * L1**2 + J_hub1 + arm.joint_inertia
+    Ma[0, 1] = Ma[1, 0] = (rho2 * L2 / 2 + m_o) * L1 * L2 * c
+    Ma[1, 1] = rho2 * L2**3 / 3 + m_o * L2**2 + J_hub2 + arm.tip_inertia
+
+    Mb = np.zeros((2, 2 * k))
+    Mb[0, :k] = -rho1 * L1**2 * sign / (j * np.pi) + J_hub1 * root[0] + arm.joint_inertia * tip[0]
+    Mb[0, k:] = rho2 * L1 * L2 * c * (1 - sign) / (j * np.pi)
+    Mb[1, k:] = -rho2 * L2**2 * sign / (j * np.pi) + J_hub2 * root[1] + arm.tip_inertia * tip[1]
+
+    Mc = np.diag(np.repeat([rho1 * L1 / 2, rho2 * L2 / 2], k))
+    Mc[:k, :k] += J_hub1 * np.outer(root[0], root[0]) + arm.joint_inertia * np.outer(tip[0], tip[0])
+    Mc[k:, k:] += J_hub2 * np.outer(root[1], root[1]) + arm.tip_inertia * np.outer(tip[1], tip[1])
+
+    B = torque_matrix(arm, k)
+    return Blocks(Ma, Mb, Mc, np.diag(stiffness(arm, k)), B[:2], B[2:])
+
+
+def stiffness(arm: ArmParameters, kappa: int) -> Array:
+    """Diagonal of Kc, (2 kappa,) [N/m]."""
+    j = np.pi * np.arange(1, kappa + 1)
+    return np.concatenate([
+        EI * j**4 / (2 * L**3) for EI, L in zip(arm.bending_stiffness, arm.link_length, strict=True)])
+
+
+def damping(arm: ArmParameters, kappa: int) -> Array:
+    """Diagonal of the modal damping matrix Dc, (2 kappa,) [N s/m].
+
+    ``stiffness``: Dc = (2 zeta / omega_i1) Kc; ``modal``: 2 zeta omega_ij Mc, with the pinned link's
+    omega_ij = (j pi / L_i)^2 sqrt(EI_i / rho_i).
+    """
+    j = np.arange(1, kappa + 1)
+    growth = j**4 if arm.damping_model == 'stiffness' else j**2
+    rows = []
+    for L, rho, EI in zip(arm.link_length, arm.linear_density, arm.bending_stiffness, strict=True):
+        first = (np.pi / L) ** 2 * np.sqrt(EI / rho)
+        rows.append(2 * arm.damping_ratio * first * (rho * L / 2) * growth)
+    return np.concatenate(rows)
+
+
+def torque_matrix(arm: ArmParameters, kappa: int) -> Array:
+    """Generalized force of the two joint torques, (2 + 2 kappa, 2): rows theta, eta_1, eta_2.
+
+    ``paper``: torque 2 acts on link 2's chord alone. ``joint``: it reacts on link 1's tip, and both
+    torques do work through the slopes of the shapes.
+    """
+    B = np.zeros((2 + 2 * kappa, 2))
+    B[:2] = np.eye(2)
+    if arm.torque_convention == 'joint':
+        root, tip = root_slopes(arm, kappa), tip_slopes(arm, kappa)
+        B[0, 1] = -1.0
+        B[2:2 + kappa, 0] = root[0]
+        B[2:2 + kappa, 1] = -tip[0]
+        B[2 + kappa:, 1] = root[1]
+    return B
+
+
+def vibration_model(
+    arm: ArmParameters, theta: Array, payload_mass: float = 0.0, kappa: int | None = None,
+) -> tuple[Array, Array]:
+    """Return (Ac (4k, 4k), Bc (4k, 2)), x = [eta; eta'], chords free, damped (paper eqs. 19-21)."""
+    k = arm.modes if kappa is None else kappa
+    b = blocks(arm, theta, payload_mass, k)
+    solved = cho_solve(cho_factor(b.Ma), np.hstack([b.Mb, b.B_theta]))
+    Mt = cho_factor(b.Mc - b.Mb.T @ solved[:, :2 * k])
+    D = np.diag(damping(arm, k))
+    rows = cho_solve(Mt, np.hstack([-b.Kc, -D, b.B_eta - b.Mb.T @ solved[:, 2 * k:]]))
+    Ac = np.block([[np.zeros((2 * k, 2 * k)), np.eye(2 * k)], [rows[:, :4 * k]]])
+    return Ac, np.vstack([np.zeros((2 * k, 2)), rows[:, 4 * k:]])
+
+
+def discretize(Ac: Array, Bc: Array, dt: float) -> tuple[Array, Array]:
+    """Exact step of dt seconds with the input held: exp([[Ac, Bc], [0, 0]] dt) gives (A, B)."""
+    n, r = Bc.shape
+    if not (np.isfinite(dt) and dt > 0):
+        raise ModelError(f'the sample time is {dt}', 'give a positive number of seconds')
+    stacked = np.zeros((n + r, n + r))
+    stacked[:n, :n], stacked[:n, n:] = Ac, Bc
+    step = expm(stacked * dt)
+    return step[:n, :n], step[:n, n:]
+
+
+def frequencies(Ac: Array) -> Array:
+    """Damped frequencies [Hz] of a continuous model, rising, one for each oscillating pair."""
+    poles = np.linalg.eigvals(Ac)
+    return np.sort(poles.imag[poles.imag > 0]) / (2 * np.pi)
+
+
+def _checked(theta: Array, payload_mass: float, kappa: int) -> Array:
+    theta = np.asarray(theta, dtype=np.float64)
+    if theta.shape != (2,) or not np.all(np.isfinite(theta)):
+        raise ModelError(f'the chord angles are {theta!r}', 'give two finite angles in rad')
+    if not (np.isfinite(payload_mass) and payload_mass >= 0):
+        raise ModelError(f'the payload mass is {payload_mass}', 'give a mass of zero or more in kg')
+    if kappa < 1:
+        raise ModelError(f'kappa is {kappa}', 'use at least one mode a link')
+    return theta
