@@ -1,0 +1,64 @@
+"""Payload from the blocks of an identified state-space model: the paper's eqs. (47)-(52), any kappa.
+
+Symbols are the paper's: M_a, M_b, M_c blocks of the mass matrix, M_t = M_c - M_b' M_a^-1 M_b, K_c the modal
+stiffness; h = 2 kappa modal coordinates; the state is [eta; eta'] with eta = [eta_11.. eta_21..].
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flexmanip_ros.errors import ModelError
+from flexmanip_ros.parameters import ArmParameters
+from flexmanip_ros.plant.linearization import Blocks, blocks
+from flexmanip_ros.types import Array
+
+
+def extract(
+    arm: ArmParameters, Ac: Array, Bc: Array, theta: Array, kappa: int, known_mb: bool = False,
+) -> float:
+    """Return the payload [kg] of a continuous model with the state [eta; eta'].
+
+    Ac: (4 kappa, 4 kappa), Bc: (4 kappa, 2), theta: (2,) chord angles [rad]; known_mb: take M_b from the
+    arm instead of from the model. Raises ModelError on other shapes or a singular model.
+    """
+    order = 4 * kappa
+    if Ac.shape != (order, order) or Bc.shape != (order, 2):
+        raise ModelError(
+            f'block extraction got A {Ac.shape} and B {Bc.shape} for kappa = {kappa}',
+            f'give A ({order}, {order}) and B ({order}, 2): the order must be 4 kappa')
+    try:
+        mass = float(masses(arm, blocks(arm, theta, kappa=kappa), Ac, Bc, known_mb))
+    except np.linalg.LinAlgError as err:
+        raise ModelError('the identified model has a singular block', 'excite both joints, or lower the order'
+                         ) from err
+    if not np.isfinite(mass):
+        raise ModelError('the identified model gives no finite payload',
+                         'excite both joints, or lower the order')
+    return mass
+
+
+def masses(arm: ArmParameters, empty: Blocks, Ac: Array, Bc: Array, known_mb: bool) -> Array:
+    """Return the payload [kg] of each model of a stack, Ac: (..., 4 kappa, 4 kappa), Bc: (..., 4 kappa, 2).
+
+    empty: the blocks of the arm without payload. Raises numpy.linalg.LinAlgError when one is singular.
+    """
+    h = Ac.shape[-1] // 2
+    G, H = -Ac[..., h:, :h], Bc[..., h:, :]
+    K_c = np.broadcast_to(empty.Kc, G.shape)
+    M_t = _transpose(np.linalg.solve(_transpose(G), K_c))  # eq. (48): M_t G = K_c
+    # eq. (49), with the bending moments of real joint torques: X = M_b' M_a^-1
+    X = _transpose(np.linalg.solve(empty.B_theta.T, _transpose(empty.B_eta - M_t @ H)))
+    X_t = _transpose(X)
+    if known_mb:
+        M_b = np.broadcast_to(empty.Mb, X_t.shape)
+    else:
+        M_b = np.linalg.solve(X_t @ X, X_t @ (empty.Mc - M_t))  # eq. (50), least squares
+    M_a = np.linalg.solve(X_t @ X, X_t @ _transpose(M_b))  # eq. (51), least squares
+    trace = np.trace(M_a - empty.Ma, axis1=-2, axis2=-1)
+    L1, L2 = arm.link_length
+    return np.asarray(trace / (L1 ** 2 + L2 ** 2))  # eq. (52)
+
+
+def _transpose(stack: Array) -> Array:
+    return np.swapaxes(stack, -1, -2)
