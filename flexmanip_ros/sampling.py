@@ -180,7 +180,7 @@ def _next(config: IdentifierParameters, state: SamplingState, raw: Sample
         total, count = state.interval_sum_ns, state.interval_count
         # Compared in whole nanoseconds times count: the same stamps give the same verdict on any machine.
         gap = not (interval * count < config.gap_factor * total
-                   and total < config.gap_factor * interval * count)
+                   and interval * count > (2.0 - config.gap_factor) * total)
         if gap:
             state = state._replace(irregular=state.irregular + 1, pending=(),
                             counters=state.counters.plus('gaps'))

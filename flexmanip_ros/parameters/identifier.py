@@ -37,7 +37,7 @@ class IdentifierParameters:
     publish_rate: float = parameter(
         50.0, 'estimates a second, on the grid of the stamps', unit='Hz', low=0.01, high=10000.0)
     gap_factor: float = parameter(
-        1.5, 'a step between stamps this many times longer or shorter than the sample time is a gap',
+        1.5, 'a step between stamps longer than this many sample times is a gap (so is one as much shorter)',
         low=1.05, high=1000.0)
     max_time_jump: float = parameter(
         1.0, 'a jump back of the stamps by more than this resets the identifier', unit='s', low=0.001)

@@ -1,0 +1,73 @@
+"""Identifier and payload side by side: they see only samples and events, in order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from flexmanip_ros.identification import rpbsid
+from flexmanip_ros.identification.modal import modes
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.payload import block_extraction, structured
+from flexmanip_ros.types import Array, CaptureEvent, Estimate, Sample, Status
+
+
+class Core(NamedTuple):
+    """Everything the estimators remember; constant in size."""
+
+    rpbsid: rpbsid.RpbsidState
+    structured: structured.StructuredState | None
+    angles: Array
+    """The latest measured configuration: (2,) [rad], or (0,) when there is none."""
+
+
+def init(config: IdentifierParameters) -> Core:
+    """Start with nothing known. ``config.outputs`` are those the messages really carry."""
+    wanted = config.payload_method == 'structured'
+    return Core(rpbsid.init(config), structured.init(config) if wanted else None, np.empty(0))
+
+
+def advance(config: IdentifierParameters, core: Core, samples: Sequence[Sample]) -> Core:
+    """Run samples through both estimators; one call of N samples gives the bits of N calls of one."""
+    identifier = core.rpbsid
+    start = 0
+    for stop in [i for i, sample in enumerate(samples) if sample.gap and i > 0] + [len(samples)]:
+        part = samples[start:stop]
+        if part[0].gap:
+            identifier = rpbsid.window_restart(config, identifier)
+        identifier = rpbsid.advance(
+            config, identifier, np.array([s.u for s in part]), np.array([s.y for s in part]))
+        start = stop
+    held = core.structured
+    if held is not None:
+        held = structured.advance(config, held, samples)
+    return Core(identifier, held, samples[-1].angles)
+
+
+def event(config: IdentifierParameters, core: Core, event: CaptureEvent) -> Core:
+    """Tell both estimators that the arm caught or let go of something before the next sample."""
+    held = core.structured
+    if held is not None:
+        held = structured.event(config, held, event)
+    return core._replace(rpbsid=rpbsid.restart(config, core.rpbsid), structured=held)
+
+
+def estimate(config: IdentifierParameters, core: Core, stamp_ns: int, dt: float) -> Estimate:
+    """Read model, modes and payload out of the estimators; the costly part, done at the publishing rate."""
+    found = rpbsid.identified(config, core.rpbsid, dt)
+    payload = None
+    if config.payload_method == 'structured' and core.structured is not None:
+        payload = structured.estimate(config, core.structured)
+    elif config.payload_method == 'block' and found is not None:
+        payload = block_extraction.estimate(config, found, core.angles)
+    if found is None:
+        return Estimate(stamp_ns, Status.WARMING_UP, None, (), payload)
+    status = found.status
+    if payload is not None and status is Status.TRACKING:
+        status = payload.status
+    return Estimate(
+        stamp_ns, status, found.model, modes(found), payload, excitation=found.excitation,
+        condition=found.condition, singular_values=found.singular_values,
+        innovation_power=found.innovation_power)

@@ -1,0 +1,178 @@
+"""The one way through the house: messages in, estimates out.
+
+The live node calls ``step`` for each message, a replay and a study call ``run``. Both take the same path, so
+the same messages give the same estimates bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+from flexmanip_ros import estimator, sampling, timeline
+from flexmanip_ros.errors import SignalError
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Sample
+
+BLOCK = 256
+"""Samples run through the compiled kernels at once when replaying."""
+PATIENCE = 2000
+"""Messages without a single usable one after which a replay gives up."""
+
+
+class State(NamedTuple):
+    """All that the identifier remembers."""
+
+    sampling: sampling.SamplingState = sampling.SamplingState()
+    timeline: timeline.Timeline | None = None
+    config: IdentifierParameters | None = None
+    """The configuration with the outputs that the messages really carry."""
+    early: tuple[CaptureEvent, ...] = ()
+    """Events that came before the first usable message."""
+    first_ns: int = 0
+    published: int = -1
+    """Index of the last publishing instant, counted from the first stamp."""
+
+    @property
+    def counters(self) -> sampling.Counters:
+        """What became of the messages."""
+        return self.sampling.counters
+
+    def stamp_of(self, kind: EventKind) -> int | None:
+        """Return the stamp of the latest event of a kind [ns], None when there was none."""
+        return self.timeline.stamp_of(kind) if self.timeline is not None else None
+
+
+def init() -> State:
+    """Start with nothing seen."""
+    return State()
+
+
+def step(config: IdentifierParameters, state: State, item: JointRecord | CaptureEvent
+         ) -> tuple[State, tuple[Estimate, ...]]:
+    """Take one message; return the estimates that are due with it.
+
+    Raises ParameterError when the configuration does not fit the signals that the messages carry.
+    """
+    if isinstance(item, CaptureEvent):
+        return _event(state, item), ()
+    state, samples = _sample(config, state, item)
+    return _consume(state, samples)
+
+
+def run(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]) -> Iterator[Estimate]:
+    """Yield the estimates of a recording. Raises SignalError when none of its messages can be used."""
+    for _, estimate in replay(config, items):
+        if estimate is not None:
+            yield estimate
+
+
+def replay(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]
+           ) -> Iterator[tuple[State, Estimate | None]]:
+    """Yield the state with each estimate of a recording, and at the end the last state with None.
+
+    The same numbers as ``step`` on each item, faster. Raises SignalError when no message can be used.
+    """
+    state = init()
+    block: list[Sample] = []
+    for item in items:
+        if isinstance(item, CaptureEvent):
+            state, ready = _consume(state, block)
+            block = []
+            yield from ((state, estimate) for estimate in ready)
+            state = _event(state, item)
+            continue
+        line = state.timeline
+        state, samples = _sample(config, state, item)
+        if state.timeline is not line:
+            block = []  # the clock was set back: what came before it is over
+        block.extend(samples)
+        if len(block) >= BLOCK or (samples and _due(state, samples[-1].stamp_ns)):
+            state, ready = _consume(state, block)
+            block = []
+            yield from ((state, estimate) for estimate in ready)
+        if state.counters.accepted == 0 and state.counters.received >= PATIENCE:
+            break
+    if state.config is not None:
+        clock, held = sampling.flush(state.config, state.sampling)
+        state = state._replace(sampling=clock)
+        block.extend(held.samples)
+    state, ready = _consume(state, block)
+    yield from ((state, estimate) for estimate in ready)
+    check_used(state)
+    yield state, None
+
+
+def current(state: State) -> Estimate | None:
+    """Return the estimate at the latest sample, whatever the publishing grid; None before the first."""
+    line = state.timeline
+    if line is None or state.config is None or line.last_ns == timeline.BEFORE_ALL:
+        return None
+    return estimator.estimate(state.config, line.core, line.last_ns, state.sampling.dt)
+
+
+def check_used(state: State) -> None:
+    """Raise SignalError when messages came and none, or just one, could be used."""
+    refusal = state.sampling.refusal
+    if state.counters.accepted <= 1 and refusal is not None:
+        raise SignalError(refusal.problem, refusal.remedy)
+
+
+def _event(state: State, event: CaptureEvent) -> State:
+    if state.timeline is None or state.config is None:
+        return state._replace(early=(*state.early, event))
+    return state._replace(timeline=timeline.event(state.config, state.timeline, event))
+
+
+def _sample(config: IdentifierParameters, state: State, record: JointRecord
+            ) -> tuple[State, tuple[Sample, ...]]:
+    clock, sampled = sampling.step(config, state.sampling, record)
+    state = state._replace(sampling=clock)
+    if sampled.reset:
+        state = State(sampling=clock, config=state.config)
+    if state.timeline is None and clock.outputs is not None:
+        state = _begin(config, state, record.stamp_ns)
+    return state, sampled.samples
+
+
+def _begin(config: IdentifierParameters, state: State, first_ns: int) -> State:
+    """Build the estimators for the outputs that are there, and give them the events that were early."""
+    assert state.sampling.outputs is not None
+    settled = config if config.outputs == state.sampling.outputs else replace(
+        config, outputs=state.sampling.outputs)
+    state = state._replace(config=settled, timeline=timeline.Timeline(estimator.init(settled)),
+                           first_ns=first_ns, published=-1)
+    early = state.early
+    state = state._replace(early=())
+    for event in early:
+        state = _event(state, event)
+    return state
+
+
+def _instant(state: State, stamp_ns: int) -> int:
+    assert state.config is not None
+    return int((stamp_ns - state.first_ns) * state.config.publish_rate * 1e-9 + 1e-6)
+
+
+def _due(state: State, stamp_ns: int) -> bool:
+    return _instant(state, stamp_ns) > state.published
+
+
+def _consume(state: State, samples: Iterable[Sample]) -> tuple[State, tuple[Estimate, ...]]:
+    """Run samples through the estimators, stopping at each publishing instant."""
+    if state.timeline is None or state.config is None:
+        return state, ()
+    ready: list[Estimate] = []
+    block: list[Sample] = []
+    for sample in samples:
+        block.append(sample)
+        if not _due(state, sample.stamp_ns):
+            continue
+        line = timeline.advance(state.config, state.timeline, block)
+        block = []
+        state = state._replace(timeline=line, published=_instant(state, sample.stamp_ns))
+        ready.append(estimator.estimate(state.config, line.core, sample.stamp_ns, state.sampling.dt))
+    if block:
+        state = state._replace(timeline=timeline.advance(state.config, state.timeline, block))
+    return state, tuple(ready)

@@ -1,0 +1,121 @@
+"""Samples and events in the order of their stamps, whatever the order of their arrival.
+
+An event that arrives early waits for its stamp. One that arrives late is applied at its own stamp: the last
+``rewind_time`` of samples is kept, the estimator goes back to a checkpoint before the event and runs them
+again. From its arrival on, the result depends on stamps alone. An older event is applied at once and counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from flexmanip_ros import estimator
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.types import CaptureEvent, EventKind, Sample
+
+BEFORE_ALL = -(1 << 63)
+"""Stamp of the sample before the first one."""
+CHECKPOINTS = 2
+"""Checkpoints within ``rewind_time``; one more is kept so that the whole of it can be run again."""
+
+
+class Checkpoint(NamedTuple):
+    """The estimator after the sample at ``after_ns``, before the one at ``stamp_ns`` and its events."""
+
+    after_ns: int
+    stamp_ns: int
+    core: estimator.Core
+
+
+class Timeline(NamedTuple):
+    """The estimator now, and what is needed to go back."""
+
+    core: estimator.Core
+    checkpoints: tuple[Checkpoint, ...] = ()
+    samples: tuple[Sample, ...] = ()
+    """From the oldest checkpoint on."""
+    applied: tuple[CaptureEvent, ...] = ()
+    """Events at or after the oldest checkpoint, in the order of their stamps."""
+    waiting: tuple[CaptureEvent, ...] = ()
+    """Events whose stamp has not been reached."""
+    latest: tuple[CaptureEvent, ...] = ()
+    """The latest event of each kind that was taken, to recognise a repeated one."""
+    last_ns: int = BEFORE_ALL
+    late_events: int = 0
+    repeated_events: int = 0
+    rewinds: int = 0
+
+    def stamp_of(self, kind: EventKind) -> int | None:
+        """Return the stamp of the latest event of a kind, None when there was none."""
+        return next((event.stamp_ns for event in self.latest if event.kind is kind), None)
+
+
+def advance(config: IdentifierParameters, line: Timeline, samples: Sequence[Sample]) -> Timeline:
+    """Run samples, in rising stamps, through the estimator, with the events that fall among them."""
+    spacing_ns = int(config.rewind_time * 1e9) // CHECKPOINTS
+    block: list[Sample] = []
+    for sample in samples:
+        due = tuple(event for event in line.waiting if event.stamp_ns <= sample.stamp_ns)
+        checkpoint_due = not line.checkpoints or sample.stamp_ns - line.checkpoints[-1].stamp_ns >= spacing_ns
+        if block and (due or checkpoint_due):
+            line = _run(config, line, block)
+            block = []
+        if checkpoint_due:
+            line = _checkpoint(config, line, sample.stamp_ns)
+        for event in due:
+            line = line._replace(core=estimator.event(config, line.core, event),
+                                 applied=(*line.applied, event),
+                                 waiting=tuple(e for e in line.waiting if e is not event))
+        block.append(sample)
+    return _run(config, line, block) if block else line
+
+
+def event(config: IdentifierParameters, line: Timeline, event: CaptureEvent) -> Timeline:
+    """Take an event: let it wait, go back for it, or (too old to go back) apply it now."""
+    previous = line.stamp_of(event.kind)
+    if previous is not None and abs(event.stamp_ns - previous) <= config.event_merge_time * 1e9:
+        return line._replace(repeated_events=line.repeated_events + 1)
+    line = line._replace(latest=(*(e for e in line.latest if e.kind is not event.kind), event))
+    if event.stamp_ns > line.last_ns:
+        return _wait(line, event)
+    if event.stamp_ns <= line.checkpoints[0].after_ns:
+        now = event._replace(stamp_ns=line.last_ns + 1)
+        return _wait(line._replace(late_events=line.late_events + 1), now)
+    return _rewind(config, line, event)
+
+
+def _wait(line: Timeline, event: CaptureEvent) -> Timeline:
+    return line._replace(waiting=tuple(sorted((*line.waiting, event), key=lambda e: e.stamp_ns)))
+
+
+def _run(config: IdentifierParameters, line: Timeline, block: list[Sample]) -> Timeline:
+    return line._replace(core=estimator.advance(config, line.core, block),
+                         samples=(*line.samples, *block), last_ns=block[-1].stamp_ns)
+
+
+def _checkpoint(config: IdentifierParameters, line: Timeline, stamp_ns: int) -> Timeline:
+    """Remember the estimator as it is before the sample at ``stamp_ns``; forget what is too old."""
+    kept = (*line.checkpoints, Checkpoint(line.last_ns, stamp_ns, line.core))
+    oldest_needed = stamp_ns - int(config.rewind_time * 1e9)
+    while len(kept) > 1 and kept[1].stamp_ns <= oldest_needed:
+        kept = kept[1:]
+    start = kept[0].after_ns
+    return line._replace(checkpoints=kept,
+                         samples=tuple(s for s in line.samples if s.stamp_ns > start),
+                         applied=tuple(e for e in line.applied if e.stamp_ns > start))
+
+
+def _rewind(config: IdentifierParameters, line: Timeline, event: CaptureEvent) -> Timeline:
+    """Go back to the last checkpoint not after the event, and run samples and events again from there."""
+    kept = tuple(c for c in line.checkpoints if c.after_ns < event.stamp_ns)
+    start = kept[-1].after_ns
+    again = tuple(sample for sample in line.samples if sample.stamp_ns > start)
+    before = tuple(sample for sample in line.samples if sample.stamp_ns <= start)
+    redo = sorted((*(e for e in line.applied if e.stamp_ns > start), *line.waiting, event),
+                  key=lambda e: e.stamp_ns)
+    back = line._replace(
+        core=kept[-1].core, checkpoints=kept, samples=before,
+        applied=tuple(e for e in line.applied if e.stamp_ns <= start),
+        waiting=tuple(redo), last_ns=start, rewinds=line.rewinds + 1)
+    return advance(config, back, again)

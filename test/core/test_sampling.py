@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flexmanip_ros import sampling
+from flexmanip_ros.parameters import IdentifierParameters, configure
+from flexmanip_ros.types import JointRecord, Sample
+
+NAMES = ('joint1', 'joint2', 'link1_bend', 'link2_bend')
+DT = 1_000_000
+
+
+def record(k: float, names: tuple[str, ...] = NAMES, **arrays: object) -> JointRecord:
+    size = len(names)
+    fields = {field: np.arange(size) + k * 0.5 + offset for offset, field in
+              ((0, 'position'), (10, 'velocity'), (20, 'effort'))}
+    fields.update({name: np.asarray(value, dtype=float) for name, value in arrays.items()})
+    return JointRecord(int(1_000_000_000 + k * DT), names, **fields)
+
+
+def drive(records: list[JointRecord], config: IdentifierParameters | None = None
+          ) -> tuple[sampling.SamplingState, list[Sample], int]:
+    config = config or IdentifierParameters()
+    state, out, resets = sampling.init(), [], 0
+    for item in records:
+        state, got = sampling.step(config, state, item)
+        if got.reset:
+            out, resets = [], resets + 1
+        out.extend(got.samples)
+    state, got = sampling.flush(config, state)
+    return state, out + list(got.samples), resets
+
+
+def test_every_regular_message_becomes_one_sample_and_the_mean_interval_is_the_sample_time() -> None:
+    state, samples, _ = drive([record(k) for k in range(100)])
+    assert len(samples) == 100
+    assert state.dt == 1e-3
+    assert not any(s.gap for s in samples)
+    assert state.counters.accepted == 100 == state.counters.received
+
+
+def test_joints_are_matched_by_name_in_any_order_and_extra_joints_are_ignored() -> None:
+    shuffled = ('link2_bend', 'gripper', 'joint2', 'joint1', 'link1_bend')
+    plain, mixed = [], []
+    for k in range(30):
+        first = record(k)
+        order = [NAMES.index(n) if n in NAMES else 0 for n in shuffled]
+        plain.append(first)
+        mixed.append(JointRecord(first.stamp_ns, shuffled, first.position[order], first.velocity[order],
+                                 first.effort[order]))
+    for a, b in zip(drive(plain)[1], drive(mixed)[1], strict=True):
+        assert (a.u == b.u).all()
+        assert (a.y == b.y).all()
+        assert (a.angles == b.angles).all()
+
+
+def test_a_bag_without_velocities_uses_displacements_only() -> None:
+    state, samples, _ = drive([record(k, velocity=[]) for k in range(30)])
+    assert state.outputs == ('link1_bend/position', 'link2_bend/position')
+    assert samples[0].y.shape == (2,)
+
+
+def test_outputs_set_by_the_user_never_shrink() -> None:
+    config = configure(IdentifierParameters, {'outputs': ['link1_bend/velocity', 'link1_bend/position'],
+                                              'order': 2})
+    state, samples, _ = drive([record(k, velocity=[]) for k in range(30)], config)
+    assert samples == []
+    assert state.refusal is not None
+    assert 'link1_bend/velocity' in state.refusal.problem
+
+
+@pytest.mark.parametrize(('bad', 'counter'), [
+    (record(40, position=[0.0, np.nan, 0.0, 0.0]), 'not_finite'),
+    (record(40, position=[0.0, 1.0]), 'unequal_sizes'),
+    (record(40, names=('a', 'b', 'c', 'd')), 'missing_signal'),
+    (record(39), 'repeated_stamp'),
+    (record(35), 'late_stamp'),
+    (record(40, effort=[]), 'missing_signal'),
+])
+def test_a_bad_message_is_dropped_and_counted_and_moves_no_clock(bad: JointRecord, counter: str) -> None:
+    good = [record(k) for k in range(60)]
+    state, samples, resets = drive([*good[:40], bad, *good[40:]])
+    assert getattr(state.counters, counter) == 1 == state.counters.dropped
+    assert resets == 0
+    assert len(samples) == 60
+    assert not any(s.gap for s in samples)
+
+
+def test_nan_matters_only_in_configured_fields() -> None:
+    fine = [record(k, velocity=[np.nan, np.nan, 0.0, 0.0]) for k in range(30)]
+    assert drive(fine)[0].counters.dropped == 0
+
+
+@pytest.mark.parametrize('missing', [5, 45])
+def test_a_missing_message_marks_a_gap_before_and_after_the_sample_time_is_known(missing: int) -> None:
+    state, samples, _ = drive([record(k) for k in range(80) if k != missing])
+    assert [s.gap for s in samples].index(True) == missing
+    assert sum(s.gap for s in samples) == 1 == state.counters.gaps
+    assert state.dt == 1e-3
+
+
+def test_a_jump_back_of_more_than_the_limit_starts_a_new_clock() -> None:
+    config = configure(IdentifierParameters, {'max_time_jump': 0.02})
+    state, samples, resets = drive([record(k) for k in range(60)] + [record(k) for k in range(50)], config)
+    assert resets == 1
+    assert len(samples) == 50
+    assert state.counters.resets == 1
+
+
+def test_a_lasting_change_of_rate_is_learned_anew() -> None:
+    slower = [record(59 + 2 * k) for k in range(1, 90)]
+    state, samples, resets = drive([record(k) for k in range(60)] + slower)
+    assert resets == 1
+    assert state.dt == pytest.approx(2e-3)
+    assert not any(s.gap for s in samples)
+
+
+@pytest.mark.parametrize('delay', [1, 3])
+def test_effort_delay_gives_each_sample_the_torque_reported_later(delay: int) -> None:
+    config = configure(IdentifierParameters, {'arm.effort_delay': delay})
+    records = [record(k) for k in range(60)]
+    _, samples, _ = drive(records, config)
+    assert len(samples) == 60 - delay
+    for k, sample in enumerate(samples):
+        assert sample.stamp_ns == records[k].stamp_ns
+        assert (sample.u == records[k + delay].effort[:2]).all()
+
+
+def test_effort_delay_never_takes_a_torque_from_across_a_gap() -> None:
+    config = configure(IdentifierParameters, {'arm.effort_delay': 1})
+    records = [record(k) for k in range(80) if not 40 <= k < 45]
+    _, samples, _ = drive(records, config)
+    stamps = [s.stamp_ns for s in samples]
+    assert records[39].stamp_ns not in stamps
+    assert samples[stamps.index(records[40].stamp_ns)].gap
+
+
+def test_jittered_stamps_are_no_gaps_and_average_to_the_sample_time() -> None:
+    rng = np.random.default_rng(1)
+    state, samples, _ = drive([record(k + 0.2 * rng.uniform(-1, 1)) for k in range(2000)])
+    assert not any(s.gap for s in samples)
+    assert state.dt == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_a_recording_shorter_than_the_learning_is_not_lost() -> None:
+    _, samples, _ = drive([record(k) for k in range(7)])
+    assert len(samples) == 7
+
+
+def test_stamps_of_zero_are_explained() -> None:
+    state, _, _ = drive([replace(record(k), stamp_ns=0) for k in range(10)])
+    assert state.refusal is not None
+    assert 'stamps do not advance' in state.refusal.problem
