@@ -1,0 +1,38 @@
+"""Write config/*.yaml and docs/parameters.md from the declared parameters.
+
+Use: ``python -m flexmanip_ros.cli.write_parameters [REPOSITORY]``
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from flexmanip_ros.parameters.document import NODES, markdown, yaml_text
+
+
+def documents() -> Iterator[tuple[str, str]]:
+    """Yield (path below the repository, text) of every file made from the declarations."""
+    for node in NODES:
+        heading = f'Defaults of {node}, written by flexmanip_ros.cli.write_parameters. Copy what you change.'
+        yield f'config/{node}.yaml', yaml_text(node, heading=heading)
+    yield 'docs/parameters.md', markdown()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write what differs; say what was written."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    root = Path(given[0]) if given else Path(__file__).resolve().parents[2]
+    for name, text in documents():
+        path = root / name
+        if path.is_file() and path.read_text(encoding='utf-8') == text:
+            continue
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding='utf-8')
+        print(f'wrote {name}')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

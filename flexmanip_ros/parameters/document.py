@@ -1,0 +1,137 @@
+"""YAML files and a table for people, made from the declared parameters so that they cannot go stale."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import yaml
+
+from flexmanip_ros.parameters.excitation import ExcitationParameters
+from flexmanip_ros.parameters.field import Leaf, leaves
+from flexmanip_ros.parameters.identifier import IdentifierParameters
+from flexmanip_ros.parameters.plant import PlantParameters
+from flexmanip_ros.parameters.trigger import TriggerParameters
+
+NODES: Mapping[str, type] = {
+    'plant_simulator': PlantParameters,
+    'excitation': ExcitationParameters,
+    'capture_trigger': TriggerParameters,
+    'rpbsid_identifier': IdentifierParameters,
+}
+"""Each node and the class that declares its parameters."""
+WIDTH = 100
+
+
+def number(value: float) -> str:
+    """Write a float so that ROS reads a double and YAML a number: always with a point."""
+    text = repr(float(value))
+    if text in ('inf', '-inf', 'nan'):
+        return text.replace('inf', '.inf').replace('nan', '.nan')
+    mantissa, exponent, power = text.partition('e')
+    return (mantissa if '.' in mantissa else mantissa + '.0') + exponent + power
+
+
+def scalar(value: Any) -> str:
+    """Write one bool, int, float or str as YAML."""
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    if isinstance(value, float):
+        return number(value)
+    if isinstance(value, str):
+        plain = value and yaml.safe_load(f'[{value}]') == [value]
+        return value if plain else "'" + value.replace("'", "''") + "'"
+    return str(value)
+
+
+def written(leaf: Leaf, value: Any) -> str:
+    """Write the value of a parameter as YAML; an empty list of texts becomes [''], as ROS needs."""
+    if not leaf.is_array:
+        return scalar(value)
+    items = [scalar(item) for item in value]
+    return f'[{", ".join(items or ["" if leaf.kind is not str else repr("")])}]'
+
+
+def limits(leaf: Leaf) -> str:
+    """Return the range or the choices in words, empty when anything goes."""
+    if leaf.choices:
+        return ' | '.join(leaf.choices)
+    if leaf.low is None and leaf.high is None:
+        return ''
+    if leaf.high is None:
+        return f'>= {leaf.low:g}'
+    if leaf.low is None:
+        return f'<= {leaf.high:g}'
+    return f'{leaf.low:g} .. {leaf.high:g}'
+
+
+def kind(leaf: Leaf) -> str:
+    """Return the type as ROS names it."""
+    name = {bool: 'bool', int: 'integer', float: 'double', str: 'string'}[leaf.kind]
+    if not leaf.is_array:
+        return name
+    return f'{name}[{leaf.size}]' if leaf.size is not None else f'{name}[]'
+
+
+def _comment(leaf: Leaf) -> str:
+    extras = [part for part in (leaf.unit, limits(leaf)) if part]
+    return leaf.words + (' (' + ', '.join(extras) + ')' if extras else '')
+
+
+def yaml_text(node: str, values: Mapping[str, Any] | None = None, heading: str = '') -> str:
+    """Return a ROS parameter file of a node: every parameter with its words, unit and range.
+
+    values: dotted names that differ from the defaults. With ``values`` only those are written.
+    """
+    lines = [f'# {line}' for line in textwrap.wrap(heading, WIDTH)]
+    lines += [f'{node}:', '  ros__parameters:']
+    group: tuple[str, ...] = ()
+    for leaf in leaves(NODES[node]):
+        if values is not None and leaf.name not in values:
+            continue
+        *path, name = leaf.name.split('.')
+        for depth, part in enumerate(path):
+            if tuple(path[:depth + 1]) != group[:depth + 1]:
+                lines.append('    ' + '  ' * depth + f'{part}:')
+        group = tuple(path)
+        indent = '    ' + '  ' * len(path)
+        lines += [f'{indent}# {line}' for line in textwrap.wrap(_comment(leaf), WIDTH - len(indent))]
+        value = leaf.default if values is None else values[leaf.name]
+        lines.append(f'{indent}{name}: {written(leaf, value)}')
+    return '\n'.join(lines) + '\n'
+
+
+def _cell(text: str) -> str:
+    return text.replace('|', '\\|')
+
+
+def table(cls: type) -> str:
+    """Return the parameters of a class as a Markdown table."""
+    rows = ['| parameter | type | default | unit | range | live | meaning |', '|---|---|---|---|---|---|---|']
+    for leaf in leaves(cls):
+        cells = (f'`{leaf.name}`', kind(leaf), f'`{written(leaf, leaf.default)}`', leaf.unit, limits(leaf),
+                 'yes' if leaf.live else '', leaf.words)
+        rows.append('| ' + ' | '.join(_cell(cell) for cell in cells) + ' |')
+    return '\n'.join(rows) + '\n'
+
+
+def markdown(nodes: Iterable[str] = tuple(NODES)) -> str:
+    """Return the reference page of all parameters."""
+    parts = ['# Parameters', '',
+             'Written by `python -m flexmanip_ros.cli.write_parameters` from the declarations in '
+             '`flexmanip_ros/parameters/`; a test fails when this page is stale.', '',
+             '`live`: may be changed while the node runs.', '']
+    for node in nodes:
+        parts += [f'## {node}', '', table(NODES[node])]
+    return '\n'.join(parts)
+
+
+def help_text(cls: type, width: int = WIDTH) -> str:
+    """Return the parameters as a list for --help."""
+    lines = []
+    for leaf in leaves(cls):
+        words = f'{leaf.name} = {written(leaf, leaf.default)}'
+        lines.append('  ' + words)
+        lines += textwrap.wrap(_comment(leaf), width - 8, initial_indent=' ' * 8, subsequent_indent=' ' * 8)
+    return '\n'.join(lines)
