@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import contextlib
+import math
+import pickle
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flexmanip_ros import parameters
+from flexmanip_ros.errors import FlexmanipError, ParameterError
+from flexmanip_ros.parameters import IdentifierParameters, configure, flatten, leaves
+
+GROUPS = [getattr(parameters, name) for name in parameters.__all__ if name.endswith('Parameters')]
+
+
+@pytest.mark.parametrize('cls', GROUPS)
+def test_every_parameter_says_what_it_is_and_accepts_its_own_default(cls: type) -> None:
+    for leaf in leaves(cls):
+        assert leaf.words, leaf.name
+        assert parameters.check(leaf, leaf.default) == leaf.default
+
+
+@pytest.mark.parametrize('cls', GROUPS)
+def test_flat_names_and_values_rebuild_the_same_configuration(cls: type) -> None:
+    assert configure(cls, flatten(cls())) == cls()
+
+
+@pytest.mark.parametrize(('values', 'words'), [
+    ({'ordr': 4}, "did you mean 'order'"),
+    ({'order': 0}, 'order'),
+    ({'order': 4.5}, 'whole number'),
+    ({'order': True}, 'whole number'),
+    ({'arm.link_length': [3.0]}, 'arm.link_length'),
+    ({'arm.link_length': [3.0, -1.0]}, 'arm.link_length'),
+    ({'arm.link_length': [3.0, math.nan]}, 'arm.link_length'),
+    ({'arm.link_length': 3.0}, 'list of numbers'),
+    ({'outputs': ['link1_bend']}, 'NAME/FIELD'),
+    ({'outputs': ['a/position', 'a/position']}, 'twice'),
+    ({'inputs': ['']}, 'inputs'),
+    ({'angles': ['joint1/position']}, 'angles'),
+    ({'payload_method': 'magic'}, 'structured'),
+    ({'future_window': 11}, 'past_window'),
+    ({'order': 21}, 'order'),
+])
+def test_a_wrong_parameter_is_named_with_the_way_out(values: dict[str, object], words: str) -> None:
+    with pytest.raises(ParameterError, match=words) as caught:
+        configure(IdentifierParameters, values)
+    assert '\n' not in str(caught.value)
+
+
+def test_an_empty_text_stands_for_the_empty_list_that_ros_cannot_write() -> None:
+    assert configure(IdentifierParameters, {'angles': ['']}).angles == ()
+
+
+@given(st.dictionaries(
+    st.sampled_from([leaf.name for leaf in leaves(IdentifierParameters)] + ['nonsense']),
+    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5),
+              st.lists(st.one_of(st.floats(), st.text(max_size=3)), max_size=4)), max_size=4))
+def test_any_values_give_a_configuration_or_one_of_our_errors(values: dict[str, object]) -> None:
+    with contextlib.suppress(FlexmanipError):
+        configure(IdentifierParameters, values)
+
+
+def test_an_error_keeps_its_words_through_a_worker_process() -> None:
+    error = ParameterError('it is wrong', 'do this')
+    again = pickle.loads(pickle.dumps(error))
+    assert str(again) == 'it is wrong; do this'

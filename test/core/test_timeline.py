@@ -1,0 +1,115 @@
+"""Stamps rule: whatever the order of arrival, the estimates that follow are those of the order of stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flexmanip_ros import pipeline
+from flexmanip_ros.parameters import IdentifierParameters, configure
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord
+
+NAMES = ('joint1', 'joint2', 'link1_bend', 'link2_bend')
+MS = 1_000_000
+CONFIG = configure(IdentifierParameters, {'payload_method': 'none', 'rewind_time': 0.05})
+
+
+def records(count: int, missing: Sequence[int] = ()) -> list[JointRecord]:
+    rng = np.random.default_rng(3)
+    out = []
+    for k in range(count):
+        values = rng.standard_normal((3, 4)) + np.sin(0.2 * k)
+        if k not in missing:
+            out.append(JointRecord(k * MS, NAMES, *values))
+    return out
+
+
+def with_event(items: list[JointRecord], stamp_ms: float, arrival: int,
+               kind: EventKind = EventKind.CAPTURE) -> list[JointRecord | CaptureEvent]:
+    event = CaptureEvent(int(stamp_ms * MS), kind)
+    return [*items[:arrival], event, *items[arrival:]]
+
+
+def step_through(items: Sequence[JointRecord | CaptureEvent], config: IdentifierParameters = CONFIG
+                 ) -> tuple[pipeline.State, list[Estimate]]:
+    state, out = pipeline.init(), []
+    for item in items:
+        state, ready = pipeline.step(config, state, item)
+        out.extend(ready)
+    return state, out
+
+
+def bits(estimate: Estimate) -> tuple[object, ...]:
+    model = estimate.model
+    parts = () if model is None else (model.A, model.B, model.C, model.D, model.K)
+    return (estimate.stamp_ns, estimate.status, *(part.tobytes() for part in parts), repr(estimate.modes))
+
+
+def same(a: Sequence[Estimate], b: Sequence[Estimate]) -> bool:
+    return [bits(e) for e in a] == [bits(e) for e in b]
+
+
+@pytest.mark.parametrize('missing', [(), (100, 101, 230)])
+def test_message_by_message_and_replayed_in_blocks_are_the_same_bits(missing: Sequence[int]) -> None:
+    items = with_event(records(400, missing), 180.0, 150)
+    _, live = step_through(items)
+    replayed = list(pipeline.run(CONFIG, items))
+    assert same(live, replayed)
+    assert len(live) >= 19
+    assert live[-1].model is not None
+
+
+@settings(max_examples=15, deadline=None)
+@given(stamp=st.integers(0, 240), delay=st.integers(-60, 45), offset=st.sampled_from([0.0, 0.3]))
+def test_from_its_arrival_on_an_event_counts_at_its_stamp_however_late(stamp: int, delay: int, offset: float
+                                                                        ) -> None:
+    items = records(320)
+    arrival = min(max(stamp + delay, 0), 300)
+    _, on_time = step_through(with_event(items, stamp + offset, 0))
+    state, shifted = step_through(with_event(items, stamp + offset, arrival))
+    after = (arrival + 1) * MS
+    assert same([e for e in on_time if e.stamp_ns > after], [e for e in shifted if e.stamp_ns > after])
+    assert state.stamp_of(EventKind.CAPTURE) == int((stamp + offset) * MS)
+
+
+def test_two_events_out_of_order_give_the_result_of_their_order() -> None:
+    items = records(320)
+    capture, release = CaptureEvent(200 * MS, EventKind.CAPTURE), CaptureEvent(215 * MS, EventKind.RELEASE)
+    _, ordered = step_through([capture, release, *items])
+    _, swapped = step_through([*items[:230], release, *items[230:240], capture, *items[240:]])
+    assert same(ordered[-3:], swapped[-3:])
+
+
+def test_an_event_too_old_to_go_back_for_is_applied_at_once_and_counted() -> None:
+    state, _ = step_through(with_event(records(400), 100.0, 350))
+    assert state.timeline is not None
+    assert state.timeline.late_events == 1
+    assert state.timeline.rewinds == 0
+
+
+def test_an_event_announced_twice_counts_once() -> None:
+    items = with_event(with_event(records(300), 200.0, 150), 200.0, 150)
+    state, twice = step_through(items)
+    _, once = step_through(with_event(records(300), 200.0, 150))
+    assert state.timeline is not None
+    assert state.timeline.repeated_events == 1
+    assert same(once, twice)
+
+
+def test_memory_stays_constant() -> None:
+    state, _ = step_through(records(1500))
+    assert state.timeline is not None
+    assert len(state.timeline.samples) <= 100
+    assert len(state.timeline.checkpoints) <= 4
+
+
+def test_a_looped_recording_gives_the_same_estimates_again() -> None:
+    config = configure(IdentifierParameters, {'payload_method': 'none', 'max_time_jump': 0.1})
+    items = with_event(records(300), 200.0, 150)
+    _, twice = step_through([*items, *items], config)
+    _, once = step_through(items, config)
+    assert same(once, twice[len(once):])
