@@ -1,0 +1,88 @@
+# Every target makes what it needs first; nothing has to be activated or sourced.
+#   make setup   .venv with the locked dependencies and the package in it
+#   make demo    the arm catches 20 kg, live: picture, bag and numbers in demo_output/
+#   make test    the test suite; among it a colcon build whose executables are started
+#   make lint    ruff and mypy
+#   make bench   every benchmark; table and JSON in benchmarks/results/
+#   make docs    what in docs/, config/ and README.md is generated from the code
+#   make lock    the dependencies anew, from requirements/*.in
+SHELL := /bin/sh
+.DEFAULT_GOAL := help
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+
+# A sourced ROS must not mix its libraries with the locked ones in the venv.
+unexport PYTHONPATH LD_LIBRARY_PATH AMENT_PREFIX_PATH COLCON_PREFIX_PATH CMAKE_PREFIX_PATH
+unexport ROS_DISTRO RMW_IMPLEMENTATION VIRTUAL_ENV PIP_REQUIRE_VIRTUALENV PYTHONDONTWRITEBYTECODE
+export ROS_LOG_DIR := $(CURDIR)/log/ros
+export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
+export MPLBACKEND := Agg
+# The kernels are compiled and serial; idle BLAS threads would only steal cores from the other nodes.
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+
+SOURCES := $(shell find flexmanip_ros -name '*.py')
+SHARED := $(shell find config launch resource -type f -not -path '*/__pycache__/*')
+
+# A venv that was moved, or whose interpreter has gone, is made again with its stamps.
+$(shell requirements/make_venv.sh --drop-broken $(VENV))
+
+.PHONY: help setup demo test lint bench docs lock clean
+help:
+	@sed -n 's/^#   make/  make/p' Makefile
+
+setup: $(VENV)/.warm
+
+$(VENV)/.python:
+	@requirements/make_venv.sh $(VENV)
+	@touch $@
+
+$(VENV)/.runtime: requirements/runtime.txt | $(VENV)/.python
+	@echo 'Installing the locked dependencies (about a minute the first time)'
+	@$(PIP) install --require-hashes -r $<
+	@touch $@
+
+# Editable: a change of the sources counts at once; installed again only when names or shared files change.
+$(VENV)/.package: setup.py setup.cfg package.xml pyproject.toml $(SHARED) $(VENV)/.runtime
+	@echo 'Installing flexmanip_ros'
+	@$(PIP) install --no-deps --no-build-isolation --editable .
+	@touch $@
+
+$(VENV)/.warm: $(SOURCES) $(VENV)/.package
+	@echo 'Compiling the kernels'
+	@$(BIN)/python -m flexmanip_ros.cli.warm_up
+	@touch $@
+
+$(VENV)/.development: requirements/development.txt $(VENV)/.runtime
+	@echo 'Installing the tools for tests'
+	@$(PIP) install --require-hashes -r $<
+	@touch $@
+
+$(VENV)/.benchmark: requirements/benchmark.txt $(VENV)/.development
+	@echo 'Installing the peers for benchmarks'
+	@$(PIP) install --require-hashes -r $<
+	@touch $@
+
+demo: setup
+	@$(BIN)/demo
+
+test: setup $(VENV)/.development
+	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: setup $(VENV)/.development
+	@$(BIN)/ruff check .
+	@$(BIN)/mypy
+
+bench: setup $(VENV)/.benchmark
+	@$(BIN)/python benchmarks/run_all.py
+
+docs: setup
+	@$(BIN)/python docs/generate.py
+
+lock: $(VENV)/.python
+	@$(PIP) install uv
+	@PATH="$(CURDIR)/$(BIN):$$PATH" requirements/lock.sh
+
+clean:
+	rm -rf $(VENV) build install log demo_output

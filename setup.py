@@ -1,0 +1,94 @@
+"""The ament_python package: what is installed where, and the names `ros2 run` knows."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from setuptools import find_packages, setup
+from setuptools.command.develop import develop
+from setuptools.command.install import install
+
+NAME = 'flexmanip_ros'
+HERE = Path(__file__).resolve().parent
+NODES = ('plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'payload_controller', 'demo')
+PROGRAMS = ('identify_bag', 'simulate_bag', 'reproduce_paper', 'monte_carlo')
+
+
+def share_files() -> list[tuple[str, list[str]]]:
+    """Return (target folder, files) for everything `ros2 launch` and `ros2 pkg` look up."""
+    share = Path('share') / NAME
+    targets = {
+        Path('share/ament_index/resource_index/packages'): [Path('resource') / NAME],
+        share: [Path('package.xml')],
+    }
+    for folder in ('config', 'launch'):
+        for path in sorted((HERE / folder).rglob('*')):
+            if path.is_file() and '__pycache__' not in path.parts:
+                relative = path.relative_to(HERE)
+                targets.setdefault(share / relative.parent, []).append(relative)
+    return [(str(target), [str(path) for path in paths]) for target, paths in targets.items()]
+
+
+def compile_kernels(where: str) -> None:
+    """Fill the compiled cache of the package in ``where``, so that the first sample meets no compiler.
+
+    Only a matter of speed: whatever goes wrong here, the kernels compile at first use instead.
+    """
+    if os.environ.get('FLEXMANIP_WARM_UP', '1') == '0':
+        return
+    path = os.pathsep.join(part for part in (where, os.environ.get('PYTHONPATH')) if part)
+    try:
+        subprocess.run(
+            [sys.executable, '-m', f'{NAME}.cli.warm_up'],
+            env={**os.environ, 'PYTHONPATH': path},
+            cwd=where,
+            timeout=600,
+            check=False,
+        )
+    except (OSError, subprocess.SubprocessError) as problem:
+        print(f'{NAME}: kernels are not compiled yet ({problem}); they will be at first use', file=sys.stderr)
+
+
+class InstallAndCompile(install):
+    """`colcon build`: the cache belongs to the installed files, so it is filled after them."""
+
+    def run(self) -> None:
+        """Install, then compile unless this only stages files for a package."""
+        super().run()
+        if self.root is None and self.install_lib is not None:
+            compile_kernels(os.path.abspath(self.install_lib))
+
+
+class DevelopAndCompile(develop):
+    """`colcon build --symlink-install`: the sources stay where they are, and so does their cache."""
+
+    def run(self) -> None:
+        """Link, then compile unless the link is being taken away."""
+        super().run()
+        if not self.uninstall:
+            compile_kernels(str(HERE))
+
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={NAME: ['py.typed']},
+    data_files=share_files(),
+    install_requires=['setuptools'],
+    maintainer='flexmanip_ros maintainers',
+    maintainer_email='maintainers@flexmanip-ros.example',
+    python_requires='>=3.11',
+    extras_require={'test': ['pytest', 'hypothesis']},
+    zip_safe=False,
+    cmdclass={'install': InstallAndCompile, 'develop': DevelopAndCompile},
+    description='Online identification of a flexible two-link arm and of the payload it catches.',
+    license='Apache-2.0',
+    entry_points={
+        'console_scripts': [f'{name} = {NAME}.ros.{name}:main' for name in NODES]
+        + [f'{name} = {NAME}.cli.{name}:main' for name in PROGRAMS],
+    },
+)
