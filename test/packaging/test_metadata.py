@@ -1,0 +1,160 @@
+"""What package.xml, setup.py, the locks and the README promise is what the code needs and has."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import flexmanip_ros
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ElementTree.parse(ROOT / 'package.xml').getroot()
+# Imported name -> (rosdep key, name on PyPI); a ROS package is its own key.
+LIBRARIES = {
+    'numpy': ('python3-numpy', 'numpy'),
+    'scipy': ('python3-scipy', 'scipy'),
+    'numba': ('python3-numba', 'numba'),
+    'matplotlib': ('python3-matplotlib', 'matplotlib'),
+    'yaml': ('python3-yaml', 'PyYAML'),
+    'rich': ('python3-rich', 'rich'),
+    'rosbags': ('python3-rosbags-pip', 'rosbags'),
+    'lz4': ('python3-lz4', 'lz4'),
+    'backports': ('python3-rosbags-pip', 'backports.zstd'),
+    'compression': ('python3-rosbags-pip', 'backports.zstd'),  # from Python 3.14 on
+}
+OPTIONAL = {'dask', 'distributed', 'pyarrow', 'skfem'}
+"""Extras, imported where they are used, with an error that names the extra."""
+
+
+def requirements(name: str) -> str:
+    return (ROOT / 'requirements' / name).read_text(encoding='utf-8')
+
+
+@pytest.fixture(scope='module')
+def distribution() -> Any:
+    """Return what setup.py declares, read by setuptools itself."""
+    importlib.import_module('setuptools')  # brings distutils where Python has none
+    core: Any = importlib.import_module('distutils.core')
+    return core.run_setup(str(ROOT / 'setup.py'), stop_after='init')
+
+
+def programs(distribution: Any) -> dict[str, str]:
+    pairs = (line.split(' = ') for line in distribution.entry_points['console_scripts'])
+    return dict(pairs)
+
+
+def declared() -> set[str]:
+    return {element.text or '' for element in PACKAGE if element.tag.endswith('depend')}
+
+
+def third_party() -> dict[str, set[str]]:
+    """Return imported name -> files, of everything that is neither Python's own nor ours."""
+    found: dict[str, set[str]] = {}
+    for path in [*(ROOT / 'flexmanip_ros').rglob('*.py'), *(ROOT / 'launch').glob('*.py')]:
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module]
+            for name in {full.split('.')[0] for full in names} - sys.stdlib_module_names - {'flexmanip_ros'}:
+                found.setdefault(name, set()).add(str(path.relative_to(ROOT)))
+    return {name: files for name, files in found.items() if name not in OPTIONAL}
+
+
+def test_one_version_everywhere(distribution: Any) -> None:
+    changelog = (ROOT / 'CHANGELOG.rst').read_text(encoding='utf-8')
+    versions = {
+        'setup.py': distribution.get_version(),
+        'package.xml': PACKAGE.findtext('version'),
+        'CHANGELOG.rst': re.findall(r'^(\d+\.\d+\.\d+) \(\d{4}-\d{2}-\d{2}\)$', changelog, re.MULTILINE)[0],
+    }
+    assert versions == dict.fromkeys(versions, flexmanip_ros.__version__)
+
+
+def test_every_import_has_a_rosdep_key() -> None:
+    for name, files in third_party().items():
+        key = LIBRARIES.get(name, (name, ''))[0]
+        assert key in declared(), f'{sorted(files)} import {name}: package.xml lacks {key}'
+
+
+def test_every_rosdep_key_is_for_something_imported() -> None:
+    used = {LIBRARIES.get(name, (name, ''))[0] for name in third_party()}
+    tools = {'python3-pytest', 'python3-hypothesis'}
+    assert declared() - used - tools == set()
+
+
+def test_every_import_is_locked() -> None:
+    lock = requirements('runtime.txt')
+    for name, files in third_party().items():
+        if name in ('launch', 'launch_ros'):
+            continue  # not on PyPI: launch files run on a full ROS installation
+        pypi = LIBRARIES.get(name, ('', 'ros-' + name))[1].lower().replace('_', '-').replace('.', '-')
+        assert re.search(rf'^{pypi}==', lock, re.MULTILINE), f'{sorted(files)} import {name}: not locked'
+
+
+@pytest.mark.parametrize('name', ['runtime.txt', 'development.txt', 'benchmark.txt'])
+def test_locks_pin_every_version_with_hashes_and_name_no_host(name: str) -> None:
+    lock = requirements(name)
+    entries = re.split(r'\n(?=\S)', lock)
+    pins = [entry for entry in entries if not entry.startswith('#')]
+    assert all('==' in pin and '--hash=sha256:' in pin for pin in pins)
+    assert '://' not in lock
+    assert not re.search(r'^\s*--(extra-)?(index|find)', lock, re.MULTILINE)
+
+
+def test_the_three_locks_agree() -> None:
+    def pins(name: str) -> dict[str, str]:
+        return dict(re.findall(r'^([\w.-]+)==(\S+)', requirements(name), re.MULTILINE))
+
+    runtime, development, benchmark = pins('runtime.txt'), pins('development.txt'), pins('benchmark.txt')
+    assert runtime.items() <= development.items() <= benchmark.items()
+
+
+def test_every_program_imports_and_is_callable(distribution: Any) -> None:
+    for name, target in programs(distribution).items():
+        module, function = target.split(':')
+        assert module.split('.')[-1] == name
+        assert callable(getattr(importlib.import_module(module), function))
+
+
+def test_every_package_is_installed(distribution: Any) -> None:
+    folders = {path.parent for path in (ROOT / 'flexmanip_ros').rglob('*.py')}
+    assert set(distribution.packages) == {'.'.join(folder.relative_to(ROOT).parts) for folder in folders}
+
+
+def test_every_configuration_and_launch_file_is_installed(distribution: Any) -> None:
+    pairs = [(Path(target), Path(file)) for target, files in distribution.data_files for file in files]
+    installed = {str(target / file.name) for target, file in pairs}
+    for folder in ('config', 'launch'):
+        for path in (ROOT / folder).rglob('*.*'):
+            if path.is_file() and '__pycache__' not in path.parts:
+                assert f'share/flexmanip_ros/{path.relative_to(ROOT)}' in installed
+    assert 'share/flexmanip_ros/package.xml' in installed
+    assert 'share/ament_index/resource_index/packages/flexmanip_ros' in installed
+
+
+def test_the_readme_names_every_program_and_only_targets_that_exist(distribution: Any) -> None:
+    readme = (ROOT / 'README.md').read_text(encoding='utf-8')
+    for name in programs(distribution):
+        assert f'`{name}`' in readme
+    targets = set(re.findall(r'^(\w+):', (ROOT / 'Makefile').read_text(encoding='utf-8'), re.MULTILINE))
+    named = set(re.findall(r'^make (\w+)', readme, re.MULTILINE))
+    assert named
+    assert named <= targets
+
+
+PAGES = ['README.md', *(f'docs/{path.name}' for path in sorted((ROOT / 'docs').glob('*.md')))]
+
+
+@pytest.mark.parametrize('page', PAGES)
+def test_links_between_pages_lead_somewhere(page: str) -> None:
+    text = (ROOT / page).read_text(encoding='utf-8')
+    for link in re.findall(r'\]\(([^)#\s]+)', text):
+        if '://' not in link:
+            assert ((ROOT / page).parent / link).exists(), f'{page} points to {link}'
