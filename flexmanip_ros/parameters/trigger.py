@@ -20,6 +20,11 @@ class TriggerParameters:
         -1.0, 'release this long after the first sample (mode time); negative: never', unit='s', low=-1.0)
     lead_time: float = parameter(
         0.05, 'an event at a set time is announced this long before its stamp', unit='s', low=0.0, high=10.0)
+    service_delay: float = parameter(
+        0.02, 'a requested event takes effect this long after the request (the time a gripper needs)',
+        unit='s', low=0.0, high=10.0, live=True)
+    stale_after: float = parameter(
+        1.0, 'a request is refused when no joint_states came for this long', unit='s', low=0.001, live=True)
 
     def __post_init__(self) -> None:
         check_all(self)

@@ -1,0 +1,122 @@
+"""ROS messages to values of the core, and back. Nothing is judged here: sampling does that."""
+
+from __future__ import annotations
+
+import array
+import struct
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import InertiaStamped
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64, Float64MultiArray, Header, MultiArrayDimension
+
+from flexmanip_ros.errors import SignalError
+from flexmanip_ros.io import cdr
+from flexmanip_ros.messages import Dimension, Inertia, LabelledArray, Value
+from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointRecord
+
+SECOND = 1_000_000_000
+
+
+def stamp_ns(stamp: Time) -> int:
+    """Return a stamp in nanoseconds."""
+    return int(stamp.sec) * SECOND + int(stamp.nanosec)
+
+
+def time_message(nanoseconds: int) -> Time:
+    """Return nanoseconds as a stamp; both fields stay in their range for times before 1970 too."""
+    sec, nanosec = divmod(nanoseconds, SECOND)
+    return Time(sec=sec, nanosec=nanosec)
+
+
+class JointStateReader:
+    """JointState from the bytes of a raw subscription, the way a bag is read: a third of the cost."""
+
+    def __init__(self) -> None:
+        self._layout: cdr.Layout | None = None
+
+    def __call__(self, raw: bytes) -> JointRecord:
+        """Return the message; through rclpy's own decoder where the bytes are of another encoding."""
+        try:
+            record, self._layout = cdr.joint_record(raw, self._layout)
+        except (cdr.CdrError, UnicodeDecodeError, struct.error):
+            return joint_record(deserialize_message(raw, JointState))
+        return record
+
+
+def joint_record(message: JointState) -> JointRecord:
+    """Return a JointState with its arrays copied; sizes and values are taken as they are."""
+    return JointRecord(
+        stamp_ns(message.header.stamp), tuple(message.name), np.array(message.position, dtype=np.float64),
+        np.array(message.velocity, dtype=np.float64), np.array(message.effort, dtype=np.float64))
+
+
+def joint_state(record: JointRecord, message: JointState | None = None) -> JointState:
+    """Return a record as a JointState, into ``message`` when one is given (saves its construction)."""
+    message = JointState() if message is None else message
+    message.header.stamp = time_message(record.stamp_ns)
+    message.name = list(record.names)
+    message.position = doubles(record.position)
+    message.velocity = doubles(record.velocity)
+    message.effort = doubles(record.effort)
+    return message
+
+
+def capture_event(message: Header) -> CaptureEvent:
+    """Return an announced event; SignalError when frame_id is neither capture nor release."""
+    try:
+        kind = EventKind(message.frame_id)
+    except ValueError as error:
+        raise SignalError(
+            f"an event has frame_id '{message.frame_id}'",
+            f'write one of {", ".join(item.value for item in EventKind)}') from error
+    return CaptureEvent(stamp_ns(message.stamp), kind)
+
+
+def header(event: CaptureEvent) -> Header:
+    """Return an event as it goes out."""
+    return Header(stamp=time_message(event.stamp_ns), frame_id=event.kind.value)
+
+
+def doubles(values: Array) -> array.array[float]:
+    """Return values as rclpy keeps a float64[]: an array.array, filled without a Python loop."""
+    return array.array('d', np.ascontiguousarray(values, dtype=np.float64).tobytes())
+
+
+def multi_array(values: LabelledArray) -> Float64MultiArray:
+    """Return a labelled array as a message."""
+    message = Float64MultiArray()
+    message.layout.dim = [
+        MultiArrayDimension(label=item.label, size=item.size, stride=item.stride)
+        for item in values.dimensions]
+    message.data = doubles(values.data)
+    return message
+
+
+def labelled_array(message: Float64MultiArray) -> LabelledArray:
+    """Return a message as a labelled array."""
+    dimensions = tuple(Dimension(item.label, item.size, item.stride) for item in message.layout.dim)
+    return LabelledArray(dimensions, np.array(message.data, dtype=np.float64))
+
+
+def inertia_stamped(value: Inertia) -> InertiaStamped:
+    """Return a payload as a robot driver takes it."""
+    message = InertiaStamped()
+    message.header.stamp = time_message(value.stamp_ns)
+    message.header.frame_id = value.frame_id
+    body = message.inertia
+    body.m = float(value.mass)
+    body.com.x, body.com.y, body.com.z = map(float, value.com)
+    body.ixx, body.ixy, body.ixz, body.iyy, body.iyz, body.izz = map(float, value.inertia)
+    return message
+
+
+def to_message(value: Value) -> Float64MultiArray | InertiaStamped | Float64:
+    """Return any value an estimate publishes as its message."""
+    if isinstance(value, LabelledArray):
+        return multi_array(value)
+    if isinstance(value, Inertia):
+        return inertia_stamped(value)
+    return Float64(data=float(value))

@@ -1,0 +1,217 @@
+"""What every node of this package shares: parameters, managed life, diagnostics, throttled words."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.context import Context
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+
+from flexmanip_ros.errors import FlexmanipError
+from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.diagnostics import ERROR, WARN, Report
+from flexmanip_ros.ros.parameters import NodeParameters
+
+Config = TypeVar('Config')
+THROTTLE_S = 2.0
+"""A repeated complaint is written at most this often."""
+
+
+class FlexmanipNode(LifecycleNode, Generic[Config]):
+    """A managed node over one configuration class.
+
+    Subclasses write ``start`` (configure), ``activated``, ``deactivated`` and ``report``. Topics and
+    services are made once and stay: what is not active takes nothing and says nothing.
+    """
+
+    def __init__(self, name: str, cls: type[Config], *, context: Context | None = None,
+                 overrides: list[Parameter] | None = None, namespace: str | None = None,
+                 cli_args: list[str] | None = None) -> None:
+        """Declare the parameters; raises ParameterError naming the one that is wrong."""
+        super().__init__(name, context=context, parameter_overrides=overrides, namespace=namespace,
+                         cli_args=cli_args)
+        self.active = False
+        self._entities_made = False
+        self.events: dict[str, int] = {}
+        self._complained: dict[str, float] = {}
+        try:
+            self.autostarts = bool(self.declare_parameter(
+                'autostart', True, ParameterDescriptor(
+                    description='configure and activate at start; false: wait for ros2 lifecycle set',
+                    read_only=True)).value)
+            self.parameters: NodeParameters[Config] = NodeParameters(self, cls, self.configuration_changed)
+        except BaseException:
+            self.destroy_node()
+            raise
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        # Steady: diagnostics come even while simulated time stands still.
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._diagnostics_timer = self.create_timer(1.0, self.diagnose, clock=self._steady)
+
+    @property
+    def config(self) -> Config:
+        """The parameters as they are now."""
+        return self.parameters.config
+
+    # What a subclass fills in.
+
+    def make_entities(self) -> None:
+        """Create publishers, subscriptions, services and timers; called once, at the first configure."""
+
+    def start(self) -> None:
+        """Build the state, compile what must be compiled. FlexmanipError refuses the configuration."""
+
+    def activated(self) -> None:
+        """Begin to work."""
+
+    def deactivated(self) -> None:
+        """Cease to work; what was published before stays."""
+
+    def configuration_changed(self, config: Config) -> None:
+        """Take parameters that were changed while running."""
+
+    def report(self, report: Report) -> None:
+        """Fill the node's diagnostic entry."""
+
+    # Managed life.
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Create what the node needs and build its state."""
+        return self._transition(self._configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Begin to work."""
+        return self._transition(self._activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Cease to work."""
+        return self._transition(self._deactivate)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Forget the state; the next configure builds it anew."""
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Cease to work for good."""
+        return self._transition(self._deactivate)
+
+    def autostart(self) -> None:
+        """Configure and activate at once, as a plain ``ros2 run`` expects, unless ``autostart`` is false."""
+        if not self.autostarts:
+            return
+        for transition in (self.trigger_configure, self.trigger_activate):
+            if transition() != TransitionCallbackReturn.SUCCESS:
+                return
+
+    def close(self) -> None:
+        """Cease to work before the node is destroyed."""
+        self._transition(self._deactivate)
+
+    def _configure(self) -> None:
+        if not self._entities_made:
+            self.make_entities()
+            self._entities_made = True
+        self.start()
+
+    def _activate(self) -> None:
+        self.activated()
+        self.active = True
+
+    def _deactivate(self) -> None:
+        if self.active:
+            self.active = False
+            self.deactivated()
+
+    def _transition(self, work: Callable[[], None]) -> TransitionCallbackReturn:
+        """Run a part of a transition; rclpy would swallow its exception without a word."""
+        try:
+            work()
+        except FlexmanipError as error:
+            self.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        except Exception:
+            self.get_logger().error(traceback.format_exc())
+            return TransitionCallbackReturn.ERROR
+        return TransitionCallbackReturn.SUCCESS
+
+    # Topics.
+
+    def publisher(self, kind: type[Any], topic: str, profile: QoSProfile) -> Publisher:
+        """Create a publisher whose quality of service the user may override."""
+        return self.create_publisher(kind, topic, profile, qos_overriding_options=qos.overridable())
+
+    def subscription(self, kind: type[Any], topic: str, callback: Callable[..., None],
+                     profile: QoSProfile, *, raw: bool = False) -> Subscription:
+        """Create a subscription whose quality of service the user may override; its events are counted."""
+        return self.create_subscription(
+            kind, topic, callback, profile, raw=raw, qos_overriding_options=qos.overridable(),
+            event_callbacks=SubscriptionEventCallbacks(
+                deadline=lambda event: self._count(topic, 'deadline_missed', event.total_count),
+                liveliness=lambda event: self._count(topic, 'publishers_not_alive', event.not_alive_count),
+                incompatible_qos=lambda event: self._incompatible(topic, event)))
+
+    def _count(self, topic: str, what: str, count: int) -> None:
+        self.events[f'{topic} {what}'] = count
+
+    def _incompatible(self, topic: str, event: Any) -> None:
+        self._count(topic, 'incompatible_publishers', event.total_count)
+        self.get_logger().error(
+            f"a publisher of '{topic}' offers a quality of service this node cannot take; set "
+            f'qos_overrides.{self.resolve_topic_name(topic)}.subscription.reliability or its like')
+
+    # Words.
+
+    def complain(self, reason: str, words: str) -> None:
+        """Log an error, at most every few seconds for one reason."""
+        now = time.monotonic()
+        if now - self._complained.get(reason, -math.inf) >= THROTTLE_S:
+            self._complained[reason] = now
+            self.get_logger().error(words)
+
+    def diagnose(self) -> None:
+        """Publish the node's diagnostic entry."""
+        report = Report()
+        self.report(report)
+        report.values['active'] = self.active
+        for name, count in self.events.items():
+            report.values[name] = count
+            if count:
+                report.worse(WARN if name.endswith('deadline_missed') else ERROR, f'{name}: {count}')
+        if not self.active:
+            report.words.insert(0, 'not active')
+        self._diagnostics.publish(report.message(self.get_name(), self.get_clock().now().to_msg()))
+
+
+def with_info(callback: Callable[[Any, Any], None]) -> Callable[..., None]:
+    """Adapt a ``(message, info)`` callback to both executors.
+
+    rclpy looks at the signature to see that the information is wanted; the events executor of Jazzy then
+    hands over one tuple where the others give two arguments.
+    """
+    def adapter(message: Any, info: Any = None) -> None:
+        if info is None:
+            message, info = message
+        callback(message, info)
+
+    adapter.__signature__ = inspect.signature(callback)  # type: ignore[attr-defined]
+    return adapter
+
+
+def sequence_number(info: Any) -> int | None:
+    """Return the publisher's number of a message, None where the middleware has none."""
+    number = info['publication_sequence_number']
+    return None if number is None or math.isnan(number) else int(number)

@@ -1,0 +1,144 @@
+"""A configuration class as ROS parameters: declared with words and ranges, read, and changed as a set."""
+
+from __future__ import annotations
+
+import difflib
+import sys
+from collections.abc import Callable, Iterable
+from typing import Any, Generic, TypeVar
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.parameters import Leaf, check, configure, flatten, leaves
+from flexmanip_ros.parameters.document import NODES, limits
+
+Config = TypeVar('Config')
+
+_SCALAR = {
+    bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Parameter.Type.DOUBLE,
+    str: Parameter.Type.STRING,
+}
+_ARRAY = {
+    bool: Parameter.Type.BOOL_ARRAY, int: Parameter.Type.INTEGER_ARRAY, float: Parameter.Type.DOUBLE_ARRAY,
+    str: Parameter.Type.STRING_ARRAY,
+}
+_EXAMPLE = {bool: 'true or false', int: 'a whole number such as 100',
+            float: 'a number with a decimal point such as 100.0', str: 'a text'}
+_ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.', 'autostart')
+_LARGEST = sys.float_info.max
+_LARGEST_INT = 2**63 - 1
+
+
+class NodeParameters(Generic[Config]):
+    """The parameters of one node, kept as a valid configuration at all times.
+
+    ``on_change`` is called with the new configuration after a set of changes was accepted.
+    """
+
+    def __init__(
+        self, node: Node, cls: type[Config], on_change: Callable[[Config], None] | None = None
+    ) -> None:
+        """Declare every parameter of ``cls``; raises ParameterError naming the one that is wrong."""
+        self._cls = cls
+        self._leaves = {leaf.name: leaf for leaf in leaves(cls)}
+        self._on_change = on_change
+        _refuse_unknown(node, self._leaves)
+        self.config: Config = configure(cls, {leaf.name: _declare(node, leaf) for leaf in leaves(cls)})
+        node.add_on_set_parameters_callback(self._validate)
+        node.add_post_set_parameters_callback(self._apply)
+
+    def _changed(self, changes: Iterable[Parameter]) -> dict[str, Any]:
+        return {item.name: item.value for item in changes if item.name in self._leaves}
+
+    def _candidate(self, changes: Iterable[Parameter]) -> Config:
+        return configure(self._cls, {**flatten(self.config), **self._changed(changes)})
+
+    def _validate(self, changes: list[Parameter]) -> SetParametersResult:
+        try:
+            self._candidate(changes)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _apply(self, changes: list[Parameter]) -> None:
+        if not self._changed(changes):
+            return
+        self.config = self._candidate(changes)
+        if self._on_change is not None:
+            self._on_change(self.config)
+
+
+def descriptor(leaf: Leaf) -> ParameterDescriptor:
+    """Return the words, range and type of a parameter as ROS tools show them."""
+    unit = f' [{leaf.unit}]' if leaf.unit else ''
+    described = ParameterDescriptor(
+        name=leaf.name, type=_type(leaf).value, description=leaf.words + unit, read_only=not leaf.live)
+    notes = [limits(leaf)] if limits(leaf) else []
+    if leaf.size is not None:
+        notes.append(f'{leaf.size} values')
+    if not leaf.is_array and (leaf.low is not None or leaf.high is not None):
+        if leaf.kind is float:
+            described.floating_point_range = [FloatingPointRange(
+                from_value=-_LARGEST if leaf.low is None else float(leaf.low),
+                to_value=_LARGEST if leaf.high is None else float(leaf.high), step=0.0)]
+        elif leaf.kind is int:
+            described.integer_range = [IntegerRange(
+                from_value=-_LARGEST_INT - 1 if leaf.low is None else int(leaf.low),
+                to_value=_LARGEST_INT if leaf.high is None else int(leaf.high), step=1)]
+    described.additional_constraints = '; '.join(notes)
+    return described
+
+
+def ros_value(leaf: Leaf, value: Any) -> Any:
+    """Return a value as ROS stores it; an empty list of texts becomes [''] (ROS cannot type an empty one)."""
+    if not leaf.is_array:
+        return value
+    return [''] if leaf.kind is str and not value else list(value)
+
+
+def _type(leaf: Leaf) -> Parameter.Type:
+    return (_ARRAY if leaf.is_array else _SCALAR)[leaf.kind]
+
+
+def _declare(node: Node, leaf: Leaf) -> Any:
+    """Declare one parameter and return its value, from an override or the default."""
+    try:
+        value = node.declare_parameter(leaf.name, ros_value(leaf, leaf.default), descriptor(leaf)).value
+    except InvalidParameterTypeException as error:
+        raise ParameterError(
+            f"parameter '{leaf.name}' is of type {_given_type(node, leaf)}",
+            f'give {"a list, each " if leaf.is_array else ""}{_EXAMPLE[leaf.kind]}') from error
+    except InvalidParameterValueException as error:
+        given = _overrides(node)[leaf.name].value
+        check(leaf, given)  # says it in our words
+        raise ParameterError(f"parameter '{leaf.name}' is {given!r}", str(error)) from error
+    return check(leaf, value)
+
+
+def _given_type(node: Node, leaf: Leaf) -> str:
+    return str(_overrides(node)[leaf.name].type_.name).lower().replace('_', ' ')
+
+
+def _overrides(node: Node) -> dict[str, Parameter]:
+    """Return what was given at start by file, command line or code; rclpy has no public name for it."""
+    given: dict[str, Parameter] = node._parameter_overrides
+    return given
+
+
+def _refuse_unknown(node: Node, known: dict[str, Leaf]) -> None:
+    """Refuse an override that no node of this package has: a typing error must not pass silently."""
+    for name in _overrides(node):
+        if name in known or name.startswith(_ROS_OWN) or name in _package_names():
+            continue
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f'see ros2 param list /{node.get_name()} or --help'
+        raise ParameterError(f"unknown parameter '{name}'", hint)
+
+
+def _package_names() -> frozenset[str]:
+    """Names of all nodes' parameters: a file under /** may serve several nodes."""
+    return frozenset(leaf.name for cls in NODES.values() for leaf in leaves(cls))

@@ -1,0 +1,174 @@
+"""Node ``rpbsid_identifier``: model, modes and payload of the arm, one recursive step per joint state.
+
+subscribes  joint_states      sensor_msgs/JointState  best effort, depth 1000; matched by name
+            capture_event     std_msgs/Header         an event commanded or known
+            capture_detected  std_msgs/Header         an event inferred from the signals
+publishes   ~/model           std_msgs/Float64MultiArray  [[A, B, K], [C, D, I]]; latched
+            ~/modes           std_msgs/Float64MultiArray  damped frequency [Hz], damping ratio
+            ~/payload_mass    std_msgs/Float64            kg
+            ~/payload_estimate std_msgs/Float64MultiArray mass, std, 95 % interval, consistency; latched
+            ~/payload         geometry_msgs/InertiaStamped at the stamp of the sample that gave it; latched
+            /diagnostics      diagnostic_msgs/DiagnosticArray  1 Hz
+services    rpbsid_identifier/reset   std_srvs/Trigger   forget everything
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from functools import partial
+
+from geometry_msgs.msg import InertiaStamped
+from rclpy.context import Context
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64, Float64MultiArray, Header
+from std_srvs.srv import Trigger
+
+from flexmanip_ros import messages, pipeline
+from flexmanip_ros.errors import FlexmanipError
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.conversions import JointStateReader, capture_event, to_message
+from flexmanip_ros.ros.diagnostics import ERROR, STALE, WARN, LossCounter, Meter, Report
+from flexmanip_ros.ros.node import FlexmanipNode, sequence_number, with_info
+from flexmanip_ros.ros.spin import run
+from flexmanip_ros.ros.warm_up import warm_up
+from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Status
+
+NAME = 'rpbsid_identifier'
+_TOPICS = (
+    (messages.MODEL, Float64MultiArray, qos.latched), (messages.MODES, Float64MultiArray, qos.output),
+    (messages.PAYLOAD_MASS, Float64, qos.output), (messages.PAYLOAD_ESTIMATE, Float64MultiArray, qos.latched),
+    (messages.PAYLOAD, InertiaStamped, qos.latched),
+)
+
+
+class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
+    """Converts, takes one step of the pipeline, publishes."""
+
+    def __init__(self, *, context: Context | None = None, overrides: list[Parameter] | None = None,
+                 namespace: str | None = None, cli_args: list[str] | None = None) -> None:
+        super().__init__(NAME, IdentifierParameters, context=context, overrides=overrides,
+                         namespace=namespace, cli_args=cli_args)
+        self.state = pipeline.init()
+        self.estimate: Estimate | None = None
+        self.refused = 0
+        self._losses = LossCounter()
+        self._meter = Meter()
+        self._reader = JointStateReader()
+
+    def make_entities(self) -> None:
+        """Publishers, subscriptions and the reset service."""
+        self._outputs = {
+            name: self.publisher(kind, f'~/{name}', profile()) for name, kind, profile in _TOPICS}
+        self._joint_states = self.subscription(
+            JointState, 'joint_states', with_info(self._on_joint_states), qos.sensor_input(), raw=True)
+        for topic in ('capture_event', 'capture_detected'):
+            self.subscription(Header, topic, partial(self._on_event, topic), qos.latched())
+        self.create_service(Trigger, '~/reset', self._on_reset)
+
+    def start(self) -> None:
+        """Compile or load every kernel before the first sample; begin with nothing known."""
+        warm_up(self.config)
+        self._forget()
+
+    def _forget(self) -> None:
+        self.state = pipeline.init()
+        self.estimate = None
+
+    def _on_joint_states(self, raw: bytes, info: object) -> None:
+        if not self.active:
+            return
+        with self._meter:
+            self._losses.note(sequence_number(info))
+            self._take(self._reader(raw))
+
+    def _on_event(self, topic: str, message: Header) -> None:
+        if not self.active:
+            return
+        try:
+            event = capture_event(message)
+        except FlexmanipError as error:
+            self._refuse(topic, str(error))
+            return
+        self.get_logger().info(f'{topic}: {event.kind.value} at {event.stamp_ns * 1e-9:.6f}')
+        self._take(event)
+
+    def _take(self, item: JointRecord | CaptureEvent) -> None:
+        """One step; whatever is wrong with the message is said and counted, and the node goes on."""
+        dropped = self.state.counters.dropped
+        try:
+            self.state, estimates = pipeline.step(self.config, self.state, item)
+        except FlexmanipError as error:
+            self._refuse('configuration', str(error))
+            return
+        refusal = self.state.sampling.refusal
+        if refusal is not None and self.state.counters.dropped > dropped:
+            self.complain(refusal.reason, f'message dropped: {refusal.problem}; {refusal.remedy}')
+        for estimate in estimates:
+            self.estimate = estimate
+            for name, value in messages.outgoing(estimate, self.config.payload_frame):
+                self._outputs[name].publish(to_message(value))
+
+    def _refuse(self, reason: str, words: str) -> None:
+        self.refused += 1
+        self.complain(reason, words)
+
+    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._forget()
+        response.success, response.message = True, 'everything identified so far is forgotten'
+        return response
+
+    def report(self, report: Report) -> None:
+        """Rate, losses, drops by reason, and what the latest estimate is worth."""
+        values, counters = report.values, self.state.counters
+        values.update(self._meter.window())
+        several = self.count_publishers(self._joint_states.topic_name) > 1
+        values['lost'] = 'unknown (several publishers)' if several else self._losses.lost
+        values.update(counters._asdict())
+        values['dropped'] = counters.dropped
+        values['refused'] = self.refused
+        line = self.state.timeline
+        if line is not None:
+            values.update(late_events=line.late_events, repeated_events=line.repeated_events,
+                          rewinds=line.rewinds)
+        if self.active and values['rate_hz'] == 0.0:
+            report.worse(STALE, 'no joint_states')
+        if self.refused:
+            report.worse(ERROR, f'{self.refused} messages refused')
+        if counters.dropped:
+            report.worse(WARN, f'{counters.dropped} messages dropped')
+        if not several and self._losses.lost:
+            report.worse(WARN, f'{self._losses.lost} messages lost')
+        self._report_estimate(report)
+
+    def _report_estimate(self, report: Report) -> None:
+        estimate = self.estimate
+        status = Status.WARMING_UP if estimate is None else estimate.status
+        payload = None if estimate is None else estimate.payload
+        report.values['status'] = status.name
+        report.values['converged'] = status in (Status.TRACKING, Status.NO_PAYLOAD_METHOD)
+        report.values['consistent'] = payload is None or payload.status is not Status.INCONSISTENT
+        if status not in (Status.TRACKING, Status.WARMING_UP, Status.NO_PAYLOAD_METHOD):
+            report.worse(WARN, status.value)
+        if estimate is None:
+            return
+        report.values.update(
+            excitation=estimate.excitation, condition=estimate.condition,
+            innovation_power=estimate.innovation_power)
+        if estimate.singular_values is not None:
+            report.values['singular_values'] = ' '.join(f'{value:.4g}' for value in estimate.singular_values)
+        if payload is not None:
+            report.values.update(
+                payload_mass_kg=payload.mass, payload_std_kg=payload.std,
+                consistency=payload.consistency if payload.consistency is not None else math.nan)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(RpbsidIdentifier, NAME, __doc__, IdentifierParameters, argv)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

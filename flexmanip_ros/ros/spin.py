@@ -1,0 +1,123 @@
+"""From a node class to a program: --help, executor, signals, exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from types import FrameType
+from typing import Any
+
+import rclpy
+from rclpy.context import Context
+from rclpy.exceptions import ParameterException
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from flexmanip_ros.errors import FlexmanipError
+from flexmanip_ros.parameters.document import help_text
+from flexmanip_ros.ros.node import FlexmanipNode
+
+BAD_INPUT = 2
+POLL_S = 0.1
+"""Longest wait inside the executor, hence the longest delay of a signal on an idle node."""
+
+
+def make_executor(context: Context | None = None) -> Executor:
+    """Return the events executor (a quarter of the cost at 1 kHz), or the plain one where it is absent."""
+    try:
+        from rclpy.experimental import EventsExecutor
+    except ImportError:
+        return SingleThreadedExecutor(context=context)
+    return EventsExecutor(context=context)
+
+
+class Interrupt:
+    """SIGINT and SIGTERM as a flag while spinning, as an exit before that."""
+
+    def __init__(self) -> None:
+        self.raised = False
+        self.spinning = False
+
+    def install(self) -> None:
+        """Take both signals; again after an executor was made, which takes them for itself."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._handle)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self.raised = True
+        if not self.spinning:
+            raise SystemExit(0)
+
+
+def spin(executor: Executor, context: Context | None, interrupt: Interrupt,
+         until: Callable[[], bool] = lambda: False) -> None:
+    """Run callbacks until a signal, the end of the context, or ``until``."""
+    interrupt.spinning = True
+    try:
+        # A bare spin() of the events executor runs no callback in rclpy 7.1.
+        while not interrupt.raised and rclpy.ok(context=context) and not until():
+            executor.spin_once(timeout_sec=POLL_S)
+    except ExternalShutdownException:
+        return
+    finally:
+        interrupt.spinning = False
+
+
+def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cls: type,
+        argv: Sequence[str] | None = None) -> int:
+    """Run one node until it is asked to stop; return the exit code.
+
+    0 after SIGINT or SIGTERM, 2 with one line on stderr for bad arguments or parameters.
+    """
+    arguments = list(sys.argv if argv is None else argv)
+    interrupt = Interrupt()
+    interrupt.install()
+    parser(name, about, cls).parse_args(remove_ros_args(arguments)[1:])
+    try:
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rcl raises types of its C extension for --ros-args and parameter files
+        return refuse(name, first_line(error))
+    try:
+        node = make()
+    except (FlexmanipError, ParameterException) as error:
+        rclpy.try_shutdown()
+        return refuse(name, str(error))
+    except RuntimeError as error:  # a QoS override that rclpy does not know
+        rclpy.try_shutdown()
+        return refuse(name, first_line(error))
+    executor = make_executor()
+    interrupt.install()
+    try:
+        executor.add_node(node)
+        node.autostart()
+        spin(executor, None, interrupt)
+    finally:
+        node.close()
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def refuse(name: str, problem: str) -> int:
+    """Say on stderr why the program does not start; return its exit code."""
+    print(f'{name}: {problem}', file=sys.stderr)
+    return BAD_INPUT
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error of the middleware, without its source locations."""
+    text = str(error).strip().splitlines()
+    line = text[0] if text else type(error).__name__
+    return line.split(', at ./')[0].split(', at /')[0]
+
+
+def parser(name: str, about: str | None, cls: type) -> argparse.ArgumentParser:
+    """Return the parser behind --help: what the node is, its topics and services, its parameters."""
+    return argparse.ArgumentParser(
+        prog=name, formatter_class=argparse.RawDescriptionHelpFormatter,
+        usage=f'{name} [--help] [--ros-args -p NAME:=VALUE --params-file FILE.yaml ...]',
+        description=about, epilog='parameters:\n' + help_text(cls))

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from ros_harness import Ros, overrides
+
+from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.parameters import (
+    ExcitationParameters,
+    IdentifierParameters,
+    PlantParameters,
+    flatten,
+    leaves,
+)
+from flexmanip_ros.parameters.document import NODES
+from flexmanip_ros.ros.parameters import NodeParameters
+
+
+@pytest.mark.parametrize('cls', NODES.values())
+def test_every_parameter_is_declared_with_its_default_words_and_range(ros: Ros, cls: type) -> None:
+    node = ros.add(Node('declaring', context=ros.context))
+    assert flatten(NodeParameters(node, cls).config) == flatten(cls())
+    for leaf in leaves(cls):
+        described = node.describe_parameter(leaf.name)
+        assert leaf.words in described.description
+        assert leaf.unit in described.description
+        assert described.read_only is not leaf.live
+        if leaf.low is not None and not leaf.is_array:
+            (limits,) = described.floating_point_range or described.integer_range
+            assert limits.from_value == leaf.low
+            assert limits.to_value == (leaf.high if leaf.high is not None else limits.to_value)
+
+
+def test_overrides_reach_the_configuration_and_an_empty_text_list_is_written_as_ros_can(ros: Ros) -> None:
+    node = ros.add(Node('declaring', context=ros.context, parameter_overrides=overrides(
+        angles=[''], payload_method='none', arm__modes=2, outputs=['link1_bend/position'], order=4)))
+    config = NodeParameters(node, IdentifierParameters).config
+    assert config.angles == ()
+    assert (config.payload_method, config.arm.modes, config.outputs) == ('none', 2, ('link1_bend/position',))
+    assert node.get_parameter('angles').value == ['']
+
+
+@pytest.mark.parametrize(('name', 'value', 'said'), [
+    ('order', 0, "'order' is 0; give a value from 1 to 60"),
+    ('order', 4.0, "'order' is of type double; give a whole number"),
+    ('arm.link_length', [3.0, -1.0], "'arm.link_length' is -1.0 m"),
+    ('arm.link_length', [3.0], "'arm.link_length' has 1 elements; give 2"),
+    ('arm.joint_mass', math.nan, "'arm.joint_mass'"),
+    ('payload_method', 'magic', 'choose one of none, block, structured'),
+    ('ordr', 4, "unknown parameter 'ordr'; did you mean 'order'?"),
+    ('publish_rate', 100, "'publish_rate' is of type integer; give a number with a decimal point"),
+    ('future_window', 11, 'cannot exceed past_window (10)'),
+    ('inputs', ['joint1'], 'write NAME/FIELD'),
+])
+def test_a_wrong_parameter_is_named_with_the_way_out(ros: Ros, name: str, value: object, said: str) -> None:
+    node = ros.add(Node('declaring', context=ros.context, parameter_overrides=[Parameter(name, value=value)]))
+    with pytest.raises(ParameterError) as caught:
+        NodeParameters(node, IdentifierParameters)
+    assert said in str(caught.value)
+
+
+def test_a_parameter_of_another_node_of_the_package_is_let_pass(ros: Ros) -> None:
+    node = ros.add(Node('declaring', context=ros.context, parameter_overrides=overrides(payload_mass=30.0)))
+    NodeParameters(node, ExcitationParameters)
+
+
+def test_a_set_of_changes_is_taken_as_a_whole_or_refused_with_the_reason(ros: Ros) -> None:
+    node = ros.add(Node('declaring', context=ros.context))
+    seen: list[ExcitationParameters] = []
+    parameters = NodeParameters(node, ExcitationParameters, seen.append)
+    good = [Parameter('amplitude', value=[1.0, 2.0]), Parameter('offset', value=[0.5, 0.5])]
+    request = SetParametersAtomically.Request(parameters=[item.to_parameter_msg() for item in good])
+    assert ros.call(SetParametersAtomically, 'declaring/set_parameters_atomically', request).result.successful
+    assert (parameters.config.amplitude, parameters.config.offset) == ((1.0, 2.0), (0.5, 0.5))
+    assert seen == [parameters.config]
+    bad = [Parameter('offset', value=[0.0, 0.0]), Parameter('amplitude', value=[-1.0, 2.0])]
+    request = SetParametersAtomically.Request(parameters=[item.to_parameter_msg() for item in bad])
+    result = ros.call(SetParametersAtomically, 'declaring/set_parameters_atomically', request).result
+    assert not result.successful
+    assert "'amplitude' is -1.0 N m; give a value from 0 to inf" in result.reason
+    assert parameters.config.offset == (0.5, 0.5)
+    assert ros.call(GetParameters, 'declaring/get_parameters', GetParameters.Request(
+        names=['offset'])).values[0].double_array_value.tolist() == [0.5, 0.5]
+
+
+def test_what_may_not_change_at_run_time_is_read_only(ros: Ros) -> None:
+    node = ros.add(Node('declaring', context=ros.context))
+    parameters = NodeParameters(node, PlantParameters)
+    (result,) = node.set_parameters([Parameter('rate', value=500.0)])
+    assert not result.successful
+    assert parameters.config.rate == 1000.0
+    answer = ros.call(DescribeParameters, 'declaring/describe_parameters', DescribeParameters.Request(
+        names=['payload_mass', 'rate']))
+    assert [item.read_only for item in answer.descriptors] == [False, True]
