@@ -1,0 +1,69 @@
+"""Compiled forward dynamics: Cholesky factor of the mass matrix and the accelerations."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+
+from flexmanip_ros.plant.kernels import assemble
+
+if TYPE_CHECKING:
+    from flexmanip_ros.plant.manipulator import Manipulator, Workspace
+    from flexmanip_ros.types import Array
+
+
+@njit(cache=True)
+def factor(M: Array) -> bool:
+    """Overwrite the lower triangle of M with its Cholesky factor, the diagonal inverted; False if not positive."""
+    n = M.shape[0]
+    for j in range(n):
+        d = M[j, j]
+        for p in range(j):
+            d -= M[j, p] * M[j, p]
+        if not d > 0.0:
+            return False
+        inverse = 1.0 / np.sqrt(d)
+        M[j, j] = inverse
+        for r in range(j + 1, n):
+            x = M[r, j]
+            for p in range(j):
+                x -= M[r, p] * M[j, p]
+            M[r, j] = x * inverse
+    return True
+
+
+@njit(cache=True)
+def solve(L: Array, x: Array) -> None:
+    """Overwrite x (n,) with M^-1 x, L from ``factor``."""
+    n = x.size
+    for r in range(n):
+        y = x[r]
+        for p in range(r):
+            y -= L[r, p] * x[p]
+        x[r] = y * L[r, r]
+    for r in range(n - 1, -1, -1):
+        y = x[r]
+        for p in range(r + 1, n):
+            y -= L[p, r] * x[p]
+        x[r] = y * L[r, r]
+
+
+@njit(cache=True)
+def acceleration(
+    arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array, qdd: Array, work: Workspace,
+) -> bool:
+    """Fill qdd (n,) for joint torques effort (2,) [N m]; payload as in ``kernels.assemble``.
+
+    Leaves the Cholesky factor of M in work.M and E in work.E. False when M is not positive definite
+    (numbers left the finite range).
+    """
+    assemble(arm, payload, q, qd, work.M, work.E, work)
+    if not factor(work.M):
+        return False
+    for r in range(q.size):
+        qdd[r] = (arm.torque[r, 0] * effort[0] + arm.torque[r, 1] * effort[1]
+                  - work.E[r] - arm.stiffness[r] * q[r] - arm.damping[r] * qd[r])
+    solve(work.M, qdd)
+    return True

@@ -1,0 +1,253 @@
+"""The nonlinear two-link flexible arm: M(q) q'' + E(q, q') + D q' + K q = B tau (paper eq. 7).
+
+q = [theta1, theta2, eta_11.., eta_21..], n = 2 + 2 kappa; theta are the chords' absolute angles.
+Payload arrays are (4,): mass [kg], inertia about its centre of mass [kg m^2], centre of mass x, y [m]
+in the tip tangent frame (x along the tangent).
+
+What others build on (compiled functions run inside other compiled functions, without allocation):
+
+* ``manipulator(arm, kappa)`` -> Manipulator, a NamedTuple of scalars and float64 arrays. Its
+  ``stiffness`` and ``damping`` (n,) may be overwritten by whoever made it (calibration).
+* ``workspace(kappa)`` -> Workspace, scratch for one thread; ``payload_array(mass, ...)``.
+* ``kernels.assemble(arm, payload, q, qd, M, E, work)``: lower triangle of M and the bias E.
+* ``acceleration_kernel.acceleration(arm, payload, q, qd, effort, qdd, work) -> bool``; ``factor``, ``solve``.
+* ``jacobian_kernel.acceleration_jacobian(arm, payload, q, qd, effort, qdd, dq, dqd, dp, work) -> bool``:
+  qdd and its derivatives by q (n, n), qd (n, n) and p = [mass, inertia, EI1, EI2] (n, 4).
+* outputs are linear: positions = ``arm.output @ q``, rates = ``arm.output @ qd`` (4, n), joint1, joint2,
+  link1_bend, link2_bend, so ``arm.output`` is their Jacobian too (``output_kernel`` for the slopes of
+  the truncated modes).
+* in Python: ``mass_matrix``, ``bias``, ``coriolis_matrix``, ``energy``, ``accelerations``.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from flexmanip_ros.errors import ModelError
+from flexmanip_ros.parameters.arm import ArmParameters
+from flexmanip_ros.plant import linearization
+from flexmanip_ros.plant.acceleration_kernel import acceleration
+from flexmanip_ros.plant.jacobian_kernel import acceleration_jacobian, bias_jacobian
+from flexmanip_ros.plant.kernels import assemble
+from flexmanip_ros.types import Array
+
+
+class Manipulator(NamedTuple):
+    """Constants of the arm for the compiled functions; link index first, SI units."""
+
+    kappa: int
+    shortening: bool
+    joint_mass: float
+    tip_mass: float
+    length: Array
+    """(2,) L."""
+    half_mass: Array
+    """(2,) rho L / 2."""
+    inertia: Array
+    """(2,) int rho x^2."""
+    moment: Array
+    """(2,) int rho x."""
+    mean_shape: Array
+    """(2, k) int rho phi."""
+    rigid_shape: Array
+    """(2, k) int rho x phi."""
+    tip_stretch: Array
+    """(2, k) diagonal of S(L); zero without shortening."""
+    root_slope: Array
+    """(2, k) phi'(0)."""
+    tip_slope: Array
+    """(2, k) phi'(L)."""
+    C2: Array
+    """(2, k, k) int rho (phi phi' - x S)."""
+    S1: Array
+    """(2, k, k) int rho S."""
+    W: Array
+    """(2, k, k, k) int rho phi_j S_mp."""
+    Q: Array
+    """(2, k, k, k, k) int rho S_jl S_mp."""
+    rotary: Array
+    """(n, n) hubs and bodies that turn with a slope."""
+    stiffness: Array
+    """(n,) diagonal of K."""
+    damping: Array
+    """(n,) diagonal of D."""
+    stiffness_per_EI: Array
+    """(n,) derivative of the stiffness by its link's EI."""
+    torque: Array
+    """(n, 2) B."""
+    output: Array
+    """(4, n) joint angles and bends from q."""
+
+
+class Workspace(NamedTuple):
+    """Scratch memory of the compiled functions, for one thread."""
+
+    M: Array
+    E: Array
+    moments: Array
+    stretch: Array
+    Y: Array
+    Z: Array
+    pairs: Array
+    columns: Array
+    left: Array
+    right: Array
+    parameters: Array
+
+
+def workspace(kappa: int) -> Workspace:
+    """Allocate scratch for arms of kappa modes a link."""
+    n = 2 + 2 * kappa
+    return Workspace(
+        M=np.zeros((n, n)), E=np.zeros(n), moments=np.zeros((2, 3 + kappa)), stretch=np.zeros((2, kappa)),
+        Y=np.zeros((2, kappa, kappa)), Z=np.zeros((2, kappa, kappa, kappa)),
+        pairs=np.zeros((2, kappa, kappa)), columns=np.zeros((6, kappa)),
+        left=np.zeros((n, n)), right=np.zeros((n, n)), parameters=np.zeros((n, 4)))
+
+
+def payload_array(
+    mass: float = 0.0, inertia: float = 0.0, com: tuple[float, float] = (0.0, 0.0),
+) -> Array:
+    """Pack a payload; raises ModelError when it is not a physical body."""
+    packed = np.array([mass, inertia, com[0], com[1]], dtype=np.float64)
+    if not np.all(np.isfinite(packed)) or mass < 0 or inertia < 0:
+        raise ModelError(
+            f'the payload is mass {mass}, inertia {inertia}, com {com}',
+            'give finite values, mass and inertia of zero or more')
+    return packed
+
+
+def manipulator(arm: ArmParameters, kappa: int | None = None) -> Manipulator:
+    """Precompute the constants of an arm with kappa modes a link (default arm.modes)."""
+    k = arm.modes if kappa is None else kappa
+    if k < 1:
+        raise ModelError(f'kappa is {k}', 'use at least one mode a link')
+    length = np.asarray(arm.link_length)
+    density = np.asarray(arm.linear_density)
+    root, tip = linearization.root_slopes(arm, k), linearization.tip_slopes(arm, k)
+    tables = [_tables(L, rho, k, arm.shortening) for L, rho in zip(length, density, strict=True)]
+    j = np.pi * np.arange(1, k + 1)
+    stiffness = np.concatenate([np.zeros(2), linearization.stiffness(arm, k)])
+    per_EI = np.concatenate([np.zeros(2), *(j**4 / (2 * L**3) for L in length)])
+    stretch = j**2 / (2 * length[:, None]) if arm.shortening else np.zeros((2, k))
+    return Manipulator(
+        kappa=k, shortening=arm.shortening, joint_mass=arm.joint_mass, tip_mass=arm.tip_mass,
+        length=length.copy(), half_mass=density * length / 2, inertia=density * length**3 / 3,
+        moment=density * length**2 / 2,
+        mean_shape=np.stack([t[0] for t in tables]), rigid_shape=np.stack([t[1] for t in tables]),
+        tip_stretch=stretch, root_slope=root, tip_slope=tip,
+        C2=np.stack([t[2] for t in tables]), S1=np.stack([t[3] for t in tables]),
+        W=np.stack([t[4] for t in tables]), Q=np.stack([t[5] for t in tables]),
+        rotary=_rotary(arm, root, tip), stiffness=stiffness,
+        damping=np.concatenate([np.zeros(2), linearization.damping(arm, k)]),
+        stiffness_per_EI=per_EI, torque=linearization.torque_matrix(arm, k),
+        output=output_matrix(arm, root, tip))
+
+
+def _tables(L: float, rho: float, k: int, shortening: bool) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Integrals over one link by Gauss-Legendre quadrature fine enough to be exact to rounding."""
+    nodes, weights = np.polynomial.legendre.leggauss(40 + 8 * k)
+    x, weights = L * (nodes + 1) / 2, rho * L * weights / 2
+    j = np.arange(1, k + 1)
+    sign = np.where(j % 2, -1.0, 1.0)
+    phi = np.sin(np.pi * j[:, None] * x / L)
+    mean = rho * L * (1 - sign) / (j * np.pi)
+    rigid = -rho * L**2 * sign / (j * np.pi)
+    S = _slope_products(L, k, x) if shortening else np.zeros((k, k, x.size))
+    C2 = rho * L / 2 * np.eye(k) - np.einsum('jmx,x->jm', S, weights * x)
+    S1 = np.einsum('jmx,x->jm', S, weights)
+    W = np.einsum('jx,mpx,x->jmp', phi, S, weights)
+    Q = np.einsum('jlx,mpx,x->jlmp', S, S, weights)
+    return mean, rigid, C2, S1, W, Q
+
+
+def _slope_products(L: float, k: int, x: Array) -> Array:
+    """S_jm(x) = int_0^x phi_j' phi_m' over the arc, (k, k, x) [1/m]."""
+    a = np.pi / L * np.arange(1, k + 1)
+    S = np.empty((k, k, x.size))
+    for j in range(k):
+        for m in range(k):
+            plus = np.sin((a[j] + a[m]) * x) / (a[j] + a[m])
+            minus = x if j == m else np.sin((a[j] - a[m]) * x) / (a[j] - a[m])
+            S[j, m] = a[j] * a[m] * (plus + minus) / 2
+    return S
+
+
+def _rotary(arm: ArmParameters, root: Array, tip: Array) -> Array:
+    """Constant mass of the bodies whose angle is a chord plus a slope."""
+    k = root.shape[1]
+    R = np.zeros((2 + 2 * k, 2 + 2 * k))
+    bodies = ((arm.hub_inertia[0], 0, root), (arm.hub_inertia[1], 1, root),
+              (arm.joint_inertia, 0, tip), (arm.tip_inertia, 1, tip))
+    for J, link, slopes in bodies:
+        row = np.zeros(2 + 2 * k)
+        row[link] = 1.0
+        row[2 + link * k:2 + (link + 1) * k] = slopes[link]
+        R += J * np.outer(row, row)
+    return R
+
+
+def output_matrix(arm: ArmParameters, root: Array, tip: Array) -> Array:
+    """Joint angles (by the arm's convention) and sensor deflections from q, (4, n)."""
+    k = root.shape[1]
+    C = np.zeros((4, 2 + 2 * k))
+    C[0, 0] = C[1, 1] = 1.0
+    if arm.angle_convention == 'encoder':
+        C[1, 0] = -1.0
+        C[0, 2:2 + k] = root[0]
+        C[1, 2:2 + k] = -tip[0]
+        C[1, 2 + k:] = root[1]
+    j = np.pi * np.arange(1, k + 1)
+    for i in range(2):
+        C[2 + i, 2 + i * k:2 + (i + 1) * k] = np.sin(j * arm.sensor_position[i])
+    return C
+
+
+def mass_matrix(arm: Manipulator, payload: Array, q: Array) -> Array:
+    """Return M(q), (n, n)."""
+    M, _ = _assembled(arm, payload, q, np.zeros_like(q))
+    return M
+
+
+def bias(arm: Manipulator, payload: Array, q: Array, qd: Array) -> Array:
+    """Return E(q, qd), the centripetal and Coriolis forces, (n,)."""
+    return _assembled(arm, payload, q, qd)[1]
+
+
+def coriolis_matrix(arm: Manipulator, payload: Array, q: Array, qd: Array) -> Array:
+    """Return C(q, qd) of the Christoffel symbols, (n, n): E = C qd and dM/dt - 2 C is skew.
+
+    E is quadratic in the rates with the symmetric Christoffel symbols, hence C = dE/dqd / 2.
+    """
+    work = workspace(arm.kappa)
+    bias_jacobian(arm, payload, q, qd, np.zeros_like(q), work.left, work.right, work)
+    return work.right / 2
+
+
+def energy(arm: Manipulator, payload: Array, q: Array, qd: Array) -> float:
+    """Kinetic plus elastic energy [J]."""
+    M = mass_matrix(arm, payload, q)
+    return float(qd @ M @ qd + q @ (arm.stiffness * q)) / 2
+
+
+def accelerations(arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array) -> Array:
+    """Return q'' (n,) for joint torques (2,) [N m]; ModelError when the mass matrix is not positive."""
+    qdd = np.empty_like(q)
+    if not acceleration(arm, payload, q, qd, effort, qdd, workspace(arm.kappa)):
+        raise ModelError('the mass matrix is not positive definite', 'check the state for non-finite numbers')
+    return qdd
+
+
+def _assembled(arm: Manipulator, payload: Array, q: Array, qd: Array) -> tuple[Array, Array]:
+    work = workspace(arm.kappa)
+    assemble(arm, payload, np.asarray(q, dtype=np.float64), np.asarray(qd, dtype=np.float64), work.M, work.E, work)
+    lower = np.tril(work.M)
+    return lower + np.tril(lower, -1).T, work.E
+
+
+__all__ = [
+    'Manipulator', 'Workspace', 'acceleration', 'acceleration_jacobian', 'accelerations', 'bias',
+    'coriolis_matrix', 'energy', 'manipulator', 'mass_matrix', 'output_matrix', 'payload_array', 'workspace',
+]
