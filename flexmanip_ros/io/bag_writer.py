@@ -1,0 +1,186 @@
+"""Plain values -> a rosbag2 recording (mcap), on disk so soon that a kill loses a fraction of a second."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import numpy as np
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2.errors import WriterError
+from rosbags.rosbag2.storage_mcap import McapWriter
+from rosbags.typesys import Stores, get_typestore
+
+from flexmanip_ros.errors import BagError
+from flexmanip_ros.messages import Diagnostics, Inertia, LabelledArray
+from flexmanip_ros.types import CaptureEvent, JointRecord
+
+FLUSH_PERIOD = 0.2
+"""Seconds between two writes to disk; the library itself waits for a mebibyte (4 s of 1 kHz)."""
+
+Value = JointRecord | CaptureEvent | float | LabelledArray | Inertia | Diagnostics
+KINDS: dict[type, str] = {
+    JointRecord: 'sensor_msgs/msg/JointState',
+    CaptureEvent: 'std_msgs/msg/Header',
+    float: 'std_msgs/msg/Float64',
+    LabelledArray: 'std_msgs/msg/Float64MultiArray',
+    Inertia: 'geometry_msgs/msg/InertiaStamped',
+    Diagnostics: 'diagnostic_msgs/msg/DiagnosticArray',
+}
+
+
+def _qos(latched: bool) -> Qos:
+    forever = QosTime(2147483647, 4294967295)
+    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
+    return Qos(QosHistory.KEEP_LAST, 1 if latched else 1000, QosReliability.RELIABLE, durability,
+               forever, forever, QosLiveliness.AUTOMATIC, forever, False)
+
+
+class BagWriter:
+    """A recording under ``path``, a new directory. Use it in a ``with``; any thread may write.
+
+    It is closed and readable after an exception too. Raises BagError when the path exists or the disk fails.
+    """
+
+    def __init__(self, path: str | Path, *, storage: StoragePlugin = StoragePlugin.MCAP) -> None:
+        self.path = Path(path)
+        self.messages = 0
+        self._types = get_typestore(Stores.ROS2_JAZZY)
+        self._convert = _Conversion(self._types.types)
+        self._connections: dict[str, tuple[type, Connection]] = {}
+        self._lock = threading.Lock()
+        self._flushed = time.monotonic()
+        try:
+            self._writer = Writer(self.path, version=9, storage_plugin=storage)
+            self._writer.open()
+        except WriterError as err:
+            raise BagError(f"bag '{path}' exists already", 'remove it or give another name') from err
+        except OSError as err:
+            raise BagError(f"bag '{path}' cannot be written: {err.strerror}", 'give another place') from err
+        self._open = True
+
+    def write(self, topic: str, log_ns: int, value: Value, *, latched: bool = False) -> None:
+        """Append a value as its message; ``log_ns`` is the time of recording, in rising order."""
+        kind = type(value)
+        if kind not in KINDS:
+            raise TypeError(f'no message for a {kind.__name__}')
+        message = self._convert(value)
+        data = bytes(self._types.serialize_cdr(message, KINDS[kind]))
+        with self._lock:
+            if not self._open:
+                raise BagError(f"bag '{self.path}' is closed", 'write before closing it')
+            try:
+                self._writer.write(self._connection(topic, kind, latched), log_ns, data)
+                self.messages += 1
+                if time.monotonic() - self._flushed > FLUSH_PERIOD:
+                    self._flush()
+            except OSError as err:
+                raise BagError(f"bag '{self.path}' cannot be written: {err.strerror}",
+                               'free some space; what was written before is kept') from err
+
+    def flush(self) -> None:
+        """Put everything on disk now; a recorder calls this on a timer, for topics that fall silent."""
+        with self._lock:
+            if self._open:
+                self._flush()
+
+    def _connection(self, topic: str, kind: type, latched: bool) -> Connection:
+        known = self._connections.get(topic)
+        if known is None:
+            connection = self._writer.add_connection(
+                topic, KINDS[kind], typestore=self._types, offered_qos_profiles=[_qos(latched)])
+            known = self._connections[topic] = (kind, connection)
+        if known[0] is not kind:
+            raise BagError(f"topic '{topic}' of bag '{self.path}' carries {KINDS[known[0]]}",
+                           f'use another topic for {KINDS[kind]}')
+        return known[1]
+
+    def _flush(self) -> None:
+        store = self._writer.storage
+        if isinstance(store, McapWriter):
+            if store.chunk.msgs:
+                store.close_chunk()
+            store.bio.flush()
+        self._flushed = time.monotonic()
+
+    def close(self) -> None:
+        """Write index and metadata. Calling it again does nothing."""
+        with self._lock:
+            if not self._open:
+                return
+            self._open = False
+            try:
+                self._writer.close()
+            except OSError as err:
+                self._writer.abort()
+                raise BagError(f"bag '{self.path}' cannot be finished: {err.strerror}",
+                               "free some space, then run 'ros2 bag reindex'; the messages are kept") from err
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self.close()
+
+
+class _Stamp(NamedTuple):
+    sec: int
+    nanosec: int
+
+
+class _Conversion:
+    """Our values -> message classes of the recording library."""
+
+    def __init__(self, classes: Any) -> None:
+        self._classes = classes
+
+    def __call__(self, value: Value) -> Any:
+        if isinstance(value, JointRecord):
+            arrays = (np.asarray(part, dtype=np.float64)
+                      for part in (value.position, value.velocity, value.effort))
+            header = self._header(value.stamp_ns, '')
+            return self._new('sensor_msgs/msg/JointState', header, list(value.names), *arrays)
+        if isinstance(value, CaptureEvent):
+            return self._header(value.stamp_ns, value.kind.value)
+        if isinstance(value, LabelledArray):
+            dimensions = [self._new('std_msgs/msg/MultiArrayDimension', *item) for item in value.dimensions]
+            layout = self._new('std_msgs/msg/MultiArrayLayout', dimensions, 0)
+            data = np.asarray(value.data, dtype=np.float64)
+            return self._new('std_msgs/msg/Float64MultiArray', layout, data)
+        if isinstance(value, Inertia):
+            com = self._new('geometry_msgs/msg/Vector3', *(float(part) for part in value.com))
+            inner = self._new('geometry_msgs/msg/Inertia', float(value.mass), com,
+                              *(float(part) for part in value.inertia))
+            return self._new('geometry_msgs/msg/InertiaStamped',
+                             self._header(value.stamp_ns, value.frame_id), inner)
+        if isinstance(value, Diagnostics):
+            return self._diagnostics(value)
+        return self._new('std_msgs/msg/Float64', float(value))
+
+    def _diagnostics(self, value: Diagnostics) -> Any:
+        statuses = []
+        for status in value.statuses:
+            pairs = [self._new('diagnostic_msgs/msg/KeyValue', key, text) for key, text in status.values]
+            statuses.append(self._new('diagnostic_msgs/msg/DiagnosticStatus', status.level, status.name,
+                                      status.message, status.hardware_id, pairs))
+        return self._new('diagnostic_msgs/msg/DiagnosticArray', self._header(value.stamp_ns, ''), statuses)
+
+    def _header(self, stamp_ns: int, frame_id: str) -> Any:
+        stamp = _Stamp(*divmod(stamp_ns, 1_000_000_000))
+        return self._new('std_msgs/msg/Header', self._new('builtin_interfaces/msg/Time', *stamp), frame_id)
+
+    def _new(self, kind: str, *fields: Any) -> Any:
+        return self._classes[kind](*fields)
