@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -40,7 +41,7 @@ def scalar(value: Any) -> str:
     if isinstance(value, float):
         return number(value)
     if isinstance(value, str):
-        plain = value and yaml.safe_load(f'[{value}]') == [value]
+        plain = re.fullmatch(r'[A-Za-z_][\w/.-]*', value) and yaml.safe_load(value) == value
         return value if plain else "'" + value.replace("'", "''") + "'"
     return str(value)
 
