@@ -10,7 +10,7 @@ SHELL := /bin/sh
 .DEFAULT_GOAL := help
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --quiet
 
 # A sourced ROS must not mix its libraries with the locked ones in the venv.
 unexport PYTHONPATH LD_LIBRARY_PATH AMENT_PREFIX_PATH COLCON_PREFIX_PATH CMAKE_PREFIX_PATH
@@ -75,10 +75,10 @@ lint: setup $(VENV)/.development
 	@$(BIN)/mypy
 
 bench: setup $(VENV)/.benchmark
-	@$(BIN)/python benchmarks/run_all.py
+	@$(BIN)/python benchmarks/run_all.py $(BENCH)
 
 docs: setup
-	@$(BIN)/python docs/generate.py
+	@$(BIN)/python -m flexmanip_ros.cli.write_parameters
 
 lock: $(VENV)/.python
 	@$(PIP) install uv

@@ -25,7 +25,7 @@ LIBRARIES = {
     'yaml': ('python3-yaml', 'PyYAML'),
     'rich': ('python3-rich', 'rich'),
     'rosbags': ('python3-rosbags-pip', 'rosbags'),
-    'lz4': ('python3-lz4', 'lz4'),
+    'lz4': ('python3-rosbags-pip', 'lz4'),
     'backports': ('python3-rosbags-pip', 'backports.zstd'),
     'compression': ('python3-rosbags-pip', 'backports.zstd'),  # from Python 3.14 on
 }

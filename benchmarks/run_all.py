@@ -1,0 +1,84 @@
+"""Run every benchmark of this folder and gather what they measured in one table and one JSON file.
+
+Use: ``python benchmarks/run_all.py [PART_OF_A_NAME ...]``. Each benchmark is a program of its own that prints a
+table and writes ``results/<name>.json``; one that fails is reported, and does not keep the others from running.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+HERE = Path(__file__).resolve().parent
+RESULTS = HERE / 'results'
+
+
+class Outcome(NamedTuple):
+    """How one benchmark went."""
+
+    name: str
+    claim: str
+    passed: bool
+    seconds: float
+
+
+def claim_of(path: Path) -> str:
+    """Return the first line of the docstring: the claim that the file measures."""
+    words = ast.get_docstring(ast.parse(path.read_text(encoding='utf-8'))) or ''
+    return words.split('\n', 1)[0]
+
+
+def run(path: Path) -> Outcome:
+    """Run one benchmark with its output shown as it comes."""
+    print(f'\n=== {path.stem}: {claim_of(path)}', flush=True)
+    begin = time.perf_counter()
+    done = subprocess.run([sys.executable, str(path)], cwd=HERE.parent, stdin=subprocess.DEVNULL, check=False)
+    return Outcome(path.stem, claim_of(path), done.returncode == 0, time.perf_counter() - begin)
+
+
+def gather(outcomes: list[Outcome]) -> dict[str, Any]:
+    """Return everything measured, with the kind of machine that measured it."""
+    results = {}
+    for path in sorted(RESULTS.glob('*.json')):
+        if path.stem != 'all':
+            results[path.stem] = json.loads(path.read_text(encoding='utf-8'))
+    return {
+        'machine': {'cores': os.cpu_count(), 'processor': platform.machine(), 'python': platform.python_version()},
+        'runs': [outcome._asdict() for outcome in outcomes],
+        'results': results,
+    }
+
+
+def table(outcomes: list[Outcome]) -> str:
+    """Return one row a benchmark as Markdown."""
+    rows = ['| benchmark | claim | ran | seconds |', '|---|---|---|---|']
+    for name, claim, passed, seconds in outcomes:
+        rows.append(f'| {name} | {claim} | {"yes" if passed else "FAILED"} | {seconds:.0f} |')
+    return '\n'.join(rows) + '\n'
+
+
+def main() -> int:
+    """Run those whose names contain an argument (all without one); exit 1 when one failed."""
+    chosen = [
+        path for path in sorted(HERE.glob('*.py'))
+        if path.stem != 'run_all' and not path.stem.startswith('_')
+        and (len(sys.argv) == 1 or any(part in path.stem for part in sys.argv[1:]))
+        and "__name__ == '__main__'" in path.read_text(encoding='utf-8')
+    ]
+    RESULTS.mkdir(exist_ok=True)
+    outcomes = [run(path) for path in chosen]
+    (RESULTS / 'all.json').write_text(json.dumps(gather(outcomes), indent=1) + '\n', encoding='utf-8')
+    (RESULTS / 'all.md').write_text(table(outcomes), encoding='utf-8')
+    print('\n' + table(outcomes))
+    return 0 if outcomes and all(outcome.passed for outcome in outcomes) else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())
