@@ -13,7 +13,9 @@ from setuptools.command.install import install
 
 NAME = 'flexmanip_ros'
 HERE = Path(__file__).resolve().parent
-NODES = ('plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'payload_controller', 'demo')
+NODES = (
+    'plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'payload_controller', 'demo',
+)
 PROGRAMS = ('identify_bag', 'simulate_bag', 'reproduce_paper', 'monte_carlo')
 
 

@@ -1,7 +1,7 @@
 """Run every benchmark of this folder and gather what they measured in one table and one JSON file.
 
-Use: ``python benchmarks/run_all.py [PART_OF_A_NAME ...]``. Each benchmark is a program of its own that prints a
-table and writes ``results/<name>.json``; one that fails is reported, and does not keep the others from running.
+Use: ``python benchmarks/run_all.py [PART_OF_A_NAME ...]``. Each benchmark is a program of its own that prints
+a table and writes ``results/<name>.json``; one that fails is reported and does not stop the others.
 """
 
 from __future__ import annotations
@@ -49,8 +49,13 @@ def gather(outcomes: list[Outcome]) -> dict[str, Any]:
     for path in sorted(RESULTS.glob('*.json')):
         if path.stem != 'all':
             results[path.stem] = json.loads(path.read_text(encoding='utf-8'))
+    machine = {
+        'cores': os.cpu_count(),
+        'processor': platform.machine(),
+        'python': platform.python_version(),
+    }
     return {
-        'machine': {'cores': os.cpu_count(), 'processor': platform.machine(), 'python': platform.python_version()},
+        'machine': machine,
         'runs': [outcome._asdict() for outcome in outcomes],
         'results': results,
     }
