@@ -113,6 +113,13 @@ def inertia_stamped(value: Inertia) -> InertiaStamped:
     return message
 
 
+def inertia(message: InertiaStamped) -> Inertia:
+    """Return a payload message as a value."""
+    body, com = message.inertia, message.inertia.com
+    return Inertia(stamp_ns(message.header.stamp), message.header.frame_id, body.m, (com.x, com.y, com.z),
+                   (body.ixx, body.ixy, body.ixz, body.iyy, body.iyz, body.izz))
+
+
 def to_message(value: Value) -> Float64MultiArray | InertiaStamped | Float64:
     """Return any value an estimate publishes as its message."""
     if isinstance(value, LabelledArray):

@@ -1,0 +1,48 @@
+"""The four nodes, one process each: the arm, its excitation, the capture and the identifier.
+
+    ros2 launch flexmanip_ros demo.launch.py capture_time:=3.0 payload_mass:=20.0
+
+With the executable `demo` the same nodes share one process, a bag is recorded and a picture drawn.
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+PACKAGE = 'flexmanip_ros'
+ARGUMENTS = (
+    # name, default, words
+    ('rate', '1000.0', 'samples a second [Hz]'),
+    ('payload_mass', '20.0', 'mass of the object [kg]'),
+    ('capture_time', '3.0', 'capture this long after the first sample [s]; negative: never'),
+    ('release_time', '-1.0', 'release this long after the first sample [s]; negative: never'),
+    ('payload_method', 'structured', 'none | block | structured'),
+    ('namespace', '', 'namespace of all nodes'),
+    ('log_level', 'info', 'debug | info | warn | error'),
+)
+
+
+def _number(name):
+    return ParameterValue(LaunchConfiguration(name), value_type=float)
+
+
+def _node(executable, parameters):
+    return Node(
+        package=PACKAGE, executable=executable, namespace=LaunchConfiguration('namespace'), output='screen',
+        parameters=[parameters], arguments=['--ros-args', '--log-level', LaunchConfiguration('log_level')])
+
+
+def generate_launch_description():
+    """Return the nodes with their arguments."""
+    return LaunchDescription([
+        *(DeclareLaunchArgument(name, default_value=default, description=words)
+          for name, default, words in ARGUMENTS),
+        _node('rpbsid_identifier', {
+            'payload_method': ParameterValue(LaunchConfiguration('payload_method'), value_type=str)}),
+        _node('capture_trigger', {
+            'mode': 'time', 'capture_time': _number('capture_time'), 'release_time': _number('release_time')}),
+        _node('excitation', {'rate': _number('rate')}),
+        _node('plant_simulator', {'rate': _number('rate'), 'payload_mass': _number('payload_mass')}),
+    ])
