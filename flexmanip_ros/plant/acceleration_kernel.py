@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
+from flexmanip_ros.plant.compiled import kernel
 from flexmanip_ros.plant.kernels import assemble
 
 if TYPE_CHECKING:
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from flexmanip_ros.types import Array
 
 
-@njit(cache=True)
+@kernel
 def factor(M: Array) -> bool:
-    """Overwrite the lower triangle of M with its Cholesky factor, the diagonal inverted; False if not positive."""
+    """Overwrite the lower triangle of M with its Cholesky factor, diagonal inverted; False if indefinite."""
     n = M.shape[0]
     for j in range(n):
         d = M[j, j]
@@ -34,7 +34,7 @@ def factor(M: Array) -> bool:
     return True
 
 
-@njit(cache=True)
+@kernel
 def solve(L: Array, x: Array) -> None:
     """Overwrite x (n,) with M^-1 x, L from ``factor``."""
     n = x.size
@@ -50,7 +50,7 @@ def solve(L: Array, x: Array) -> None:
         x[r] = y * L[r, r]
 
 
-@njit(cache=True)
+@kernel
 def acceleration(
     arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array, qdd: Array, work: Workspace,
 ) -> bool:

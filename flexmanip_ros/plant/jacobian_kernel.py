@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
 from flexmanip_ros.plant.acceleration_kernel import acceleration
+from flexmanip_ros.plant.compiled import kernel
 from flexmanip_ros.plant.kernels import assemble
 from flexmanip_ros.plant.link_jacobian_kernel import link_jacobian, point_jacobian
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from flexmanip_ros.types import Array
 
 
-@njit(cache=True)
+@kernel
 def force_jacobian(
     arm: Manipulator, payload: Array, q: Array, qd: Array, qdd: Array,
     left: Array, right: Array, dp: Array, work: Workspace,
@@ -114,10 +114,10 @@ def force_jacobian(
         hn = columns[5, j] + 2.0 * aj * w2
         left[0, r2] += length * (s * ge + c * gn)
         right[0, r2] += length * (s * he + c * hn)
-        for l in range(k):
-            vl = arm.tip_stretch[0, l] * q[2 + l]
-            left[2 + l, r2] -= vl * (c * ge - s * gn)
-            right[2 + l, r2] -= vl * (c * he - s * hn)
+        for t in range(k):
+            vl = arm.tip_stretch[0, t] * q[2 + t]
+            left[2 + t, r2] -= vl * (c * ge - s * gn)
+            right[2 + t, r2] -= vl * (c * he - s * hn)
         # by eta1_j and its rate: P'' changes
         stretch = arm.tip_stretch[0, j]
         if stretch != 0.0:
@@ -129,14 +129,14 @@ def force_jacobian(
             he, hn = c * dpe + s * dpn, c * dpn - s * dpe
             left[1, r1] += A * gn - B * ge
             right[1, r1] += A * hn - B * he
-            for l in range(k):
-                al, bl = moments[0, 3 + l], moments[1, 3 + l]
-                left[2 + k + l, r1] += al * ge + bl * gn
-                right[2 + k + l, r1] += al * he + bl * hn
+            for t in range(k):
+                al, bl = moments[0, 3 + t], moments[1, 3 + t]
+                left[2 + k + t, r1] += al * ge + bl * gn
+                right[2 + k + t, r1] += al * he + bl * hn
     _parameter_columns(arm, payload, q, qd, qdd, base_e, base_n, c, s, length, dp)
 
 
-@njit(cache=True)
+@kernel
 def _parameter_columns(
     arm: Manipulator, payload: Array, q: Array, qd: Array, qdd: Array,
     base_e: float, base_n: float, c: float, s: float, length: float, dp: Array,
@@ -174,11 +174,11 @@ def _parameter_columns(
         slope = arm.tip_slope[1, j]
         dp[r2, 0] = (-arm.tip_stretch[1, j] * q[r2] - py * slope) * X + px * slope * Y
         dp[r2, 1] = slope * turn
-        dp[r1, 2] = arm.stiffness_per_EI[r1] * q[r1]
-        dp[r2, 3] = arm.stiffness_per_EI[r2] * q[r2]
+        dp[r1, 2] = arm.unit_stiffness[r1] * q[r1]
+        dp[r2, 3] = arm.unit_stiffness[r2] * q[r2]
 
 
-@njit(cache=True)
+@kernel
 def bias_jacobian(
     arm: Manipulator, payload: Array, q: Array, qd: Array, qdd: Array,
     left: Array, right: Array, work: Workspace,
@@ -188,7 +188,7 @@ def bias_jacobian(
     force_jacobian(arm, payload, q, qd, qdd, left, right, work.parameters, work)
 
 
-@njit(cache=True)
+@kernel
 def solve_columns(L: Array, X: Array) -> None:
     """Overwrite X (n, m) with -M^-1 X, L from ``acceleration_kernel.factor``."""
     n, m = X.shape
@@ -213,7 +213,7 @@ def solve_columns(L: Array, X: Array) -> None:
             X[r, c] = -X[r, c]
 
 
-@njit(cache=True)
+@kernel
 def acceleration_jacobian(
     arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array,
     qdd: Array, dq: Array, dqd: Array, dp: Array, work: Workspace,

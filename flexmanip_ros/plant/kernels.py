@@ -12,14 +12,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
+
+from flexmanip_ros.plant.compiled import kernel
 
 if TYPE_CHECKING:
     from flexmanip_ros.plant.manipulator import Manipulator, Workspace
     from flexmanip_ros.types import Array
 
 
-@njit(cache=True)
+@kernel
 def add_point(
     m: float, cx: float, cy: float, arm: Manipulator, i: int, q: Array, qd: Array,
     M: Array, E: Array, moments: Array,
@@ -61,10 +62,10 @@ def add_point(
         bj = px * arm.tip_slope[i, j]
         M[o + j, i] += m * (a * bj - b * aj)
         E[o + j] += m * (aj * X + bj * Y)
-        for l in range(j + 1):
-            al = -arm.tip_stretch[i, l] * q[o + l] - py * arm.tip_slope[i, l]
-            bl = px * arm.tip_slope[i, l]
-            M[o + j, o + l] += m * (aj * al + bj * bl)
+        for t in range(j + 1):
+            al = -arm.tip_stretch[i, t] * q[o + t] - py * arm.tip_slope[i, t]
+            bl = px * arm.tip_slope[i, t]
+            M[o + j, o + t] += m * (aj * al + bj * bl)
         if i == 1:
             moments[0, 3 + j] += m * aj
             moments[1, 3 + j] += m * bj
@@ -77,7 +78,7 @@ def add_point(
         moments[1, 2] += m * bdd
 
 
-@njit(cache=True)
+@kernel
 def add_link(
     arm: Manipulator, i: int, q: Array, qd: Array, M: Array, E: Array, work: Workspace,
 ) -> None:
@@ -108,8 +109,8 @@ def add_link(
                 for p in range(k):
                     y += arm.W[i, j, m, p] * q[o + p]
                     z = 0.0
-                    for l in range(k):
-                        z += arm.Q[i, j, l, m, p] * q[o + l]
+                    for t in range(k):
+                        z += arm.Q[i, j, t, m, p] * q[o + t]
                     Z[i, j, m, p] = z
                 Y[i, j, m] = y
                 c2 += arm.C2[i, j, m] * q[o + m]
@@ -165,7 +166,7 @@ def add_link(
                 moments[0, 3 + j] -= s
 
 
-@njit(cache=True)
+@kernel
 def assemble(
     arm: Manipulator, payload: Array, q: Array, qd: Array, M: Array, E: Array, work: Workspace,
 ) -> None:
@@ -190,8 +191,8 @@ def assemble(
         for j in range(k):
             slope = payload[1] * arm.tip_slope[1, j]
             M[2 + k + j, 1] += slope
-            for l in range(j + 1):
-                M[2 + k + j, 2 + k + l] += slope * arm.tip_slope[1, l]
+            for t in range(j + 1):
+                M[2 + k + j, 2 + k + t] += slope * arm.tip_slope[1, t]
     add_link(arm, 0, q, qd, M, E, work)
     add_link(arm, 1, q, qd, M, E, work)
     add_point(arm.joint_mass + arm.tip_mass + 2.0 * arm.half_mass[1] + payload[0], 0.0, 0.0,
@@ -232,5 +233,5 @@ def assemble(
         M[2 + j, 1] += v * (A * s + B * c)
         M[2 + k + j, 0] += length * (aj * s + bj * c)
         if arm.shortening:
-            for l in range(k):
-                M[2 + k + j, 2 + l] -= arm.tip_stretch[0, l] * q[2 + l] * (aj * c - bj * s)
+            for t in range(k):
+                M[2 + k + j, 2 + t] -= arm.tip_stretch[0, t] * q[2 + t] * (aj * c - bj * s)

@@ -34,7 +34,8 @@ class Blocks(NamedTuple):
 def root_slopes(arm: ArmParameters, kappa: int) -> Array:
     """Slopes phi'(0) of each link's sine shapes, (2, kappa) [1/m]."""
     j = np.arange(1, kappa + 1)
-    return np.pi * j / np.asarray(arm.link_length)[:, None]
+    slopes: Array = np.pi * j / np.asarray(arm.link_length)[:, None]
+    return slopes
 
 
 def tip_slopes(arm: ArmParameters, kappa: int) -> Array:

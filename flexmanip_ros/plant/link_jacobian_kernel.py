@@ -10,14 +10,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
+
+from flexmanip_ros.plant.compiled import kernel
 
 if TYPE_CHECKING:
     from flexmanip_ros.plant.manipulator import Manipulator, Workspace
     from flexmanip_ros.types import Array
 
 
-@njit(cache=True)
+@kernel
 def point_jacobian(
     m: float, cx: float, cy: float, arm: Manipulator, i: int, base_e: float, base_n: float,
     q: Array, qd: Array, qdd: Array, left: Array, right: Array, work: Workspace,
@@ -84,7 +85,7 @@ def point_jacobian(
             columns[5, c] += 2.0 * m * bdc
 
 
-@njit(cache=True)
+@kernel
 def link_jacobian(
     arm: Manipulator, i: int, base_e: float, base_n: float, q: Array, qd: Array, qdd: Array,
     left: Array, right: Array, work: Workspace,
@@ -122,7 +123,7 @@ def link_jacobian(
             left[i, o + c] += slope_e * base_n - arm.mean_shape[i, c] * base_e
 
 
-@njit(cache=True)
+@kernel
 def _bending_jacobian(
     arm: Manipulator, i: int, q: Array, qd: Array, qdd: Array, left: Array, right: Array, work: Workspace,
 ) -> None:
@@ -132,18 +133,18 @@ def _bending_jacobian(
     turn = qdd[i]
     Z, Y, pairs = work.Z, work.Y, work.pairs
     for p in range(k):
-        for l in range(k):
-            pairs[1, p, l] = q[o + p] * q[o + l]
-            pairs[0, p, l] = (qd[o + p] * qd[o + l] + q[o + p] * qdd[o + l]
-                              - 0.5 * w * w * pairs[1, p, l])
+        for t in range(k):
+            pairs[1, p, t] = q[o + p] * q[o + t]
+            pairs[0, p, t] = (qd[o + p] * qd[o + t] + q[o + p] * qdd[o + t]
+                              - 0.5 * w * w * pairs[1, p, t])
     for j in range(k):
         for m in range(j + 1):
             force, stretch = 0.0, 0.0
             for p in range(k):
-                for l in range(k):
-                    S = arm.Q[i, j, m, p, l]
-                    force += S * pairs[0, p, l]
-                    stretch += S * pairs[1, p, l]
+                for t in range(k):
+                    S = arm.Q[i, j, m, p, t]
+                    force += S * pairs[0, p, t]
+                    stretch += S * pairs[1, p, t]
             left[o + j, o + m] += force
             left[i, o + j] += w * stretch * qd[o + m]
             if m != j:

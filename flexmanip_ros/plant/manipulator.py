@@ -73,7 +73,7 @@ class Manipulator(NamedTuple):
     """(n,) diagonal of K."""
     damping: Array
     """(n,) diagonal of D."""
-    stiffness_per_EI: Array
+    unit_stiffness: Array
     """(n,) derivative of the stiffness by its link's EI."""
     torque: Array
     """(n, 2) B."""
@@ -130,7 +130,7 @@ def manipulator(arm: ArmParameters, kappa: int | None = None) -> Manipulator:
     tables = [_tables(L, rho, k, arm.shortening) for L, rho in zip(length, density, strict=True)]
     j = np.pi * np.arange(1, k + 1)
     stiffness = np.concatenate([np.zeros(2), linearization.stiffness(arm, k)])
-    per_EI = np.concatenate([np.zeros(2), *(j**4 / (2 * L**3) for L in length)])
+    per_stiffness = np.concatenate([np.zeros(2), *(j**4 / (2 * L**3) for L in length)])
     stretch = j**2 / (2 * length[:, None]) if arm.shortening else np.zeros((2, k))
     return Manipulator(
         kappa=k, shortening=arm.shortening, joint_mass=arm.joint_mass, tip_mass=arm.tip_mass,
@@ -142,11 +142,11 @@ def manipulator(arm: ArmParameters, kappa: int | None = None) -> Manipulator:
         W=np.stack([t[4] for t in tables]), Q=np.stack([t[5] for t in tables]),
         rotary=_rotary(arm, root, tip), stiffness=stiffness,
         damping=np.concatenate([np.zeros(2), linearization.damping(arm, k)]),
-        stiffness_per_EI=per_EI, torque=linearization.torque_matrix(arm, k),
+        unit_stiffness=per_stiffness, torque=linearization.torque_matrix(arm, k),
         output=output_matrix(arm, root, tip))
 
 
-def _tables(L: float, rho: float, k: int, shortening: bool) -> tuple[Array, Array, Array, Array, Array, Array]:
+def _tables(L: float, rho: float, k: int, shortening: bool) -> tuple[Array, ...]:
     """Integrals over one link by Gauss-Legendre quadrature fine enough to be exact to rounding."""
     nodes, weights = np.polynomial.legendre.leggauss(40 + 8 * k)
     x, weights = L * (nodes + 1) / 2, rho * L * weights / 2
@@ -242,7 +242,7 @@ def accelerations(arm: Manipulator, payload: Array, q: Array, qd: Array, effort:
 
 def _assembled(arm: Manipulator, payload: Array, q: Array, qd: Array) -> tuple[Array, Array]:
     work = workspace(arm.kappa)
-    assemble(arm, payload, np.asarray(q, dtype=np.float64), np.asarray(qd, dtype=np.float64), work.M, work.E, work)
+    assemble(arm, payload, np.asarray(q, float), np.asarray(qd, float), work.M, work.E, work)
     lower = np.tril(work.M)
     return lower + np.tril(lower, -1).T, work.E
 
