@@ -42,16 +42,16 @@ def compile_kernels(where: str) -> None:
     if os.environ.get('FLEXMANIP_WARM_UP', '1') == '0':
         return
     path = os.pathsep.join(part for part in (where, os.environ.get('PYTHONPATH')) if part)
+    command = [sys.executable, '-m', f'{NAME}.cli.warm_up']
     try:
-        subprocess.run(
-            [sys.executable, '-m', f'{NAME}.cli.warm_up'],
-            env={**os.environ, 'PYTHONPATH': path},
-            cwd=where,
-            timeout=600,
-            check=False,
+        done = subprocess.run(
+            command, env={**os.environ, 'PYTHONPATH': path}, cwd=where, timeout=600,
+            check=False, capture_output=True, text=True, stdin=subprocess.DEVNULL,
         )
+        words = done.stdout if done.returncode == 0 else done.stderr
     except (OSError, subprocess.SubprocessError) as problem:
-        print(f'{NAME}: kernels are not compiled yet ({problem}); they will be at first use', file=sys.stderr)
+        words = str(problem)
+    print(f'{NAME}: compiling the kernels: {words.strip().splitlines()[-1:]}')
 
 
 class InstallAndCompile(install):
