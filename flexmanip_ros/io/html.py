@@ -1,0 +1,85 @@
+"""Pages that need nothing else: pictures and tables inside one HTML file."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Iterable, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from flexmanip_ros.io.table import write_file
+from flexmanip_ros.types import Array
+
+STYLE = """
+body{font:16px/1.5 system-ui,sans-serif;color:#1a1a1a;max-width:1100px;margin:2rem auto;padding:0 1rem}
+h1{font-size:1.6rem;margin-bottom:.2rem}h2{font-size:1.2rem;margin-top:2.2rem;border-bottom:1px solid #ddd}
+img{width:100%;height:auto}table{border-collapse:collapse;margin:.6rem 0;font-size:.9rem}
+th,td{padding:.2rem .7rem;text-align:left;border-bottom:1px solid #e6e6e6;vertical-align:top}
+td.n{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}
+nav a{margin-right:1rem}.note{color:#555}.changed{background:#fff3d6}div.wide{overflow-x:auto}
+caption{text-align:left;font-weight:600;padding:.3rem 0}
+"""
+
+
+class Section(NamedTuple):
+    """A heading and the HTML below it."""
+
+    title: str
+    body: str
+
+
+def page(title: str, lead: str, sections: Sequence[Section]) -> str:
+    """Return a whole page with a contents list. ``title`` and ``lead`` are plain text."""
+    links = ''.join(f'<a href="#s{k}">{escape(section.title)}</a>' for k, section in enumerate(sections))
+    parts = ''.join(f'<h2 id="s{k}">{escape(section.title)}</h2>{section.body}'
+                    for k, section in enumerate(sections))
+    return (f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+            f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head><body>'
+            f'<h1>{escape(title)}</h1><p class="note">{escape(lead)}</p><nav>{links}</nav>{parts}'
+            '</body></html>\n')
+
+
+def picture(drawn: Figure, words: str) -> str:
+    """Return a figure as an inline image."""
+    buffer = io.BytesIO()
+    drawn.savefig(buffer, format='png')
+    data = base64.b64encode(buffer.getvalue()).decode('ascii')
+    return f'<img alt="{escape(words)}" src="data:image/png;base64,{data}">'
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = '') -> str:
+    """Return a table; numbers are set right and short, texts are escaped."""
+    head = ''.join(f'<th>{escape(name)}</th>' for name in header)
+    body = ''.join('<tr>' + ''.join(_cell(value) for value in row) + '</tr>' for row in rows)
+    top = f'<caption>{escape(caption)}</caption>' if caption else ''
+    return f'<div class="wide"><table>{top}<tr>{head}</tr>{body}</table></div>'
+
+
+def number(value: Any, digits: int = 5) -> str:
+    """Write a number for people; a missing one is a dash."""
+    if value is None or (isinstance(value, float) and np.isnan(value)):
+        return '\N{EN DASH}'
+    return str(value) if isinstance(value, (int, str)) else f'{float(value):.{digits}g}'
+
+
+def _cell(value: Any) -> str:
+    if value is None or isinstance(value, (int, float, np.number)):
+        return f'<td class="n">{number(value)}</td>'
+    return f'<td>{escape(str(value))}</td>'
+
+
+def matrix(name: str, values: Array, rows: Sequence[str] = (), columns: Sequence[str] = ()) -> str:
+    """Return a matrix as a table with its signals named."""
+    header = ['', *(columns or [f'x{k + 1}' for k in range(values.shape[1])])]
+    labels = rows or [f'x{k + 1}' for k in range(values.shape[0])]
+    return table(header, [[label, *row] for label, row in zip(labels, values.tolist(), strict=True)], name)
+
+
+def write(path: str | Path, text: str) -> None:
+    """Write a page, whole or not at all."""
+    write_file(path, lambda file: file.write(text.encode('utf-8')))

@@ -1,0 +1,176 @@
+"""The parts every picture is made of: one look, units on every axis, the event marked.
+
+Colours are Okabe and Ito's, which people with any colour vision tell apart. matplotlib is imported only here
+and in the modules that draw, so everything else works without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from flexmanip_ros.types import Array, Estimate, EventKind, Status
+
+COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#7F7F7F', '#000000')
+PAYLOAD_COLOUR = '#009E73'
+TRUTH_COLOUR = '#000000'
+EVENT_COLOUR = '#AA0000'
+STATUS_COLOURS = {
+    Status.WARMING_UP: '#C8C8C8', Status.TRACKING: '#009E73', Status.POORLY_EXCITED: '#E69F00',
+    Status.ILL_CONDITIONED: '#CC79A7', Status.SAMPLE_GAP: '#56B4E9', Status.INCONSISTENT: '#D55E00',
+    Status.NO_PAYLOAD_METHOD: '#56B4E9', Status.UNOBSERVABLE: '#7F7F7F', Status.DIVERGED: '#000000',
+}
+WIDTH = 10.0
+"""Inches; about the width of a page."""
+DPI = 120
+POINTS = 2000
+"""A line is thinned to its envelope above this many points."""
+
+Event = tuple[float, EventKind]
+Known = tuple[float, float, Sequence[float]]
+"""From and to [s], and the frequencies [Hz] that are true between."""
+
+
+def figure(rows: int, heights: Sequence[float], *, share_time: bool = True) -> tuple[Figure, list[Any]]:
+    """Return a figure of the page's width and its axes, one below the other with one time axis."""
+    made = Figure(figsize=(WIDTH, float(sum(heights)) + 0.6), dpi=DPI, layout='constrained')
+    FigureCanvasAgg(made)
+    axes = made.subplots(rows, 1, sharex=share_time, squeeze=False, height_ratios=list(heights))[:, 0]
+    for ax in axes:
+        ax.grid(True, color='#E4E4E4', linewidth=0.7)
+        ax.set_axisbelow(True)
+        for side in ('top', 'right'):
+            ax.spines[side].set_visible(False)
+    if share_time:
+        axes[-1].set_xlabel('time since the first sample [s]')
+    return made, list(axes)
+
+
+def save(made: Figure, path: str | Path) -> None:
+    """Write a figure as PNG."""
+    made.savefig(str(path), format='png')
+
+
+def envelope(time: Array, values: Array) -> tuple[Array, Array]:
+    """Thin a line (N,) so that its picture stays the same: the extremes of each stretch, in order."""
+    stretch = 2 * values.size // POINTS
+    if stretch < 2:
+        return time, values
+    count = values.size // stretch * stretch
+    blocks = values[:count].reshape(-1, stretch)
+    low, high = blocks.argmin(axis=1), blocks.argmax(axis=1)
+    base = np.arange(0, count, stretch)
+    keep = np.unique(np.concatenate([base + low, base + high, [values.size - 1]]))
+    return time[keep], values[keep]
+
+
+def lines(ax: Any, time: Array, columns: Array, labels: Sequence[str], title: str, unit: str) -> None:
+    """Draw signals (N, k) over time."""
+    for k, label in enumerate(labels):
+        ax.plot(*envelope(time, columns[:, k]), color=COLOURS[k % len(COLOURS)], linewidth=1.1, label=label)
+    ax.set_ylabel(f'{title}\n[{unit}]')
+    legend(ax)
+
+
+def legend(ax: Any) -> None:
+    """Put the legend beside the plot, where it hides nothing."""
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(loc='upper left', bbox_to_anchor=(1.005, 1.0), frameon=False, fontsize=9, borderaxespad=0.0)
+
+
+def events(axes: Iterable[Any], found: Sequence[Event]) -> None:
+    """Mark captures and releases in every plot, named in the first."""
+    for index, ax in enumerate(axes):
+        for time, kind in found:
+            ax.axvline(time, color=EVENT_COLOUR, linestyle='--', linewidth=1.2)
+            if index == 0:
+                ax.annotate(f'{kind.value} {time:.2f} s', (time, 1.0), xycoords=('data', 'axes fraction'),
+                            xytext=(3, 3), textcoords='offset points', color=EVENT_COLOUR, fontsize=9)
+
+
+def times(estimates: Sequence[Estimate], start_ns: int) -> Array:
+    """Return the time of each estimate [s]: (T,)."""
+    return np.array([(estimate.stamp_ns - start_ns) * 1e-9 for estimate in estimates], dtype=np.float64)
+
+
+def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int,
+                truth: Sequence[Known] = ()) -> None:
+    """Draw the identified frequencies with their 95 % bands."""
+    time = times(estimates, start_ns)
+    count = max((len(estimate.modes) for estimate in estimates), default=0)
+    values = np.full((len(estimates), count, 2), np.nan)
+    for row, estimate in enumerate(estimates):
+        for k, mode in enumerate(estimate.modes):
+            values[row, k] = mode.frequency_hz, mode.frequency_std_hz
+    for k in range(count):
+        colour, middle, spread = COLOURS[k % len(COLOURS)], values[:, k, 0], 1.96 * values[:, k, 1]
+        ax.fill_between(time, middle - spread, middle + spread, color=colour, alpha=0.2, linewidth=0)
+        ax.plot(time, middle, color=colour, linewidth=1.4, label=f'mode {k + 1}, 95 % band')
+    for index, (begin, end, known) in enumerate(truth):
+        for k, frequency in enumerate(known):
+            ax.plot([begin, end], [frequency] * 2, color=TRUTH_COLOUR, linestyle=(0, (4, 3)), linewidth=1.1,
+                    label='true' if index == k == 0 else None)
+    if count:
+        limit(ax, values[:, :, 0], [f for _, _, known in truth for f in known])
+    ax.set_ylabel('frequency\n[Hz]')
+    legend(ax)
+
+
+def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
+            truth: Sequence[tuple[float, float, float]] = ()) -> None:
+    """Draw the payload with its 95 % interval; truth: (from [s], to [s], mass [kg]) of each stretch."""
+    rows = [estimate for estimate in estimates if estimate.payload is not None]
+    time = times(rows, start_ns)
+    held = [estimate.payload for estimate in estimates if estimate.payload is not None]
+    table = np.array([(p.mass, p.lower, p.upper) for p in held], dtype=np.float64).reshape(len(held), 3)
+    ax.fill_between(time, table[:, 1], table[:, 2], color=PAYLOAD_COLOUR, alpha=0.25, linewidth=0,
+                    label='95 % interval')
+    ax.plot(time, table[:, 0], color=PAYLOAD_COLOUR, linewidth=1.5, label='estimate')
+    for index, (begin, end, mass) in enumerate(truth):
+        ax.plot([begin, end], [mass, mass], color=TRUTH_COLOUR, linestyle=(0, (4, 3)), linewidth=1.2,
+                label='true' if index == 0 else None)
+    limit(ax, table, [mass for _, _, mass in truth])
+    ax.set_ylabel('payload\n[kg]')
+    legend(ax)
+
+
+def limit(ax: Any, values: Array, known: Sequence[float]) -> None:
+    """Choose the vertical range from where the values settle, so that a transient does not hide the rest."""
+    late = values[values.shape[0] // 2:]
+    late = late[np.isfinite(late)]
+    every = np.concatenate([values[np.isfinite(values)], np.asarray(known, dtype=np.float64)])
+    if late.size == 0 or every.size == 0:
+        return
+    settled = np.concatenate([np.percentile(late, [2, 98]), np.asarray(known, dtype=np.float64)])
+    low, high = float(settled.min()), float(settled.max())
+    middle = np.percentile(every, [5, 95])
+    room = max(high - low, 0.02 * max(abs(high), abs(low)), 1e-6)
+    low, high = max(low - 1.5 * room, min(low, middle[0])), min(high + 1.5 * room, max(high, middle[1]))
+    ax.set_ylim(low - 0.15 * room, high + 0.15 * room)
+
+
+def statuses(ax: Any, estimates: Sequence[Estimate], start_ns: int) -> None:
+    """Draw what the estimates were worth over time."""
+    time = times(estimates, start_ns)
+    seen: list[Status] = []
+    begin = 0
+    for k in range(1, len(estimates) + 1):
+        if k < len(estimates) and estimates[k].status is estimates[begin].status:
+            continue
+        status = estimates[begin].status
+        ax.axvspan(time[begin], time[min(k, len(estimates) - 1)], color=STATUS_COLOURS[status], linewidth=0)
+        if status not in seen:
+            seen.append(status)
+        begin = k
+    ax.set_yticks([])
+    ax.set_ylabel('status', rotation=0, ha='right', va='center')
+    ax.grid(False)
+    names = [Patch(color=STATUS_COLOURS[s], label=s.name.lower().replace('_', ' ')) for s in seen]
+    ax.legend(handles=names, loc='upper left', bbox_to_anchor=(1.005, 1.2), frameon=False, fontsize=9,
+              borderaxespad=0.0)
