@@ -20,13 +20,14 @@ LARGEST_FILE = 1 << 20
 """Bytes; a parameter file is a page of text."""
 
 
-class _Loader(yaml.SafeLoader):  # type: ignore[misc]
+class _Loader(yaml.SafeLoader):
     """Safe YAML as ROS reads it: 1e-3 is a number, a name twice is a mistake, aliases are not understood."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.events.AliasEvent):
-            mark = self.peek_event().start_mark
-            raise yaml.composer.ComposerError(None, None, 'ROS parameter files have no aliases (*name)', mark)
+            problem = 'ROS parameter files have no aliases (*name)'
+            parser: Any = self
+            raise yaml.composer.ComposerError(None, None, problem, parser.peek_event().start_mark)
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:

@@ -120,6 +120,7 @@ def signals_figure(made: Run) -> Figure:
     drawn, axes = plots.figure(len(groups), [1.7] * len(groups))
     for ax, group in zip(axes, groups, strict=True):
         plots.lines(ax, made.signals.time, *group)
+    axes[-1].set_xlim(0.0, made.end or 1.0)
     plots.events(axes, made.events)
     return drawn
 

@@ -84,4 +84,5 @@ def _parameters(config: IdentifierParameters) -> str:
         cells = (leaf.name, written(leaf, values[leaf.name]), leaf.unit, leaf.words)
         rows.append(f'<tr{changed}>' + ''.join(f'<td>{escape(cell)}</td>' for cell in cells) + '</tr>')
     return ('<p class="note">Marked: different from the default.</p><div class="wide"><table>'
-            '<tr><th>parameter</th><th>value</th><th>unit</th><th>meaning</th></tr>' + ''.join(rows) + '</table></div>')
+            '<tr><th>parameter</th><th>value</th><th>unit</th><th>meaning</th></tr>'
+            + ''.join(rows) + '</table></div>')

@@ -1,0 +1,86 @@
+"""What every program shares: progress on a terminal, one line for an error, exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from flexmanip_ros.errors import FlexmanipError
+
+SUCCESS, BAD_INPUT, INTERRUPTED = 0, 2, 130
+Report = Callable[[int, int | None], None]
+"""Called with what is done and what there is to do (None: unknown)."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Arguments with one line for a mistake."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong and where help is; exit 2."""
+        self.exit(BAD_INPUT, f'{self.prog}: {message}; see {self.prog} --help\n')
+
+
+def parser(prog: str, words: str, epilog: str) -> Parser:
+    """Return a parser whose examples keep their lines."""
+    return Parser(prog=prog, description=words, epilog=epilog, allow_abbrev=False,
+                  formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
+@contextmanager
+def progress(words: str, unit: str) -> Iterator[Report]:
+    """Show a bar on stderr when that is a terminal; otherwise nothing."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda done, total: None
+        return
+    bar = Progress(TextColumn(words), BarColumn(), MofNCompleteColumn(), TextColumn(unit),
+                   TimeRemainingColumn(), console=console, transient=True)
+    with bar:
+        task = bar.add_task(words, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def complain(prog: str, error: BaseException | str) -> None:
+    """Write one line on stderr."""
+    print(f'{prog}: {" ".join(str(error).split())}', file=sys.stderr)
+
+
+def run(prog: str, body: Callable[[], int]) -> int:
+    """Run a program: our errors become one line and exit 2, an interrupt exit 130."""
+    with _terminate_as_interrupt():
+        try:
+            return body()
+        except FlexmanipError as error:
+            complain(prog, error)
+            return BAD_INPUT
+        except KeyboardInterrupt:
+            complain(prog, 'interrupted')
+            return INTERRUPTED
+        except BrokenPipeError:
+            sys.stderr.close()  # the reader of our output is gone; nothing is left to say
+            return SUCCESS
+
+
+@contextmanager
+def _terminate_as_interrupt() -> Iterator[None]:
+    """Make SIGTERM do what Ctrl-C does, so that what was computed is written in both cases."""
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    try:
+        before = signal.signal(signal.SIGTERM, interrupt)
+    except ValueError:  # not the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

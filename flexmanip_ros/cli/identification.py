@@ -1,0 +1,178 @@
+"""A recording through the pipeline to its outputs; identify_bag and studies over bags call it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from flexmanip_ros import holdout, pipeline
+from flexmanip_ros.errors import BagError, FlexmanipError
+from flexmanip_ros.history import History, Signals
+from flexmanip_ros.io import bag
+from flexmanip_ros.io.outputs import Outputs, TableOutput, open_output
+from flexmanip_ros.io.table import check_place
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.summary import Summary, summarize
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Mode
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to identify from what, and where it goes. Times count from the first stamp [s]."""
+
+    bag: str | Path
+    config: IdentifierParameters
+    joint_states: str = 'joint_states'
+    events: tuple[str, ...] = ('capture_event', 'capture_detected')
+    capture_time: float | None = None
+    release_time: float | None = None
+    validate_from: float | None = None
+    output: str | None = None
+    report: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What came out. ``fault`` is what was wrong with the recording: the rest was used all the same."""
+
+    summary: Summary
+    modes: tuple[Mode, ...]
+    outputs: tuple[str, ...]
+    written: tuple[str, ...]
+    fault: FlexmanipError | None
+    interrupted: bool = False
+
+
+def identify(request: Request, progress: bag.Progress | None = None) -> Result:
+    """Run the identifier over a recording and write what was asked for.
+
+    Raises FlexmanipError when there is nothing to report: no usable message, no place to write.
+    """
+    started = time.perf_counter()
+    if request.report is not None:
+        check_place(request.report)
+        _require_pictures()
+    feed = _Feed(request, progress)
+    kept: list[Estimate] = []
+    state = pipeline.init()
+    with ExitStack() as stack:
+        frame = request.config.payload_frame
+        outputs = [] if request.output is None else [open_output(request.output, frame)]
+        sink = stack.enter_context(Outputs(*outputs))
+        for now, estimate in pipeline.replay(request.config, feed):
+            state = now
+            if estimate is None:
+                continue
+            sink.write(estimate)
+            if request.report is not None:
+                kept.append(estimate)
+        for output in outputs:
+            if isinstance(output, TableOutput):
+                output.start_ns = feed.first_ns
+    if feed.fault is not None and state.counters.accepted == 0:
+        raise feed.fault
+    last = pipeline.current(state)
+    summary = summarize(state, last, time.perf_counter() - started)
+    scores = None
+    signals = None if feed.history is None else feed.history.signals()
+    if request.validate_from is not None and signals is not None:
+        scores = holdout.score(None if last is None else last.model, signals, request.validate_from)
+        summary = replace(summary, vaf_simulation_percent=tuple(scores.simulation.tolist()),
+                          vaf_prediction_percent=tuple(scores.prediction.tolist()))
+    fault = feed.fault or _dropped(state)
+    if request.report is not None and signals is not None:
+        _report(request, summary, feed, kept, signals, last, scores, state, fault)
+    return Result(
+        summary, () if last is None else last.modes, state.sampling.outputs or request.config.outputs,
+        tuple(str(place) for place in (request.output, request.report) if place is not None), fault,
+        feed.interrupted)
+
+
+class _Feed:
+    """The messages of a recording, up to its fault; remembers what scores and pictures need."""
+
+    def __init__(self, request: Request, progress: bag.Progress | None) -> None:
+        self.fault: FlexmanipError | None = None
+        self.interrupted = False
+        self.first_ns: int | None = None
+        self.events: list[CaptureEvent] = []
+        wanted = request.report is not None or request.validate_from is not None
+        self.history = History(request.config) if wanted else None
+        self._request = request
+        self._progress = progress
+
+    def __iter__(self) -> Iterator[bag.Item]:
+        request = self._request
+        try:
+            topics = bag.Topics(request.joint_states, request.events)
+            for item in bag.read(request.bag, topics, self._progress):
+                yield from self._pass(item)
+        except BagError as error:
+            self.fault = error
+        except KeyboardInterrupt:
+            self.fault = BagError('interrupted', 'what was read until then is reported')
+            self.interrupted = True
+
+    def _pass(self, item: bag.Item) -> Iterator[bag.Item]:
+        if isinstance(item, JointRecord):
+            if self.history is not None:
+                self.history.add(item)
+            if self.first_ns is None:
+                self.first_ns = item.stamp_ns
+                yield from self._known_events(item.stamp_ns)
+        if self._held_out(item.stamp_ns):
+            return
+        if isinstance(item, CaptureEvent):
+            self.events.append(item)
+        yield item
+
+    def _known_events(self, first_ns: int) -> Iterator[CaptureEvent]:
+        for at, kind in ((self._request.capture_time, EventKind.CAPTURE),
+                         (self._request.release_time, EventKind.RELEASE)):
+            if at is not None:
+                event = CaptureEvent(first_ns + round(at * 1e9), kind)
+                self.events.append(event)
+                yield event
+
+    def _held_out(self, stamp_ns: int) -> bool:
+        limit = self._request.validate_from
+        if limit is None or self.first_ns is None:
+            return False
+        return stamp_ns >= self.first_ns + round(limit * 1e9)
+
+
+def _dropped(state: pipeline.State) -> FlexmanipError | None:
+    """Return what was wrong with messages that had to be left out; repeated stamps and gaps are a status."""
+    counters, refusal = state.counters, state.sampling.refusal
+    faulty = counters.not_finite + counters.unequal_sizes
+    if not faulty or refusal is None:
+        return None
+    what = 'NaN or infinity in a configured signal' if counters.not_finite else 'arrays of unequal sizes'
+    return BagError(f'{faulty} of {counters.received} messages hold {what} and were left out',
+                    'look at the publisher of the joint states')
+
+
+def _require_pictures() -> None:
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as err:
+        raise FlexmanipError('--report needs matplotlib, which is not installed',
+                             "run 'pip install matplotlib', or leave --report away") from err
+
+
+def _report(request: Request, summary: Summary, feed: _Feed, kept: list[Estimate], signals: Signals,
+            last: Estimate | None, scores: holdout.Scores | None, state: pipeline.State,
+            fault: FlexmanipError | None) -> None:
+    from flexmanip_ros.io import pictures, report  # matplotlib only when asked for
+
+    assert request.report is not None
+    config = state.config or request.config
+    made = pictures.run(config, signals, kept, feed.events)
+    counts: dict[str, Any] = {**state.counters._asdict(), 'dropped': state.counters.dropped}
+    report.identification_report(
+        request.report, Path(request.bag).name, config, summary, made,
+        None if last is None else last.model, scores, counts, '' if fault is None else str(fault))

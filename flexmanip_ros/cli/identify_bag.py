@@ -1,0 +1,114 @@
+"""identify_bag: the identifier over a recording, no ROS running."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+
+from flexmanip_ros.cli import console
+from flexmanip_ros.cli.identification import Request, Result, identify
+from flexmanip_ros.io.parameter_file import load
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.parameters.document import help_text
+from flexmanip_ros.types import Status
+
+PROG = 'identify_bag'
+NODE = 'rpbsid_identifier'
+EXAMPLES = """examples:
+  identify_bag recording                                     the default arm, structured payload estimate
+  identify_bag recording --params my_arm.yaml --report report.html
+  identify_bag recording --set payload_method=none --set 'inputs=[motor/effort]' \\
+      --set 'outputs=[arm/position]' --set order=4 --validate-from 5
+  identify_bag recording --output estimates.csv --json
+
+exit status: 0 on success; 2 on bad input or arguments, with one line on stderr. Of a damaged recording
+everything before the fault is used and written, then the fault is reported.
+
+parameters (in --params under rpbsid_identifier or /**, or with --set):
+"""
+
+
+def _parser() -> console.Parser:
+    made = console.parser(
+        PROG, 'Identify a flexible arm and its payload from a rosbag2 recording. No ROS needs to run.',
+        EXAMPLES + help_text(IdentifierParameters))
+    add = made.add_argument
+    add('bag', metavar='BAG', help='rosbag2 directory, or the .mcap or .db3 file itself')
+    add('--params', metavar='FILE.yaml', help='ROS parameter file for rpbsid_identifier')
+    add('--set', metavar='name=value', action='append', default=[],
+        help='override one parameter (YAML value)')
+    add('--validate-from', metavar='SECONDS', type=float,
+        help='identify before this time from the first stamp, score the model on the rest')
+    add('--output', metavar='OUT', help='estimates: .csv or .npz a table, anything else a rosbag2 recording')
+    add('--report', metavar='REPORT.html', help='one page with pictures and tables')
+    add('--json', action='store_true', help='print the result as JSON, the last line of stdout')
+    add('--joint-states', metavar='TOPIC', default='joint_states',
+        help='default: joint_states, in any namespace')
+    add('--capture-event', metavar='TOPIC', action='append',
+        help='default: capture_event and capture_detected beside the joint states')
+    for kind in ('capture', 'release'):
+        add(f'--{kind}-time', metavar='SECONDS', type=float,
+            help=f'add a {kind} at this time from the first stamp')
+    return made
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; return its exit status."""
+    given = _parser().parse_args(arguments)
+    return console.run(PROG, lambda: _main(given))
+
+
+def _main(given: argparse.Namespace) -> int:
+    config = load(IdentifierParameters, NODE, given.params, given.set)
+    request = Request(
+        given.bag, config, joint_states=given.joint_states,
+        events=tuple(given.capture_event or ('capture_event', 'capture_detected')),
+        capture_time=given.capture_time, release_time=given.release_time, validate_from=given.validate_from,
+        output=given.output, report=given.report)
+    with console.progress('identifying', 'messages') as progress:
+        result = identify(request, progress)
+    if not given.json:
+        print('\n'.join(describe(result)))
+    else:
+        print(json.dumps(result.summary.as_json(), allow_nan=False))
+    if result.fault is not None:
+        kept = ''.join(f"; what was identified is in '{place}'" for place in result.written)
+        console.complain(PROG, f'{result.fault}{kept}')
+        return console.INTERRUPTED if result.interrupted else console.BAD_INPUT
+    return console.SUCCESS
+
+
+def describe(result: Result) -> list[str]:
+    """Return the result as lines for people."""
+    summary = result.summary
+    lines = [f'samples      {summary.samples}, {summary.gaps} gaps, '
+             f'sample time {_text(summary.sample_time_s)} s, identified in {summary.wall_s:.2f} s']
+    lines += [f'{name:12s} at {time:.3f} s' for name, time in (
+        ('capture', summary.capture_time_s), ('release', summary.release_time_s)) if time is not None]
+    lines.append(f'status       {summary.status}: {Status[summary.status].value}')
+    for k, mode in enumerate(result.modes):
+        spread = f' +- {1.96 * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else ''
+        lines.append(f'mode {k + 1}       {mode.frequency_hz:.4f}{spread} Hz, '
+                     f'damping ratio {mode.damping_ratio:.4f}')
+    if summary.payload_ci95_kg is not None:
+        low, high = summary.payload_ci95_kg
+        lines.append(f'payload      {_text(summary.payload_mass_kg)} kg, '
+                     f'95 % interval {_text(low)} .. {_text(high)} kg, '
+                     f'residual power {_text(summary.consistency)}')
+    for words, values in (('simulation', summary.vaf_simulation_percent),
+                          ('prediction', summary.vaf_prediction_percent)):
+        if values is not None:
+            said = [f'{name} {_text(value)} %' for name, value in zip(result.outputs, values, strict=True)]
+            lines.append(f'VAF {words:8s} {", ".join(said)}')
+    lines += [f'written      {place}' for place in result.written]
+    return lines
+
+
+def _text(value: float | None) -> str:
+    return 'unknown' if value is None else f'{value:.6g}'
+
+
+if __name__ == '__main__':
+    sys.exit(main())
