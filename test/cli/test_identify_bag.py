@@ -1,0 +1,220 @@
+"""The program identify_bag, called as a user calls it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from flexmanip_ros import messages, pipeline
+from flexmanip_ros.cli.identify_bag import main
+from flexmanip_ros.io import bag
+from flexmanip_ros.io.bag_writer import BagWriter
+from flexmanip_ros.parameters import IdentifierParameters, configure
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+
+START = 1_700_000_000_000_000_000
+KEYS = ['samples', 'gaps', 'sample_time_s', 'wall_s', 'status', 'frequencies_hz', 'damping_ratios',
+        'payload_mass_kg', 'payload_std_kg', 'payload_ci95_kg', 'consistency', 'capture_time_s',
+        'release_time_s', 'vaf_simulation_percent', 'vaf_prediction_percent']
+OTHER = {'payload_method': 'none', 'inputs': ['motor/effort'], 'outputs': ['arm/position', 'arm/velocity'],
+         'angles': [], 'order': 2, 'past_window': 6, 'future_window': 4}
+SETTINGS = [f'--set={name}={json.dumps(value)}' for name, value in OTHER.items()]
+
+
+def _oscillator(count: int = 1500, dt: float = 0.01) -> list[JointRecord]:
+    """A damped oscillation at 2 Hz driven by noise, as another machine would publish it."""
+    rng = np.random.default_rng(3)
+    omega, zeta = 2.0 * np.pi * 2.0, 0.05
+    continuous = np.array([[0.0, 1.0], [-omega**2, -2.0 * zeta * omega]])
+    from scipy.linalg import expm
+
+    full = expm(np.block([[continuous, np.array([[0.0], [50.0]])], [np.zeros((1, 3))]]) * dt)
+    x, records = np.zeros(2), []
+    for k in range(count):
+        u = rng.normal()
+        noisy = x + rng.normal(size=2) * [0.005, 0.05]
+        records.append(JointRecord(
+            START + round(k * dt * 1e9), ('other', 'motor', 'arm'), np.array([0.0, 0.0, noisy[0]]),
+            np.array([np.nan, 0.0, noisy[1]]), np.array([0.0, u, 0.0])))
+        x = full[:2, :2] @ x + full[:2, 2] * u
+    return records
+
+
+def _bag(path: Path, records: list[JointRecord], event_s: float | None = None) -> Path:
+    with BagWriter(path) as writer:
+        for record in records:
+            writer.write('/joint_states', record.stamp_ns, record)
+        if event_s is not None:
+            stamp = START + round(event_s * 1e9)
+            writer.write('/capture_event', records[-1].stamp_ns, CaptureEvent(stamp, EventKind.CAPTURE))
+    return path
+
+
+@pytest.fixture(scope='module')
+def recording(tmp_path_factory):
+    return _bag(tmp_path_factory.mktemp('bags') / 'oscillator', _oscillator())
+
+
+def _run(capsys, *arguments: object) -> tuple[int, str, str]:
+    status = main([str(argument) for argument in arguments])
+    seen = capsys.readouterr()
+    return status, seen.out, seen.err
+
+
+def test_json_has_exactly_the_promised_keys_on_the_last_line(recording, capsys):
+    status, out, err = _run(capsys, recording, *SETTINGS, '--json', '--validate-from', 10)
+    assert (status, err) == (0, '')
+    found = json.loads(out.splitlines()[-1])
+    assert list(found) == KEYS
+    assert found['sample_time_s'] == pytest.approx(0.01)
+    assert found['frequencies_hz'] == [pytest.approx(2.0, rel=0.05)]
+    assert found['payload_mass_kg'] is None
+    assert found['capture_time_s'] is None
+    assert all(score > 80.0 for score in found['vaf_simulation_percent'])
+    assert all(score > 80.0 for score in found['vaf_prediction_percent'])
+
+
+def test_without_json_the_result_is_written_for_people(recording, capsys):
+    status, out, _ = _run(capsys, recording, *SETTINGS)
+    assert status == 0
+    assert 'mode 1' in out
+    assert 'Hz' in out
+
+
+def test_a_table_holds_what_the_pipeline_says(recording, capsys, tmp_path):
+    for name in ('out.csv', 'out.npz'):
+        assert _run(capsys, recording, *SETTINGS, '--output', tmp_path / name)[0] == 0
+    estimates = list(pipeline.run(configure(IdentifierParameters, OTHER), bag.read(recording)))
+    with np.load(tmp_path / 'out.npz', allow_pickle=False) as stored:
+        assert stored['stamp_ns'].tolist() == [estimate.stamp_ns for estimate in estimates]
+        assert stored['A'].shape == (len(estimates), 2, 2)
+        np.testing.assert_array_equal(stored['A'][-1], estimates[-1].model.A)
+        assert stored['frequency_hz'][-1] == estimates[-1].modes[0].frequency_hz
+    with (tmp_path / 'out.csv').open(encoding='utf-8') as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(estimates)
+    assert float(rows[-1]['frequency1_hz']) == estimates[-1].modes[0].frequency_hz
+    assert rows[-1]['payload_mass_kg'] == ''
+    assert rows[-1]['status'] == estimates[-1].status.name
+
+
+def test_a_recording_of_the_estimates_holds_what_the_node_would_publish(recording, capsys, tmp_path):
+    assert _run(capsys, recording, *SETTINGS, '--output', tmp_path / 'out')[0] == 0
+    estimates = pipeline.run(configure(IdentifierParameters, OTHER), bag.read(recording))
+    last = [estimate for estimate in estimates if estimate.model is not None][-1]
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Reader(tmp_path / 'out') as reader:
+        stored = {connection.topic: (stamp, store.deserialize_cdr(raw, connection.msgtype))
+                  for connection, stamp, raw in reader.messages()}
+    expected = dict(messages.outgoing(last, 'link2_tip'))
+    assert set(stored) == {f'/rpbsid_identifier/{name}' for name in expected}
+    for name, value in expected.items():
+        stamp, message = stored[f'/rpbsid_identifier/{name}']
+        assert stamp == last.stamp_ns
+        np.testing.assert_array_equal(message.data, value.data)
+
+
+def test_an_existing_recording_is_kept_and_said_before_the_work(recording, capsys, tmp_path):
+    (tmp_path / 'out').mkdir()
+    status, _, err = _run(capsys, recording, *SETTINGS, '--output', tmp_path / 'out')
+    assert status == 2
+    assert 'exists already' in err
+
+
+def test_the_report_is_one_page_that_needs_nothing_else(recording, capsys, tmp_path):
+    page = tmp_path / 'report.html'
+    assert _run(capsys, recording, *SETTINGS, '--report', page, '--validate-from', 10)[0] == 0
+    text = page.read_text(encoding='utf-8')
+    assert text.count('data:image/png;base64,') == 3
+    assert 'http' not in text
+    for word in ('Result', 'Signals', 'Frequencies', 'Validation', 'Model', 'Parameters', 'Messages'):
+        assert f'>{word}</h2>' in text
+
+
+def test_a_capture_time_can_be_given_by_hand(recording, capsys):
+    status, out, _ = _run(capsys, recording, *SETTINGS, '--json', '--capture-time', 5, '--release-time', 8)
+    found = json.loads(out)
+    assert status == 0
+    assert (found['capture_time_s'], found['release_time_s']) == (5.0, 8.0)
+
+
+def test_an_event_in_the_recording_is_found(capsys, tmp_path):
+    path = _bag(tmp_path / 'bag', _oscillator(600), 3.0)
+    _, out, _ = _run(capsys, path, *SETTINGS, '--json')
+    assert json.loads(out)['capture_time_s'] == 3.0
+
+
+def test_what_comes_before_a_fault_is_used_and_written(recording, capsys, tmp_path):
+    content = next(recording.glob('*.mcap')).read_bytes()
+    broken = tmp_path / 'broken.mcap'
+    broken.write_bytes(content[:len(content) // 2])
+    status, out, err = _run(capsys, broken, *SETTINGS, '--json', '--output', tmp_path / 'out.csv')
+    assert status == 2
+    assert err.count('\n') == 1
+    assert 'damaged' in err
+    assert 'out.csv' in err
+    assert json.loads(out)['samples'] > 500
+    assert len((tmp_path / 'out.csv').read_text(encoding='utf-8').splitlines()) > 100
+
+
+@pytest.mark.parametrize(('arguments', 'words'), [
+    (['--set', 'order=1000'], "parameter 'order'"),
+    (['--set', 'ordre=4'], "did you mean 'order'"),
+    (['--set', 'inputs=[motor2/effort]'], "'motor2/effort'"),
+    (['--params', 'nothing.yaml'], 'does not exist'),
+    (['--validate-from', '100'], 'leaves no samples'),
+    (['--validate-from', '0'], 'leaves no samples'),
+    (['--output', 'no/such/folder/out.csv'], 'does not exist'),
+    (['--report', 'no/such/folder/out.html'], 'does not exist'),
+    (['--joint-states', '/elsewhere'], 'the topics there are'),
+])
+def test_bad_arguments_are_one_line_and_exit_2(recording, capsys, arguments, words):
+    status, _, err = _run(capsys, recording, *SETTINGS, *arguments)
+    assert status == 2
+    assert words in err
+    assert err.count('\n') == 1
+
+
+@pytest.mark.parametrize('arguments', [[], ['a', 'b'], ['bag', '--unknown'], ['bag', '--validate-from', 'x']])
+def test_a_command_line_that_cannot_be_read_exits_2(capsys, arguments):
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert capsys.readouterr().err.count('\n') == 1
+
+
+def test_help_lists_examples_and_every_parameter(capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(['--help'])
+    assert caught.value.code == 0
+    out = capsys.readouterr().out
+    assert 'arm.bending_stiffness' in out
+    assert 'examples:' in out
+
+
+def test_faulty_messages_are_left_out_counted_and_reported(capsys, tmp_path):
+    records = _oscillator(600)
+    records[100].position[2] = np.nan
+    short = records[200]
+    records[200] = JointRecord(short.stamp_ns, short.names, short.position[:2], short.velocity, short.effort)
+    status, out, err = _run(capsys, _bag(tmp_path / 'bag', records), *SETTINGS, '--json')
+    assert status == 2
+    assert '2 of 600 messages' in err
+    assert json.loads(out)['samples'] == 598
+
+
+def test_a_recording_of_nothing_but_nan_is_refused(capsys, tmp_path):
+    records = _oscillator(50)
+    for record in records:
+        record.effort[:] = np.nan
+    status, out, err = _run(capsys, _bag(tmp_path / 'bag', records), *SETTINGS, '--json',
+                            '--output', tmp_path / 'out')
+    assert (status, out) == (2, '')
+    assert 'NaN' in err
+    assert not (tmp_path / 'out').exists()
