@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.field import check_all, parameter
 
 
@@ -20,7 +22,22 @@ class ExcitationParameters:
         (0.0, 0.0), 'constant torque added to each joint', unit='N m', size=2, live=True)
     period: tuple[float, ...] = parameter(
         (1.0, 0.5), 'period of each square wave', unit='s', low=1e-3, size=2)
+    band: tuple[float, ...] = parameter(
+        (0.5, 15.0), 'lowest and highest frequency of multisine and chirp', unit='Hz', low=1e-3, size=2)
+    repeat_time: float = parameter(
+        4.0, 'multisine, PRBS and chirp repeat after this time', unit='s', low=0.01, high=600.0)
+    bit_time: float = parameter(0.05, 'shortest pulse of the PRBS', unit='s', low=1e-4, high=60.0)
     seed: int = parameter(1, 'seed of multisine phases and PRBS', low=0)
 
     def __post_init__(self) -> None:
         check_all(self)
+        low, high = self.band
+        if not low < high:
+            raise ParameterError(f"parameter 'band' is {low} to {high} Hz", 'give the lower frequency first')
+        if self.shape in ('multisine', 'chirp') and high > self.rate / 2:
+            raise ParameterError(
+                f"parameter 'band' reaches {high} Hz", f'stay below half the rate ({self.rate / 2} Hz)')
+        if self.shape == 'multisine' and int(high * self.repeat_time) < math.ceil(low * self.repeat_time):
+            raise ParameterError(
+                f"parameter 'band' holds no harmonic of 1 / repeat_time ({1 / self.repeat_time:g} Hz)",
+                'widen the band or lengthen repeat_time')

@@ -1,0 +1,134 @@
+"""Catching and letting go: momentum, bodies, several in a row."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
+from flexmanip_ros.plant import capture, excitation, manipulator, simulator
+from flexmanip_ros.types import Array
+
+CONFIG = PlantParameters(noise='none', arm=ArmParameters(modes=2))
+BODY = replace(CONFIG, payload_inertia=3.0, payload_com=(0.3, -0.2), object_velocity=(0.2, -0.1),
+               object_spin=0.3)
+WAVES = excitation.sequence(ExcitationParameters(), 400)
+
+
+def moving(config: PlantParameters) -> simulator.PlantState:
+    state = simulator.init(config)
+    for torque in WAVES:
+        state, _ = simulator.step(config, state, 5 * torque)
+    return state
+
+
+def momentum(state: simulator.PlantState) -> Array:
+    half = state.x.size // 2
+    return state.model.mass_matrix(state.x, state.payload) @ state.x[half:]
+
+
+@pytest.mark.parametrize('model', ['nonlinear', 'linear'])
+@pytest.mark.parametrize('config', [CONFIG, BODY], ids=['point', 'body'])
+def test_momentum_is_conserved_at_the_capture(config: PlantParameters, model: str) -> None:
+    config = replace(config, model=model)
+    before = moving(config)
+    after = simulator.attach(config, before)
+    J = before.model.body_jacobian(before.x, config.payload_com)
+    own = J.T @ np.array([
+        *(config.payload_mass * np.array(config.object_velocity)),
+        config.payload_inertia * config.object_spin])
+    assert momentum(after) == pytest.approx(momentum(before) + own, rel=1e-9, abs=1e-9)
+    half = before.x.size // 2
+    assert np.array_equal(after.x[:half], before.x[:half])
+    assert not np.allclose(after.x[half:], before.x[half:])
+
+
+def test_angular_momentum_about_the_base_is_that_of_arm_and_object() -> None:
+    """An independent route: J' p of a rigid turn about the base is the angular momentum itself."""
+    before = moving(BODY)
+    after = simulator.attach(BODY, before)
+    turn = np.zeros(before.x.size // 2)
+    turn[:2] = 1.0
+    place = position_of(before, BODY.payload_com)
+    v = np.array(BODY.object_velocity)
+    own = (BODY.payload_mass * (place[0] * v[1] - place[1] * v[0])
+           + BODY.payload_inertia * BODY.object_spin)
+    assert turn @ momentum(after) == pytest.approx(turn @ momentum(before) + own, rel=1e-9)
+
+
+def position_of(state: simulator.PlantState, com: tuple[float, float]) -> Array:
+    arm = state.model.arm
+    k = arm.kappa
+    q = state.x[:state.x.size // 2]
+    reach = [arm.length[i] - arm.tip_stretch[i] @ q[2 + i * k:2 + (i + 1) * k] ** 2 / 2 for i in range(2)]
+    heading = q[1] + arm.tip_slope[1] @ q[2 + k:]
+    unit = [np.array([np.cos(a), np.sin(a)]) for a in (*q[:2], heading)]
+    left = np.array([-unit[2][1], unit[2][0]])
+    return reach[0] * unit[0] + reach[1] * unit[1] + com[0] * unit[2] + com[1] * left
+
+
+def test_the_tip_jacobian_is_the_derivative_of_the_tip() -> None:
+    state = moving(CONFIG)
+    com = (0.3, -0.2)
+    J = state.model.body_jacobian(state.x, com)
+    half = state.x.size // 2
+    for c in range(half):
+        step = np.zeros(state.x.size)
+        step[c] = 1e-6
+        ahead, behind = (position_of(replace(state, x=state.x + s * step), com) for s in (1, -1))
+        assert J[:2, c] == pytest.approx((ahead - behind) / 2e-6, abs=1e-8)
+
+
+def test_energy_is_lost_unless_the_object_moves_with_the_tip() -> None:
+    before = moving(CONFIG)
+    half = before.x.size // 2
+    arm = before.model.arm
+    energy = manipulator.energy(arm, before.payload, before.x[:half], before.x[half:])
+    after = simulator.attach(CONFIG, before)
+    lost = energy - manipulator.energy(arm, after.payload, after.x[:half], after.x[half:])
+    assert lost > 0
+    vx, vy, spin = before.model.body_jacobian(before.x, (0.0, 0.0)) @ before.x[half:]
+    matched = replace(CONFIG, object_velocity=(vx, vy), object_spin=spin)
+    gentle = simulator.attach(matched, before)
+    assert gentle.x == pytest.approx(before.x, abs=1e-12)
+
+
+def test_the_papers_capture_leaves_the_rates() -> None:
+    config = replace(CONFIG, capture_impact='continuous')
+    before = moving(config)
+    after = simulator.attach(config, before)
+    assert np.array_equal(after.x, before.x)
+    assert after.payload[0] == 20.0
+
+
+def test_release_keeps_the_rates_and_empties_the_hand() -> None:
+    held = simulator.attach(CONFIG, moving(CONFIG))
+    after = simulator.release(CONFIG, held)
+    assert np.array_equal(after.x, held.x)
+    assert not after.payload.any()
+
+
+def test_two_captures_make_one_body() -> None:
+    state = simulator.attach(CONFIG, moving(CONFIG))
+    state = simulator.attach(replace(CONFIG, payload_mass=10.0, payload_com=(0.3, 0.0)), state)
+    assert state.payload == pytest.approx([30.0, 20.0 * 0.1**2 + 10.0 * 0.2**2, 0.1, 0.0])
+    # the same mass matrix as two separate bodies have
+    q = state.x[:state.x.size // 2]
+    J = capture.body_jacobian(state.model.arm, q, (0.3, 0.0))
+    M = state.model.mass_matrix(state.x, np.array([20.0, 0.0, 0.0, 0.0])) + 10.0 * J[:2].T @ J[:2]
+    assert state.model.mass_matrix(state.x, state.payload) == pytest.approx(M, rel=1e-12, abs=1e-10)
+
+
+def test_a_soft_gripper_ends_with_the_whole_object() -> None:
+    config = replace(BODY, gripper_ramp=0.05)
+    state = simulator.attach(config, moving(config))
+    assert state.payload[0] == 0.0
+    masses = []
+    for _ in range(60):
+        state, _ = simulator.step(config, state, np.zeros(2))
+        masses.append(state.payload[0])
+    assert masses[:50] == pytest.approx(np.arange(1, 51) * 0.4)
+    assert state.payload == pytest.approx([20.0, 3.0, 0.3, -0.2])
+    assert masses[50:] == pytest.approx([20.0] * 10)
