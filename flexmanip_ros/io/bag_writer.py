@@ -52,15 +52,18 @@ class BagWriter:
     """A recording under ``path``, a new directory. Use it in a ``with``; any thread may write.
 
     It is closed and readable after an exception too. Raises BagError when the path exists or the disk fails.
+    flush_period: seconds; None leaves it to the library, and the same messages then give the same bytes.
     """
 
-    def __init__(self, path: str | Path, *, storage: StoragePlugin = StoragePlugin.MCAP) -> None:
+    def __init__(self, path: str | Path, *, storage: StoragePlugin = StoragePlugin.MCAP,
+                 flush_period: float | None = FLUSH_PERIOD) -> None:
         self.path = Path(path)
         self.messages = 0
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._convert = _Conversion(self._types.types)
         self._connections: dict[str, tuple[type, Connection]] = {}
         self._lock = threading.Lock()
+        self._flush_period = np.inf if flush_period is None else flush_period
         self._flushed = time.monotonic()
         try:
             self._writer = Writer(self.path, version=9, storage_plugin=storage)
@@ -84,7 +87,7 @@ class BagWriter:
             try:
                 self._writer.write(self._connection(topic, kind, latched), log_ns, data)
                 self.messages += 1
-                if time.monotonic() - self._flushed > FLUSH_PERIOD:
+                if time.monotonic() - self._flushed > self._flush_period:
                     self._flush()
             except OSError as err:
                 raise BagError(f"bag '{self.path}' cannot be written: {err.strerror}",

@@ -57,11 +57,12 @@ def _load(text: str, what: str) -> Any:
         raise ParameterError(f'{what} is not valid YAML{place}: {reason}', 'correct that line') from err
 
 
-def read(path: str | Path, node: str) -> dict[str, Any]:
+def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, Any]:
     """Return the parameters a file gives to ``node``, nested groups flattened with dots.
 
     Sections named ``/**``, ``node``, ``/ns/node`` or with wildcards apply, later ones win; sections of other
-    nodes are left alone. Raises ParameterError naming the file.
+    nodes are left alone. A file without any section for ``node`` is an error unless ``optional``. Raises
+    ParameterError naming the file.
     """
     where = f"parameter file '{path}'"
     try:
@@ -81,7 +82,7 @@ def read(path: str | Path, node: str) -> dict[str, Any]:
         raise ParameterError(f"{where} has no 'ros__parameters'",
                              f"write '{node}: {{ros__parameters: {{...}}}}'")
     chosen = [name for name in sections if _applies(name, node)]
-    if not chosen:
+    if not chosen and not optional:
         near = difflib.get_close_matches(node, [name.rpartition('/')[2] for name in sections], n=1)
         hint = f" ('{near[0]}' is close)" if near else ''
         raise ParameterError(f"{where} is for {', '.join(sorted(sections))}, not for {node}{hint}",
@@ -135,9 +136,10 @@ def parse_overrides(items: Iterable[str]) -> dict[str, Any]:
     return values
 
 
-def load(cls: type[Config], node: str, path: str | Path | None, overrides: Iterable[str] = ()) -> Config:
+def load(cls: type[Config], node: str, path: str | Path | None, overrides: Iterable[str] = (), *,
+         optional: bool = False) -> Config:
     """Return the configuration of ``node`` from a parameter file (or none) and ``name=value`` overrides."""
-    from_file = {} if path is None else read(path, node)
+    from_file = {} if path is None else read(path, node, optional=optional)
     from_line = parse_overrides(overrides)
     if path is not None:
         try:

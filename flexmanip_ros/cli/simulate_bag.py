@@ -1,0 +1,130 @@
+"""simulate_bag: the simulated arm into a recording, as fast as it can, with the truth beside it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexmanip_ros.cli import console
+from flexmanip_ros.errors import BagError, ParameterError
+from flexmanip_ros.io.bag_writer import BagWriter
+from flexmanip_ros.io.parameter_file import load
+from flexmanip_ros.io.table import check_place, write_file
+from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, flatten
+from flexmanip_ros.parameters.document import help_text
+from flexmanip_ros.plant import excitation, linearization, simulator
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+
+PROG = 'simulate_bag'
+START_NS = 1_700_000_000_000_000_000
+"""Stamp of the first sample; fixed, so that the same arguments give the same bytes."""
+PREFIX = 'excitation.'
+EXAMPLES = """examples:
+  simulate_bag recording                                20 kg caught at 3 s, 6 s at 1 kHz, 40 dB
+  simulate_bag recording --payload 50 --duration 10 --seed 7
+  simulate_bag recording --set 'initial_angles=[0.0, 0.0]' --set excitation.shape=prbs
+  simulate_bag recording --capture-time 3 --release-time 6 --duration 9 --params config/plant_simulator.yaml
+
+Writes the recording (rosbag2, mcap) and, beside it, NAME.truth.json with what an estimator should find.
+exit status: 0 on success; 2 on bad arguments, with one line on stderr.
+
+parameters of the plant (in --params under plant_simulator or /**, or with --set):
+"""
+MORE = f'\n\nparameters of the torque (in --params under excitation, or with --set {PREFIX}NAME=VALUE):\n'
+
+
+def _parser() -> console.Parser:
+    made = console.parser(
+        PROG, 'Simulate the flexible arm catching something, into a rosbag2 recording. No ROS needs to run.',
+        EXAMPLES + help_text(PlantParameters) + MORE + help_text(ExcitationParameters))
+    add = made.add_argument
+    add('bag', metavar='BAG', help='the recording to make; must not exist')
+    add('--duration', metavar='SECONDS', type=float, default=6.0, help='default: 6')
+    add('--seed', metavar='N', type=int, help='seed of the noise (parameter seed)')
+    add('--payload', metavar='KG', type=float, help='mass of the object (parameter payload_mass)')
+    add('--capture-time', metavar='SECONDS', type=float, default=3.0, help='default: 3; negative: never')
+    add('--release-time', metavar='SECONDS', type=float, default=-1.0, help='default: never')
+    add('--params', metavar='FILE.yaml', help='ROS parameter file with plant_simulator and excitation')
+    add('--set', metavar='name=value', action='append', default=[],
+        help=f'override one parameter; {PREFIX}NAME for the torque')
+    return made
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; return its exit status."""
+    given = _parser().parse_args(arguments)
+    return console.run(PROG, lambda: _main(given))
+
+
+def configurations(given: argparse.Namespace) -> tuple[PlantParameters, ExcitationParameters]:
+    """Return what the arguments ask for; named arguments win over --set, --set over the file."""
+    plant_items = [item for item in given.set if not item.startswith(PREFIX)]
+    plant_items += [f'{name}={value!r}' for name, value in (
+        ('seed', given.seed), ('payload_mass', given.payload)) if value is not None]
+    torque_items = [item.removeprefix(PREFIX) for item in given.set if item.startswith(PREFIX)]
+    plant = load(PlantParameters, 'plant_simulator', given.params, plant_items, optional=True)
+    torque_items.append(f'rate={plant.rate!r}')  # one torque a sample
+    torque = load(ExcitationParameters, 'excitation', given.params, torque_items, optional=True)
+    return plant, torque
+
+
+def _main(given: argparse.Namespace) -> int:
+    plant, torque = configurations(given)
+    if not 0.0 < given.duration <= 1e6:
+        raise ParameterError(f'--duration is {given.duration:g}', 'give seconds above 0')
+    count = max(round(given.duration * plant.rate), 1)
+    events = tuple(
+        CaptureEvent(START_NS + round(at * 1e9), kind)
+        for at, kind in ((given.capture_time, EventKind.CAPTURE), (given.release_time, EventKind.RELEASE))
+        if 0.0 <= at < given.duration)
+    target = Path(given.bag)
+    truth_path = target.with_name(target.name + '.truth.json')
+    if target.exists():
+        raise BagError(f"'{target}' exists already", 'remove it or give another name')
+    check_place(truth_path)
+    trajectory = simulator.simulate(plant, excitation.sequence(torque, count), events, START_NS)
+    with (console.progress('simulating', 'samples') as progress,
+          BagWriter(target, flush_period=None) as writer):
+        for k, item in enumerate(simulator.records(trajectory, events)):
+            topic = '/joint_states' if isinstance(item, JointRecord) else '/capture_event'
+            writer.write(topic, item.stamp_ns, item, latched=isinstance(item, CaptureEvent))
+            if k % 1000 == 0:
+                progress(k, count)
+    known = truth(plant, torque, events)
+    text = json.dumps(known, indent=1) + '\n'
+    write_file(truth_path, lambda file: file.write(text.encode('utf-8')))
+    print(f"wrote '{target}' ({count} samples, {given.duration:g} s) and '{truth_path}'")
+    return console.SUCCESS
+
+
+def truth(plant: PlantParameters, torque: ExcitationParameters, events: Sequence[CaptureEvent]
+          ) -> dict[str, Any]:
+    """Return what an estimator of this run should find."""
+    at = {event.kind: (event.stamp_ns - START_NS) * 1e-9 for event in events}
+    return {
+        'payload_mass_kg': plant.payload_mass if EventKind.CAPTURE in at else 0.0,
+        'capture_time_s': at.get(EventKind.CAPTURE), 'release_time_s': at.get(EventKind.RELEASE),
+        'working_point_deg': [math.degrees(angle) for angle in plant.initial_angles],
+        'sample_time_s': 1.0 / plant.rate,
+        'frequencies_before_hz': frequencies(plant, 0.0),
+        'frequencies_after_hz': frequencies(plant, plant.payload_mass),
+        'plant': flatten(plant), 'excitation': flatten(torque),
+    }
+
+
+def frequencies(plant: PlantParameters, payload: float) -> list[float]:
+    """Return the damped frequencies of the arm linearized at its start, the lowest two [Hz]."""
+    Ac, _ = linearization.vibration_model(plant.arm, np.array(plant.initial_angles), payload)
+    found = np.sort(np.abs(np.linalg.eigvals(Ac).imag))[::-1] / (2.0 * np.pi)
+    return sorted(float(value) for value in found[found > 1e-9])[:4:2]
+
+
+if __name__ == '__main__':
+    sys.exit(main())
