@@ -30,6 +30,23 @@ class IdentifierParameters:
     regularization: tuple[float, ...] = parameter(
         (0.1, 0.1, 0.1), 'regularization alpha 1..3 on internally scaled signals', low=1e-12, high=1e12, size=3)
     direct_feedthrough: bool = parameter(False, 'identify D instead of holding it at zero')
+    estimator: str = parameter(
+        'factor', 'factor: moments in one triangular factor, solved when a model is asked for; '
+        'paper: three recursive least squares at every sample', choices=('factor', 'paper'))
+    state_basis: str = parameter(
+        'singular', 'selection S of the state from observability x controllability: leading singular vectors '
+        '(estimator paper: as fixed); fixed, S = [I 0]; tracked, followed sample by sample (estimator paper only)',
+        choices=('singular', 'fixed', 'tracked'))
+    weighted_observability: bool = parameter(
+        True, 'select the state from the observability of the system (A) instead of the predictor (A - K C)')
+    kalman_gain: str = parameter(
+        'riccati', 'gain K: riccati, of the stationary Kalman filter of the residuals (stable predictor); '
+        'regression, estimated like A and B (the paper; the only way of estimator paper)',
+        choices=('riccati', 'regression'))
+    forgetting: str = parameter(
+        'excitation', 'when old information is let go: excitation, as fast as new comes in; constant, at every '
+        'sample (the paper); innovation, only while the model does not fit',
+        choices=('excitation', 'constant', 'innovation'))
     restart_on_event: bool = parameter(
         True, 'restart the covariances of the least squares at a capture or release')
     payload_method: str = parameter(
@@ -59,6 +76,9 @@ class IdentifierParameters:
         if self.angles and len(self.angles) != 2:
             raise ParameterError(
                 f"parameter 'angles' names {len(self.angles)} signals", "name two, or [''] for none")
+        if self.state_basis == 'tracked' and self.estimator != 'paper':
+            raise ParameterError(
+                "parameter 'state_basis' is 'tracked'", "set estimator to 'paper', or choose singular or fixed")
         if self.future_window > self.past_window:
             raise ParameterError(
                 f"parameter 'future_window' is {self.future_window}",

@@ -1,0 +1,109 @@
+"""Compiled kernels shared by the estimators: intake of a sample, and how much of the past to keep."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from flexmanip_ros.types import Array
+
+WEIGHT, WEIGHT2, PRIOR, ENERGY, LATELY, POWER, GAMMA, FORGET = 0, 1, 2, 3, 4, 5, 6, 7
+"""Sum of weights, sum of squared weights, weight left of the prior, variation of the signals as
+remembered and lately (unit: squared peaks), innovation power, last conversion factor, last beta."""
+SCALARS = 8
+FILLED, USED, SEEN, REJECTED = 0, 1, 2, 3
+"""Samples in a row without a gap, regressions since the restart, samples since reset, samples refused."""
+COUNTS = 4
+
+CONSTANT, EXCITATION, INNOVATION = 0, 1, 2
+"""Modes of forgetting, see ``memory``."""
+
+QUIET, LIVELY = 0.02, 0.2
+"""Relative variation of the signals below which nothing is forgotten, above which forgetting is full."""
+LARGEST = 1e100
+"""Numbers are brought to about 1 by the first value of their channel; beyond this the sample is refused."""
+SURPRISE = 2.0
+"""Innovation power above which the plant is taken to have changed."""
+
+
+@njit(cache=True)
+def accept(u: Array, y: Array, new: Array, scale: Array, counts: Array) -> bool:
+    """Scale one sample into ``new`` (r + m,); a number that is not finite breaks the window instead.
+
+    The scale of a channel is the power of two next to its first value that is not zero: exact, so
+    nothing of it is seen outside, and squares neither overflow nor vanish inside.
+    """
+    r = u.shape[0]
+    counts[SEEN] += 1
+    for i in range(new.shape[0]):
+        value = u[i] if i < r else y[i - r]
+        if not math.isfinite(value):
+            counts[FILLED] = 0
+            counts[REJECTED] += 1
+            return False
+        if scale[i] == 0.0 and value != 0.0:
+            exponent = math.frexp(value)[1]
+            scale[i] = math.ldexp(1.0, -max(min(exponent, 1000), -1000))
+        new[i] = value * scale[i]
+        if abs(new[i]) > LARGEST:
+            counts[FILLED] = 0
+            counts[REJECTED] += 1
+            return False
+    return True
+
+
+@njit(cache=True)
+def remember(new: Array, mean: Array, scalars: Array, p: int) -> None:
+    """Follow the variation of the signals: mean (2, r + m) holds slow means and running peaks."""
+    rate = 1.0 / (20.0 * p)
+    energy = 0.0
+    for i in range(new.shape[0]):
+        size = abs(new[i])
+        if size > mean[1, i]:
+            mean[1, i] = size
+        if mean[1, i] > 0.0:
+            deviation = (new[i] - mean[0, i]) / mean[1, i]
+            energy += deviation * deviation
+        mean[0, i] += rate * (new[i] - mean[0, i])
+    scalars[LATELY] += (energy - scalars[LATELY]) / p
+
+
+@njit(cache=True)
+def memory(scalars: Array, counts: Array, beta: float, mode: int) -> float:
+    """Return the forgetting factor of this sample.
+
+    Old information is let go only as far as new information comes in: with signals that vary less
+    than 2 % of what is remembered (silence, saturation, a constant torque) nothing is forgotten.
+    Mode INNOVATION forgets only while the innovations are larger than the model expects.
+    """
+    b = beta
+    if mode == INNOVATION:
+        surprise = (scalars[POWER] - 1.0) / (SURPRISE - 1.0)
+        b = 1.0 - (1.0 - beta) * min(max(surprise, 0.0), 1.0)
+    quiet = QUIET
+    lively = LIVELY
+    if mode == CONSTANT:  # as the paper has it; only what would end in 0/0 is kept out
+        quiet = 1e-12
+        lively = 1e-11
+    ratio = scalars[LATELY] / scalars[ENERGY] if scalars[ENERGY] > 0.0 else 1.0
+    open_ = min(max((ratio - quiet) / (lively - quiet), 0.0), 1.0)
+    rate = max(1.0 - b, 1.0 / (counts[USED] + 1.0)) * open_
+    scalars[ENERGY] += rate * (scalars[LATELY] - scalars[ENERGY])
+    b = 1.0 - (1.0 - b) * open_
+    scalars[FORGET] = b
+    return b
+
+
+@njit(cache=True)
+def judge(residual: Array, variance: Array, scalars: Array, counts: Array, b: float, parameters: int) -> None:
+    """Update the innovation variance (m,) and power from one recursive residual (m,)."""
+    m = residual.shape[0]
+    rate = 1.0 / scalars[WEIGHT]
+    power = 0.0
+    for i in range(m):
+        square = residual[i] * residual[i]
+        power += square / variance[i] if variance[i] > 0.0 else 1.0
+        variance[i] += rate * (square - variance[i])
+    if counts[USED] > parameters:
+        scalars[POWER] += 0.02 * (min(power / m, 1e6) - scalars[POWER])

@@ -1,0 +1,161 @@
+"""The model as a function of second moments: predictor-based subspace identification from one factor.
+
+Every quantity of the method is linear in phi(k) = [z(k); u(k); y(k)], so its least-squares problems
+need the moments of phi only. With an upper triangular R, R'R = sum of weights x phi phi', a signal
+s(k) = M phi(k) has the moments of the columns of R M'. The recursion equals the batch solution with the
+same weights to round-off, and no state is ever stale.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_discrete_are, solve_triangular
+
+from flexmanip_ros.identification.varx import observability_controllability, open_loop_weight
+from flexmanip_ros.types import Array
+
+RIDGE = 1e-8
+"""Relative ridge that picks the solution of least norm where the data leave a direction free."""
+
+
+class Realized(NamedTuple):
+    """A model in the basis of the state sequence x = T z, with what uncertainty needs. Scaled signals."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    K: Array
+    Xi: Array
+    """(m, p (r + m)) VARX parameters."""
+    xi_u: Array
+    """(m, r) direct term of the VARX."""
+    S: Array
+    """(n, f m) selection of the state from the observability of the predictor x controllability."""
+    T: Array
+    """(n, p (r + m)) = S x predictor observability x controllability."""
+    state: Array
+    """(q, n) columns with the moments of x."""
+    residual: Array
+    """(m, m) square root E with E'E = innovation moments."""
+    regression: Array
+    """(d, d) upper triangular factor of the regressors' moments, ridge included."""
+    singular_values: Array
+
+
+def triangle(tall: Array) -> Array:
+    """Upper triangular R with R'R = tall' tall."""
+    R: Array = np.linalg.qr(tall, mode='r')  # type: ignore[assignment]
+    return R
+
+
+def regress(regressor: Array, target: Array) -> Array:
+    """Least squares: the (k, d) matrix M of least norm with target ~ regressor M'. (q, d), (q, k)."""
+    return np.asarray(np.linalg.lstsq(regressor, target, rcond=1e-13)[0].T, dtype=np.float64)
+
+
+def solve_regressor(R: Array, d: int, m: int) -> tuple[Array, Array]:
+    """VARX parameters (m, d) and the factor (d, d) they were solved with."""
+    head = R[:d, :d]
+    size = np.sqrt(np.einsum('ij,ij->j', head, head))
+    size[size == 0.0] = 1.0
+    diagonal = np.abs(np.diag(head)) / size
+    target = R[:d, -m:]
+    if d and diagonal.min() < RIDGE:
+        stacked = np.zeros((2 * d, d + m))
+        stacked[:d, :d] = head
+        stacked[:d, d:] = target
+        stacked[d:, :d] = np.diag(RIDGE * size)
+        folded = triangle(stacked)
+        head, target = folded[:d, :d], folded[:d, d:]
+    solution: Array = solve_triangular(head, target, check_finite=False)
+    return solution.T, head
+
+
+def row_whitening(
+    data: Array, head: Array, residual: Array, power: float, f: int, width: int,
+) -> Array:
+    """(f m, f m): brings the errors that the rows of G z take over from the VARX parameters to one size.
+
+    Row block i is Xi on a window shifted by i samples and filled with zeros. Such a window lies off the
+    data, where the parameters are loose: unweighted, the later rows would spoil the state.
+    data: (past, past), data'data = moments of z; head: factor Xi was solved with; residual: (m, m)
+    moments of the innovations; power: root of the moments of the outputs, for a floor under the residual.
+    """
+    past, m, d = data.shape[0], residual.shape[0], head.shape[0]
+    moved = np.zeros((f, d, past))
+    for i in range(f):
+        moved[i, i * width:past] = data.T[:past - i * width]
+    loose = solve_triangular(
+        head, moved.transpose(1, 0, 2).reshape(d, -1), trans='T', check_finite=False
+    ).reshape(d, f, past).transpose(1, 0, 2).reshape(f, -1)
+    rows = triangle(loose.T)
+    noise = triangle(np.vstack([residual, RIDGE * power * np.eye(m)]))
+    inverse: Array = np.kron(
+        np.linalg.inv(rows + RIDGE * np.abs(rows).max() * np.eye(f)).T, np.linalg.inv(noise).T)
+    return inverse
+
+
+def riccati_gain(A: Array, C: Array, process: Array, measurement: Array, fallback: Array) -> Array:
+    """K (n, m) of the stationary Kalman filter for residuals of state (q, n) and output (q, m)."""
+    floor = RIDGE ** 2 * max(np.trace(measurement.T @ measurement), 1e-300)
+    R = measurement.T @ measurement + floor * np.eye(C.shape[0])
+    scale = np.trace(R)
+    Q, S = process.T @ process / scale, process.T @ measurement / scale
+    try:
+        P = solve_discrete_are(A.T, C.T, Q, R / scale, s=S)
+    except (np.linalg.LinAlgError, ValueError):
+        return fallback
+    gain: Array = np.linalg.solve(C @ P @ C.T + R / scale, (A @ P @ C.T + S).T).T
+    return gain if np.all(np.isfinite(gain)) else fallback
+
+
+def realize(
+    R: Array, r: int, m: int, n: int, f: int, *, feedthrough: bool, weighted: bool, fixed: bool = False,
+    riccati: bool = False,
+) -> Realized | None:
+    """Model of order n from the factor R (q, q) of [z; u; y]; None when the moments carry no state.
+
+    fixed: the state is the first n rows of observability x controllability (S = [I 0]); otherwise the
+    leading n left singular vectors of their product with the data. riccati: the gain K solves the Riccati
+    equation of the residuals, which makes the predictor stable; otherwise it is regressed like A and B.
+    """
+    width = r + m
+    past = R.shape[0] - width
+    d = past + r if feedthrough else past
+    solution, head = solve_regressor(R, d, m)
+    Xi, xi_u = solution[:, :past], solution[:, past:] if feedthrough else np.zeros((m, r))
+    G = observability_controllability(Xi, f, r, weighted)
+    tail = R[d:, past + r:]
+    residual = triangle(tail) if tail.shape[0] > m else tail
+    if fixed:
+        whiten = np.eye(f * m)
+    else:
+        power = float(np.linalg.norm(R[:, past + r:]))
+        whiten = row_whitening(R[:past, :past], head, residual, power, f, width)
+    left, values, _ = np.linalg.svd(whiten @ (G @ R[:past, :past].T), full_matrices=False)
+    if not np.all(np.isfinite(values)) or values.size < n or values[n - 1] <= 1e-14 * values[0]:
+        return None
+    S = np.eye(n, f * m) if fixed else (left[:, :n] / np.sqrt(values[:n])).T @ whiten
+    if weighted:
+        S = S @ open_loop_weight(Xi, f, r)
+        G = observability_controllability(Xi, f, r, False)
+    T = S @ G
+    state = R[:, :past] @ T.T
+    u, y = R[:, past:past + r], R[:, past + r:]
+    output = np.hstack([state, u]) if feedthrough else state
+    CD = regress(output, y)
+    innovation = y - output @ CD.T
+    following = R[:, width:] @ T.T
+    ABK = regress(np.hstack([state, u, innovation]), following)
+    K = ABK[:, n + r:]
+    if riccati:
+        rest = following - np.hstack([state, u]) @ ABK[:, :n + r].T
+        K = riccati_gain(ABK[:, :n], CD[:, :n], rest, innovation, K)
+    D = CD[:, n:] if feedthrough else np.zeros((m, r))
+    return Realized(
+        A=ABK[:, :n], B=ABK[:, n:n + r], C=CD[:, :n], D=D, K=K, Xi=Xi, xi_u=xi_u, S=S, T=T,
+        state=state, residual=residual, regression=head, singular_values=values,
+    )

@@ -1,0 +1,130 @@
+"""Changes of basis and of time: similarity, balancing, discrete to continuous (paper section 3.2)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm, logm, solve_triangular
+
+from flexmanip_ros.errors import ModelError
+from flexmanip_ros.identification.moments import triangle
+from flexmanip_ros.types import Array, StateSpace
+
+WORST_BASIS = 1e10
+"""A transformation conditioned worse than this (after scaling) is not used."""
+
+
+def transform(model: StateSpace, W: Array) -> StateSpace:
+    """The same system with the state W x. W: (n, n), invertible (eq. 44)."""
+    back = np.asarray(np.linalg.solve(W.T, np.vstack([W @ model.A, model.C]).T).T, dtype=np.float64)
+    n = model.order
+    return StateSpace(back[:n], W @ model.B, back[n:], model.D, W @ model.K, model.dt)
+
+
+def to_continuous(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
+    """Ac (n, n) [1/s] and Bc (n, r) whose response to inputs held over dt is (A, B).
+
+    Matrix logarithm of [[A, B], [0, I]] / dt. Raises ModelError where no real logarithm exists
+    (a pole at zero or on the negative real axis).
+    """
+    n, r = B.shape
+    joint = np.zeros((n + r, n + r))
+    joint[:n, :n], joint[:n, n:], joint[n:, n:] = A, B, np.eye(r)
+    poles = np.linalg.eigvals(A)
+    if not np.all(np.isfinite(A)) or _outside_log(poles):
+        raise ModelError(
+            'the model has a pole that no continuous system has', 'lower the order or the sample time')
+    log = np.real(logm(joint)) / dt
+    return log[:n, :n], log[:n, n:]
+
+
+def _outside_log(poles: NDArray[Any]) -> bool:
+    """Whether a pole has no real logarithm: at zero or on the negative real axis."""
+    return bool(np.any((np.abs(poles.imag) < 1e-12 * np.abs(poles)) & (poles.real <= 0.0)))
+
+
+def to_discrete(Ac: Array, Bc: Array, dt: float) -> tuple[Array, Array]:
+    """A (n, n), B (n, r) of (Ac, Bc) with inputs held over dt [s]."""
+    n, r = Bc.shape
+    joint = np.zeros((n + r, n + r))
+    joint[:n, :n], joint[:n, n:] = Ac, Bc
+    power = expm(joint * dt)
+    return power[:n, :n], power[:n, n:]
+
+
+def continuous_state_matrix(A: Array, dt: float) -> Array | None:
+    """log(A) / dt by eigenvectors, fast; None where it is not real or the eigenvectors are unusable."""
+    poles, vectors = np.linalg.eig(A)
+    if _outside_log(poles):
+        return None
+    if np.linalg.cond(vectors) > WORST_BASIS:
+        return None
+    log: Array = np.real(np.linalg.solve(vectors.T, (vectors * np.log(poles)).T).T) / dt
+    return log
+
+
+def known_output_basis(model: StateSpace) -> Array | None:
+    """W (n, n) that brings the model to the basis in which the configured C is known, or None.
+
+    As many outputs as states: y = x, W = C. Half as many (displacements only): x = [y; dy/dt],
+    W = [C; C Ac] with Ac found before anything else (docs/identification.md).
+    """
+    m, n = model.C.shape
+    if m == n:
+        W = model.C
+    elif 2 * m == n:
+        Ac = continuous_state_matrix(model.A, model.dt)
+        if Ac is None:
+            return None
+        W = np.vstack([model.C, model.C @ Ac])
+    else:
+        return None
+    size = np.linalg.norm(W, axis=1)
+    if not np.all(size > 0.0) or np.linalg.cond(W / size[:, None]) > WORST_BASIS:
+        return None
+    return W
+
+
+def balancing(model: StateSpace, horizon: int = 0) -> Array:
+    """W (n, n) with equal, diagonal observability and controllability over ``horizon`` steps.
+
+    A finite horizon (10 n by default) also serves marginal and unstable models. Signs are fixed by the
+    first non-zero output of each state, so the basis moves smoothly with the model.
+    """
+    n = model.order
+    horizon = horizon or 10 * n
+    inputs = np.hstack([model.B, model.K]) if np.linalg.norm(model.B) > 0 else model.K
+    reach, seen = [inputs], [model.C]
+    for _ in range(horizon - 1):
+        reach.append(model.A @ reach[-1])
+        seen.append(seen[-1] @ model.A)
+    Lc = triangle(np.hstack(reach).T).T
+    Lo = triangle(np.vstack(seen)).T
+    left, values, _ = np.linalg.svd(Lo.T @ Lc)
+    if values[-1] <= 1e-13 * values[0]:
+        return np.eye(n)
+    W = (left / np.sqrt(values)).T @ Lo.T
+    C = np.linalg.solve(W.T, model.C.T).T
+    first = np.argmax(np.abs(C) > 0.1 * np.abs(C).max(axis=0), axis=0)
+    sign = np.where(C[first, np.arange(n)] < 0.0, -1.0, 1.0)
+    balanced: Array = sign[:, None] * W
+    return balanced
+
+
+def markov(model: StateSpace, count: int) -> Array:
+    """(count, m, r): impulse response D, C B, C A B, ..."""
+    out = np.empty((count, *model.D.shape))
+    state = model.B
+    for k in range(count):
+        out[k] = model.D if k == 0 else model.C @ state
+        if k > 0:
+            state = model.A @ state
+    return out
+
+
+def solve_upper(R: Array, b: Array) -> Array:
+    """Solve R x = b for upper triangular R."""
+    x: Array = solve_triangular(R, b, check_finite=False)
+    return x

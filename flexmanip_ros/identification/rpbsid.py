@@ -1,0 +1,181 @@
+"""Recursive predictor-based subspace identification, paper section 3.1: init, step, restart.
+
+Two estimators behind one interface. ``factor`` (default) carries one triangular factor of the moments of
+[z; u; y] and solves the whole method when a model is asked for (``moments``); ``paper`` runs the three
+recursive least squares of the paper at every sample (``paper_kernel``). Memory is constant and the cost
+per sample bounded in both; decompositions happen only in ``identified``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flexmanip_ros.errors import SignalError
+from flexmanip_ros.identification import factor_kernel, memory_kernel, paper_kernel, publication
+from flexmanip_ros.identification.memory_kernel import FILLED, POWER, PRIOR, USED, WEIGHT, WEIGHT2
+from flexmanip_ros.identification.moments import solve_regressor
+from flexmanip_ros.identification.uncertainty import Identified
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.types import Array
+
+MODES = {
+    'constant': memory_kernel.CONSTANT, 'excitation': memory_kernel.EXCITATION,
+    'innovation': memory_kernel.INNOVATION,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class RpbsidState:
+    """All the identifier remembers; nothing grows.
+
+    z: (p (r + m),) past window, scaled; scale: (r + m,); mean: (2, r + m) slow means and peaks;
+    variance: (m,) of the innovations, scaled; scalars, counts: see ``memory_kernel``;
+    memory: the arrays of the estimator, in the order its kernel takes them.
+    """
+
+    z: Array
+    scale: Array
+    mean: Array
+    variance: Array
+    scalars: Array
+    counts: Array
+    memory: tuple[Array, ...]
+
+    def copy(self) -> RpbsidState:
+        """Return a state whose arrays may be overwritten."""
+        return RpbsidState(
+            self.z.copy(), self.scale.copy(), self.mean.copy(), self.variance.copy(), self.scalars.copy(),
+            self.counts.copy(), tuple(array.copy() for array in self.memory))
+
+
+def init(config: IdentifierParameters) -> RpbsidState:
+    """Start with an empty memory."""
+    r, m = len(config.inputs), len(config.outputs)
+    p = config.past_window
+    memory = _paper_memory(config, r, m) if config.estimator == 'paper' else _factor_memory(config, r, m)
+    scalars = np.zeros(memory_kernel.SCALARS)
+    scalars[PRIOR] = scalars[POWER] = 1.0
+    return RpbsidState(
+        z=np.zeros(p * (r + m)), scale=np.zeros(r + m), mean=np.zeros((2, r + m)), variance=np.zeros(m),
+        scalars=scalars, counts=np.zeros(memory_kernel.COUNTS, dtype=np.int64), memory=memory)
+
+
+def _regressors(config: IdentifierParameters, r: int, m: int) -> int:
+    return config.past_window * (r + m) + (r if config.direct_feedthrough else 0)
+
+
+def _factor_memory(config: IdentifierParameters, r: int, m: int) -> tuple[Array, ...]:
+    q = (config.past_window + 1) * (r + m)
+    d = _regressors(config, r, m)
+    return np.zeros((q, q)), np.zeros(q), np.zeros(q), np.zeros(d), np.zeros((m, d))
+
+
+def _paper_memory(config: IdentifierParameters, r: int, m: int) -> tuple[Array, ...]:
+    n, f = config.order, config.future_window
+    d1 = _regressors(config, r, m)
+    d2 = n + r + m
+    d3 = n + r if config.direct_feedthrough else n
+    theta_x, theta_y = np.eye(n, d2), np.eye(m, d3)  # the paper's step (d)
+    return (
+        np.zeros((d1, d1)), np.zeros((m, d1)), np.zeros((m, d1)), np.zeros(d1),
+        np.zeros((d2, d2)), theta_x, np.zeros(d2), np.zeros((d3, d3)), theta_y, np.zeros(d3),
+        np.eye(n, f * m), np.eye(n), np.zeros(d2 + 1))
+
+
+def step(config: IdentifierParameters, state: RpbsidState, u: Array, y: Array) -> RpbsidState:
+    """Take one sample u (r,), y (m,) in JointState units. Pure: the state given is left as it was."""
+    return advance(config, state, np.asarray(u, dtype=float)[None], np.asarray(y, dtype=float)[None])
+
+
+def advance(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array) -> RpbsidState:
+    """Take N samples U (N, r), Y (N, m): the same bits as N steps, one copy of the state.
+
+    A sample that is not finite is refused and breaks the window. Raises SignalError on wrong sizes.
+    """
+    r, m = len(config.inputs), len(config.outputs)
+    U = np.ascontiguousarray(U, dtype=float)
+    Y = np.ascontiguousarray(Y, dtype=float)
+    if U.ndim != 2 or Y.ndim != 2 or U.shape[1] != r or Y.shape[1] != m or len(U) != len(Y):
+        raise SignalError(
+            f'samples of shapes {U.shape} and {Y.shape} do not fit {r} inputs and {m} outputs',
+            'give as many rows of both, one column per configured signal')
+    new = state.copy()
+    mode = MODES[config.forgetting]
+    common: tuple[Any, ...] = (new.z, new.scale, new.mean, new.variance, new.scalars, new.counts)
+    if config.estimator == 'paper':
+        options: tuple[Any, ...] = (
+            config.past_window, config.future_window, int(config.direct_feedthrough),
+            int(config.weighted_observability), int(config.state_basis == 'tracked'),
+            np.array(config.regularization), np.array(config.forgetting_factor), mode)
+        memory: tuple[Any, ...] = new.memory
+        paper_kernel.advance_paper(U, Y, *memory, *common, *options)
+    else:
+        R, row, scratch, peaks, prior = new.memory
+        factor_kernel.advance_factor(
+            U, Y, R, new.z, row, scratch, peaks, prior, new.scale, new.mean, new.variance, new.scalars,
+            new.counts, config.past_window, int(config.direct_feedthrough), config.regularization[0],
+            config.forgetting_factor[0], mode)
+    return new
+
+
+def window_restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
+    """Samples are missing: no regressor will straddle the gap; what was learnt is kept."""
+    new = state.copy()
+    new.counts[FILLED] = 0
+    if config.estimator == 'paper':
+        new.memory[-1][-1] = 0.0
+    return new
+
+
+def restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
+    """Take note that the plant changed at this instant (capture, release).
+
+    The window restarts and, if so configured, the information. Parameters stay as prior mean, worth
+    ``regularization`` on signals of unit peak.
+    """
+    new = window_restart(config, state)
+    if not config.restart_on_event or not new.counts[USED]:
+        return new
+    new.counts[USED] = 0
+    new.scalars[[WEIGHT, WEIGHT2]] = 0.0
+    new.scalars[[PRIOR, POWER]] = 1.0
+    roots = [np.sqrt(alpha) for alpha in config.regularization]
+    if config.estimator == 'paper':
+        S1, xi, prior1, peaks1, S2, _, peaks2, S3, _, peaks3 = new.memory[:10]
+        prior1[:] = xi
+        for S, peaks, root in ((S1, peaks1, roots[0]), (S2, peaks2, roots[1]), (S3, peaks3, roots[2])):
+            S[:] = np.diag(np.divide(1.0, root * peaks, out=np.zeros_like(peaks), where=peaks > 0.0))
+        return new
+    R, _, _, peaks, prior = new.memory
+    d, m = peaks.size, prior.shape[0]
+    prior[:] = solve_regressor(R, d, m)[0]
+    R[:] = 0.0
+    R[np.arange(d), np.arange(d)] = roots[0] * peaks
+    R[:d, -m:] = (roots[0] * peaks)[:, None] * prior.T
+    return new
+
+
+def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> Identified | None:
+    """Return the model as of the last sample, or None before there is one. dt: sample time [s]."""
+    d = _regressors(config, len(config.inputs), len(config.outputs))
+    few = state.counts[USED] <= max(config.past_window, config.order)
+    if few or not np.all(np.isfinite(state.memory[0])):
+        return None
+    if config.estimator == 'paper':
+        scale = state.scale
+        realized, R = publication.from_recursion(
+            config, state.memory, np.tile(state.mean[1, len(config.inputs):], config.future_window))
+    else:
+        realized, R, scale = publication.from_factor(config, state.memory[0], state.scale)
+    if realized is None:
+        return None
+    return publication.publish(
+        config, realized, R, scale, state.scalars, state.variance, int(state.counts[USED]), d, dt)
+
+
+def reset(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
+    """Forget everything (a looped bag, numbers out of range)."""
+    return init(config)

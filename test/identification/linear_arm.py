@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are
+
+from flexmanip_ros.parameters import IdentifierParameters, configure
+from flexmanip_ros.types import StateSpace
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def benchmark(name: str) -> ModuleType:
+    """A benchmark as a module, so that a test can run a short form of it."""
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, ROOT / 'benchmarks' / f'{name}.py')
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def shared_data(name: str) -> Path:
+    """A measured record that stays outside the repository; skips where it is absent."""
+    folder = Path(os.environ.get('FLEXMANIP_DATA', ROOT.parent / 'shared' / 'data'))
+    if not (folder / name).exists():
+        pytest.skip(f'{name} is not at {folder}; set FLEXMANIP_DATA')
+    return folder / name
+
+
+def configuration(r: int, m: int, **values: object) -> IdentifierParameters:
+    return configure(IdentifierParameters, {
+        'inputs': [f'in{i}/effort' for i in range(r)], 'outputs': [f'out{i}/position' for i in range(m)],
+        'angles': [''], 'payload_method': 'none', **values})
+
+
+def observer(A: np.ndarray, C: np.ndarray) -> np.ndarray:
+    """Gain of a Kalman filter with strong process noise."""
+    n, m = A.shape[0], C.shape[0]
+    P = solve_discrete_are(A.T, C.T, 10.0 * np.eye(n), np.eye(m))
+    return np.linalg.solve(C @ P @ C.T + np.eye(m), C @ P @ A.T).T
+
+
+def random_system(n: int, r: int, m: int, rng: np.random.Generator) -> StateSpace:
+    """Stable, with poles inside 0.95 and an observer that forgets within a few samples."""
+    A = rng.standard_normal((n, n))
+    A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
+    C = rng.standard_normal((m, n))
+    K = observer(A, C)
+    return StateSpace(A, rng.standard_normal((n, r)), C, np.zeros((m, r)), K, 0.01)
+
+
+def record(
+    model: StateSpace, count: int, noise: float, rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs and outputs of the innovation form, driven by white noise."""
+    m, r = model.D.shape
+    u = rng.standard_normal((count, r))
+    e = noise * rng.standard_normal((count, m))
+    x = np.zeros(model.order)
+    y = np.empty((count, m))
+    for k in range(count):
+        y[k] = model.C @ x + model.D @ u[k] + e[k]
+        x = model.A @ x + model.B @ u[k] + model.K @ e[k]
+    return u, y
+
+
+def sorted_poles(A: np.ndarray) -> np.ndarray:
+    return np.sort_complex(np.linalg.eigvals(A))

@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from linear_arm import configuration, random_system, record, sorted_poles
+
+from flexmanip_ros.errors import SignalError
+from flexmanip_ros.identification import rpbsid
+from flexmanip_ros.identification.memory_kernel import FILLED, REJECTED, USED
+from flexmanip_ros.identification.pbsid import pbsid
+from flexmanip_ros.identification.realization import markov
+
+ESTIMATORS = [
+    {'estimator': 'factor'}, {'estimator': 'factor', 'state_basis': 'fixed', 'direct_feedthrough': True},
+    {'estimator': 'paper'}, {'estimator': 'paper', 'state_basis': 'tracked', 'direct_feedthrough': True},
+]
+
+
+def arrays(state: rpbsid.RpbsidState) -> list[np.ndarray]:
+    named = [getattr(state, field.name) for field in dataclasses.fields(state) if field.name != 'memory']
+    return [*named, *state.memory]
+
+
+def same(a: rpbsid.RpbsidState, b: rpbsid.RpbsidState) -> bool:
+    return all(np.array_equal(x, y) for x, y in zip(arrays(a), arrays(b), strict=True))
+
+
+@pytest.mark.parametrize('choice', ESTIMATORS)
+def test_steps_and_one_advance_give_the_same_bits(choice):
+    rng = np.random.default_rng(1)
+    config = configuration(2, 3, order=3, past_window=4, future_window=3, **choice)
+    u, y = record(random_system(3, 2, 3, rng), 60, 0.1, rng)
+    stepped = rpbsid.init(config)
+    for k in range(60):
+        before = rpbsid.advance(config, stepped, u[:0], y[:0])
+        after = rpbsid.step(config, stepped, u[k], y[k])
+        assert same(before, stepped), 'a step leaves the state it was given as it was'
+        stepped = after
+    assert same(stepped, rpbsid.advance(config, rpbsid.init(config), u, y))
+
+
+@pytest.mark.parametrize(('n', 'r', 'm'), [(3, 2, 2), (4, 1, 3), (2, 2, 1), (5, 3, 5)])
+@pytest.mark.parametrize('beta', [1.0, 0.995])
+def test_recursion_equals_batch(n, r, m, beta):
+    rng = np.random.default_rng(n)
+    u, y = record(random_system(n, r, m, rng), 800, 0.05, rng)
+    config = configuration(
+        r, m, order=n, past_window=7, future_window=5, forgetting_factor=[beta] * 3, forgetting='constant',
+        regularization=[1e-12] * 3, state_basis='fixed', kalman_gain='regression')
+    found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), u, y), 0.01)
+    assert found is not None
+    batch, _ = pbsid(u, y, n=n, p=7, f=5, dt=0.01, weighted=True, fixed=True, forgetting=beta)
+    assert np.abs(sorted_poles(found.model.A) - sorted_poles(batch.A)).max() < 1e-5
+    size = np.abs(markov(batch, 10)).max()
+    assert np.abs(markov(found.model, 10) - markov(batch, 10)).max() < 1e-5 * size
+
+
+def test_estimators_agree_on_long_clean_records():
+    rng = np.random.default_rng(5)
+    system = random_system(3, 2, 3, rng)
+    u, y = record(system, 4000, 1e-3, rng)
+    for choice in ESTIMATORS:
+        config = configuration(
+            2, 3, order=3, past_window=8, future_window=4, forgetting_factor=[0.999] * 3, **choice)
+        found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), u, y), 0.01)
+        assert found is not None
+        assert np.abs(sorted_poles(found.model.A) - sorted_poles(system.A)).max() < 5e-3, choice
+
+
+@pytest.mark.parametrize('choice', ESTIMATORS)
+def test_no_regressor_straddles_a_gap(choice):
+    rng = np.random.default_rng(2)
+    config = configuration(1, 1, order=1, past_window=3, future_window=2, **choice)
+    state = rpbsid.advance(config, rpbsid.init(config), *rng.standard_normal((2, 20, 1)))
+    gap = rpbsid.window_restart(config, state)
+    used = gap.counts[USED]
+    for k in range(3):
+        gap = rpbsid.step(config, gap, rng.standard_normal(1), rng.standard_normal(1))
+        assert gap.counts[USED] == used, k
+    gap = rpbsid.step(config, gap, rng.standard_normal(1), rng.standard_normal(1))
+    assert gap.counts[USED] == used + 1
+
+
+@pytest.mark.parametrize('choice', ESTIMATORS)
+def test_restart_keeps_the_parameters_and_drops_the_confidence(choice):
+    rng = np.random.default_rng(3)
+    system = random_system(3, 2, 3, rng)
+    u, y = record(system, 2000, 0.05, rng)
+    config = configuration(2, 3, order=3, past_window=6, future_window=3, forgetting_factor=[1.0] * 3,
+                           regularization=[1e-2] * 3, **choice)
+    state = rpbsid.advance(config, rpbsid.init(config), u, y)
+    before = rpbsid.identified(config, state, 0.01)
+    restarted = rpbsid.restart(config, state)
+    assert restarted.counts[USED] == 0
+    assert restarted.counts[FILLED] == 0
+    assert rpbsid.identified(config, restarted, 0.01) is None
+    after = rpbsid.identified(config, rpbsid.advance(config, restarted, u[:40], y[:40]), 0.01)
+    assert before is not None
+    assert after is not None
+    assert np.linalg.norm(after.spread) > 1.3 * np.linalg.norm(before.spread)
+    kept = dataclasses.replace(config, restart_on_event=False)
+    assert rpbsid.restart(kept, state).counts[USED] == state.counts[USED]
+
+
+def test_sample_that_is_not_finite_is_refused_and_breaks_the_window():
+    config = configuration(1, 1, order=1, past_window=3, future_window=1)
+    state = rpbsid.advance(config, rpbsid.init(config), *np.random.default_rng(0).standard_normal((2, 20, 1)))
+    bad = rpbsid.step(config, state, np.array([np.nan]), np.array([1.0]))
+    assert bad.counts[REJECTED] == 1
+    assert bad.counts[FILLED] == 0
+    assert np.array_equal(bad.memory[0], state.memory[0])
+
+
+def test_samples_of_the_wrong_size_are_an_error():
+    config = configuration(2, 1, order=1, past_window=3, future_window=1)
+    with pytest.raises(SignalError, match='2 inputs and 1 outputs'):
+        rpbsid.step(config, rpbsid.init(config), np.zeros(1), np.zeros(1))
