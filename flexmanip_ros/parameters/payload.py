@@ -14,5 +14,18 @@ class PayloadParameters:
     known_coupling: bool = parameter(
         False, '`block`: use the coupling M_b of the arm model instead of identifying it (2-8 times tighter)')
 
+    dynamics: str = parameter(
+        'nonlinear', '`structured`: nonlinear, follows the moving configuration; linear, stays at the first one',
+        choices=('nonlinear', 'linear'))
+    stiffness_std: float = parameter(
+        0.03, 'relative standard deviation of the bending stiffnesses, learned from the empty arm', low=0.0,
+        high=1.0)
+    damping_std: float = parameter(
+        0.005, 'standard deviation of the damping ratio, learned from the empty arm', low=0.0, high=1.0)
+    capture_speed: float = parameter(
+        0.3, 'how fast an object may move against the tip when it is caught', unit='m/s', low=0.0, high=100.0)
+    memory_time: float = parameter(
+        20.0, 'how long old samples count', unit='s', low=0.1, high=1e6)
+
     def __post_init__(self) -> None:
         check_all(self)

@@ -1,0 +1,70 @@
+"""What the structured estimator remembers: arrays of constant size, copied before each call that writes them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from flexmanip_ros.types import Array
+
+HORIZON = 512
+"""Samples after an event that are kept and fitted again and again from the event on."""
+
+# columns of ``noise``, one row a sensor: variance used; of the innovations; slow part of it; sums of this block;
+# least one; of the part no motion explains (fourth differences); share in what is known of the payload
+EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT = range(8)
+# elements of ``count``
+HELD, STORED, PASSED, PASSING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN = range(11)
+# elements of ``score``
+MOVE, VARIANCE, DRIFT, NOW = range(4)
+
+
+class Memory(NamedTuple):
+    """The filter and the fit that runs behind it; nx states, m sensors."""
+
+    x: Array
+    """(nx,) mean."""
+    S: Array
+    """(nx, nx) square root of the covariance."""
+    noise: Array
+    """(m, 8) what is known of each sensor's noise."""
+    recent: Array
+    """(m, 4) its last measurements."""
+    count: Array
+    """(11,) counters."""
+    score: Array
+    """(4,) moves of the payload in this batch, their variance; mean squared normalised move; innovation power."""
+    x0: Array
+    """(nx,) mean just after the last event."""
+    S0: Array
+    """(nx, nx) its square root."""
+    xi: Array
+    """(nx,) fitted departure from x0 in units of S0."""
+    samples: Array
+    """(HORIZON, 3 + m) duration since the sample before, torques held meanwhile, measurements."""
+    xr: Array
+    """(nx,) reference trajectory of the running pass."""
+    Sr: Array
+    """(nx, nx) its sensitivity to xi."""
+    N: Array
+    """(nx, nx) information gathered in the pass."""
+    g: Array
+    """(nx,) gradient gathered in the pass."""
+    power: Array
+    """(m,) mean squared normalised innovation of each sensor since the event, slowly forgotten."""
+
+
+def memory(nx: int, m: int) -> Memory:
+    """Allocate."""
+    return Memory(
+        x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 8)), recent=np.zeros((m, 4)),
+        count=np.zeros(11, dtype=np.int64),
+        score=np.zeros(4), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx),
+        samples=np.zeros((HORIZON, 3 + m)), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
+        g=np.zeros(nx), power=np.ones(m))
+
+
+def copy(state: Memory) -> Memory:
+    """Return the same values in arrays of their own."""
+    return Memory(*(part.copy() for part in state))

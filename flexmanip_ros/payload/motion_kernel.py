@@ -1,0 +1,217 @@
+"""Compiled motion of the structured filter: the arm's equations carry the mean, their Jacobian the spread.
+
+The state is [q (n), qd (n), parameters (5)], parameters = [payload, ln stiffness factor 1, 2, damping ratio 1, 2].
+The spread is a square root S (nx, nx), covariance = S S'; without process noise it moves as S <- F S.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from flexmanip_ros.plant.acceleration_kernel import acceleration, factor, solve
+from flexmanip_ros.plant.compiled import kernel
+from flexmanip_ros.plant.jacobian_kernel import acceleration_jacobian
+from flexmanip_ros.types import Array
+
+if TYPE_CHECKING:
+    from flexmanip_ros.plant.manipulator import Manipulator, Workspace
+
+PARAMETERS = 5
+"""Payload, two stiffness factors (logarithm), two damping ratios."""
+
+
+class Motion(NamedTuple):
+    """The arm as the filter integrates it. ``arm``'s stiffness and damping are scratch, set from the state."""
+
+    arm: Manipulator
+    work: Workspace
+    frozen: bool
+    """Hold the mass matrix at the working point (a linear plant) instead of following the configuration."""
+    M0: Array
+    """(n, n) mass matrix of the empty arm at the working point, used when frozen."""
+    Mp: Array
+    """(n, n) its derivative by the payload."""
+    stiffness: Array
+    """(n,) nominal K."""
+    damping: Array
+    """(n,) D at a damping ratio of one."""
+    scale: float
+    """Payload [kg] of state zero when something is held."""
+    least: float
+    """Least payload [kg] of an arm thought empty: keeps the mass matrix positive."""
+    substeps: float
+    """Longest integration step [s]."""
+    payload: Array
+    a: Array
+    q: Array
+    k: Array
+    dq: Array
+    dqd: Array
+    dp: Array
+    G: Array
+    X: Array
+    Y: Array
+
+
+@kernel
+def payload_mass(motion: Motion, state: float, held: bool) -> float:
+    """Payload [kg] from its state: scale exp(state) > 0 when something is held, else the state itself."""
+    if held:
+        return motion.scale * np.exp(min(state, 12.0))
+    return max(state, motion.least)
+
+
+@kernel
+def set_parameters(motion: Motion, x: Array, held: bool) -> None:
+    """Write payload, stiffness and damping of the state into the arm."""
+    n = motion.q.size
+    k = (n - 2) // 2
+    motion.payload[0] = payload_mass(motion, x[2 * n], held)
+    for link in range(2):
+        factor_EI = np.exp(x[2 * n + 1 + link])
+        ratio = x[2 * n + 3 + link]
+        for j in range(2 + link * k, 2 + (link + 1) * k):
+            motion.arm.stiffness[j] = motion.stiffness[j] * factor_EI
+            motion.arm.damping[j] = motion.damping[j] * ratio
+
+
+@kernel
+def accelerate(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array) -> bool:
+    """Fill qdd (n,); leaves the factor of M in work.M."""
+    if not motion.frozen:
+        return acceleration(motion.arm, motion.payload, q, qd, effort, qdd, motion.work)
+    arm, M = motion.arm, motion.work.M
+    n = q.size
+    for r in range(n):
+        for c in range(r + 1):
+            M[r, c] = motion.M0[r, c] + motion.payload[0] * motion.Mp[r, c]
+    if not factor(M):
+        return False
+    for r in range(n):
+        qdd[r] = (arm.torque[r, 0] * effort[0] + arm.torque[r, 1] * effort[1]
+                  - arm.stiffness[r] * q[r] - arm.damping[r] * qd[r])
+    solve(M, qdd)
+    return True
+
+
+@kernel
+def linearize(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array, held: bool) -> bool:
+    """Fill qdd and its derivatives: motion.dq, motion.dqd (n, n) and motion.G (n, 5) by the parameters."""
+    n = q.size
+    k = (n - 2) // 2
+    arm, M, a, G = motion.arm, motion.work.M, motion.a, motion.G
+    if motion.frozen:
+        if not accelerate(motion, q, qd, effort, qdd):
+            return False
+        for c in range(n + 1):
+            for r in range(n):
+                a[r] = 0.0
+            if c == n:
+                for r in range(n):
+                    for j in range(n):
+                        a[r] -= motion.Mp[max(r, j), min(r, j)] * qdd[j]
+            else:
+                a[c] = -arm.stiffness[c]
+            solve(M, a)
+            for r in range(n):
+                if c == n:
+                    motion.dp[r, 0] = a[r]
+                else:
+                    motion.dq[r, c] = a[r]
+                    motion.dqd[r, c] = a[r] * arm.damping[c] / arm.stiffness[c] if arm.stiffness[c] > 0.0 else 0.0
+    elif not acceleration_jacobian(
+            arm, motion.payload, q, qd, effort, qdd, motion.dq, motion.dqd, motion.dp, motion.work):
+        return False
+    rate = motion.payload[0] if held else 1.0
+    for r in range(n):
+        G[r, 0] = motion.dp[r, 0] * rate
+    for link in range(2):
+        for part in range(2):
+            for r in range(n):
+                a[r] = 0.0
+            for j in range(2 + link * k, 2 + (link + 1) * k):
+                a[j] = -arm.stiffness[j] * q[j] if part == 0 else -motion.damping[j] * qd[j]
+            solve(M, a)
+            for r in range(n):
+                G[r, 1 + 2 * part + link] = a[r]
+    return True
+
+
+@kernel
+def predict(motion: Motion, x: Array, S: Array, effort: Array, duration: float, held: bool) -> bool:
+    """Carry x and S over a time [s] with the torque held; False when numbers left the finite range."""
+    if duration <= 0.0:
+        return True
+    set_parameters(motion, x, held)
+    steps = max(int(np.ceil(duration / motion.substeps)), 1)
+    for _ in range(steps):
+        if not runge_kutta(motion, x, effort, duration / steps, held):
+            return False
+        spread(motion, S, duration / steps)
+    return True
+
+
+@kernel
+def runge_kutta(motion: Motion, x: Array, effort: Array, h: float, held: bool) -> bool:
+    """One step of fourth order; the linearisation is left in motion as of the midpoint."""
+    n = motion.q.size
+    k, trial = motion.k, motion.q
+    q, qd = x[:n], x[n:2 * n]
+    if not accelerate(motion, q, qd, effort, k[0]):
+        return False
+    for i in range(n):
+        trial[i] = q[i] + 0.5 * h * qd[i]
+        k[4, i] = qd[i] + 0.5 * h * k[0, i]
+    if not accelerate(motion, trial, k[4], effort, k[1]):
+        return False
+    for i in range(n):
+        trial[i] = q[i] + 0.5 * h * k[4, i]
+        k[5, i] = qd[i] + 0.5 * h * k[1, i]
+    if not linearize(motion, trial, k[5], effort, k[2], held):
+        return False
+    for i in range(n):
+        trial[i] = q[i] + h * k[5, i]
+        k[6, i] = qd[i] + h * k[2, i]
+    if not accelerate(motion, trial, k[6], effort, k[3]):
+        return False
+    for i in range(n):
+        x[i] += h / 6.0 * (qd[i] + 2.0 * (k[4, i] + k[5, i]) + k[6, i])
+        x[n + i] += h / 6.0 * (k[0, i] + 2.0 * (k[1, i] + k[2, i]) + k[3, i])
+        if not abs(x[i]) + abs(x[n + i]) < 1e6:
+            return False
+    return True
+
+
+@kernel
+def spread(motion: Motion, S: Array, h: float) -> None:
+    """S <- F S, F the fourth-order Taylor series of the linearised flow over h."""
+    n = motion.q.size
+    nx = S.shape[1]
+    X, Y = motion.X, motion.Y
+    for i in range(2 * n):
+        for c in range(nx):
+            X[i, c] = S[i, c]
+    weight = 1.0
+    for order in range(1, 5):
+        for i in range(n):
+            for c in range(nx):
+                Y[i, c] = X[n + i, c]
+                Y[n + i, c] = 0.0
+            for j in range(n):
+                a = motion.dq[i, j]
+                b = motion.dqd[i, j]
+                for c in range(nx):
+                    Y[n + i, c] += a * X[j, c] + b * X[n + j, c]
+        if order == 1:
+            for i in range(n):
+                for p in range(PARAMETERS):
+                    g = motion.G[i, p]
+                    for c in range(nx):
+                        Y[n + i, c] += g * S[2 * n + p, c]
+        weight *= h / order
+        for i in range(2 * n):
+            for c in range(nx):
+                S[i, c] += weight * Y[i, c]
+                X[i, c] = Y[i, c]

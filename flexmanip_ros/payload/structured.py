@@ -1,0 +1,214 @@
+"""Payload from the arm's own equations of motion: filter and refit in one, moving configuration, honest interval.
+
+``init`` / ``step`` / ``advance`` / ``event`` / ``estimate``; the state is never written to. See docs/payload.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.payload import memory as mem
+from flexmanip_ros.payload import structured_start as start
+from flexmanip_ros.payload.motion_kernel import predict
+from flexmanip_ros.payload.structured_judgement import judge
+from flexmanip_ros.payload.structured_kernel import Sensors
+from flexmanip_ros.payload.structured_kernel import advance as run
+from flexmanip_ros.payload.structured_model import Model, build, sensors
+from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload, Sample
+
+FIRST_LOOK = 24
+"""Samples looked at before the filter starts: they tell its noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class StructuredState:
+    """Everything remembered; constant in size."""
+
+    model: Model | None
+    """None when the configured signals cannot give a payload."""
+    sensors: Sensors | None = None
+    memory: mem.Memory | None = None
+    waiting: tuple[Sample | CaptureEvent, ...] = ()
+    """What came before the filter started."""
+    last_ns: int = 0
+    effort: Array | None = None
+    """(2,) torque held since then."""
+    released: float = 0.0
+    """Payload let go at the last release [kg]."""
+    restarts: int = 0
+    """How often numbers left the finite range."""
+
+
+def init(config: IdentifierParameters) -> StructuredState:
+    """Start with an empty arm of which nothing is measured."""
+    return StructuredState(build(config))
+
+
+def step(config: IdentifierParameters, state: StructuredState, sample: Sample) -> StructuredState:
+    """Take one sample."""
+    return advance(config, state, (sample,))
+
+
+def advance(
+    config: IdentifierParameters, state: StructuredState, samples: Sequence[Sample],
+) -> StructuredState:
+    """Take samples in the order of their stamps; the same bits as one by one."""
+    if state.model is None or not samples:
+        return state
+    if state.memory is None:
+        needed = FIRST_LOOK - sum(isinstance(item, Sample) for item in state.waiting)
+        state = replace(state, waiting=(*state.waiting, *samples[:needed]))
+        if len(samples) < needed:
+            return state
+        state, samples = _begin(config, state), samples[needed:]
+    begin = 0
+    for stop in [i for i, sample in enumerate(samples) if sample.gap and i > 0] + [len(samples)]:
+        part = samples[begin:stop]
+        if part and part[0].gap:
+            state = _resume(config, state, part[0])
+        state = _run(config, state, part)
+        begin = stop
+    return state
+
+
+def event(config: IdentifierParameters, state: StructuredState, event: CaptureEvent) -> StructuredState:
+    """The arm took or let go of something before the next sample."""
+    if state.model is None:
+        return state
+    if state.memory is None:
+        return replace(state, waiting=(*state.waiting, event))
+    m = mem.copy(state.memory)
+    assert state.effort is not None
+    ahead = max(event.stamp_ns - state.last_ns, 0)
+    predict(state.model.motion, m.x, m.S, state.effort, ahead * 1e-9, bool(m.count[mem.HELD]))
+    released = _change(config, state.model, m, event.kind)
+    return replace(state, memory=m, last_ns=state.last_ns + ahead, released=released)
+
+
+def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
+    """Return the payload with its interval; never a NaN."""
+    return judge(config, state.model, state.memory, state.restarts)
+
+
+def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: EventKind) -> float:
+    """Reopen what an event changes: the rates, and what is held. Returns the payload let go [kg]."""
+    payload = m.x.size - 5
+    held = bool(m.count[mem.HELD])
+    before = float(model.motion.scale * np.exp(min(m.x[payload], 12.0))) if held else 0.0
+    columns = start.jump(config, model, m)
+    opened = np.zeros((m.x.size, 1))
+    if kind is EventKind.CAPTURE:
+        if not held:
+            _forget_payload(m)  # the arm was empty: what it seemed to hold were its errors
+        opened[payload] = start.PAYLOAD_STD
+        m.count[mem.HELD] = 1
+    else:
+        _forget_payload(m)
+        opened[payload] = start.EMPTY_STD * model.motion.scale + 0.3 * before
+        m.count[mem.HELD] = 0
+    m.S[:] = start.widen(m.S, np.hstack([columns, opened]))
+    _anchor(m)
+    return before
+
+
+def _forget_payload(m: mem.Memory) -> None:
+    """Condition an empty arm on holding exactly nothing; drop what is known of a payload that is let go."""
+    payload = m.x.size - 5
+    if not m.count[mem.HELD]:
+        f = m.S[payload].copy()
+        square = float(f @ f)
+        if square > 0.0:
+            gain = m.S @ f / square
+            m.x[:] -= gain * m.x[payload]
+            m.S[:] -= np.outer(gain, f)
+    m.x[payload] = 0.0
+    m.S[payload] = 0.0
+
+
+def _anchor(m: mem.Memory) -> None:
+    """Begin a new horizon of refits here."""
+    m.x0[:], m.S0[:] = m.x, m.S
+    m.xi[:] = 0.0
+    for counter in (mem.STORED, mem.PASSED, mem.PASSING, mem.SINCE_EVENT, mem.SINCE_NOISE, mem.IN_BATCH, mem.BATCHES):
+        m.count[counter] = 0
+    m.count[mem.BLOCKS] = min(m.count[mem.BLOCKS], 40)
+    m.score[:] = 0.0
+    m.score[mem.DRIFT] = 1.0
+    m.noise[:, mem.WEIGHT] = 0.0
+    m.power[:] = 1.0
+
+
+def _begin(config: IdentifierParameters, state: StructuredState) -> StructuredState:
+    """Start the filter with what waited."""
+    model = state.model
+    assert model is not None
+    items = state.waiting
+    samples = [item for item in items if isinstance(item, Sample)]
+    Y = _measurements(model, samples)
+    steps = np.diff([sample.stamp_ns for sample in samples]) * 1e-9
+    dt = float(np.median(steps))
+    m = mem.memory(2 * model.motion.q.size + 5, len(model.roles))
+    m.noise[:] = start.noise(model, Y)
+    m.count[mem.BLOCKS] = 2
+    start.first(config, model, m, Y[0])
+    _anchor(m)
+    state = replace(
+        state, memory=m, sensors=sensors(config, model, dt, start.diffusion(config, model, m)), waiting=(),
+        last_ns=samples[0].stamp_ns, effort=samples[0].u.copy())
+    for item in items:
+        state = event(config, state, item) if isinstance(item, CaptureEvent) else _run(config, state, (item,))
+    return state
+
+
+def _resume(config: IdentifierParameters, state: StructuredState, sample: Sample) -> StructuredState:
+    """After a gap: keep what is known of arm, payload and noise, look at the motion anew."""
+    assert state.model is not None and state.memory is not None
+    m = mem.copy(state.memory)
+    n = state.model.motion.q.size
+    parameters, spread = m.x[2 * n:].copy(), m.S[2 * n:].copy()
+    start.first(config, state.model, m, _measurements(state.model, [sample])[0])
+    m.x[2 * n:] = parameters
+    m.S[2 * n:] = 0.0
+    m.S[2 * n:, 2 * n:] = np.linalg.qr(spread.T, mode='r').T
+    _anchor(m)
+    return replace(state, memory=m, last_ns=sample.stamp_ns, effort=sample.u.copy())
+
+
+def _run(config: IdentifierParameters, state: StructuredState, samples: Sequence[Sample]) -> StructuredState:
+    """Take samples without a gap among them."""
+    assert state.model is not None and state.memory is not None
+    assert state.sensors is not None and state.effort is not None
+    if not samples:
+        return state
+    stamps = np.array([state.last_ns] + [sample.stamp_ns for sample in samples])
+    efforts = np.array([state.effort] + [sample.u for sample in samples])
+    m = mem.copy(state.memory)
+    taken = run(state.model.motion, state.sensors, m, np.maximum(np.diff(stamps), 0) * 1e-9, efforts[:-1],
+                _measurements(state.model, samples))
+    if taken < len(samples):
+        return _restart(config, state, samples[taken:])
+    return replace(state, memory=m, last_ns=int(stamps[-1]), effort=efforts[-1])
+
+
+def _restart(
+    config: IdentifierParameters, state: StructuredState, samples: Sequence[Sample],
+) -> StructuredState:
+    """Numbers left the finite range: begin again, still knowing whether something is held."""
+    assert state.memory is not None
+    fresh = replace(init(config), restarts=state.restarts + 1)
+    if state.memory.count[mem.HELD]:
+        fresh = replace(fresh, waiting=(CaptureEvent(samples[0].stamp_ns, EventKind.CAPTURE),))
+    return advance(config, fresh, samples[1:])
+
+
+def _measurements(model: Model, samples: Sequence[Sample]) -> Array:
+    """Outputs and the angles that are not among them, (N, m)."""
+    Y = np.array([sample.y for sample in samples])
+    if not model.extra:
+        return Y
+    angles = np.array([sample.angles for sample in samples])
+    return np.hstack([Y, angles[:, list(model.extra)]])
