@@ -6,44 +6,35 @@ just to have the compiler's half minute behind you. `make setup` and `colcon bui
 
 from __future__ import annotations
 
-import importlib
 import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-import numpy as np
-
 from flexmanip_ros import pipeline
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
+from flexmanip_ros.plant import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+
+Item = JointRecord | CaptureEvent
 
 SAMPLES = 200
 PERIOD_NS = 1_000_000
 
 
-def simulation() -> list[JointRecord | CaptureEvent]:
-    """Return what the simulated arm sends while it catches and lets go, from both ways to step it."""
-    excitation = importlib.import_module('flexmanip_ros.plant.excitation')
-    simulator = importlib.import_module('flexmanip_ros.plant.simulator')
+def simulation() -> list[Item]:
+    """Return what the simulated arm sends while it catches and lets go; steps it both ways."""
     config = PlantParameters()
     efforts = excitation.sequence(ExcitationParameters(), SAMPLES)
     events = (CaptureEvent(SAMPLES // 3 * PERIOD_NS, EventKind.CAPTURE),
               CaptureEvent(SAMPLES // 3 * 2 * PERIOD_NS, EventKind.RELEASE))
-    run = simulator.simulate(config, efforts, events)
     state = simulator.init(config)
-    for k in range(3):
-        state, _ = simulator.step(config, state, efforts[k])
-    items: list[JointRecord | CaptureEvent] = []
-    for k in range(SAMPLES):
-        stamp = int(run.stamp_ns[k])
-        items += [event for event in events if event.stamp_ns == stamp]
-        items.append(JointRecord(stamp, tuple(simulator.JOINT_NAMES), np.asarray(run.position[k]),
-                                 np.asarray(run.velocity[k]), np.asarray(run.effort[k])))
-    return items
+    for torques in efforts[:3]:
+        state, _ = simulator.step(config, state, torques)
+    return list(simulator.records(simulator.simulate(config, efforts, events), events))
 
 
-def estimation(method: str, items: list[JointRecord | CaptureEvent]) -> None:
+def estimation(method: str, items: list[Item]) -> None:
     """Run the identifier both ways, sample by sample and in blocks."""
     config = replace(IdentifierParameters(), payload_method=method)
     for _ in pipeline.run(config, items):
@@ -55,7 +46,7 @@ def estimation(method: str, items: list[JointRecord | CaptureEvent]) -> None:
 
 def recipes() -> Iterator[tuple[str, Callable[[], object]]]:
     """Yield the parts in the order in which they are wanted."""
-    made: list[JointRecord | CaptureEvent] = []
+    made: list[Item] = []
     yield 'plant', lambda: made.extend(simulation())
     yield 'identifier', lambda: estimation('none', made)
     yield 'payload from the blocks', lambda: estimation('block', made)
