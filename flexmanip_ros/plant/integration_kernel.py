@@ -56,17 +56,18 @@ def runge_kutta(
 @kernel
 def run_nonlinear(
     arm: Manipulator, payload: Array, slopes: Slopes, x: Array, previous: Array, efforts: Array, dt: float,
-    steps: int, position: Array, velocity: Array, scratch: Array, work: Workspace,
+    steps: int, position: Array, velocity: Array, scratch: Array, loads: Array, work: Workspace,
 ) -> int:
     """Record each sample, then integrate to the next under its torque; return how many samples are good.
 
     x (2n,) and previous (2,), the torque of the interval before, are advanced in place. efforts: (N, 2);
-    position, velocity: (N, 4) filled; scratch: (5, 2n).
+    position, velocity: (N, 4) filled; scratch: (5, 2n), loads: (7,).
     """
     n = x.size // 2
     count: int = efforts.shape[0]
     for k in range(count):
-        measure(arm, payload, slopes, x[:n], x[n:], previous, position[k], velocity[k], scratch[0, :n], work)
+        measure(arm, payload, slopes, x[:n], x[n:], previous, position[k], velocity[k],
+                scratch[0, :n], loads, work)
         if not runge_kutta(arm, payload, x, efforts[k], dt / steps, steps, scratch, work):
             return k
         previous[0] = efforts[k, 0]

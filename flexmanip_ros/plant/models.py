@@ -57,6 +57,7 @@ class NonlinearModel:
         self._steps = substeps(self.arm, config)
         self._work = arm_dynamics.workspace(self.arm.kappa)
         self._scratch = scratch(4 + 4 * self.arm.kappa)
+        self._loads = np.zeros(7)
 
     def rest(self) -> Array:
         """State at rest: chords at the initial angles, no bending."""
@@ -70,7 +71,7 @@ class NonlinearModel:
         """See Model."""
         return run_nonlinear(
             self.arm, payload, self.slopes, x, previous, efforts, self._dt, self._steps, position, velocity,
-            self._scratch, self._work)
+            self._scratch, self._loads, self._work)
 
     def mass_matrix(self, x: Array, payload: Array) -> Array:
         """See Model."""
