@@ -134,17 +134,18 @@ def frequency_figure(made: Run) -> Figure:
 
 
 def payload_figure(made: Run) -> Figure:
-    """Draw the payload with its interval; the consistency of the residuals below."""
-    drawn, axes = plots.figure(2, [3.2, 1.3])
+    """Draw the payload with its interval, whole and close up; the consistency of the residuals below."""
+    drawn, axes = plots.figure(3, [2.0, 2.4, 1.3])
     plots.payload(axes[0], made.estimates, made.start_ns, _stretches(made)[1])
+    plots.payload(axes[1], made.estimates, made.start_ns, _stretches(made)[1], zoom=True)
     rows = [estimate for estimate in made.estimates if estimate.payload is not None]
     values = np.array([e.payload.consistency for e in rows if e.payload is not None], dtype=np.float64)
-    axes[1].plot(plots.times(rows, made.start_ns), values, color=plots.COLOURS[0], linewidth=1.2)
-    axes[1].axhline(1.0, color='#555555', linewidth=1.0, linestyle=':')
+    axes[2].plot(plots.times(rows, made.start_ns), values, color=plots.COLOURS[0], linewidth=1.2)
+    axes[2].axhline(1.0, color='#555555', linewidth=1.0, linestyle=':')
     finite = values[np.isfinite(values)]
     if finite.size:
-        axes[1].set_ylim(0.0, max(2.0, 1.2 * float(np.percentile(finite, 98))))
-    axes[1].set_ylabel('residual power\n[-], noise = 1')
+        axes[2].set_ylim(0.0, max(2.0, 1.2 * float(np.percentile(finite, 98))))
+    axes[2].set_ylabel('residual power\n[-], noise = 1')
     axes[-1].set_xlim(0.0, made.end or 1.0)
     plots.events(axes, made.events)
     return drawn

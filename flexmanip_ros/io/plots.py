@@ -123,8 +123,11 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int,
 
 
 def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
-            truth: Sequence[tuple[float, float, float]] = ()) -> None:
-    """Draw the payload with its 95 % interval; truth: (from [s], to [s], mass [kg]) of each stretch."""
+            truth: Sequence[tuple[float, float, float]] = (), *, zoom: bool = False) -> None:
+    """Draw the payload with its 95 % interval.
+
+    truth: (from [s], to [s], mass [kg]) of each stretch; zoom: the range of the last estimates, without zero.
+    """
     rows = [estimate for estimate in estimates if estimate.payload is not None]
     time = times(rows, start_ns)
     held = [estimate.payload for estimate in estimates if estimate.payload is not None]
@@ -135,8 +138,13 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
     for index, (begin, end, mass) in enumerate(truth):
         ax.plot([begin, end], [mass, mass], color=TRUTH_COLOUR, linestyle=(0, (4, 3)), linewidth=1.2,
                 label='true' if index == 0 else None)
-    limit(ax, table, [mass for _, _, mass in truth])
-    ax.set_ylabel('payload\n[kg]')
+    limit(ax, table, [mass for _, _, mass in truth[-1:]] if zoom else [0.0, *(mass for _, _, mass in truth)])
+    last = table[-1] if len(held) and np.isfinite(table[-1]).all() else None
+    if last is not None and not zoom:
+        words = f'{last[0]:.4g} kg, 95 %: {last[1]:.4g} to {last[2]:.4g} kg'
+        ax.annotate(words, (1.0, 0.03), ha='right', va='bottom', xycoords='axes fraction',
+                    color=PAYLOAD_COLOUR, fontsize=10, fontweight='bold')
+    ax.set_ylabel('payload, close up\n[kg]' if zoom else 'payload\n[kg]')
     legend(ax)
 
 

@@ -1,0 +1,82 @@
+"""Figures that say how good estimates are: error, and whether the interval tells the truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta
+
+from flexmanip_ros.types import Array
+
+
+@dataclass(frozen=True)
+class Score:
+    """One estimator over many runs.
+
+    runs, failed: counts; mean_error_percent, median_error_percent: of the mean relative error in the window;
+    rms_error_percent: of the last estimate; bias_kg: mean of its error; coverage_percent: how often its 95 %
+    interval held the truth, with the 95 % interval of that figure; us_per_sample: median cost.
+    """
+
+    runs: int
+    failed: int
+    mean_error_percent: float
+    median_error_percent: float
+    rms_error_percent: float
+    bias_kg: float
+    coverage_percent: float
+    coverage_low: float
+    coverage_high: float
+    us_per_sample: float
+
+
+def relative_error_percent(masses: Array, true: float) -> float:
+    """Mean of |mass - true| / true over a stretch (N,) [%]; nan without a true mass or any estimate."""
+    known = masses[np.isfinite(masses)]
+    if known.size == 0 or true <= 0.0:
+        return math.nan
+    return float(100.0 * np.mean(np.abs(known - true)) / true)
+
+
+def coverage(hits: int, runs: int, confidence: float = 0.95) -> tuple[float, float, float]:
+    """Return the share of hits and its Clopper-Pearson interval [%]."""
+    if runs == 0:
+        return math.nan, math.nan, math.nan
+    tail = (1.0 - confidence) / 2.0
+    low = 0.0 if hits == 0 else float(beta.ppf(tail, hits, runs - hits + 1))
+    high = 1.0 if hits == runs else float(beta.ppf(1.0 - tail, hits + 1, runs - hits))
+    return 100.0 * hits / runs, 100.0 * low, 100.0 * high
+
+
+def score(rows: Sequence[Mapping[str, Any]]) -> Score:
+    """Sum up the rows of one estimator."""
+    good = [row for row in rows if not row.get('error') and _number(row, 'payload_mass_kg') is not None]
+    errors = np.array([row['payload_mass_kg'] - row['payload_true_kg'] for row in good], dtype=np.float64)
+    truths = np.array([row['payload_true_kg'] for row in good], dtype=np.float64)
+    window = np.array([_number(row, 'error_percent', math.nan) for row in good], dtype=np.float64)
+    window = window[np.isfinite(window)]
+    with np.errstate(divide='ignore', invalid='ignore'):
+        relative = 100.0 * errors / truths
+    relative = relative[np.isfinite(relative)]
+    hits = sum(bool(row['covered']) for row in good)
+    share, low, high = coverage(hits, len(good))
+    costs = [row['us_per_sample'] for row in good if _number(row, 'us_per_sample') is not None]
+    return Score(
+        runs=len(rows), failed=len(rows) - len(good), mean_error_percent=_mean(window),
+        median_error_percent=float(np.median(window)) if window.size else math.nan,
+        rms_error_percent=math.sqrt(_mean(relative**2)) if relative.size else math.nan,
+        bias_kg=_mean(errors), coverage_percent=share, coverage_low=low, coverage_high=high,
+        us_per_sample=float(np.median(costs)) if costs else math.nan)
+
+
+def _number(row: Mapping[str, Any], name: str, missing: Any = None) -> Any:
+    value = row.get(name)
+    return value if isinstance(value, (int, float)) and math.isfinite(value) else missing
+
+
+def _mean(values: Array) -> float:
+    return float(np.mean(values)) if values.size else math.nan

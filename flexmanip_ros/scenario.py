@@ -1,0 +1,196 @@
+"""What a study repeats: an arm, a motion, a payload, noise, faults and the estimators to compare."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.parameters import (
+    ExcitationParameters,
+    IdentifierParameters,
+    PlantParameters,
+    configure,
+    leaves,
+)
+
+GROUPS: Mapping[str, type] = {
+    'plant': PlantParameters, 'excitation': ExcitationParameters, 'identifier': IdentifierParameters}
+DISTRIBUTIONS = ('uniform', 'normal', 'choice')
+CAPTURE_TIME = 'capture_time'
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What goes wrong on the way from the arm to the estimator; probabilities a message."""
+
+    drop: float = 0.0
+    duplicate: float = 0.0
+    swap: float = 0.0
+    """Two neighbours change places."""
+    nan: float = 0.0
+    """One value of the message is NaN."""
+    gap: tuple[float, float] = (0.0, 0.0)
+    """From and to [s]: every message between is lost."""
+    event_delay: float = 0.0
+    """The event arrives this late [s]."""
+
+    def __post_init__(self) -> None:
+        for name in ('drop', 'duplicate', 'swap', 'nan'):
+            value = getattr(self, name)
+            if not 0.0 <= value <= 1.0:
+                raise ParameterError(f"fault '{name}' is {value!r}", 'give a probability, 0 to 1')
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One experiment; a seed turns it into one run.
+
+    duration, capture_time, release_time: [s], a negative time means never; window: the mean relative error is
+    taken between these times [s]; plant, excitation, identifier: dotted parameters; vary: what is drawn anew
+    for each seed; estimators: name -> identifier parameters of each estimator that sees the same samples.
+    """
+
+    name: str = 'study'
+    duration: float = 6.0
+    capture_time: float = 3.0
+    release_time: float = -1.0
+    window: tuple[float, float] = (4.0, 6.0)
+    plant: Mapping[str, Any] = field(default_factory=dict)
+    excitation: Mapping[str, Any] = field(default_factory=dict)
+    identifier: Mapping[str, Any] = field(default_factory=dict)
+    vary: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    faults: Faults = field(default_factory=Faults)
+    estimators: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: {'default': {}})
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.duration <= 1e5:
+            raise ParameterError(f'duration is {self.duration!r}', 'give seconds above 0')
+        if not self.estimators:
+            raise ParameterError('estimators is empty', 'name at least one')
+        for name in self.vary:
+            _check_varied(name, self.vary[name])
+        for name in self.estimators:
+            self.configuration(0, name)  # unknown or bad parameters are said before the first run
+
+    def configuration(self, seed: int, estimator: str) -> Run:
+        """Return everything one run needs; the same seed gives the same run."""
+        drawn = {name: _draw(self.vary[name], np.random.default_rng([seed, index]))
+                 for index, name in enumerate(sorted(self.vary))}
+        groups: dict[str, dict[str, Any]] = {
+            name: dict(getattr(self, name)) for name in ('plant', 'excitation', 'identifier')}
+        capture = self.capture_time
+        for name, value in drawn.items():
+            group, _, rest = name.partition('.')
+            if name == CAPTURE_TIME:
+                capture = float(value)
+            elif group == 'arm':  # the true arm and the one the estimator is told
+                groups['plant'][name] = groups['identifier'][name] = value
+            else:
+                groups[group][rest] = value
+        groups['identifier'].update(self.estimators[estimator])
+        groups['plant'].setdefault('seed', seed)
+        plant = configure(PlantParameters, groups['plant'])
+        groups['excitation']['rate'] = plant.rate
+        return Run(plant, configure(ExcitationParameters, groups['excitation']),
+                   configure(IdentifierParameters, groups['identifier']), capture, drawn)
+
+
+@dataclass(frozen=True)
+class Run:
+    """The configurations of one run and what was drawn for it."""
+
+    plant: PlantParameters
+    excitation: ExcitationParameters
+    identifier: IdentifierParameters
+    capture_time: float
+    drawn: Mapping[str, Any]
+
+
+def scenario(tree: Any) -> Scenario:
+    """Return the scenario in a parsed YAML document. Raises ParameterError naming what is wrong."""
+    if not isinstance(tree, Mapping):
+        raise ParameterError('a scenario is a list of names and values', 'see config/scenarios/')
+    known = {item.name for item in fields(Scenario)}
+    for name in tree:
+        if name not in known:
+            raise ParameterError(f"a scenario has no '{name}'", f'known are {", ".join(sorted(known))}')
+    given = dict(tree)
+    for name in ('plant', 'excitation', 'identifier'):
+        given[name] = _flat(name, given.get(name) or {})
+    if 'estimators' in given:
+        given['estimators'] = {str(key): _flat(str(key), value or {})
+                               for key, value in _mapping('estimators', given['estimators']).items()}
+    given['vary'] = {str(key): _mapping(str(key), value)
+                     for key, value in _mapping('vary', given.get('vary') or {}).items()}
+    given['faults'] = _faults(given.get('faults') or {})
+    for name in ('duration', 'capture_time', 'release_time'):
+        if name in given:
+            given[name] = _number(name, given[name])
+    for name in ('window',):
+        if name in given:
+            given[name] = _pair(name, given[name])
+    return Scenario(**given)
+
+
+def _faults(tree: Any) -> Faults:
+    given = dict(_mapping('faults', tree))
+    known = {item.name for item in fields(Faults)}
+    for name, value in given.items():
+        if name not in known:
+            raise ParameterError(f"unknown fault '{name}'", f'known are {", ".join(sorted(known))}')
+        given[name] = _pair(name, value) if name == 'gap' else _number(name, value)
+    return Faults(**given)
+
+
+def _mapping(name: str, value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise ParameterError(f"'{name}' of a scenario is {value!r:.60}", 'list names and values below it')
+    return value
+
+
+def _flat(name: str, tree: Any, prefix: str = '') -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in _mapping(name, tree).items():
+        dotted = f'{prefix}{key}'
+        flat.update(_flat(dotted, value, dotted + '.') if isinstance(value, Mapping) else {dotted: value})
+    return flat
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ParameterError(f"'{name}' of a scenario is {value!r:.60}", 'give a number')
+    return float(value)
+
+
+def _pair(name: str, value: Any) -> tuple[float, float]:
+    if not isinstance(value, (list, tuple)) or len(value) != 2:
+        raise ParameterError(f"'{name}' of a scenario is {value!r:.60}", 'give [from, to] in seconds')
+    return _number(name, value[0]), _number(name, value[1])
+
+
+def _check_varied(name: str, how: Mapping[str, Any]) -> None:
+    group, _, rest = name.partition('.')
+    declared = {leaf.name for cls in (GROUPS[group],) for leaf in leaves(cls)} if group in GROUPS else set()
+    arm = {leaf.name for leaf in leaves(PlantParameters) if leaf.name.startswith('arm.')}
+    if name != CAPTURE_TIME and rest not in declared and name not in arm:
+        raise ParameterError(f"'{name}' cannot be varied",
+                             'name capture_time, arm.NAME, plant.NAME, excitation.NAME or identifier.NAME')
+    if len(how) != 1 or next(iter(how)) not in DISTRIBUTIONS:
+        raise ParameterError(f"'{name}' is varied by {dict(how)!r:.60}",
+                             'give one of uniform: [low, high], normal: [mean, std], choice: [...]')
+    kind, values = next(iter(how.items()))
+    if not isinstance(values, (list, tuple)) or not values or (kind != 'choice' and len(values) != 2):
+        raise ParameterError(f"'{kind}' of '{name}' is {values!r:.60}", 'give a list of values')
+
+
+def _draw(how: Mapping[str, Any], rng: np.random.Generator) -> Any:
+    kind, values = next(iter(how.items()))
+    if kind == 'choice':
+        return values[int(rng.integers(len(values)))]
+    low, high = np.asarray(values[0], dtype=np.float64), np.asarray(values[1], dtype=np.float64)
+    drawn = rng.uniform(low, high) if kind == 'uniform' else rng.normal(low, high)
+    return drawn.tolist() if isinstance(drawn, np.ndarray) else float(drawn)
