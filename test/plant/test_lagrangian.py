@@ -1,0 +1,39 @@
+"""The equations of motion against an independent Lagrangian, differentiated automatically."""
+
+from __future__ import annotations
+
+import lagrangian
+import numpy as np
+import pytest
+
+from flexmanip_ros.parameters import ArmParameters
+from flexmanip_ros.plant import manipulator
+
+BODIES = {'point': (20.0, 0.0, 0.0, 0.0), 'body': (20.0, 1.5, 0.2, -0.1)}
+
+
+@pytest.mark.parametrize('body', BODIES.values(), ids=BODIES)
+@pytest.mark.parametrize('shortening', [False, True])
+@pytest.mark.parametrize('kappa', [1, 3])
+def test_equations_of_motion_follow_from_the_lagrangian(
+    kappa: int, shortening: bool, body: tuple[float, float, float, float],
+) -> None:
+    parameters = ArmParameters(
+        link_length=(3.0, 2.0), linear_density=(5.0, 4.0), bending_stiffness=(5000.0, 3000.0),
+        hub_inertia=(1.0, 2.0), joint_inertia=0.5, tip_inertia=0.3, shortening=shortening)
+    derived = lagrangian.forces(parameters, kappa, body)
+    arm = manipulator.manipulator(parameters, kappa)
+    payload = manipulator.payload_array(body[0], body[1], body[2:])
+    rng = np.random.default_rng(kappa)
+    for _ in range(3):
+        q, qd, qdd = rng.normal(size=(3, 2 + 2 * kappa))
+        q[2:] *= 0.2  # bends of 20 cm, so that each term counts
+        ours = (manipulator.mass_matrix(arm, payload, q) @ qdd + manipulator.bias(arm, payload, q, qd)
+                + arm.stiffness * q)
+        assert ours == pytest.approx(lagrangian.evaluate(derived, q, qd, qdd), rel=1e-9, abs=1e-8)
+
+
+def test_torques_do_the_work_of_their_joint_angles() -> None:
+    """Virtual work: tau1 turns link 1's root, tau2 link 2's root against link 1's tip."""
+    arm = manipulator.manipulator(ArmParameters(), 3)
+    assert arm.torque.T == pytest.approx(arm.output[:2])
