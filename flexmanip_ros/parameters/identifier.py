@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.arm import ArmParameters
 from flexmanip_ros.parameters.field import check_all, parameter
+from flexmanip_ros.parameters.payload import PayloadParameters
 
 FIELDS = ('position', 'velocity', 'effort')
 
@@ -65,6 +66,7 @@ class IdentifierParameters:
         low=0.0, high=60.0)
     payload_frame: str = parameter('link2_tip', 'frame_id of the published payload')
     arm: ArmParameters = field(default_factory=ArmParameters)
+    payload: PayloadParameters = field(default_factory=PayloadParameters)
 
     def __post_init__(self) -> None:
         check_all(self)

@@ -15,7 +15,7 @@ class PayloadParameters:
         False, '`block`: use the coupling M_b of the arm model instead of identifying it (2-8 times tighter)')
 
     dynamics: str = parameter(
-        'nonlinear', '`structured`: nonlinear, follows the moving configuration; linear, stays at the first one',
+        'nonlinear', '`structured`: nonlinear, follows the moving configuration; linear, keeps the first',
         choices=('nonlinear', 'linear'))
     stiffness_std: float = parameter(
         0.03, 'relative standard deviation of the bending stiffnesses, learned from the empty arm', low=0.0,

@@ -6,12 +6,19 @@ stiffness; h = 2 kappa modal coordinates; the state is [eta; eta'] with eta = [e
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.parameters import ArmParameters
+from flexmanip_ros.identification.uncertainty import Identified
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
+from flexmanip_ros.payload import block_interval
+from flexmanip_ros.payload.angles import chords
+from flexmanip_ros.payload.modal_basis import sensor_matrix
 from flexmanip_ros.plant.linearization import Blocks, blocks
-from flexmanip_ros.types import Array
+from flexmanip_ros.types import Array, Payload, Status
 
 
 def extract(
@@ -38,6 +45,24 @@ def extract(
     return mass
 
 
+def estimate(config: IdentifierParameters, identified: Identified, angles: Array) -> Payload:
+    """Return the payload of an identified model with its 95 % interval; never a NaN.
+
+    angles: (2,) measured, by the arm's convention. The interval comes from models drawn from the covariance
+    of the identified one (``block_interval``).
+    """
+    kappa = identified.model.order // 4
+    seen = sensor_matrix(config, kappa) if identified.model.order == 4 * kappa else None
+    if seen is None or angles.shape != (2,) or np.linalg.matrix_rank(seen[0]) < 2 * kappa:
+        return block_interval.unknown(Status.UNOBSERVABLE)
+    empty = blocks(config.arm, chords(config.arm, angles), kappa=kappa)
+
+    def mass_of(Ac: Array, Bc: Array) -> Array:
+        return masses(config.arm, empty, Ac, Bc, config.payload.known_coupling)
+
+    return block_interval.payload(identified, *seen, mass_of)
+
+
 def masses(arm: ArmParameters, empty: Blocks, Ac: Array, Bc: Array, known_mb: bool) -> Array:
     """Return the payload [kg] of each model of a stack, Ac: (..., 4 kappa, 4 kappa), Bc: (..., 4 kappa, 2).
 
@@ -53,12 +78,12 @@ def masses(arm: ArmParameters, empty: Blocks, Ac: Array, Bc: Array, known_mb: bo
     if known_mb:
         M_b = np.broadcast_to(empty.Mb, X_t.shape)
     else:
-        M_b = np.linalg.solve(X_t @ X, X_t @ (empty.Mc - M_t))  # eq. (50), least squares
+        M_b = np.asarray(np.linalg.solve(X_t @ X, X_t @ (empty.Mc - M_t)))  # eq. (50), least squares
     M_a = np.linalg.solve(X_t @ X, X_t @ _transpose(M_b))  # eq. (51), least squares
     trace = np.trace(M_a - empty.Ma, axis1=-2, axis2=-1)
     L1, L2 = arm.link_length
     return np.asarray(trace / (L1 ** 2 + L2 ** 2))  # eq. (52)
 
 
-def _transpose(stack: Array) -> Array:
+def _transpose(stack: NDArray[Any]) -> Array:
     return np.swapaxes(stack, -1, -2)

@@ -1,18 +1,19 @@
-"""What the structured estimator remembers: arrays of constant size, copied before each call that writes them."""
+"""What the structured estimator remembers: arrays of constant size, copied before a call writes them."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexmanip_ros.types import Array
 
 HORIZON = 512
 """Samples after an event that are kept and fitted again and again from the event on."""
 
-# columns of ``noise``, one row a sensor: variance used; of the innovations; slow part of it; sums of this block;
-# least one; of the part no motion explains (fourth differences); share in what is known of the payload
+# columns of ``noise``, one row a sensor: variance used; of the innovations; slow part of it; two sums of
+# this block; least one; of what no motion explains (fourth differences); share in what the payload rests on
 EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT = range(8)
 # elements of ``count``
 HELD, STORED, PASSED, PASSING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN = range(11)
@@ -31,10 +32,10 @@ class Memory(NamedTuple):
     """(m, 8) what is known of each sensor's noise."""
     recent: Array
     """(m, 4) its last measurements."""
-    count: Array
+    counts: NDArray[np.int64]
     """(11,) counters."""
     score: Array
-    """(4,) moves of the payload in this batch, their variance; mean squared normalised move; innovation power."""
+    """(4,) move of the payload in this batch, its variance; mean squared normalised move; time to diffuse."""
     x0: Array
     """(nx,) mean just after the last event."""
     S0: Array
@@ -59,7 +60,7 @@ def memory(nx: int, m: int) -> Memory:
     """Allocate."""
     return Memory(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 8)), recent=np.zeros((m, 4)),
-        count=np.zeros(11, dtype=np.int64),
+        counts=np.zeros(11, dtype=np.int64),
         score=np.zeros(4), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx),
         samples=np.zeros((HORIZON, 3 + m)), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
         g=np.zeros(nx), power=np.ones(m))
@@ -67,4 +68,4 @@ def memory(nx: int, m: int) -> Memory:
 
 def copy(state: Memory) -> Memory:
     """Return the same values in arrays of their own."""
-    return Memory(*(part.copy() for part in state))
+    return Memory._make(part.copy() for part in state)

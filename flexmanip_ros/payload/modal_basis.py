@@ -30,31 +30,26 @@ def sensor_matrix(config: IdentifierParameters, kappa: int) -> tuple[Array, tupl
 def to_modal(Ac: Array, Bc: Array, C: Array, S: Array, rates: tuple[bool, ...]) -> tuple[Array, Array]:
     """Return (Ac, Bc) with the state [eta; eta'] from continuous models in any basis.
 
-    Ac: (..., n, n), Bc: (..., n, r), C: (m, n), S: (m, n / 2). A displacement without its rate among the
-    outputs is completed by C Ac, in continuous time, where that is known to read the rates (a discrete C A is not: it
-    depends on the payload). Raises numpy.linalg.LinAlgError when the outputs do not fix the basis.
+    Ac: (..., n, n), Bc: (..., n, r), C: (..., m, n), S: (m, n / 2). A displacement without its rate among the
+    outputs is completed by C Ac, in continuous time, where that is known to read the rates (a discrete
+    C A is not: it depends on the payload). Raises numpy.linalg.LinAlgError when that fixes no basis.
     """
     h = S.shape[1]
     is_rate = np.array(rates, dtype=bool)
     known = np.zeros((S.shape[0], 2 * h))
     known[~is_rate, :h] = S[~is_rate]
     known[is_rate, h:] = S[is_rate]
-    seen = np.broadcast_to(C, (*Ac.shape[:-2], *C.shape))
+    seen = np.broadcast_to(C, (*Ac.shape[:-2], *C.shape[-2:]))
     alone = [row for row in np.flatnonzero(~is_rate)
              if not any(np.allclose(S[row], S[other]) for other in np.flatnonzero(is_rate))]
     if alone:
         derived = np.zeros((len(alone), 2 * h))
         derived[:, h:] = S[alone]
         known = np.vstack([known, derived])
-        seen = np.concatenate([seen, C[alone] @ Ac], axis=-2)
+        seen = np.concatenate([seen, C[..., alone, :] @ Ac], axis=-2)
     if np.linalg.matrix_rank(known) < 2 * h:
         raise np.linalg.LinAlgError('the outputs do not see every modal coordinate')
     # eq. (44): seen = known T, so T = known^+ seen takes the identified state to [eta; eta']
     T = np.linalg.pinv(known) @ seen
     Ac_modal = np.swapaxes(np.linalg.solve(np.swapaxes(T, -1, -2), np.swapaxes(T @ Ac, -1, -2)), -1, -2)
     return Ac_modal, T @ Bc
-
-
-def observable(S: Array, rates: tuple[bool, ...]) -> bool:
-    """Whether the outputs fix every modal coordinate (mid-span sensors do not see even modes)."""
-    return bool(np.linalg.matrix_rank(S) == S.shape[1]) and len(rates) == S.shape[0]

@@ -1,7 +1,7 @@
 """Compiled motion of the structured filter: the arm's equations carry the mean, their Jacobian the spread.
 
-The state is [q (n), qd (n), parameters (5)], parameters = [payload, ln stiffness factor 1, 2, damping ratio 1, 2].
-The spread is a square root S (nx, nx), covariance = S S'; without process noise it moves as S <- F S.
+The state is [q (n), qd (n), parameters (5)], parameters = [payload, ln stiffness factor 1, 2, damping
+ratio 1, 2]. The spread is a square root S (nx, nx), covariance = S S'; it moves as S <- F S.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PARAMETERS = 5
 
 
 class Motion(NamedTuple):
-    """The arm as the filter integrates it. ``arm``'s stiffness and damping are scratch, set from the state."""
+    """The arm as the filter integrates it; stiffness and damping in ``arm`` are set from the state."""
 
     arm: Manipulator
     work: Workspace
@@ -59,7 +59,7 @@ class Motion(NamedTuple):
 def payload_mass(motion: Motion, state: float, held: bool) -> float:
     """Payload [kg] from its state: scale exp(state) > 0 when something is held, else the state itself."""
     if held:
-        return motion.scale * np.exp(min(state, 12.0))
+        return motion.scale * float(np.exp(min(state, 12.0)))
     return max(state, motion.least)
 
 
@@ -120,7 +120,8 @@ def linearize(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array, he
                     motion.dp[r, 0] = a[r]
                 else:
                     motion.dq[r, c] = a[r]
-                    motion.dqd[r, c] = a[r] * arm.damping[c] / arm.stiffness[c] if arm.stiffness[c] > 0.0 else 0.0
+                    bends = arm.stiffness[c] > 0.0
+                    motion.dqd[r, c] = a[r] * arm.damping[c] / arm.stiffness[c] if bends else 0.0
     elif not acceleration_jacobian(
             arm, motion.payload, q, qd, effort, qdd, motion.dq, motion.dqd, motion.dp, motion.work):
         return False

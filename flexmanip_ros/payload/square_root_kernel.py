@@ -40,7 +40,7 @@ def absorb_measurement(x: Array, S: Array, f: Array, e: float, r: float, varianc
 
 @kernel
 def absorb_noise(S: Array, deviation: Array, W: Array) -> None:
-    """S <- lower triangular L, L L' = S S' + diag(deviation^2), by Householder reflections; W: (nx, 2 nx) scratch."""
+    """S <- lower triangular L, L L' = S S' + diag(deviation^2), by Householder; W: (nx, 2 nx) scratch."""
     nx = S.shape[0]
     for i in range(nx):
         for c in range(nx):
@@ -75,7 +75,7 @@ def absorb_noise(S: Array, deviation: Array, W: Array) -> None:
 
 @kernel
 def factor_information(N: Array) -> bool:
-    """Overwrite the lower triangle of N with the Cholesky factor of I + N; False when numbers are not finite."""
+    """Overwrite the lower triangle of N with the Cholesky factor of I + N; False when it is not finite."""
     nx = N.shape[0]
     for j in range(nx):
         d = 1.0 + N[j, j]

@@ -1,6 +1,6 @@
-"""Payload from the arm's own equations of motion: filter and refit in one, moving configuration, honest interval.
+"""Payload from the arm's own equations of motion, in any configuration, moving or not.
 
-``init`` / ``step`` / ``advance`` / ``event`` / ``estimate``; the state is never written to. See docs/payload.md.
+A filter and a refit behind it (``structured_kernel``). States are never written to. See docs/payload.md.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     m = mem.copy(state.memory)
     assert state.effort is not None
     ahead = max(event.stamp_ns - state.last_ns, 0)
-    predict(state.model.motion, m.x, m.S, state.effort, ahead * 1e-9, bool(m.count[mem.HELD]))
+    predict(state.model.motion, m.x, m.S, state.effort, ahead * 1e-9, bool(m.counts[mem.HELD]))
     released = _change(config, state.model, m, event.kind)
     return replace(state, memory=m, last_ns=state.last_ns + ahead, released=released)
 
@@ -97,7 +97,7 @@ def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
 def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: EventKind) -> float:
     """Reopen what an event changes: the rates, and what is held. Returns the payload let go [kg]."""
     payload = m.x.size - 5
-    held = bool(m.count[mem.HELD])
+    held = bool(m.counts[mem.HELD])
     before = float(model.motion.scale * np.exp(min(m.x[payload], 12.0))) if held else 0.0
     columns = start.jump(config, model, m)
     opened = np.zeros((m.x.size, 1))
@@ -105,11 +105,11 @@ def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: Eve
         if not held:
             _forget_payload(m)  # the arm was empty: what it seemed to hold were its errors
         opened[payload] = start.PAYLOAD_STD
-        m.count[mem.HELD] = 1
+        m.counts[mem.HELD] = 1
     else:
         _forget_payload(m)
         opened[payload] = start.EMPTY_STD * model.motion.scale + 0.3 * before
-        m.count[mem.HELD] = 0
+        m.counts[mem.HELD] = 0
     m.S[:] = start.widen(m.S, np.hstack([columns, opened]))
     _anchor(m)
     return before
@@ -118,7 +118,7 @@ def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: Eve
 def _forget_payload(m: mem.Memory) -> None:
     """Condition an empty arm on holding exactly nothing; drop what is known of a payload that is let go."""
     payload = m.x.size - 5
-    if not m.count[mem.HELD]:
+    if not m.counts[mem.HELD]:
         f = m.S[payload].copy()
         square = float(f @ f)
         if square > 0.0:
@@ -133,9 +133,10 @@ def _anchor(m: mem.Memory) -> None:
     """Begin a new horizon of refits here."""
     m.x0[:], m.S0[:] = m.x, m.S
     m.xi[:] = 0.0
-    for counter in (mem.STORED, mem.PASSED, mem.PASSING, mem.SINCE_EVENT, mem.SINCE_NOISE, mem.IN_BATCH, mem.BATCHES):
-        m.count[counter] = 0
-    m.count[mem.BLOCKS] = min(m.count[mem.BLOCKS], 40)
+    for counter in (mem.STORED, mem.PASSED, mem.PASSING, mem.SINCE_EVENT, mem.SINCE_NOISE, mem.IN_BATCH,
+                    mem.BATCHES):
+        m.counts[counter] = 0
+    m.counts[mem.BLOCKS] = min(m.counts[mem.BLOCKS], 40)
     m.score[:] = 0.0
     m.score[mem.DRIFT] = 1.0
     m.noise[:, mem.WEIGHT] = 0.0
@@ -153,7 +154,7 @@ def _begin(config: IdentifierParameters, state: StructuredState) -> StructuredSt
     dt = float(np.median(steps))
     m = mem.memory(2 * model.motion.q.size + 5, len(model.roles))
     m.noise[:] = start.noise(model, Y)
-    m.count[mem.BLOCKS] = 2
+    m.counts[mem.BLOCKS] = 2
     start.first(config, model, m, Y[0])
     _anchor(m)
     state = replace(
@@ -166,22 +167,25 @@ def _begin(config: IdentifierParameters, state: StructuredState) -> StructuredSt
 
 def _resume(config: IdentifierParameters, state: StructuredState, sample: Sample) -> StructuredState:
     """After a gap: keep what is known of arm, payload and noise, look at the motion anew."""
-    assert state.model is not None and state.memory is not None
+    assert state.model is not None
+    assert state.memory is not None
     m = mem.copy(state.memory)
     n = state.model.motion.q.size
     parameters, spread = m.x[2 * n:].copy(), m.S[2 * n:].copy()
     start.first(config, state.model, m, _measurements(state.model, [sample])[0])
     m.x[2 * n:] = parameters
     m.S[2 * n:] = 0.0
-    m.S[2 * n:, 2 * n:] = np.linalg.qr(spread.T, mode='r').T
+    m.S[2 * n:, 2 * n:] = np.linalg.qr(spread.T)[1].T
     _anchor(m)
     return replace(state, memory=m, last_ns=sample.stamp_ns, effort=sample.u.copy())
 
 
 def _run(config: IdentifierParameters, state: StructuredState, samples: Sequence[Sample]) -> StructuredState:
     """Take samples without a gap among them."""
-    assert state.model is not None and state.memory is not None
-    assert state.sensors is not None and state.effort is not None
+    assert state.model is not None
+    assert state.memory is not None
+    assert state.sensors is not None
+    assert state.effort is not None
     if not samples:
         return state
     stamps = np.array([state.last_ns] + [sample.stamp_ns for sample in samples])
@@ -200,7 +204,7 @@ def _restart(
     """Numbers left the finite range: begin again, still knowing whether something is held."""
     assert state.memory is not None
     fresh = replace(init(config), restarts=state.restarts + 1)
-    if state.memory.count[mem.HELD]:
+    if state.memory.counts[mem.HELD]:
         fresh = replace(fresh, waiting=(CaptureEvent(samples[0].stamp_ns, EventKind.CAPTURE),))
     return advance(config, fresh, samples[1:])
 

@@ -36,9 +36,9 @@ def judge(config: IdentifierParameters, model: Model | None, m: mem.Memory | Non
     status = Status.TRACKING
     if consistency > POWER_LIMIT or inflation > DRIFT_LIMIT:
         status = Status.INCONSISTENT
-    if m.count[mem.SINCE_EVENT] < FEW:
+    if m.counts[mem.SINCE_EVENT] < FEW:
         status = Status.WARMING_UP
-    if not m.count[mem.HELD]:
+    if not m.counts[mem.HELD]:
         return empty(float(m.x[state]), std, consistency, status)
     mass = float(model.motion.scale * np.exp(min(m.x[state], 12.0)))
     if std > UNKNOWN_STD and status is Status.TRACKING:
@@ -58,7 +58,7 @@ def empty(seeming: float, std: float, consistency: float, status: Status) -> Pay
 
 def drift(m: mem.Memory) -> float:
     """Factor on the payload's variance: how much farther it moved than it should, beyond chance."""
-    batches = int(m.count[mem.BATCHES])
+    batches = int(m.counts[mem.BATCHES])
     if batches == 0:
         return 1.0
     return max(1.0, float(m.score[mem.DRIFT]) - 2.0 * math.sqrt(2.0 / batches))

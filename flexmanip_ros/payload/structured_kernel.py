@@ -1,8 +1,9 @@
-"""Compiled loop of the structured estimator: filter every sample, refit what came since the last event behind it.
+"""Compiled loop of the structured estimator: filter every sample, refit behind it all since the last event.
 
-The filter alone would linearise the first samples after an event at a poor guess and never take that back.
-So the samples since the event are kept (``HORIZON``), and a Gauss-Newton pass over them runs three samples for
-each new one; when it catches up, its result replaces the filter's state, and the next pass starts there.
+The filter alone would linearise the first samples after an event at a poor guess and never take that
+back. So the samples since the event are kept (``HORIZON``), and a Gauss-Newton pass over them runs three
+samples for each new one; when it catches up, its result replaces the filter's state, and the next pass
+starts there.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexmanip_ros.payload.memory import (
     BATCHES,
@@ -70,7 +72,7 @@ class Sensors(NamedTuple):
 
     H: Array
     """(m, n) of q or qd."""
-    rate: Array
+    rate: NDArray[np.bool_]
     """(m,) whether H reads qd."""
     feed: Array
     """(m, 2) direct effect of the torque."""
@@ -101,7 +103,7 @@ def measure(motion: Motion, sensors: Sensors, m: Memory, effort: Array, y: Array
             spread += f[c] * f[c]
         variance = spread + r
         square = e * e / variance
-        m.power[i] += (min(square, 25.0) - m.power[i]) / min(m.count[SINCE_EVENT] + 100, 1000)
+        m.power[i] += (min(square, 25.0) - m.power[i]) / min(m.counts[SINCE_EVENT] + 100, 1000)
         residual = min(max(e / np.sqrt(variance), -5.0), 5.0) * np.sqrt(r)
         m.noise[i, BLOCK_SUM] += residual
         m.noise[i, BLOCK_POWER] += residual * residual
@@ -117,19 +119,19 @@ def measure(motion: Motion, sensors: Sensors, m: Memory, effort: Array, y: Array
         m.noise[i, WEIGHT] += gain * gain * variance
         absorb_measurement(x, S, f, e, r, variance)
         white_noise(m, i, y[i])
-    m.count[SEEN] = min(m.count[SEEN] + 1, 2000)
+    m.counts[SEEN] = min(m.counts[SEEN] + 1, 2000)
 
 
 @kernel
 def white_noise(m: Memory, i: int, y: float) -> None:
-    """Variance of sensor i's white noise, from fourth differences: motion at the vibrations has next to none."""
+    """Variance of sensor i's white noise, from fourth differences, in which slow motion has no part."""
     recent = m.recent[i]
-    if m.count[SEEN] >= 4:
+    if m.counts[SEEN] >= 4:
         difference = y - 4.0 * recent[0] + 6.0 * recent[1] - 4.0 * recent[2] + recent[3]
         square = difference * difference / 70.0
-        if m.count[SEEN] > 50:
+        if m.counts[SEEN] > 50:
             square = min(square, 16.0 * m.noise[i, WHITE] + 1e-300)
-        m.noise[i, WHITE] += (square - m.noise[i, WHITE]) / (m.count[SEEN] - 3)
+        m.noise[i, WHITE] += (square - m.noise[i, WHITE]) / (m.counts[SEEN] - 3)
     for p in range(3, 0, -1):
         recent[p] = recent[p - 1]
     recent[0] = y
@@ -138,12 +140,12 @@ def white_noise(m: Memory, i: int, y: float) -> None:
 @kernel
 def learn_noise(sensors: Sensors, m: Memory) -> None:
     """At the end of a block: the variance of each sensor, and its slow part when that is not white."""
-    m.count[IN_BLOCK] += 1
-    if m.count[IN_BLOCK] < sensors.block:
+    m.counts[IN_BLOCK] += 1
+    if m.counts[IN_BLOCK] < sensors.block:
         return
-    m.count[IN_BLOCK] = 0
-    m.count[BLOCKS] = min(m.count[BLOCKS] + 1, BLOCK_MEMORY)
-    blocks = m.count[BLOCKS]
+    m.counts[IN_BLOCK] = 0
+    m.counts[BLOCKS] = min(m.counts[BLOCKS] + 1, BLOCK_MEMORY)
+    blocks = m.counts[BLOCKS]
     doubt = 3.0 * np.sqrt(2.0 / blocks)
     for i in range(m.noise.shape[0]):
         row = m.noise[i]
@@ -157,15 +159,15 @@ def learn_noise(sensors: Sensors, m: Memory) -> None:
 
 @kernel
 def judge_payload(sensors: Sensors, m: Memory) -> None:
-    """At the end of a batch: did the payload move as far as its variance allows?"""
-    m.count[IN_BATCH] += 1
-    if m.count[IN_BATCH] < 8 * sensors.block:
+    """At the end of a batch: see whether the payload moved farther than its variance allows."""
+    m.counts[IN_BATCH] += 1
+    if m.counts[IN_BATCH] < 8 * sensors.block:
         return
-    m.count[IN_BATCH] = 0
+    m.counts[IN_BATCH] = 0
     if m.score[VARIANCE] > 0.0:
-        m.count[BATCHES] = min(m.count[BATCHES] + 1, BATCH_MEMORY)
+        m.counts[BATCHES] = min(m.counts[BATCHES] + 1, BATCH_MEMORY)
         square = m.score[MOVE] * m.score[MOVE] / m.score[VARIANCE]
-        m.score[DRIFT] += (square - m.score[DRIFT]) / m.count[BATCHES]
+        m.score[DRIFT] += (square - m.score[DRIFT]) / m.counts[BATCHES]
     m.score[MOVE] = 0.0
     m.score[VARIANCE] = 0.0
 
@@ -181,17 +183,17 @@ def begin_pass(m: Memory) -> None:
             m.xr[i] += m.S0[i, c] * m.xi[c]
             m.Sr[i, c] = m.S0[i, c]
             m.N[i, c] = 0.0
-    m.count[PASSED] = 0
-    m.count[PASSING] = 1
+    m.counts[PASSED] = 0
+    m.counts[PASSING] = 1
 
 
 @kernel
 def pass_sample(motion: Motion, sensors: Sensors, m: Memory) -> bool:
     """Take one kept sample into the refit; False when numbers left the finite range."""
-    sample = m.samples[m.count[PASSED]]
+    sample = m.samples[m.counts[PASSED]]
     n, nx = motion.q.size, m.x.size
     effort, f = sample[1:3], sensors.f
-    if not predict(motion, m.xr, m.Sr, effort, sample[0], m.count[HELD] != 0):
+    if not predict(motion, m.xr, m.Sr, effort, sample[0], m.counts[HELD] != 0):
         return False
     for i in range(m.noise.shape[0]):
         r = m.noise[i, EFFECTIVE]
@@ -205,7 +207,7 @@ def pass_sample(motion: Motion, sensors: Sensors, m: Memory) -> bool:
             m.g[a] += scaled * e
             for b in range(a + 1):
                 m.N[a, b] += scaled * f[b]
-    m.count[PASSED] += 1
+    m.counts[PASSED] += 1
     return True
 
 
@@ -224,7 +226,7 @@ def finish_pass(m: Memory) -> bool:
     for c in range(nx):
         move += m.S0[payload, c] * m.g[c]
     # a step in the logarithm of the payload is not trusted beyond the range of its linearisation
-    limit = 1.0 if m.count[HELD] != 0 else 1e300
+    limit = 1.0 if m.counts[HELD] != 0 else 1e300
     shorten = min(1.0, limit / max(abs(move), 1e-300))
     for c in range(nx):
         m.xi[c] += shorten * m.g[c]
@@ -236,14 +238,14 @@ def finish_pass(m: Memory) -> bool:
         forward(m.N, m.Sr[i])
         for c in range(nx):
             m.S[i, c] = m.Sr[i, c]
-    m.count[PASSING] = 0
+    m.counts[PASSING] = 0
     return True
 
 
 @kernel
 def refit(motion: Motion, sensors: Sensors, m: Memory, duration: float, effort: Array, y: Array) -> bool:
     """Keep a sample and let the refit behind the filter take up to three."""
-    stored = m.count[STORED]
+    stored = m.counts[STORED]
     if stored >= HORIZON:
         return True
     m.samples[stored, 0] = duration
@@ -251,16 +253,16 @@ def refit(motion: Motion, sensors: Sensors, m: Memory, duration: float, effort: 
     m.samples[stored, 2] = effort[1]
     for i in range(y.size):
         m.samples[stored, 3 + i] = y[i]
-    m.count[STORED] = stored + 1
-    if m.count[PASSING] == 0:
+    m.counts[STORED] = stored + 1
+    if m.counts[PASSING] == 0:
         if stored + 1 < FIRST_PASS or 3 * (stored + 1) > 2 * HORIZON:
             return True
         begin_pass(m)
     for _ in range(3):
-        if m.count[PASSED] < m.count[STORED] and not pass_sample(motion, sensors, m):
+        if m.counts[PASSED] < m.counts[STORED] and not pass_sample(motion, sensors, m):
             return False
-    if m.count[PASSED] == m.count[STORED]:
-        m.count[IN_BATCH] = 0
+    if m.counts[PASSED] == m.counts[STORED]:
+        m.counts[IN_BATCH] = 0
         m.score[MOVE] = 0.0
         m.score[VARIANCE] = 0.0
         return finish_pass(m)
@@ -271,14 +273,14 @@ def refit(motion: Motion, sensors: Sensors, m: Memory, duration: float, effort: 
 def diffuse(sensors: Sensors, m: Memory, duration: float) -> None:
     """Add the process noise of a while, so that the memory stays finite."""
     m.score[NOW] += duration
-    m.count[SINCE_NOISE] += 1
-    if m.count[SINCE_NOISE] < NOISE_EVERY or m.count[STORED] < HORIZON:
+    m.counts[SINCE_NOISE] += 1
+    if m.counts[SINCE_NOISE] < NOISE_EVERY or m.counts[STORED] < HORIZON:
         return
     root = np.sqrt(m.score[NOW])
     for i in range(m.x.size):
         sensors.deviation[i] = sensors.diffusion[i] * root
     absorb_noise(m.S, sensors.deviation, sensors.W)
-    m.count[SINCE_NOISE] = 0
+    m.counts[SINCE_NOISE] = 0
     m.score[NOW] = 0.0
 
 
@@ -291,15 +293,16 @@ def advance(
     Returns how many were taken; fewer than N when numbers left the finite range.
     """
     for k in range(Y.shape[0]):
-        if not predict(motion, m.x, m.S, efforts[k], durations[k], m.count[HELD] != 0):
+        if not predict(motion, m.x, m.S, efforts[k], durations[k], m.counts[HELD] != 0):
             return k
         measure(motion, sensors, m, efforts[k], Y[k])
         if not abs(m.x[m.x.size - 5]) < 1e9:
             return k
-        m.count[SINCE_EVENT] += 1
+        m.counts[SINCE_EVENT] += 1
         learn_noise(sensors, m)
         if not refit(motion, sensors, m, durations[k], efforts[k], Y[k]):
             return k
         judge_payload(sensors, m)
         diffuse(sensors, m, durations[k])
-    return Y.shape[0]
+    taken: int = Y.shape[0]
+    return taken

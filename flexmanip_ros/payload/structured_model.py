@@ -60,8 +60,9 @@ def motion(config: IdentifierParameters) -> Motion:
     return Motion(
         arm=arm, work=workspace(nominal.kappa), frozen=config.payload.dynamics == 'linear',
         M0=np.zeros((n, n)), Mp=np.zeros((n, n)), stiffness=nominal.stiffness, damping=unit,
-        scale=lightest, least=-0.5 * lightest, substeps=STEP_ANGLE / fastest, payload=np.zeros(4), a=np.zeros(n),
-        q=np.zeros(n), k=np.zeros((8, n)), dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)),
+        scale=lightest, least=-0.5 * lightest, substeps=STEP_ANGLE / fastest, payload=np.zeros(4),
+        a=np.zeros(n), q=np.zeros(n), k=np.zeros((8, n)), dq=np.zeros((n, n)), dqd=np.zeros((n, n)),
+        dp=np.zeros((n, 4)),
         G=np.zeros((n, PARAMETERS)), X=np.zeros((2 * n, nx)), Y=np.zeros((2 * n, nx)))
 
 
@@ -87,8 +88,8 @@ def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Ar
 def truncated_feedthrough(arm: ArmParameters, kappa: int) -> Array:
     """What the modes beyond kappa add to angles and bends under a held torque, (4, 2) per N m.
 
-    A pinned beam under end moments has exact slopes and deflections; their sine series up to kappa is what the
-    model has already. Zero for the paper's torques, which do not bend, and for chord angles.
+    A pinned beam under end moments has exact slopes and deflections; their sine series up to kappa is what
+    the model has already. Zero for the paper's torques, which do not bend, and for chord angles.
     """
     through = np.zeros((4, 2))
     if arm.torque_convention != 'joint' or not arm.slope_correction:

@@ -6,6 +6,7 @@ import numpy as np
 
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import memory as mem
+from flexmanip_ros.payload.angles import chords
 from flexmanip_ros.payload.motion_kernel import set_parameters
 from flexmanip_ros.payload.signals import Quantity
 from flexmanip_ros.payload.structured_model import Model
@@ -16,7 +17,7 @@ from flexmanip_ros.types import Array
 CERTAIN = 1e-9
 """Standard deviation of what is taken as known."""
 EMPTY_STD = 0.05
-"""Standard deviation of an empty arm's payload over the lightest tip mass: how far an arm is known to be empty."""
+"""Standard deviation of what an empty arm seems to hold, over its lightest tip mass."""
 PAYLOAD_STD = 2.0
 """Standard deviation of the logarithm of an unknown payload."""
 ANGLE_STD, RATE_STD = 0.03, 1.0
@@ -57,7 +58,7 @@ def first(config: IdentifierParameters, model: Model, m: mem.Memory, y: Array) -
         elif role.quantity is Quantity.BEND:
             shape = model.motion.arm.output[2 + role.link, 2 + role.link * k]
             m.x[2 + role.link * k] = y[i] * shape / (shape ** 2 + 0.1)
-    m.x[:2] = chords(config, angles)
+    m.x[:2] = chords(config.arm, angles)
     m.x[2 * n + 3:] = config.arm.damping_ratio
     std = np.zeros(m.x.size)
     std[:2], std[n:n + 2] = ANGLE_STD, RATE_STD
@@ -84,23 +85,16 @@ def freeze(model: Model, q: Array) -> None:
     model.motion.Mp[:] = mass_matrix(nominal, np.array([1.0, 0.0, 0.0, 0.0]), rest) - model.motion.M0
 
 
-def chords(config: IdentifierParameters, angles: Array) -> Array:
-    """Chord angles (2,) from measured ones, root slopes neglected: they are a hundredth and average out."""
-    if config.arm.angle_convention == 'chord':
-        return angles
-    return np.array([angles[0], angles[0] + angles[1]])
-
-
 def widen(S: Array, columns: Array) -> Array:
     """Return a square root of S S' + columns columns'."""
-    root: Array = np.linalg.qr(np.hstack([S, columns]).T, mode='r').T
+    root: Array = np.linalg.qr(np.hstack([S, columns]).T)[1].T
     return root
 
 
 def jump(config: IdentifierParameters, model: Model, m: mem.Memory) -> Array:
-    """Columns (nx, c) of the rate jump at an event: an unknown impulse at the tip, and a part of it unexplained."""
+    """Columns (nx, c) of the rate jump at an event: an impulse at the tip, and what it leaves open."""
     n = model.motion.q.size
-    held = bool(m.count[mem.HELD])
+    held = bool(m.counts[mem.HELD])
     set_parameters(model.motion, m.x, held)
     q = m.x[:n]
     if model.motion.frozen:
@@ -128,6 +122,6 @@ def diffusion(config: IdentifierParameters, model: Model, m: mem.Memory) -> Arra
     # a rate is then forgotten over T: what it gains in T equals what T seconds of samples tell of it
     gained[n:n + 2] = 1e-4 / T
     gained[n + 2:2 * n] = 1e-5 / T * np.array(config.arm.link_length).max()
-    gained[2 * n] = (1e-4 if m.count[mem.HELD] else 1e-3) / T
+    gained[2 * n] = (1e-4 if m.counts[mem.HELD] else 1e-3) / T
     gained[2 * n + 1:] = 1e-4 / T
     return gained

@@ -1,0 +1,102 @@
+"""Interval of a payload read from an identified model: the model's covariance through the extraction.
+
+The standard deviation is of first order. The interval is made of the payloads of models drawn from the
+covariance (a fixed set of normal numbers, so the same model gives the same interval): the extraction bends
+strongly as soon as the payload is uncertain by some ten per cent, and then a symmetric interval misses.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+from flexmanip_ros.errors import ModelError
+from flexmanip_ros.identification.realization import to_continuous
+from flexmanip_ros.identification.uncertainty import Identified
+from flexmanip_ros.payload.modal_basis import to_modal
+from flexmanip_ros.types import Array, Payload, Status
+
+DRAWS = 256
+"""Models drawn for the interval."""
+STEP = 1e-4
+"""Step of the derivatives, in standard deviations."""
+
+
+def unknown(status: Status, consistency: float = 1.0) -> Payload:
+    """Return the payload of which nothing is known."""
+    return Payload(0.0, math.inf, 0.0, math.inf, consistency, status)
+
+
+def payload(
+    identified: Identified, S: Array, rates: tuple[bool, ...], mass_of: Callable[[Array, Array], Array],
+) -> Payload:
+    """Return the payload; S, rates: what the outputs see; mass_of: payload of modal (Ac, Bc)."""
+    model = identified.model
+    power = identified.innovation_power if math.isfinite(identified.innovation_power) else 1.0
+    if not (np.isfinite(model.A).all() and np.isfinite(model.B).all() and np.isfinite(model.C).all()):
+        return unknown(Status.DIVERGED)
+    try:
+        Ac, Bc = to_continuous(model.A, model.B, model.dt)
+        mass = float(mass_of(*to_modal(Ac, Bc, model.C, S, rates)))
+        directions = continuous_spread(identified)
+        around = mass_of(*_modal(Ac, Bc, model.C, [STEP * part for part in directions], S, rates))
+        std = float(np.linalg.norm((around - mass) / STEP))
+        normal = draws(directions[0].shape[0])
+        drawn = mass_of(*_modal(
+            Ac, Bc, model.C, [np.tensordot(normal, part, axes=1) for part in directions], S, rates))
+    except (np.linalg.LinAlgError, ModelError):
+        return unknown(Status.ILL_CONDITIONED, power)
+    if not (math.isfinite(mass) and math.isfinite(std)) or directions[0].shape[0] == 0:
+        return unknown(Status.ILL_CONDITIONED, power)
+    # a fit that is worse than its noise has a wider interval by as much
+    widening = math.sqrt(max(1.0, power))
+    drawn = np.where(np.isfinite(drawn), drawn, np.inf)
+    lower, upper = np.quantile(drawn, [0.025, 0.975], method='nearest')
+    lower = mass - widening * max(mass - lower, 1.96 * std)
+    upper = mass + widening * max(upper - mass, 1.96 * std)
+    return Payload(max(mass, 0.0), widening * std, max(lower, 0.0), max(upper, 0.0), power, identified.status)
+
+
+def continuous_spread(identified: Identified) -> tuple[Array, Array, Array]:
+    """Directions (s, ...) in which Ac, Bc and C vary, one standard deviation each.
+
+    The derivative of the matrix logarithm of [[A, B], [0, I]] by its eigenvectors: an element ij in that
+    basis is divided by the difference quotient of the logarithm at the poles i and j.
+    """
+    model, spread = identified.model, identified.spread
+    n, r, m = model.order, model.B.shape[1], model.C.shape[0]
+    s = spread.shape[1]
+    dA = spread[:n * n].T.reshape(s, n, n)
+    dB = spread[n * n:n * (n + r)].T.reshape(s, n, r)
+    dC = spread[n * (n + r):n * (n + r + m)].T.reshape(s, m, n)
+    joint = np.zeros((n + r, n + r))
+    joint[:n, :n], joint[:n, n:], joint[n:, n:] = model.A, model.B, np.eye(r)
+    poles, V = np.linalg.eig(joint)
+    gap = poles[:, None] - poles[None, :]
+    near = np.abs(gap) < 1e-9
+    quotient = np.where(near, 1.0 / poles[:, None],
+                        (np.log(poles)[:, None] - np.log(poles)[None, :]) / np.where(near, 1.0, gap))
+    change = np.zeros((s, n + r, n + r))
+    change[:, :n, :n], change[:, :n, n:] = dA, dB
+    turned = np.linalg.solve(V, change @ V) * quotient
+    log = np.real(np.linalg.solve(V.T, np.swapaxes(V @ turned, -1, -2)).swapaxes(-1, -2)) / model.dt
+    return log[:, :n, :n], log[:, :n, n:], dC
+
+
+def draws(size: int) -> Array:
+    """Return DRAWS standard normal vectors (DRAWS, size), evenly spread, always the same ones."""
+    if size == 0:
+        return np.zeros((DRAWS, 0))
+    normal: Array = ndtri(qmc.Halton(size, scramble=True, rng=np.random.default_rng(0)).random(DRAWS))
+    return normal
+
+
+def _modal(
+    Ac: Array, Bc: Array, C: Array, change: list[Array], S: Array, rates: tuple[bool, ...],
+) -> tuple[Array, Array]:
+    """Return a stack of models away from (Ac, Bc, C), in the modal basis."""
+    return to_modal(Ac + change[0], Bc + change[1], C + change[2], S, rates)
