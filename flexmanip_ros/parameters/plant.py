@@ -16,8 +16,8 @@ class PlantParameters:
     initial_angles: tuple[float, ...] = parameter(
         (1.0471975511965976, 0.7853981633974483), 'chord angles theta at the start', unit='rad', size=2)
     model: str = parameter(
-        'nonlinear', 'nonlinear: assumed modes; linear: the same at the initial angles (the paper); '
-        'finite_element: Hermite beams at the initial angles',
+        'nonlinear', 'nonlinear: assumed modes; linear: the same at the initial angles, without shortening '
+        'and slope correction (the paper); finite_element: Hermite beams at the initial angles',
         choices=('nonlinear', 'linear', 'finite_element'))
     elements: int = parameter(10, 'finite elements of each link (model finite_element)', low=2, high=60)
     locked: bool = parameter(False, 'hold both joints (encoder angles, or chords) at their initial angles')

@@ -51,6 +51,38 @@ def solve(L: Array, x: Array) -> None:
 
 
 @kernel
+def hold(L: Array, held: Array, qdd: Array, columns: Array) -> None:
+    """Change qdd (n,) by constraint forces so that held qdd = 0.
+
+    held: (m, n) constant rows, m at most 2; L from ``factor``; columns: (2, n) scratch.
+    """
+    rows, n = held.shape
+    a, b, d = 0.0, 0.0, 1.0
+    x, y = 0.0, 0.0
+    for i in range(rows):
+        for c in range(n):
+            columns[i, c] = held[i, c]
+        solve(L, columns[i])
+    for c in range(n):
+        a += held[0, c] * columns[0, c]
+        x += held[0, c] * qdd[c]
+        if rows == 2:
+            b += held[0, c] * columns[1, c]
+            y += held[1, c] * qdd[c]
+    if rows == 2:
+        d = 0.0
+        for c in range(n):
+            d += held[1, c] * columns[1, c]
+    determinant = a * d - b * b
+    first = (d * x - b * y) / determinant
+    second = (a * y - b * x) / determinant
+    for c in range(n):
+        qdd[c] -= first * columns[0, c]
+        if rows == 2:
+            qdd[c] -= second * columns[1, c]
+
+
+@kernel
 def acceleration(
     arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array, qdd: Array, work: Workspace,
 ) -> bool:

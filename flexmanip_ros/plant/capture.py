@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, null_space
 
 from flexmanip_ros.parameters.plant import PlantParameters
 from flexmanip_ros.plant.manipulator import Manipulator
@@ -72,10 +72,14 @@ def body_jacobian(arm: Manipulator, q: Array, com: tuple[float, float]) -> Array
     return J
 
 
-def rates_after(M: Array, J: Array, qd: Array, body: Body) -> Array:
-    """Rates (n,) just after the body is caught; M (n, n) is the mass matrix before."""
+def rates_after(M: Array, J: Array, qd: Array, body: Body, held: Array | None = None) -> Array:
+    """Rates (n,) just after the body is caught; M (n, n) is the mass matrix before.
+
+    held: (m, n) rows of locked joints, whose reaction takes part of the impulse.
+    """
     weight = np.array([body.mass, body.mass, body.inertia])
     slip = np.array([*body.velocity, body.spin]) - J @ qd
     after = M + J.T @ (weight[:, None] * J)
-    jump: Array = cho_solve(cho_factor(after), J.T @ (weight * slip))
+    free = np.eye(qd.size) if held is None or not len(held) else null_space(held)
+    jump: Array = free @ cho_solve(cho_factor(free.T @ after @ free), free.T @ (J.T @ (weight * slip)))
     return qd + jump

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.plant.acceleration_kernel import acceleration
+from flexmanip_ros.plant.acceleration_kernel import acceleration, hold
 from flexmanip_ros.plant.compiled import kernel
 from flexmanip_ros.plant.output_kernel import measure
 
@@ -21,12 +21,12 @@ LIMIT = 1e6
 
 @kernel
 def runge_kutta(
-    arm: Manipulator, payload: Array, x: Array, effort: Array, h: float, steps: int,
+    arm: Manipulator, payload: Array, held: Array, x: Array, effort: Array, h: float, steps: int,
     scratch: Array, work: Workspace,
 ) -> bool:
     """Advance x = [q; qd] (2n,) by steps of h seconds under a held torque; False when it diverged.
 
-    scratch: (5, 2n), rows trial state and the four slopes.
+    held: (0 or 2, n) combinations of q that stay; scratch: (5, 2n), trial state and the four slopes.
     """
     size = x.size
     n = size // 2
@@ -46,6 +46,8 @@ def runge_kutta(
                 slope[r] = trial[n + r]
             if not acceleration(arm, payload, trial[:n], trial[n:], effort, slope[n:], work):
                 return False
+            if held.shape[0]:
+                hold(work.M, held, slope[n:], work.held)
         for r in range(size):
             x[r] += h / 6.0 * (scratch[1, r] + 2.0 * (scratch[2, r] + scratch[3, r]) + scratch[4, r])
             if not abs(x[r]) < LIMIT:
@@ -55,8 +57,9 @@ def runge_kutta(
 
 @kernel
 def run_nonlinear(
-    arm: Manipulator, payload: Array, slopes: Slopes, x: Array, previous: Array, efforts: Array, dt: float,
-    steps: int, position: Array, velocity: Array, scratch: Array, loads: Array, work: Workspace,
+    arm: Manipulator, payload: Array, slopes: Slopes, held: Array, x: Array, previous: Array,
+    efforts: Array, dt: float, steps: int, position: Array, velocity: Array, scratch: Array, loads: Array,
+    work: Workspace,
 ) -> int:
     """Record each sample, then integrate to the next under its torque; return how many samples are good.
 
@@ -66,9 +69,9 @@ def run_nonlinear(
     n = x.size // 2
     count: int = efforts.shape[0]
     for k in range(count):
-        measure(arm, payload, slopes, x[:n], x[n:], previous, position[k], velocity[k],
+        measure(arm, payload, slopes, held, x[:n], x[n:], previous, position[k], velocity[k],
                 scratch[0, :n], loads, work)
-        if not runge_kutta(arm, payload, x, efforts[k], dt / steps, steps, scratch, work):
+        if not runge_kutta(arm, payload, held, x, efforts[k], dt / steps, steps, scratch, work):
             return k
         previous[0] = efforts[k, 0]
         previous[1] = efforts[k, 1]

@@ -95,6 +95,7 @@ class Workspace(NamedTuple):
     left: Array
     right: Array
     parameters: Array
+    held: Array
 
 
 def workspace(kappa: int) -> Workspace:
@@ -104,7 +105,7 @@ def workspace(kappa: int) -> Workspace:
         M=np.zeros((n, n)), E=np.zeros(n), moments=np.zeros((2, 3 + kappa)), stretch=np.zeros((2, kappa)),
         Y=np.zeros((2, kappa, kappa)), Z=np.zeros((2, kappa, kappa, kappa)),
         pairs=np.zeros((2, kappa, kappa)), columns=np.zeros((6, kappa)),
-        left=np.zeros((n, n)), right=np.zeros((n, n)), parameters=np.zeros((n, 4)))
+        left=np.zeros((n, n)), right=np.zeros((n, n)), parameters=np.zeros((n, 4)), held=np.zeros((2, n)))
 
 
 def payload_array(

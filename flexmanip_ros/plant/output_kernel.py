@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.plant.acceleration_kernel import acceleration
+from flexmanip_ros.plant.acceleration_kernel import acceleration, hold
 from flexmanip_ros.plant.compiled import kernel
 from flexmanip_ros.types import Array
 
@@ -28,13 +28,14 @@ class Slopes(NamedTuple):
 
 @kernel
 def measure(
-    arm: Manipulator, payload: Array, slopes: Slopes, q: Array, qd: Array, previous: Array,
+    arm: Manipulator, payload: Array, slopes: Slopes, held: Array, q: Array, qd: Array, previous: Array,
     position: Array, velocity: Array, qdd: Array, loads: Array, work: Workspace,
 ) -> None:
     """Fill position and velocity (4,): joint1, joint2, link1_bend, link2_bend.
 
     previous: torque (2,) of the interval that ends at this instant: at a jump of the torque the
-    truncated modes still show the one before. Scratch: qdd (n,), loads (7,).
+    truncated modes still show the one before; held: see ``integration_kernel``. Scratch: qdd (n,),
+    loads (7,).
     """
     for r in range(4):
         place, rate = 0.0, 0.0
@@ -44,6 +45,8 @@ def measure(
         position[r] = place
         velocity[r] = rate
     if slopes.active and acceleration(arm, payload, q, qd, previous, qdd, work):
+        if held.shape[0]:
+            hold(work.M, held, qdd, work.held)
         end_loads(arm, payload, slopes, q, qdd, previous, loads)
         for r in range(4):
             for c in range(7):

@@ -181,7 +181,7 @@ def _take(config: PlantParameters, state: PlantState, body: Body) -> PlantState:
     n = x.size // 2
     if config.capture_impact == 'momentum' and (body.mass or body.inertia):
         M = state.model.mass_matrix(x, state.payload)
-        x[n:] = rates_after(M, state.model.body_jacobian(x, body.com), x[n:], body)
+        x[n:] = rates_after(M, state.model.body_jacobian(x, body.com), x[n:], body, state.model.held)
     return replace(state, x=x, payload=joined(state.payload, body))
 
 
