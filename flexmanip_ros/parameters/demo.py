@@ -15,8 +15,10 @@ class DemoParameters:
     duration: float = parameter(6.0, 'length of the run', unit='s', low=0.5, high=3600.0)
     rate: float = parameter(1000.0, 'samples a second', unit='Hz', low=100.0, high=10000.0)
     payload_mass: float = parameter(20.0, 'mass of the object', unit='kg', low=0.0, high=1000.0)
-    capture_time: float = parameter(3.0, 'capture after the first sample; negative: never', unit='s', low=-1.0)
-    release_time: float = parameter(-1.0, 'release after the first sample; negative: never', unit='s', low=-1.0)
+    capture_time: float = parameter(
+        3.0, 'capture after the first sample; negative: never', unit='s', low=-1.0)
+    release_time: float = parameter(
+        -1.0, 'release after the first sample; negative: never', unit='s', low=-1.0)
     snr_db: float = parameter(40.0, 'signal-to-noise ratio of every output', unit='dB', low=-20.0, high=200.0)
     seed: int = parameter(1, 'seed of the noise', low=0)
 

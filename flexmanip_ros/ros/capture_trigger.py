@@ -53,8 +53,8 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
 
     def make_entities(self) -> None:
         """Publishers, subscription and services."""
-        self._events = self.publisher(Header, 'capture_event', qos.latched())
-        self._detected = self.publisher(Header, 'capture_detected', qos.latched())
+        self.events_publisher = self.publisher(Header, 'capture_event', qos.latched())
+        self.detected_publisher = self.publisher(Header, 'capture_detected', qos.latched())
         self.subscription(JointState, 'joint_states', self._on_joint_states, qos.sensor_input(), raw=True)
         self.create_service(Trigger, '~/capture', self._on_capture)
         self.create_service(Trigger, '~/release', self._on_release)
@@ -93,7 +93,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
             key=lambda event: event.stamp_ns))
 
     def _announce(self, event: CaptureEvent) -> None:
-        self._events.publish(header(event))
+        self.events_publisher.publish(header(event))
         self.announced.append(event)
         self.get_logger().info(f'{event.kind.value} at {event.stamp_ns * 1e-9:.6f}')
 

@@ -58,6 +58,7 @@ class Meter:
         self._times_ns: list[int] = []
         self._entered_ns = 0
         self._window_ns = time.monotonic_ns()
+        self._worst_p99_us = math.nan
 
     def __enter__(self) -> Meter:
         self._entered_ns = time.perf_counter_ns()
@@ -75,12 +76,19 @@ class Meter:
         times_us = np.array(self._times_ns, dtype=np.float64) * 1e-3
         self._times_ns, self._window_ns = [], now
         some = times_us.size > 0
+        p99_us = float(np.percentile(times_us, 99)) if some else math.nan
+        self._worst_p99_us = float(np.fmax(self._worst_p99_us, p99_us))
         return {
             'rate_hz': times_us.size / seconds,
             'callback_p50_us': float(np.percentile(times_us, 50)) if some else math.nan,
-            'callback_p99_us': float(np.percentile(times_us, 99)) if some else math.nan,
+            'callback_p99_us': p99_us,
             'callback_max_us': float(times_us.max()) if some else math.nan,
         }
+
+    def worst_p99_us(self) -> float:
+        """Return the largest p99 [us] of any window, the present one included."""
+        self.window()
+        return self._worst_p99_us
 
 
 class LossCounter:

@@ -42,7 +42,7 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
 
     def make_entities(self) -> None:
         """Publisher and timer."""
-        self._commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.command())
+        self.commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.command())
         self._message = Float64MultiArray()
         self._grid = SampleGrid(self, self.config.rate)
         self._timer = self.create_timer(1.0 / self.config.rate, self._tick, clock=self._grid.clock)
@@ -80,7 +80,7 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
 
     def _send(self, torque: Array) -> None:
         self._message.data = doubles(torque)
-        self._commands.publish(self._message)
+        self.commands.publish(self._message)
 
     def report(self, report: Report) -> None:
         """Rate and instants that passed without a command."""

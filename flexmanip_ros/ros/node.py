@@ -6,7 +6,8 @@ import inspect
 import math
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -15,13 +16,15 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.subscription import Subscription
 
-from flexmanip_ros.errors import FlexmanipError
+from flexmanip_ros.errors import FlexmanipError, ParameterError
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.diagnostics import ERROR, WARN, Report
 from flexmanip_ros.ros.parameters import NodeParameters
@@ -109,13 +112,14 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
         """Cease to work for good."""
         return self._transition(self._deactivate)
 
-    def autostart(self) -> None:
-        """Configure and activate at once, as a plain ``ros2 run`` expects, unless ``autostart`` is false."""
-        if not self.autostarts:
-            return
-        for transition in (self.trigger_configure, self.trigger_activate):
-            if transition() != TransitionCallbackReturn.SUCCESS:
-                return
+    def autostart(self) -> bool:
+        """Configure and activate at once, as a plain ``ros2 run`` expects, unless ``autostart`` is false.
+
+        Return False, with the reason logged, when the node could not.
+        """
+        return not self.autostarts or all(
+            transition() == TransitionCallbackReturn.SUCCESS
+            for transition in (self.trigger_configure, self.trigger_activate))
 
     def close(self) -> None:
         """Cease to work before the node is destroyed."""
@@ -152,17 +156,20 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
 
     def publisher(self, kind: type[Any], topic: str, profile: QoSProfile) -> Publisher:
         """Create a publisher whose quality of service the user may override."""
-        return self.create_publisher(kind, topic, profile, qos_overriding_options=qos.overridable())
+        with _qos_errors(topic):
+            return self.create_publisher(kind, topic, profile, qos_overriding_options=qos.overridable())
 
     def subscription(self, kind: type[Any], topic: str, callback: Callable[..., None],
                      profile: QoSProfile, *, raw: bool = False) -> Subscription:
         """Create a subscription whose quality of service the user may override; its events are counted."""
-        return self.create_subscription(
-            kind, topic, callback, profile, raw=raw, qos_overriding_options=qos.overridable(),
-            event_callbacks=SubscriptionEventCallbacks(
-                deadline=lambda event: self._count(topic, 'deadline_missed', event.total_count),
-                liveliness=lambda event: self._count(topic, 'publishers_not_alive', event.not_alive_count),
-                incompatible_qos=lambda event: self._incompatible(topic, event)))
+        watch = SubscriptionEventCallbacks(
+            deadline=lambda event: self._count(topic, 'deadline_missed', event.total_count),
+            liveliness=lambda event: self._count(topic, 'publishers_not_alive', event.not_alive_count),
+            incompatible_qos=lambda event: self._incompatible(topic, event))
+        with _qos_errors(topic):
+            return self.create_subscription(
+                kind, topic, callback, profile, raw=raw, qos_overriding_options=qos.overridable(),
+                event_callbacks=watch)
 
     def _count(self, topic: str, what: str, count: int) -> None:
         self.events[f'{topic} {what}'] = count
@@ -194,6 +201,16 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
         if not self.active:
             report.words.insert(0, 'not active')
         self._diagnostics.publish(report.message(self.get_name(), self.get_clock().now().to_msg()))
+
+
+@contextmanager
+def _qos_errors(topic: str) -> Iterator[None]:
+    """Say a quality of service that cannot be as an error of the parameter that asked for it."""
+    try:
+        yield
+    except (RuntimeError, ValueError, InvalidQosOverridesError, ParameterException) as error:
+        raise ParameterError(f"qos_overrides of '{topic}': {error}",
+                             'give a policy that ROS knows, such as reliable or best_effort') from error
 
 
 def with_info(callback: Callable[[Any, Any], None]) -> Callable[..., None]:

@@ -70,6 +70,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
     def start(self) -> None:
         """Take a step, a capture and a release, so that nothing is compiled while the clock runs."""
         state = simulator.init(self.config)
+        self._noise_std = state.noise_std
         state = simulator.attach(self.config, state)
         state, _ = simulator.step(self.config, state, np.zeros(2))
         simulator.release(self.config, state)
@@ -95,7 +96,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
     def _revive(self) -> None:
         """Put the arm at its start from the next stamp on: stamps never go back."""
         self._alive_ns = self._stamp(self.samples)
-        self.state = simulator.init(self.config, self._alive_ns)
+        self.state = simulator.init(self.config, self._alive_ns, self._noise_std)
         self._pending, self._fault, self.efforts = (), '', np.zeros(2)
 
     def _stamp(self, index: int) -> int:
@@ -118,7 +119,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
     def _step(self) -> None:
         assert self.state is not None
         try:
-            self._apply_events(self._stamp(self.samples))
+            self._apply_events(simulator.stamp(self.config, self.state))
             self.state, record = simulator.step(self.config, self.state, self.efforts)
         except FlexmanipError as error:
             self._fault = str(error)

@@ -49,7 +49,7 @@ class Recorder(Node):
         self.last_ns = 0
         self.joint_states = 0
         self.events: list[CaptureEvent] = []
-        self.heard: dict[str, Value] = {}
+        self.said: dict[str, list[messages.Value]] = {}
         self.losses = LossCounter()
         self._reader = JointStateReader()
         self._log_ns = 0
@@ -86,7 +86,8 @@ class Recorder(Node):
         value = convert(message)
         if isinstance(value, CaptureEvent):
             self.events.append(value)
-        self.heard[topic] = value
+        if topic.startswith(IDENTIFIER) and isinstance(value, messages.Value):
+            self.said.setdefault(topic.rpartition('/')[2], []).append(value)
         self._write('/' + topic.lstrip('/'), value, latched=latched)
 
     def _write(self, topic: str, value: Value, *, latched: bool) -> None:

@@ -54,13 +54,13 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self.state = pipeline.init()
         self.estimate: Estimate | None = None
         self.refused = 0
-        self._losses = LossCounter()
-        self._meter = Meter()
+        self.losses = LossCounter()
+        self.meter = Meter()
         self._reader = JointStateReader()
 
     def make_entities(self) -> None:
         """Publishers, subscriptions and the reset service."""
-        self._outputs = {
+        self.outputs = {
             name: self.publisher(kind, f'~/{name}', profile()) for name, kind, profile in _TOPICS}
         self._joint_states = self.subscription(
             JointState, 'joint_states', with_info(self._on_joint_states), qos.sensor_input(), raw=True)
@@ -80,8 +80,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
     def _on_joint_states(self, raw: bytes, info: object) -> None:
         if not self.active:
             return
-        with self._meter:
-            self._losses.note(sequence_number(info))
+        with self.meter:
+            self.losses.note(sequence_number(info))
             self._take(self._reader(raw))
 
     def _on_event(self, topic: str, message: Header) -> None:
@@ -109,7 +109,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         for estimate in estimates:
             self.estimate = estimate
             for name, value in messages.outgoing(estimate, self.config.payload_frame):
-                self._outputs[name].publish(to_message(value))
+                self.outputs[name].publish(to_message(value))
 
     def _refuse(self, reason: str, words: str) -> None:
         self.refused += 1
@@ -123,9 +123,9 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
     def report(self, report: Report) -> None:
         """Rate, losses, drops by reason, and what the latest estimate is worth."""
         values, counters = report.values, self.state.counters
-        values.update(self._meter.window())
+        values.update(self.meter.window())
         several = self.count_publishers(self._joint_states.topic_name) > 1
-        values['lost'] = 'unknown (several publishers)' if several else self._losses.lost
+        values['lost'] = 'unknown (several publishers)' if several else self.losses.lost
         values.update(counters._asdict())
         values['dropped'] = counters.dropped
         values['refused'] = self.refused
@@ -139,8 +139,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             report.worse(ERROR, f'{self.refused} messages refused')
         if counters.dropped:
             report.worse(WARN, f'{counters.dropped} messages dropped')
-        if not several and self._losses.lost:
-            report.worse(WARN, f'{self._losses.lost} messages lost')
+        if not several and self.losses.lost:
+            report.worse(WARN, f'{self.losses.lost} messages lost')
         self._report_estimate(report)
 
     def _report_estimate(self, report: Report) -> None:

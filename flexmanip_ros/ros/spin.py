@@ -35,11 +35,16 @@ def make_executor(context: Context | None = None) -> Executor:
 
 
 class Interrupt:
-    """SIGINT and SIGTERM as a flag while spinning, as an exit before that."""
+    """SIGINT and SIGTERM as a flag while spinning, as an exit before that.
 
-    def __init__(self) -> None:
+    exit_with_signal: end with 128 + the signal's number, as a program that did not finish its work.
+    """
+
+    def __init__(self, *, exit_with_signal: bool = False) -> None:
         self.raised = False
         self.spinning = False
+        self.exit_code = 0
+        self._exit_with_signal = exit_with_signal
 
     def install(self) -> None:
         """Take both signals; again after an executor was made, which takes them for itself."""
@@ -48,8 +53,9 @@ class Interrupt:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.raised = True
+        self.exit_code = 128 + number if self._exit_with_signal else 0
         if not self.spinning:
-            raise SystemExit(0)
+            raise SystemExit(self.exit_code)
 
 
 def spin(executor: Executor, context: Context | None, interrupt: Interrupt,
@@ -75,8 +81,8 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
     arguments = list(sys.argv if argv is None else argv)
     interrupt = Interrupt()
     interrupt.install()
-    parser(name, about, cls).parse_args(remove_ros_args(arguments)[1:])
     try:
+        parser(name, about, cls).parse_args(remove_ros_args(arguments)[1:])
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rcl raises types of its C extension for --ros-args and parameter files
         return refuse(name, first_line(error))
@@ -85,14 +91,12 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
     except (FlexmanipError, ParameterException) as error:
         rclpy.try_shutdown()
         return refuse(name, str(error))
-    except RuntimeError as error:  # a QoS override that rclpy does not know
-        rclpy.try_shutdown()
-        return refuse(name, first_line(error))
     executor = make_executor()
     interrupt.install()
     try:
         executor.add_node(node)
-        node.autostart()
+        if not node.autostart():
+            return BAD_INPUT  # the node has said why
         spin(executor, None, interrupt)
     finally:
         node.close()

@@ -1,0 +1,161 @@
+"""All nodes of the demonstration in one process, on one executor, over DDS."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rclpy.context import Context
+from rclpy.executors import Executor
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from flexmanip_ros.errors import FlexmanipError
+from flexmanip_ros.parameters.demo import DemoParameters
+from flexmanip_ros.ros.capture_trigger import CaptureTrigger
+from flexmanip_ros.ros.demo_result import Facts
+from flexmanip_ros.ros.excitation import Excitation
+from flexmanip_ros.ros.node import FlexmanipNode
+from flexmanip_ros.ros.plant_simulator import PlantSimulator
+from flexmanip_ros.ros.recorder import Recorder
+from flexmanip_ros.ros.rpbsid_identifier import RpbsidIdentifier
+from flexmanip_ros.ros.spin import make_executor
+
+READERS = 3
+"""Who reads joint_states here: identifier, trigger, recorder."""
+DISCOVERY_TIMEOUT = 20.0
+
+
+class CompositionError(FlexmanipError):
+    """The nodes cannot work together as they should."""
+
+
+class Composition:
+    """Plant, excitation, trigger, identifier and recorder; made, started, and ended as one."""
+
+    def __init__(self, config: DemoParameters, bag: Path, context: Context | None = None) -> None:
+        """Create every node and open the bag; nothing runs yet."""
+        self.config = config
+        self._nodes: list[Node] = []
+        self._started = 0.0
+        self.executor: Executor = make_executor(context)
+        try:
+            quiet = {'autostart': False}
+            self.plant = self._add(PlantSimulator(context=context, overrides=_parameters(
+                **quiet, rate=config.rate, payload_mass=config.payload_mass, snr_db=config.snr_db,
+                seed=config.seed)))
+            self.excitation = self._add(Excitation(context=context, overrides=_parameters(
+                **quiet, rate=config.rate)))
+            self.trigger = self._add(CaptureTrigger(context=context, overrides=_parameters(
+                **quiet, mode='time', capture_time=config.capture_time, release_time=config.release_time)))
+            self.identifier = self._add(RpbsidIdentifier(context=context, overrides=_parameters(**quiet)))
+            self.recorder = Recorder(bag, context=context)
+            self._nodes.append(self.recorder)
+            self.executor.add_node(self.recorder)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def managed(self) -> tuple[FlexmanipNode[Any], ...]:
+        """The nodes with a managed life, in the order in which they start."""
+        return self.identifier, self.trigger, self.excitation, self.plant
+
+    def _add(self, node: Any) -> Any:
+        self._nodes.append(node)
+        self.executor.add_node(node)
+        return node
+
+    def configure(self) -> None:
+        """Build states and compile kernels: the slow part, before any clock runs."""
+        for node in self.managed:
+            if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
+                raise CompositionError(f'{node.get_name()} could not be configured', 'see its log above')
+
+    def connect(self, interrupted: Callable[[], bool]) -> None:
+        """Wait until every reader is matched with its writer, and make sure that nobody else is there."""
+        limit = time.monotonic() + DISCOVERY_TIMEOUT
+        while not self._matched():
+            if interrupted():
+                return
+            if time.monotonic() > limit:
+                raise CompositionError(
+                    f'the nodes did not find each other within {DISCOVERY_TIMEOUT:.0f} s',
+                    'unset ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS')
+            self.executor.spin_once(timeout_sec=0.05)
+        if foreign_arm(self.recorder, own_writers=1, own_readers=2):
+            raise CompositionError('another arm or controller is on these topics',
+                                   'run again, or set ROS_DOMAIN_ID to a free number')
+
+    def _matched(self) -> bool:
+        commands, events = self.excitation.commands, self.trigger.events_publisher
+        outputs = self.identifier.outputs.values()
+        return (self.plant.joint_states.get_subscription_count() >= READERS
+                and commands.get_subscription_count() >= 2 and events.get_subscription_count() >= 3
+                and all(item.get_subscription_count() >= 1 for item in outputs))
+
+    def start(self) -> None:
+        """Begin: who listens first, the plant's clock last."""
+        gc.collect()
+        self._started = time.monotonic()
+        gc.freeze()  # what lives from here on is not looked through again while the clock runs
+        for node in self.managed:
+            node.trigger_activate()
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds of the run that are recorded."""
+        recorder = self.recorder
+        return 0.0 if recorder.first_ns is None else (recorder.last_ns - recorder.first_ns) * 1e-9
+
+    @property
+    def finished(self) -> bool:
+        """Whether the last sample of the run was recorded."""
+        return self.recorder.joint_states >= round(self.config.duration * self.config.rate)
+
+    def drain(self) -> None:
+        """Stop the plant and let everybody take what is still on the way."""
+        self.plant.trigger_deactivate()
+        self.excitation.trigger_deactivate()
+        limit = time.monotonic() + 2.0
+        while time.monotonic() < limit:
+            self.executor.spin_once(timeout_sec=0.02)
+            sent = self.plant.samples
+            if (self.recorder.joint_states >= sent and self.identifier.state.counters.received >= sent
+                    and time.monotonic() > limit - 1.8):
+                return
+
+    def facts(self) -> Facts:
+        """Return what the run came to."""
+        identifier, recorder = self.identifier, self.recorder
+        return Facts(
+            identifier.config, self.plant.config, self.elapsed, time.monotonic() - self._started,
+            recorder.joint_states, recorder.losses.lost + identifier.losses.lost,
+            identifier.meter.worst_p99_us(),
+            recorder.said,
+            str(recorder.failure) if recorder.failure is not None else '')
+
+    def close(self) -> None:
+        """Finish the bag, stop and destroy every node. May be called at any moment, and again."""
+        for node in self._nodes:
+            if isinstance(node, (FlexmanipNode, Recorder)):
+                node.close()
+        self.executor.shutdown()
+        for node in self._nodes:
+            node.destroy_node()
+        self._nodes = []
+
+
+def foreign_arm(node: Node, own_writers: int, own_readers: int) -> bool:
+    """Tell whether somebody else publishes joint states or listens to efforts on this domain."""
+    return bool(node.count_publishers('joint_states') > own_writers
+                or node.count_subscribers('effort_controller/commands') > own_readers
+                or node.count_publishers('effort_controller/commands') > own_writers)
+
+
+def _parameters(**values: Any) -> list[Parameter]:
+    return [Parameter(name, value=value) for name, value in values.items()]

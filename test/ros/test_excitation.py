@@ -1,0 +1,45 @@
+from __future__ import annotations
+
+import numpy as np
+from rclpy.parameter import Parameter
+from ros_harness import Ros, overrides
+from std_msgs.msg import Float64MultiArray
+
+from flexmanip_ros.plant.excitation import torque
+from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.excitation import Excitation
+
+
+def test_torques_follow_the_clock_and_end_at_zero(ros: Ros) -> None:
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands', qos.sensor_output())
+    node = ros.add(Excitation(context=ros.context, overrides=overrides(rate=200.0, period=[0.1, 0.05])))
+    node.trigger_configure()
+    ros.wait(lambda: node.commands.get_subscription_count() == 1)
+    node.trigger_activate()
+    ros.wait(lambda: len(heard) >= 60)
+    node.trigger_deactivate()
+    ros.wait(lambda: heard[-1].data.tolist() == [0.0, 0.0], what='zero torque at the end')
+    expected = [torque(node.config, k) for k in range(node._last + 1)]
+    said = [np.array(message.data) for message in heard[:-1]]
+    steps = iter(expected)  # instants may be skipped on a busy machine, never reordered
+    assert all(any((one == other).all() for other in steps) for one in said)
+    assert len(said) + node.skipped == len(expected)
+
+
+def test_amplitude_and_offset_change_while_it_runs(ros: Ros) -> None:
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
+    node = ros.managed(Excitation(context=ros.context, overrides=overrides(rate=200.0)))
+    ros.wait(lambda: len(heard) > 3)
+    assert set(np.abs(heard[-1].data)) == {10.0, 5.0}
+    (result,) = node.set_parameters([Parameter('amplitude', value=[1.0, 2.0])])
+    assert result.successful
+    ros.wait(lambda: set(np.abs(heard[-1].data)) == {1.0, 2.0})
+
+
+def test_nothing_is_sent_before_it_is_active(ros: Ros) -> None:
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
+    node = ros.add(Excitation(context=ros.context, overrides=overrides(rate=500.0)))
+    node.trigger_configure()
+    ros.wait(lambda: node.commands.get_subscription_count() == 1)
+    node._tick()
+    assert heard == []
