@@ -15,10 +15,11 @@ Item = JointRecord | CaptureEvent
 
 def inject(items: Iterable[Item], faults: Faults, rng: np.random.Generator) -> list[Item]:
     """Return the messages with the faults of a scenario; events are delayed, never lost."""
-    records = [item for item in items if isinstance(item, JointRecord)]
-    events = [item for item in items if isinstance(item, CaptureEvent)]
+    given = list(items)
+    records = [item for item in given if isinstance(item, JointRecord)]
+    events = [item for item in given if isinstance(item, CaptureEvent)]
     if not records:
-        return list(items)
+        return given
     start = records[0].stamp_ns
     begin, end = (start + round(edge * 1e9) for edge in faults.gap)
     arriving: list[tuple[int, Item]] = []

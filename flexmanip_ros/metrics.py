@@ -54,7 +54,10 @@ def coverage(hits: int, runs: int, confidence: float = 0.95) -> tuple[float, flo
 
 def score(rows: Sequence[Mapping[str, Any]]) -> Score:
     """Sum up the rows of one estimator."""
-    good = [row for row in rows if not row.get('error') and _number(row, 'payload_mass_kg') is not None]
+    good = [row for row in rows if not row.get('error')]
+    failed, runs = len(rows) - len(good), len(rows)
+    needed = ('payload_mass_kg', 'payload_true_kg')
+    good = [row for row in good if all(_number(row, name) is not None for name in needed)]
     errors = np.array([row['payload_mass_kg'] - row['payload_true_kg'] for row in good], dtype=np.float64)
     truths = np.array([row['payload_true_kg'] for row in good], dtype=np.float64)
     window = np.array([_number(row, 'error_percent', math.nan) for row in good], dtype=np.float64)
@@ -66,7 +69,7 @@ def score(rows: Sequence[Mapping[str, Any]]) -> Score:
     share, low, high = coverage(hits, len(good))
     costs = [row['us_per_sample'] for row in good if _number(row, 'us_per_sample') is not None]
     return Score(
-        runs=len(rows), failed=len(rows) - len(good), mean_error_percent=_mean(window),
+        runs=runs, failed=failed, mean_error_percent=_mean(window),
         median_error_percent=float(np.median(window)) if window.size else math.nan,
         rms_error_percent=math.sqrt(_mean(relative**2)) if relative.size else math.nan,
         bias_kg=_mean(errors), coverage_percent=share, coverage_low=low, coverage_high=high,

@@ -77,7 +77,8 @@ def measure(config: IdentifierParameters, items: Sequence[JointRecord | CaptureE
     wall = time.perf_counter() - started
     last = pipeline.current(state)
     row: Row = summarize(state, last, wall).as_json()
-    low, high = row.pop('payload_ci95_kg') or (None, None)
+    interval: tuple[float | None, float | None] = row.pop('payload_ci95_kg') or (None, None)
+    low, high = interval
     for name in ('vaf_simulation_percent', 'vaf_prediction_percent', 'wall_s'):
         row.pop(name)
     for kind in ('frequencies_hz', 'damping_ratios'):
@@ -89,7 +90,7 @@ def measure(config: IdentifierParameters, items: Sequence[JointRecord | CaptureE
         row['release_time_s'] is None or row['release_time_s'] < row['capture_time_s'])
     true = None if true_kg is None else (true_kg if held else 0.0)
     row['payload_true_kg'] = true
-    row['covered'] = None if true is None or low is None or high is None else low <= true <= high
+    row['covered'] = None if true is None or low is None or high is None else bool(low <= true <= high)
     row['error_percent'] = None if true is None else _window_error(state, estimates, true, window)
     return row
 

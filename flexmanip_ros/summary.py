@@ -60,11 +60,11 @@ def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -
 def event_time(state: pipeline.State, kind: EventKind) -> float | None:
     """Return when the latest event of a kind was, from the first sample's stamp [s]."""
     stamp = state.stamp_of(kind)
-    return None if stamp is None else (stamp - state.first_ns) * 1e-9
+    return None if stamp is None else (stamp - state.first_ns) / 1e9
 
 
 def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+    return float(value) if math.isfinite(value) else None
 
 
 def _json(value: Any) -> Any:

@@ -47,7 +47,8 @@ _Loader.add_implicit_resolver(
     'tag:yaml.org,2002:float', re.compile(r'^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$'), list('-+.0123456789'))
 
 
-def _load(text: str, what: str) -> Any:
+def parse(text: str, what: str) -> Any:
+    """Return a YAML document as plain values. Raises ParameterError naming ``what`` and the line."""
     try:
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as err:
@@ -74,7 +75,7 @@ def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, An
     except (OSError, ValueError) as err:
         reason = getattr(err, 'strerror', None) or 'it is not UTF-8 text'
         raise ParameterError(f'{where} cannot be read: {reason}', 'give a readable YAML file') from err
-    document = _load(text, where)
+    document = parse(text, where)
     if document is None:
         return {}
     sections = dict(_sections(document, '', where))
@@ -132,7 +133,7 @@ def parse_overrides(items: Iterable[str]) -> dict[str, Any]:
         name, equals, text = item.partition('=')
         if not equals or not name.strip():
             raise ParameterError(f"--set got '{item}'", 'write name=value, for example --set order=4')
-        values[name.strip()] = _load(text, f'the value of --set {name.strip()}')
+        values[name.strip()] = parse(text, f'the value of --set {name.strip()}')
     return values
 
 

@@ -1,0 +1,151 @@
+"""monte_carlo: many runs of a scenario, or many recordings; one row a run, resumable."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from flexmanip_ros.cli import console, tasks, workers
+from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.io.journal import Journal
+from flexmanip_ros.io.parameter_file import load, parse, parse_overrides
+from flexmanip_ros.metrics import score
+from flexmanip_ros.parameters import IdentifierParameters, flatten
+from flexmanip_ros.scenario import Scenario, scenario
+from flexmanip_ros.study import Row
+
+PROG = 'monte_carlo'
+EXAMPLES = """examples:
+  monte_carlo config/scenarios/capture.yaml --runs 100 --output capture.csv
+  monte_carlo recordings/ --params my_arm.yaml --output recordings.parquet
+  monte_carlo config/scenarios/capture.yaml --runs 100000 --scheduler tcp://head:8786 --output capture.parquet
+
+An interrupted study continues when the same command is given again; more --runs add to what is there.
+A run that fails is a row with its error. NAME.truth.json beside a recording tells the true payload.
+exit status: 0 on success, 2 on bad arguments, 130 when interrupted.
+"""
+
+
+def _parser() -> console.Parser:
+    made = console.parser(
+        PROG, 'Repeat a scenario over many seeds, or identify a folder of recordings.', EXAMPLES)
+    add = made.add_argument
+    add('source', metavar='SCENARIO.yaml|FOLDER', help='what to repeat, or where the recordings are')
+    add('--runs', type=int, default=100, metavar='N',
+        help='seeds FIRST .. FIRST+N-1 of the scenario (default 100)')
+    add('--first-seed', type=int, default=0, metavar='FIRST', help='default: 0')
+    add('--output', default='study.csv', metavar='TABLE', help='.csv or .parquet (default study.csv)')
+    add('--workers', type=int, metavar='N', help='processes; default: one a core; 0: this one only')
+    add('--scheduler', metavar='ADDRESS', help='send the runs to this Dask cluster instead')
+    add('--params', metavar='FILE.yaml', help='parameter file of the identifier, for recordings')
+    add('--set', metavar='name=value', action='append', default=[],
+        help='parameter of the identifier, over whatever the scenario or file says')
+    return made
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; return its exit status."""
+    given = _parser().parse_args(arguments)
+    return console.run(PROG, lambda: _main(given))
+
+
+def _main(given: argparse.Namespace) -> int:
+    todo, identity = _plan(given)
+    interrupted = False
+    with Journal(given.output, identity) as journal:
+        done = {row[tasks.KEY] for row in journal.rows}
+        left = [task for task in todo if task.key not in done]
+        if done:
+            print(f'continuing: {len(todo) - len(left)} of {len(todo)} runs are there', file=sys.stderr)
+        try:
+            with console.progress('running', 'runs') as progress:
+                for count, outcome in enumerate(_compute(given, left), start=1):
+                    journal.add(outcome.result if outcome.error is None
+                                else tasks.failed(outcome.task, outcome.error))
+                    progress(len(todo) - len(left) + count, len(todo))
+        except KeyboardInterrupt:
+            interrupted = True
+        journal.finish(('estimator', 'seed', tasks.KEY))
+    for line in describe(journal.rows):
+        print(line)
+    print(f"wrote '{given.output}' ({len(journal.rows)} rows)")
+    if interrupted:
+        console.complain(PROG, 'interrupted; the same command continues where this one stopped')
+        return console.INTERRUPTED
+    return console.SUCCESS
+
+
+def _plan(given: argparse.Namespace) -> tuple[Sequence[tasks.Task], dict[str, Any]]:
+    """Return the runs asked for, and what identifies the study in its journal."""
+    source = Path(given.source)
+    if source.is_dir():
+        config = load(IdentifierParameters, 'rpbsid_identifier', given.params, given.set)
+        found = tasks.recordings(source)
+        if not found:
+            raise ParameterError(f"folder '{source}' holds no recording",
+                                 'give a folder of rosbag2 recordings')
+        return ([tasks.Recorded(str(path), config, (0.0, float('inf'))) for path in found],
+                {'recordings': str(source), 'parameters': _digest(flatten(config))})
+    if given.runs < 1:
+        raise ParameterError(f'--runs is {given.runs}', 'give at least 1')
+    if given.params is not None:
+        raise ParameterError('--params is for recordings', 'put the parameters into the scenario file')
+    study = read_scenario(source, given.set)
+    return ([tasks.Simulated(study, given.first_seed + k) for k in range(given.runs)],
+            {'scenario': study.name, 'parameters': _digest(asdict(study))})
+
+
+def read_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
+    """Return the scenario in a YAML file, with overrides of the identifier's parameters."""
+    try:
+        text = path.read_text(encoding='utf-8')
+    except (OSError, ValueError) as err:
+        reason = getattr(err, 'strerror', None) or 'it is not UTF-8 text'
+        raise ParameterError(f"scenario '{path}' cannot be read: {reason}", 'check the path') from err
+    try:
+        made = scenario(parse(text, 'the file'))
+        if overrides:
+            values = parse_overrides(overrides)
+            made = replace(made, estimators={
+                name: {**given, **values} for name, given in made.estimators.items()})
+    except ParameterError as err:
+        raise ParameterError(f"scenario '{path}': {err.problem}", err.remedy) from err
+    return made
+
+
+def _digest(values: Any) -> str:
+    text = json.dumps(values, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode('utf-8')).hexdigest()[:16]
+
+
+def _compute(given: argparse.Namespace, todo: Sequence[tasks.Task]) -> Iterator[workers.Outcome]:
+    if given.scheduler is not None:
+        return workers.cluster(tasks.work, todo, given.scheduler)
+    count = given.workers if given.workers is not None else len(os.sched_getaffinity(0))
+    if count < 0:
+        raise ParameterError(f'--workers is {count}', 'give 0 or more')
+    return workers.processes(tasks.work, todo, count) if count else workers.serial(tasks.work, todo)
+
+
+def describe(rows: Sequence[Row]) -> list[str]:
+    """Return the scores of each estimator as lines for people."""
+    lines = [f'{"estimator":24s} {"runs":>6s} {"failed":>6s} {"mean err %":>10s} {"median %":>9s} '
+             f'{"rms %":>8s} {"bias kg":>9s} {"95 % interval holds":>22s} {"us/sample":>9s}']
+    for name in sorted({str(row.get('estimator', '')) for row in rows}):
+        made = score([row for row in rows if str(row.get('estimator', '')) == name])
+        held = f'{made.coverage_percent:.1f} % ({made.coverage_low:.1f}..{made.coverage_high:.1f})'
+        lines.append(f'{name:24s} {made.runs:6d} {made.failed:6d} {made.mean_error_percent:10.4g} '
+                     f'{made.median_error_percent:9.4g} {made.rms_error_percent:8.4g} {made.bias_kg:9.3g} '
+                     f'{held:>22s} {made.us_per_sample:9.1f}')
+    return lines
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,136 @@
+"""Where the runs of a study are computed: this process, this machine's cores, or a Dask cluster."""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, NamedTuple
+
+from flexmanip_ros.errors import FlexmanipError
+
+THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
+AHEAD = 4
+"""Runs handed out for each worker, so that none waits."""
+ANSWER_TIME = 10.0
+"""Seconds after which a scheduler that says nothing is taken not to be there."""
+ATTEMPTS = 2
+"""A run during which the worker died is tried once more, alone; then its death is its error."""
+
+Task = Any
+Work = Callable[[Task], Any]
+
+
+class Outcome(NamedTuple):
+    """A task with its result, or with the error that came instead."""
+
+    task: Task
+    result: Any
+    error: BaseException | None
+
+
+def serial(work: Work, tasks: Iterable[Task]) -> Iterator[Outcome]:
+    """Compute here, one after the other."""
+    for task in tasks:
+        try:
+            result = work(task)
+        except Exception as error:  # a failed run is a result
+            yield Outcome(task, None, error)
+        else:
+            yield Outcome(task, result, None)
+
+
+def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome]:
+    """Compute in ``count`` processes of this machine. Outcomes come as they are ready.
+
+    A worker that dies (killed, out of memory) costs at most the run that killed it.
+    """
+    for name in THREADS:
+        os.environ.setdefault(name, '1')  # one run a core; more threads would only get in each other's way
+    waiting = iter(tasks)
+    again: list[tuple[Task, int]] = []
+    while True:
+        pool = ProcessPoolExecutor(count, multiprocessing.get_context('spawn'), _leave_interrupts)
+        running: dict[Future[Any], tuple[Task, int]] = {}
+        try:
+            if again:  # alone, so that it is known which one kills
+                task, attempt = again.pop()
+                running[pool.submit(work, task)] = (task, attempt)
+            else:
+                _fill(pool, work, waiting, running, count * AHEAD)
+            if not running:
+                return
+            alone = len(running) == 1 and next(iter(running.values()))[1] > 0
+            while running:
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    task, attempt = running.pop(future)
+                    error = future.exception()
+                    if not isinstance(error, BrokenProcessPool):
+                        yield Outcome(task, None if error else future.result(), error)
+                    elif attempt + 1 < ATTEMPTS:
+                        again.append((task, attempt + 1))
+                    else:
+                        yield Outcome(task, None, FlexmanipError(
+                            'the worker died in this run', 'run it alone with --workers 0 to see why'))
+                if not alone and not again:
+                    _fill(pool, work, waiting, running, count * AHEAD)
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _leave_interrupts() -> None:
+    """Ctrl-C reaches every process of a terminal; only the one that collects answers it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _fill(pool: ProcessPoolExecutor, work: Work, waiting: Iterator[Task],
+          running: dict[Future[Any], tuple[Task, int]], most: int) -> None:
+    try:
+        while len(running) < most:
+            task = next(waiting)
+            running[pool.submit(work, task)] = (task, 0)
+    except StopIteration:
+        return
+    except BrokenProcessPool:  # the task that could not be handed out is tried with the others
+        broken: Future[Any] = Future()
+        broken.set_exception(BrokenProcessPool())
+        running[broken] = (task, 0)
+
+
+def cluster(work: Work, tasks: Iterable[Task], address: str) -> Iterator[Outcome]:
+    """Compute on an existing Dask cluster. The workers need this package installed."""
+    try:
+        dask = importlib.import_module('dask.distributed')
+    except ImportError as err:
+        raise FlexmanipError('--scheduler needs dask.distributed, which is not installed',
+                             "run 'pip install distributed', or leave --scheduler away") from err
+    try:
+        client = dask.Client(address, timeout=ANSWER_TIME)
+    except (OSError, ValueError) as err:
+        raise FlexmanipError(f"no Dask scheduler answers at '{address}'",
+                             'start one with: dask scheduler, and workers with: dask worker ADDRESS') from err
+    with client:
+        waiting = iter(tasks)
+        cores = max(sum(client.nthreads().values()), 1)
+        running: dict[Any, Task] = {}
+        ready = dask.as_completed()
+
+        def hand_out() -> None:
+            for task in waiting:
+                future = client.submit(work, task, pure=False, retries=1)
+                running[future] = task
+                ready.add(future)
+                if len(running) >= cores * AHEAD:
+                    return
+
+        hand_out()
+        for future in ready:
+            task = running.pop(future)
+            error = future.exception()
+            yield Outcome(task, None if error else future.result(), error)
+            future.release()
+            hand_out()

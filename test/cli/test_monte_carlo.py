@@ -1,0 +1,208 @@
+"""The program monte_carlo: resumable, and a failed run is a row."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from flexmanip_ros.cli import tasks, workers
+from flexmanip_ros.cli.monte_carlo import main
+from flexmanip_ros.io.bag_writer import BagWriter
+from flexmanip_ros.types import JointRecord
+
+SCENARIO = """
+name: quick
+duration: 0.2
+capture_time: 0.1
+window: [0.15, 0.2]
+identifier: {payload_method: none}
+vary:
+  plant.payload_mass: {uniform: [12.0, 100.0]}
+"""
+
+
+@pytest.fixture
+def scenario_file(tmp_path):
+    path = tmp_path / 'quick.yaml'
+    path.write_text(SCENARIO, encoding='utf-8')
+    return path
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding='utf-8') as file:
+        return list(csv.DictReader(file))
+
+
+def _run(*arguments: object) -> int:
+    return main([str(argument) for argument in arguments])
+
+
+def _without_cost(rows: list[dict[str, str]]) -> list[dict[str, str]]:
+    return [{name: value for name, value in row.items() if name != 'us_per_sample'} for row in rows]
+
+
+def test_one_row_a_run_and_the_same_bits_for_the_same_seed(scenario_file, tmp_path):
+    for name in ('a.csv', 'b.csv'):
+        assert _run(scenario_file, '--runs', 3, '--workers', 0, '--output', tmp_path / name) == 0
+    first, second = _rows(tmp_path / 'a.csv'), _rows(tmp_path / 'b.csv')
+    assert [row['seed'] for row in first] == ['0', '1', '2']
+    assert len({row['plant.payload_mass'] for row in first}) == 3
+    assert _without_cost(first) == _without_cost(second)
+
+
+def test_a_study_continues_where_a_kill_left_it(scenario_file, tmp_path, capsys):
+    out = tmp_path / 'out.csv'
+    assert _run(scenario_file, '--runs', 2, '--workers', 0, '--output', out) == 0
+    journal = tmp_path / 'out.csv.journal'
+    content = journal.read_bytes()
+    journal.write_bytes(content[:-30])  # a kill in the middle of the second row
+    out.unlink()
+    assert _run(scenario_file, '--runs', 3, '--workers', 0, '--output', out) == 0
+    assert 'continuing: 1 of 3' in capsys.readouterr().err
+    assert [row['seed'] for row in _rows(out)] == ['0', '1', '2']
+
+
+def test_a_finished_study_is_not_done_again(scenario_file, tmp_path):
+    out = tmp_path / 'out.csv'
+    for _ in range(2):
+        assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
+    assert len(_rows(out)) == 1
+
+
+def test_another_study_does_not_overwrite_this_one(scenario_file, tmp_path, capsys):
+    out = tmp_path / 'out.csv'
+    assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
+    scenario_file.write_text(SCENARIO.replace('0.2\n', '0.25\n', 1), encoding='utf-8')
+    assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 2
+    assert 'another study' in capsys.readouterr().err
+
+
+def test_a_failed_run_is_a_row_with_its_error(scenario_file, tmp_path, capsys):
+    scenario_file.write_text(SCENARIO + 'excitation: {amplitude: [1.0e+150, 1.0e+150]}\n', encoding='utf-8')
+    out = tmp_path / 'out.csv'
+    assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
+    assert 'diverged' in _rows(out)[0]['error']
+
+
+def test_parquet_holds_the_same_rows(scenario_file, tmp_path):
+    parquet = pytest.importorskip('pyarrow.parquet')
+    out = tmp_path / 'out.parquet'
+    assert _run(scenario_file, '--runs', 2, '--workers', 0, '--output', out) == 0
+    table = parquet.read_table(out).to_pydict()
+    assert table['seed'] == [0, 1]
+    assert all(isinstance(value, float) for value in table['plant.payload_mass'])
+
+
+def test_a_folder_of_recordings_is_a_study_and_a_broken_one_a_row(tmp_path):
+    import numpy as np
+
+    folder = tmp_path / 'bags'
+    folder.mkdir()
+    for name in ('one', 'two'):
+        with BagWriter(folder / name) as writer:
+            rng = np.random.default_rng(1)
+            for k in range(300):
+                record = JointRecord(k * 1_000_000, ('a',), rng.normal(size=1), rng.normal(size=1),
+                                     rng.normal(size=1))
+                writer.write('/joint_states', record.stamp_ns, record)
+    (folder / 'three.mcap').write_bytes(b'not a recording')
+    (folder / 'one.truth.json').write_text(json.dumps({'payload_mass_kg': 20.0}), encoding='utf-8')
+    out = tmp_path / 'out.csv'
+    settings = ['--set=payload_method=none', '--set=inputs=[a/effort]', '--set=outputs=[a/position]',
+                '--set=order=1']
+    assert _run(folder, '--workers', 0, '--output', out, *settings) == 0
+    rows = {Path(row['run']).name: row for row in _rows(out)}
+    assert set(rows) == {'one', 'two', 'three.mcap'}
+    assert 'cannot be read' in rows['three.mcap']['error']
+    assert rows['one']['samples'] == '300'
+    assert tasks.true_payload(folder / 'one') == 20.0
+
+
+FRAGILE = '''
+import os
+from flexmanip_ros.errors import FlexmanipError
+
+def square(task):
+    if task == 2:
+        raise FlexmanipError('two', 'another number')
+    if task == 3:
+        os._exit(1)
+    return task * task
+'''
+
+
+def test_a_worker_that_dies_costs_only_its_run(tmp_path, monkeypatch):
+    (tmp_path / 'fragile_work.py').write_text(FRAGILE, encoding='utf-8')
+    monkeypatch.syspath_prepend(tmp_path)
+    square = importlib.import_module('fragile_work').square
+    outcomes = {outcome.task: outcome for outcome in workers.processes(square, range(6), 2)}
+    assert {task: outcome.result for task, outcome in outcomes.items()} == {
+        0: 0, 1: 1, 2: None, 3: None, 4: 16, 5: 25}
+    assert 'another number' in str(outcomes[2].error)
+    assert 'the worker died' in str(outcomes[3].error)
+
+
+@pytest.mark.parametrize(('text', 'words'), [
+    ('duration: -1', 'duration'),
+    ('runs: 3', "no 'runs'"),
+    ('vary: {plant.payload: {uniform: [1, 2]}}', 'cannot be varied'),
+    ('vary: {plant.payload_mass: {gauss: [1, 2]}}', 'uniform'),
+    ('plant: {ordre: 3}', "unknown parameter 'ordre'"),
+    ('estimators: {}', 'estimators'),
+    ('faults: {drop: 2}', 'probability'),
+    ('- a', 'names and values'),
+])
+def test_a_bad_scenario_is_one_line_and_exit_2(scenario_file, tmp_path, capsys, text, words):
+    scenario_file.write_text(text, encoding='utf-8')
+    assert _run(scenario_file, '--output', tmp_path / 'out.csv') == 2
+    err = capsys.readouterr().err
+    assert words in err
+    assert str(scenario_file) in err
+    assert err.count('\n') == 1
+
+
+@pytest.mark.parametrize('path', sorted((Path(__file__).parents[2] / 'config' / 'scenarios').glob('*.yaml')))
+def test_the_scenarios_in_config_are_valid(path):
+    from flexmanip_ros.cli.monte_carlo import read_scenario
+
+    assert read_scenario(path).name == path.stem
+
+
+def test_the_same_work_goes_to_a_dask_cluster(scenario_file, tmp_path):
+    pytest.importorskip('distributed')
+    here = tmp_path / 'scheduler.json'
+    common = [sys.executable, '-m', 'dask']
+    quiet = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL}
+    started = [subprocess.Popen([*common, 'scheduler', '--host', '127.0.0.1', '--port', '0', '--no-dashboard',
+                                 '--scheduler-file', str(here)], **quiet)]
+    try:
+        deadline = time.monotonic() + 60.0
+        while not here.exists() or not here.read_text():
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        address = json.loads(here.read_text())['address']
+        started += [subprocess.Popen([*common, 'worker', address, '--nthreads', '1', '--no-nanny',
+                                      '--no-dashboard', '--host', '127.0.0.1'], **quiet) for _ in range(2)]
+        far, near = tmp_path / 'far.csv', tmp_path / 'near.csv'
+        assert _run(scenario_file, '--runs', 4, '--scheduler', address, '--output', far) == 0
+        assert _run(scenario_file, '--runs', 4, '--workers', 0, '--output', near) == 0
+        assert _without_cost(_rows(far)) == _without_cost(_rows(near))
+    finally:
+        for process in reversed(started):
+            process.terminate()
+        for process in started:
+            process.wait(timeout=30)
+
+
+def test_a_cluster_that_is_not_there_is_one_clear_line(scenario_file, tmp_path, capsys, monkeypatch):
+    pytest.importorskip('distributed')
+    monkeypatch.setattr(workers, 'ANSWER_TIME', 0.5)
+    assert _run(scenario_file, '--scheduler', 'tcp://127.0.0.1:9', '--output', tmp_path / 'out.csv') == 2
+    assert 'no Dask scheduler answers' in capsys.readouterr().err
