@@ -1,0 +1,148 @@
+"""Every way a recording can be broken: one clear line, and what was good is read."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import suppress
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from recordings import START, good_part, joint_state_record, storage_file, write
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from flexmanip_ros.errors import BagError
+from flexmanip_ros.io import bag
+from flexmanip_ros.io.bag_writer import BagWriter
+from flexmanip_ros.types import CaptureEvent, JointRecord
+
+
+def test_missing_things_are_named(tmp_path):
+    assert 'does not exist' in good_part(tmp_path / 'nothing')[1]
+    (tmp_path / 'folder').mkdir()
+    assert 'metadata.yaml' in good_part(tmp_path / 'folder')[1]
+    (tmp_path / 'notes.txt').write_text('words')
+    assert 'is not a bag' in good_part(tmp_path / 'notes.txt')[1]
+    (tmp_path / 'old.bag').write_text('#ROSBAG V2.0')
+    assert 'ROS 1' in good_part(tmp_path / 'old.bag')[1]
+    for name in ('a.mcap', 'a.db3'):
+        (tmp_path / name).write_bytes(b'')
+        assert 'is empty' in good_part(tmp_path / name)[1]
+        (tmp_path / name).write_bytes(b'something else entirely' * 100)
+        assert 'cannot be read' in good_part(tmp_path / name)[1]
+
+
+def test_a_missing_topic_is_answered_with_those_that_are_there(tmp_path):
+    path = write(tmp_path / 'bag', topic='/other')
+    line = good_part(path)[1]
+    assert '/other (sensor_msgs/msg/JointState)' in line
+    assert '/capture_event (std_msgs/msg/Header)' in line
+
+
+@pytest.mark.parametrize('topic', ['/joint_states', '/capture_event'])
+def test_a_topic_of_the_wrong_type_is_said(tmp_path, topic):
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.write('/joint_states' if topic != '/joint_states' else '/x', START, joint_state_record(0))
+        writer.write(topic, START, 1.0)
+    assert f"topic '{topic}'" in good_part(tmp_path / 'bag')[1]
+    assert 'Float64' in good_part(tmp_path / 'bag')[1]
+
+
+def test_a_recording_without_joint_states_is_said(tmp_path):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        writer.add_connection('/joint_states', 'sensor_msgs/msg/JointState', typestore=store)
+    assert 'no message' in good_part(tmp_path / 'bag')[1]
+
+
+def test_a_garbled_message_and_an_unknown_event_are_reported_after_the_rest(tmp_path):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    path = tmp_path / 'bag'
+    good = bytes(store.serialize_cdr(store.types['std_msgs/msg/Float64'](1.0), 'std_msgs/msg/Float64'))
+    whole = write(tmp_path / 'whole', 3, event_at=None)
+    with Reader(whole) as reader:
+        raws = [raw for _, _, raw in reader.messages()]
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        joints = writer.add_connection('/joint_states', 'sensor_msgs/msg/JointState', typestore=store)
+        for k, raw in enumerate((raws[0], good, raws[1][:-3], raws[2])):
+            writer.write(joints, START + k, raw)
+    items, line = good_part(path)
+    assert len(items) == 2
+    assert 'garbled' in line
+    assert '1 more' in line
+
+
+@pytest.mark.parametrize('storage', list(StoragePlugin))
+def test_the_good_part_of_a_truncated_recording_is_read_and_the_rest_is_reported(tmp_path, storage):
+    path = write(tmp_path / 'bag', 2000, storage=storage)
+    file = storage_file(path)
+    content = file.read_bytes()
+    file.write_bytes(content[:len(content) * 6 // 10])
+    for place in (path, file):
+        items, line = good_part(place)
+        records = [item for item in items if isinstance(item, JointRecord)]
+        assert len(records) > 800
+        assert [record.stamp_ns for record in records] == [START + k * 1_000_000 for k in range(len(records))]
+        assert 'damaged' in line
+
+
+def test_a_recording_without_metadata_is_read_and_reported(tmp_path):
+    path = write(tmp_path / 'bag')
+    (path / 'metadata.yaml').unlink()
+    items, line = good_part(path)
+    assert len(items) == 51
+    assert 'metadata' in line
+
+
+@pytest.mark.parametrize('text', ['', 'words', 'rosbag2_bagfile_information: {version: 5}', ': : :', '\x00'])
+def test_broken_metadata_is_reported_in_one_line(tmp_path, text):
+    path = write(tmp_path / 'bag')
+    (path / 'metadata.yaml').write_text(text)
+    assert len(good_part(path)[0]) == 51
+
+
+def test_compressed_recordings_are_read_and_salvaged(tmp_path):
+    source = write(tmp_path / 'plain', 3000)
+    store = get_typestore(Stores.ROS2_JAZZY)
+    writer = Writer(tmp_path / 'packed', version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with Reader(source) as reader, writer:
+        joints = writer.add_connection('/joint_states', 'sensor_msgs/msg/JointState', typestore=store)
+        for connection, stamp, raw in reader.messages():
+            if connection.topic == '/joint_states':
+                writer.write(joints, stamp, raw)
+    file = storage_file(tmp_path / 'packed')
+    assert len(list(bag.read(file))) == 3000
+    content = file.read_bytes()
+    file.write_bytes(content[:len(content) // 2])
+    assert len(good_part(file)[0]) > 1000
+
+
+@pytest.fixture(scope='module')
+def small(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('fuzz')
+    return {storage: storage_file(write(folder / storage.name, 30, storage=storage))
+            for storage in StoragePlugin}
+
+
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data(), storage=st.sampled_from(list(StoragePlugin)))
+def test_whatever_the_bytes_only_our_error_comes_out(small, tmp_path, data, storage):
+    source = small[storage]
+    content = bytearray(source.read_bytes())
+    for _ in range(data.draw(st.integers(0, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    del content[data.draw(st.integers(0, len(content))):]
+    target = tmp_path / source.name
+    target.write_bytes(bytes(content))
+    with suppress(BagError):
+        for item in bag.read(target):
+            assert isinstance(item, (JointRecord, CaptureEvent))
+
+
+def test_a_foreign_database_is_refused(tmp_path):
+    with sqlite3.connect(tmp_path / 'other.db3') as database:
+        database.execute('CREATE TABLE cats (name TEXT)')
+    database.close()
+    assert 'cannot be read' in good_part(tmp_path / 'other.db3')[1]
