@@ -106,9 +106,9 @@ def riccati_gain(A: Array, C: Array, process: Array, measurement: Array, fallbac
     Q, S = process.T @ process / scale, process.T @ measurement / scale
     try:
         P = solve_discrete_are(A.T, C.T, Q, R / scale, s=S)
+        gain: Array = np.linalg.solve(C @ P @ C.T + R / scale, (A @ P @ C.T + S).T).T
     except (np.linalg.LinAlgError, ValueError):
         return fallback
-    gain: Array = np.linalg.solve(C @ P @ C.T + R / scale, (A @ P @ C.T + S).T).T
     return gain if np.all(np.isfinite(gain)) else fallback
 
 
