@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexmanip_ros.plant.compiled import kernel
-from flexmanip_ros.plant.kernels import assemble
+from flexmanip_ros.plant.kernels import assemble, elastic
 
 if TYPE_CHECKING:
     from flexmanip_ros.plant.manipulator import Manipulator, Workspace
@@ -92,10 +92,11 @@ def acceleration(
     (numbers left the finite range).
     """
     assemble(arm, payload, q, qd, work.M, work.E, work)
+    elastic(arm, q, work)
     if not factor(work.M):
         return False
     for r in range(q.size):
         qdd[r] = (arm.torque[r, 0] * effort[0] + arm.torque[r, 1] * effort[1]
-                  - work.E[r] - arm.stiffness[r] * q[r] - arm.damping[r] * qd[r])
+                  - work.E[r] - work.elastic[r] - arm.damping[r] * qd[r])
     solve(work.M, qdd)
     return True

@@ -229,6 +229,15 @@ def acceleration_jacobian(
     for r in range(q.size):
         dq[r, r] += arm.stiffness[r]
         dqd[r, r] += arm.damping[r]
+    if arm.shortening:
+        k = arm.kappa
+        for i in range(2):
+            o = 2 + i * k
+            for j in range(k):
+                r = o + j
+                dp[r, 2 + i] = work.elastic[r] * arm.unit_stiffness[r] / arm.stiffness[r]
+                for m in range(k):
+                    dq[r, o + m] += work.tangent[r, m]
     solve_columns(work.M, dq)
     solve_columns(work.M, dqd)
     solve_columns(work.M, dp)

@@ -235,3 +235,31 @@ def assemble(
         if arm.shortening:
             for t in range(k):
                 M[2 + k + j, 2 + t] -= arm.tip_stretch[0, t] * q[2 + t] * (aj * c - bj * s)
+
+
+@kernel
+def elastic(arm: Manipulator, q: Array, work: Workspace) -> None:
+    """Fill work.elastic (n,) with dV/dq and, link by link, work.tangent (n, k) with its part from V4.
+
+    V4 (``shape_integrals.quartic``) is of the same order as the kinetic energy of the shortening. The
+    stiffness EI is read back from arm.stiffness, so that a calibrated one counts.
+    """
+    k = arm.kappa
+    for r in range(q.size):
+        work.elastic[r] = arm.stiffness[r] * q[r]
+    if arm.shortening:
+        for i in range(2):
+            o = 2 + i * k
+            EI = arm.stiffness[o] / arm.unit_stiffness[o]
+            for j in range(k):
+                force = 0.0
+                for m in range(k):
+                    bend = 0.0
+                    for p in range(k):
+                        row = 0.0
+                        for t in range(k):
+                            row += arm.quartic[i, j, m, p, t] * q[o + t]
+                        bend += row * q[o + p]
+                    work.tangent[o + j, m] = 3.0 * EI * bend
+                    force += bend * q[o + m]
+                work.elastic[o + j] += EI * force

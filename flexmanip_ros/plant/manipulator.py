@@ -30,7 +30,8 @@ from flexmanip_ros.parameters.arm import ArmParameters
 from flexmanip_ros.plant import linearization
 from flexmanip_ros.plant.acceleration_kernel import acceleration
 from flexmanip_ros.plant.jacobian_kernel import acceleration_jacobian, bias_jacobian
-from flexmanip_ros.plant.kernels import assemble
+from flexmanip_ros.plant.kernels import assemble, elastic
+from flexmanip_ros.plant.shape_integrals import link_tables, output_matrix, quartic, rotary
 from flexmanip_ros.types import Array
 
 
@@ -67,6 +68,8 @@ class Manipulator(NamedTuple):
     """(2, k, k, k) int rho phi_j S_mp."""
     Q: Array
     """(2, k, k, k, k) int rho S_jl S_mp."""
+    quartic: Array
+    """(2, k, k, k, k) totally symmetric: fourth-order elastic energy EI quartic eta^4 / 4."""
     rotary: Array
     """(n, n) hubs and bodies that turn with a slope."""
     stiffness: Array
@@ -86,6 +89,8 @@ class Workspace(NamedTuple):
 
     M: Array
     E: Array
+    elastic: Array
+    tangent: Array
     moments: Array
     stretch: Array
     Y: Array
@@ -102,7 +107,8 @@ def workspace(kappa: int) -> Workspace:
     """Allocate scratch for arms of kappa modes a link."""
     n = 2 + 2 * kappa
     return Workspace(
-        M=np.zeros((n, n)), E=np.zeros(n), moments=np.zeros((2, 3 + kappa)), stretch=np.zeros((2, kappa)),
+        M=np.zeros((n, n)), E=np.zeros(n), elastic=np.zeros(n), tangent=np.zeros((n, kappa)),
+        moments=np.zeros((2, 3 + kappa)), stretch=np.zeros((2, kappa)),
         Y=np.zeros((2, kappa, kappa)), Z=np.zeros((2, kappa, kappa, kappa)),
         pairs=np.zeros((2, kappa, kappa)), columns=np.zeros((6, kappa)),
         left=np.zeros((n, n)), right=np.zeros((n, n)), parameters=np.zeros((n, 4)), held=np.zeros((2, n)))
@@ -128,7 +134,7 @@ def manipulator(arm: ArmParameters, kappa: int | None = None) -> Manipulator:
     length = np.asarray(arm.link_length)
     density = np.asarray(arm.linear_density)
     root, tip = linearization.root_slopes(arm, k), linearization.tip_slopes(arm, k)
-    tables = [_tables(L, rho, k, arm.shortening) for L, rho in zip(length, density, strict=True)]
+    tables = [link_tables(L, rho, k, arm.shortening) for L, rho in zip(length, density, strict=True)]
     j = np.pi * np.arange(1, k + 1)
     stiffness = np.concatenate([np.zeros(2), linearization.stiffness(arm, k)])
     per_stiffness = np.concatenate([np.zeros(2), *(j**4 / (2 * L**3) for L in length)])
@@ -141,69 +147,11 @@ def manipulator(arm: ArmParameters, kappa: int | None = None) -> Manipulator:
         tip_stretch=stretch, root_slope=root, tip_slope=tip,
         C2=np.stack([t[2] for t in tables]), S1=np.stack([t[3] for t in tables]),
         W=np.stack([t[4] for t in tables]), Q=np.stack([t[5] for t in tables]),
-        rotary=_rotary(arm, root, tip), stiffness=stiffness,
+        quartic=np.stack([quartic(L, k, arm.shortening) for L in length]),
+        rotary=rotary(arm, root, tip), stiffness=stiffness,
         damping=np.concatenate([np.zeros(2), linearization.damping(arm, k)]),
         unit_stiffness=per_stiffness, torque=linearization.torque_matrix(arm, k),
         output=output_matrix(arm, root, tip))
-
-
-def _tables(L: float, rho: float, k: int, shortening: bool) -> tuple[Array, ...]:
-    """Integrals over one link by Gauss-Legendre quadrature fine enough to be exact to rounding."""
-    nodes, weights = np.polynomial.legendre.leggauss(40 + 8 * k)
-    x, weights = L * (nodes + 1) / 2, rho * L * weights / 2
-    j = np.arange(1, k + 1)
-    sign = np.where(j % 2, -1.0, 1.0)
-    phi = np.sin(np.pi * j[:, None] * x / L)
-    mean = rho * L * (1 - sign) / (j * np.pi)
-    rigid = -rho * L**2 * sign / (j * np.pi)
-    S = _slope_products(L, k, x) if shortening else np.zeros((k, k, x.size))
-    C2 = rho * L / 2 * np.eye(k) - np.einsum('jmx,x->jm', S, weights * x)
-    S1 = np.einsum('jmx,x->jm', S, weights)
-    W = np.einsum('jx,mpx,x->jmp', phi, S, weights)
-    Q = np.einsum('jlx,mpx,x->jlmp', S, S, weights)
-    return mean, rigid, C2, S1, W, Q
-
-
-def _slope_products(L: float, k: int, x: Array) -> Array:
-    """S_jm(x) = int_0^x phi_j' phi_m' over the arc, (k, k, x) [1/m]."""
-    a = np.pi / L * np.arange(1, k + 1)
-    S = np.empty((k, k, x.size))
-    for j in range(k):
-        for m in range(k):
-            plus = np.sin((a[j] + a[m]) * x) / (a[j] + a[m])
-            minus = x if j == m else np.sin((a[j] - a[m]) * x) / (a[j] - a[m])
-            S[j, m] = a[j] * a[m] * (plus + minus) / 2
-    return S
-
-
-def _rotary(arm: ArmParameters, root: Array, tip: Array) -> Array:
-    """Constant mass of the bodies whose angle is a chord plus a slope."""
-    k = root.shape[1]
-    R = np.zeros((2 + 2 * k, 2 + 2 * k))
-    bodies = ((arm.hub_inertia[0], 0, root), (arm.hub_inertia[1], 1, root),
-              (arm.joint_inertia, 0, tip), (arm.tip_inertia, 1, tip))
-    for J, link, slopes in bodies:
-        row = np.zeros(2 + 2 * k)
-        row[link] = 1.0
-        row[2 + link * k:2 + (link + 1) * k] = slopes[link]
-        R += J * np.outer(row, row)
-    return R
-
-
-def output_matrix(arm: ArmParameters, root: Array, tip: Array) -> Array:
-    """Joint angles (by the arm's convention) and sensor deflections from q, (4, n)."""
-    k = root.shape[1]
-    C = np.zeros((4, 2 + 2 * k))
-    C[0, 0] = C[1, 1] = 1.0
-    if arm.angle_convention == 'encoder':
-        C[1, 0] = -1.0
-        C[0, 2:2 + k] = root[0]
-        C[1, 2:2 + k] = -tip[0]
-        C[1, 2 + k:] = root[1]
-    j = np.pi * np.arange(1, k + 1)
-    for i in range(2):
-        C[2 + i, 2 + i * k:2 + (i + 1) * k] = np.sin(j * arm.sensor_position[i])
-    return C
 
 
 def mass_matrix(arm: Manipulator, payload: Array, q: Array) -> Array:
@@ -230,7 +178,31 @@ def coriolis_matrix(arm: Manipulator, payload: Array, q: Array, qd: Array) -> Ar
 def energy(arm: Manipulator, payload: Array, q: Array, qd: Array) -> float:
     """Kinetic plus elastic energy [J]."""
     M = mass_matrix(arm, payload, q)
-    return float(qd @ M @ qd + q @ (arm.stiffness * q)) / 2
+    fourth = 0.0
+    for i in range(2):
+        part = slice(2 + i * arm.kappa, 2 + (i + 1) * arm.kappa)
+        EI = arm.stiffness[part][0] / arm.unit_stiffness[part][0]
+        eta = q[part]
+        fourth += EI / 2 * np.einsum('jklm,j,k,l,m', arm.quartic[i], eta, eta, eta, eta)
+    return float(qd @ M @ qd + q @ (arm.stiffness * q) + fourth) / 2
+
+
+def elastic_forces(arm: Manipulator, q: Array) -> Array:
+    """Return the elastic forces dV/dq (n,): K q, and of third order when shortening is kept."""
+    work = workspace(arm.kappa)
+    elastic(arm, np.asarray(q, float), work)
+    return work.elastic
+
+
+def elastic_tangent(arm: Manipulator, q: Array) -> Array:
+    """Return the derivative (n, n) of the elastic forces by q."""
+    work = workspace(arm.kappa)
+    elastic(arm, np.asarray(q, float), work)
+    K = np.diag(arm.stiffness)
+    for i in range(2):
+        part = slice(2 + i * arm.kappa, 2 + (i + 1) * arm.kappa)
+        K[part, part] += work.tangent[part]
+    return K
 
 
 def accelerations(arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array) -> Array:
@@ -250,5 +222,6 @@ def _assembled(arm: Manipulator, payload: Array, q: Array, qd: Array) -> tuple[A
 
 __all__ = [
     'Manipulator', 'Workspace', 'acceleration', 'acceleration_jacobian', 'accelerations', 'bias',
-    'coriolis_matrix', 'energy', 'manipulator', 'mass_matrix', 'output_matrix', 'payload_array', 'workspace',
+    'coriolis_matrix', 'elastic_forces', 'energy', 'manipulator', 'mass_matrix',
+    'payload_array', 'workspace',
 ]

@@ -44,7 +44,8 @@ def energies(
             kinetic += rho * weight / 2 * speed2(r, q, qd)
             curvature = sum(-(j * np.pi / L) ** 2 * np.sin(j * np.pi * x / L) * eta[j - 1]
                             for j in range(1, kappa + 1))
-            potential += EI * weight / 2 * curvature**2
+            steeper = 1 + slope(x, L, eta) ** 2 if arm.shortening else 1  # inextensible, to fourth order
+            potential += EI * weight / 2 * curvature**2 * steeper
         kinetic += arm.hub_inertia[i] / 2 * ca.jtimes(q[i] + slope(0.0, L, eta), q, qd) ** 2
         origin = point(arm, i, L, eta, origin, e, normal)
         heading = q[i] + slope(L, L, eta)

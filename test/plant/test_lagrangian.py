@@ -29,7 +29,7 @@ def test_equations_of_motion_follow_from_the_lagrangian(
         q, qd, qdd = rng.normal(size=(3, 2 + 2 * kappa))
         q[2:] *= 0.2  # bends of 20 cm, so that each term counts
         ours = (manipulator.mass_matrix(arm, payload, q) @ qdd + manipulator.bias(arm, payload, q, qd)
-                + arm.stiffness * q)
+                + manipulator.elastic_forces(arm, q))
         assert ours == pytest.approx(lagrangian.evaluate(derived, q, qd, qdd), rel=1e-9, abs=1e-8)
 
 

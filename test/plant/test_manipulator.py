@@ -88,7 +88,7 @@ def test_derivatives_of_the_acceleration(shortening: bool, kappa: int, payload: 
     assert np.array_equal(qdd, m.accelerations(arm, payload, q, qd, tau))
 
     def stiffer(link: int, h: float) -> Array:
-        K = arm.stiffness.copy()
+        K = arm.stiffness.copy()  # the elastic forces of third order scale with it
         part = slice(2 + link * kappa, 2 + (link + 1) * kappa)
         K[part] += h * arm.unit_stiffness[part]
         return m.accelerations(arm._replace(stiffness=K), payload, q, qd, tau)
