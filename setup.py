@@ -84,7 +84,12 @@ setup(
     maintainer='flexmanip_ros maintainers',
     maintainer_email='maintainers@flexmanip-ros.example',
     python_requires='>=3.11',
-    extras_require={'test': ['pytest', 'hypothesis']},
+    extras_require={
+        'test': ['pytest', 'hypothesis'],
+        'finite_element': ['scikit-fem'],
+        'cluster': ['dask', 'distributed'],
+        'parquet': ['pyarrow'],
+    },
     zip_safe=False,
     cmdclass={'install': InstallAndCompile, 'develop': DevelopAndCompile},
     description='Online identification of a flexible two-link arm and of the payload it catches.',
