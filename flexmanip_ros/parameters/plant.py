@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.arm import ArmParameters
 from flexmanip_ros.parameters.field import check_all, parameter
+from flexmanip_ros.parameters.sensing import ActuatorParameters, SensorParameters
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,13 @@ class PlantParameters:
         'standard deviation of the four positions, then the four rates', unit='rad, m, rad/s, m/s',
         low=0.0, size=8)
     seed: int = parameter(1, 'seed of the noise', low=0)
+    sensors: SensorParameters = field(default_factory=SensorParameters)
+    actuators: ActuatorParameters = field(default_factory=ActuatorParameters)
     arm: ArmParameters = field(default_factory=ArmParameters)
 
     def __post_init__(self) -> None:
         check_all(self)
+        if self.sensors.stamp_jitter * self.rate > 0.15:
+            raise ParameterError(
+                f"parameter 'sensors.stamp_jitter' is {self.sensors.stamp_jitter} s",
+                f'stamps would change places; stay below {0.15 / self.rate:g} s at {self.rate:g} Hz')

@@ -12,18 +12,19 @@ from flexmanip_ros.types import Array
 
 BLOCK = 512
 """Samples drawn at once."""
+COLUMNS = 10
 
 
 def block(seed: int, number: int) -> Array:
-    """Standard normal numbers (BLOCK, 8) of samples BLOCK * number and on: positions, then rates."""
+    """Standard normal numbers (BLOCK, 10) from sample BLOCK * number on: positions, rates, stamp, loss."""
     bits = np.random.Philox(key=seed, counter=[0, 0, 0, number])
-    return np.random.Generator(bits).standard_normal((BLOCK, 8))
+    return np.random.Generator(bits).standard_normal((BLOCK, COLUMNS))
 
 
 def normal(seed: int, first: int, count: int) -> Array:
-    """Standard normal numbers (count, 8) of samples first .. first + count - 1."""
+    """Standard normal numbers (count, 10) of samples first .. first + count - 1."""
     if count == 0:
-        return np.zeros((0, 8))
+        return np.zeros((0, COLUMNS))
     numbers = range(first // BLOCK, (first + count - 1) // BLOCK + 1)
     drawn = np.concatenate([block(seed, number) for number in numbers])
     start = first - BLOCK * numbers[0]

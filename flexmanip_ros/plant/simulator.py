@@ -16,7 +16,8 @@ import numpy as np
 from flexmanip_ros.errors import ModelError, SignalError
 from flexmanip_ros.parameters.excitation import ExcitationParameters
 from flexmanip_ros.parameters.plant import PlantParameters
-from flexmanip_ros.plant import excitation, models, noise
+from flexmanip_ros.parameters.sensing import SensorParameters
+from flexmanip_ros.plant import excitation, models, noise, sensors
 from flexmanip_ros.plant.capture import Body, free_object, joined, rates_after
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointRecord
 
@@ -42,16 +43,22 @@ class PlantState:
     noise_std: Array
     """(8,) of the positions, then the rates."""
     noise_block: Array
-    """(BLOCK, 8) standard normal numbers around the next sample."""
+    """(BLOCK, 10) standard normal numbers around the next sample."""
     noise_number: int
     """Which block that is."""
+    gauges: Array
+    """(2, 2) low-pass state of the deflections and of their rates."""
+    commands: Array
+    """(command_delay, 2) torques on their way to the drives."""
+    reported: Array
+    """(effort_delay, 2) torques that are still to be reported."""
     taking: Body | None = None
     """Part of an object that a soft gripper takes at each of the next samples."""
     taking_left: int = 0
 
 
 class Trajectory(NamedTuple):
-    """A simulated run, columns in the order of JOINT_NAMES (effort: the two joints)."""
+    """A simulated run as its messages tell it, columns in the order of JOINT_NAMES (effort: the joints)."""
 
     stamp_ns: np.ndarray[tuple[int], np.dtype[np.int64]]
     position: Array
@@ -70,7 +77,9 @@ def init(config: PlantParameters, start_ns: int = 0, noise_std: Array | None = N
     return PlantState(
         model=model, start_ns=start_ns, index=0, x=model.rest(), payload=np.zeros(4), previous=np.zeros(2),
         noise_std=_levels(config) if noise_std is None else np.array(noise_std, dtype=np.float64),
-        noise_block=noise.block(config.seed, 0), noise_number=0)
+        noise_block=noise.block(config.seed, 0), noise_number=0, gauges=np.zeros((2, 2)),
+        commands=np.zeros((config.actuators.command_delay, 2)),
+        reported=np.zeros((config.arm.effort_delay, 2)))
 
 
 def stamp(config: PlantParameters, state: PlantState) -> int:
@@ -78,15 +87,27 @@ def stamp(config: PlantParameters, state: PlantState) -> int:
     return state.start_ns + round(state.index * 1e9 / config.rate)
 
 
-def step(config: PlantParameters, state: PlantState, efforts: Array) -> tuple[PlantState, JointRecord]:
+def step(
+    config: PlantParameters, state: PlantState, efforts: Array,
+) -> tuple[PlantState, JointRecord | None]:
     """Record the present sample and integrate one period under efforts (2,) [N m].
 
+    The record is None when the sample is lost on its way (``sensors.drop_probability``).
     Raises SignalError when efforts are not two finite numbers, ModelError when the simulation diverges.
     """
     efforts = _checked(np.asarray(efforts, dtype=np.float64).reshape(1, -1))
     now = stamp(config, state)
-    state, position, velocity = _advance(config, state, efforts)
-    record = JointRecord(now, JOINT_NAMES, position[0], velocity[0], np.array([*efforts[0], 0.0, 0.0]))
+    number = state.index // noise.BLOCK
+    if number != state.noise_number:
+        state = replace(state, noise_block=noise.block(config.seed, number), noise_number=number)
+    drawn = state.noise_block[state.index % noise.BLOCK][None]
+    state, position, velocity, effort = _advance(config, state, efforts)
+    if not sensors.arrives(config, drawn)[0]:
+        return state, None
+    sensors.read(config, position, velocity, state.noise_std, drawn)
+    record = JointRecord(
+        now + int(sensors.jitter_ns(config, drawn)[0]), JOINT_NAMES, position[0], velocity[0],
+        np.array([*effort[0], 0.0, 0.0]))
     return state, record
 
 
@@ -117,7 +138,7 @@ def simulate(
     own_levels = config.noise == 'snr' and noise_std is None
     state = init(config, start_ns, np.zeros(8) if own_levels else noise_std)
     stamps = start_ns + np.round(np.arange(count) * 1e9 / config.rate).astype(np.int64)
-    position, velocity = np.empty((count, 4)), np.empty((count, 4))
+    rows = np.empty((count, 10))
     ordered = sorted(events, key=lambda event: event.stamp_ns)
     places = [int(np.searchsorted(stamps, event.stamp_ns)) for event in ordered]
     for first, last, event in zip([0, *places], [*places, count], [None, *ordered], strict=True):
@@ -125,13 +146,16 @@ def simulate(
             state = (attach if event.kind is EventKind.CAPTURE else release)(config, state)
         while first < last:
             end = first + 1 if state.taking_left else last
-            state, position[first:end], velocity[first:end] = _advance(config, state, efforts[first:end])
+            state, *parts = _advance(config, state, efforts[first:end])
+            rows[first:end] = np.hstack(parts)
             first = end
-    if own_levels:
-        levels = noise.std_for_snr(position, velocity, config.snr_db)
-        normal = noise.normal(config.seed, 0, count) * levels
-        position, velocity = position + normal[:, :4], velocity + normal[:, 4:]
-    return Trajectory(stamps, position, velocity, efforts)
+    position, velocity, effort = rows[:, :4].copy(), rows[:, 4:8].copy(), rows[:, 8:].copy()
+    levels = noise.std_for_snr(position, velocity, config.snr_db) if own_levels else state.noise_std
+    drawn = noise.normal(config.seed, 0, count)
+    sensors.read(config, position, velocity, levels, drawn)
+    kept = sensors.arrives(config, drawn)
+    stamps = stamps + sensors.jitter_ns(config, drawn)
+    return Trajectory(stamps[kept], position[kept], velocity[kept], effort[kept])
 
 
 def records(
@@ -147,33 +171,29 @@ def records(
             np.array([*trajectory.effort[k], 0.0, 0.0]))
 
 
-def _advance(config: PlantParameters, state: PlantState, efforts: Array) -> tuple[PlantState, Array, Array]:
-    """Run efforts.shape[0] samples; return the state after them, positions and velocities (N, 4)."""
+def _advance(
+    config: PlantParameters, state: PlantState, efforts: Array,
+) -> tuple[PlantState, Array, Array, Array]:
+    """Run commands (N, 2); return the state after them, positions, rates (N, 4) and reported torques."""
     if state.taking is not None:
         state = _take(config, state, state.taking)
         left = state.taking_left - 1
         state = replace(state, taking_left=left, taking=state.taking if left else None)
-    x, previous = state.x.copy(), state.previous.copy()
-    position, velocity = np.empty((len(efforts), 4)), np.empty((len(efforts), 4))
-    good = state.model.advance(x, state.payload, previous, efforts, position, velocity)
-    if good < len(efforts) or not np.all(np.isfinite(x)):
+    count = len(efforts)
+    queue = np.concatenate([state.commands, sensors.saturated(config, efforts)])
+    applied = np.ascontiguousarray(queue[:count])
+    reported = np.concatenate([state.reported, applied])
+    x, previous, gauges = state.x.copy(), state.previous.copy(), state.gauges.copy()
+    position, velocity = np.empty((count, 4)), np.empty((count, 4))
+    good = state.model.advance(x, state.payload, previous, applied, position, velocity)
+    if good < count:
         raise ModelError(
             f'the simulation diverged {(state.index + good) / config.rate:.3f} s after its start',
             'lower the torque, raise the stiffness or the rate, or reset the plant')
-    normal, number = state.noise_block, state.noise_number
-    if np.any(state.noise_std):
-        if len(efforts) == 1:
-            if state.index // noise.BLOCK != number:
-                number = state.index // noise.BLOCK
-                normal = noise.block(config.seed, number)
-            drawn = normal[state.index % noise.BLOCK][None]
-        else:
-            drawn = noise.normal(config.seed, state.index, len(efforts))
-        position = position + drawn[:, :4] * state.noise_std[:4]
-        velocity = velocity + drawn[:, 4:] * state.noise_std[4:]
-    after = replace(state, index=state.index + len(efforts), x=x, previous=previous,
-                    noise_block=normal, noise_number=number)
-    return after, position, velocity
+    sensors.gauge(config, position, velocity, gauges)
+    after = replace(state, index=state.index + count, x=x, previous=previous, gauges=gauges,
+                    commands=queue[count:], reported=reported[count:])
+    return after, position, velocity, reported[:count]
 
 
 def _take(config: PlantParameters, state: PlantState, body: Body) -> PlantState:
@@ -190,7 +210,8 @@ def _levels(config: PlantParameters) -> Array:
         return np.zeros(8)
     if config.noise == 'std':
         return np.array(config.noise_std)
-    quiet = replace(config, noise='none')
+    gauges_only = SensorParameters(strain_cutoff=config.sensors.strain_cutoff)
+    quiet = replace(config, noise='none', sensors=gauges_only)
     waves = ExcitationParameters(rate=config.rate, amplitude=config.rehearsal_torque)
     efforts = excitation.sequence(waves, round(REHEARSAL_TIME * config.rate))
     half = round(round(len(efforts) / 2) * 1e9 / config.rate)
