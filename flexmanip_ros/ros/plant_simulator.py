@@ -126,7 +126,8 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             self.get_logger().error(f'the simulation stopped: {error}; call {NAME}/reset to start again')
             return
         self.samples += 1
-        self.joint_states.publish(joint_state(record, self._message))
+        if record is not None:  # lost on its way (sensors.drop_probability)
+            self.joint_states.publish(joint_state(record, self._message))
 
     def _apply_events(self, stamp: int) -> None:
         """Take or let go of the object before the first sample that is not older than the event."""
