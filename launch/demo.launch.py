@@ -5,11 +5,13 @@
 With the executable `demo` the same nodes share one process, a bag is recorded and a picture drawn.
 """
 
-from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
+
+from flexmanip_ros.parameters.demo import IDENTIFIER
+from launch import LaunchDescription
 
 PACKAGE = 'flexmanip_ros'
 ARGUMENTS = (
@@ -28,6 +30,10 @@ def _number(name):
     return ParameterValue(LaunchConfiguration(name), value_type=float)
 
 
+def _plain(value):
+    return list(value) if isinstance(value, tuple) else value
+
+
 def _node(executable, parameters):
     return Node(
         package=PACKAGE, executable=executable, namespace=LaunchConfiguration('namespace'), output='screen',
@@ -40,9 +46,11 @@ def generate_launch_description():
         *(DeclareLaunchArgument(name, default_value=default, description=words)
           for name, default, words in ARGUMENTS),
         _node('rpbsid_identifier', {
+            **{name: _plain(value) for name, value in IDENTIFIER.items()},
             'payload_method': ParameterValue(LaunchConfiguration('payload_method'), value_type=str)}),
         _node('capture_trigger', {
-            'mode': 'time', 'capture_time': _number('capture_time'), 'release_time': _number('release_time')}),
+            'mode': 'time', 'capture_time': _number('capture_time'),
+            'release_time': _number('release_time')}),
         _node('excitation', {'rate': _number('rate')}),
         _node('plant_simulator', {'rate': _number('rate'), 'payload_mass': _number('payload_mass')}),
     ])

@@ -12,14 +12,16 @@ class TriggerParameters:
     """When a capture or release is announced."""
 
     mode: str = parameter(
-        'service', 'service: on request; time: at set times after the first sample; auto: found in the signals',
+        'service', 'service: on request; time: at set times after the first sample; auto: found in the '
+        'signals',
         choices=('service', 'time', 'auto'))
     capture_time: float = parameter(
         3.0, 'capture this long after the first sample (mode time); negative: never', unit='s', low=-1.0)
     release_time: float = parameter(
         -1.0, 'release this long after the first sample (mode time); negative: never', unit='s', low=-1.0)
     lead_time: float = parameter(
-        0.05, 'an event at a set time is announced this long before its stamp', unit='s', low=0.0, high=10.0)
+        0.5, 'an event at a set time is announced this long before its stamp, so that nobody hears of it late',
+        unit='s', low=0.0, high=10.0)
     service_delay: float = parameter(
         0.02, 'a requested event takes effect this long after the request (the time a gripper needs)',
         unit='s', low=0.0, high=10.0, live=True)

@@ -12,10 +12,11 @@ from rclpy.context import Context
 from rclpy.executors import Executor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 
 from flexmanip_ros.errors import FlexmanipError
-from flexmanip_ros.parameters.demo import DemoParameters
+from flexmanip_ros.parameters import leaves
+from flexmanip_ros.parameters.demo import DemoParameters, settings
+from flexmanip_ros.parameters.document import NODES, written
 from flexmanip_ros.ros.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.demo_result import Facts
 from flexmanip_ros.ros.excitation import Excitation
@@ -44,15 +45,10 @@ class Composition:
         self._started = 0.0
         self.executor: Executor = make_executor(context)
         try:
-            quiet = {'autostart': False}
-            self.plant = self._add(PlantSimulator(context=context, overrides=_parameters(
-                **quiet, rate=config.rate, payload_mass=config.payload_mass, snr_db=config.snr_db,
-                seed=config.seed)))
-            self.excitation = self._add(Excitation(context=context, overrides=_parameters(
-                **quiet, rate=config.rate)))
-            self.trigger = self._add(CaptureTrigger(context=context, overrides=_parameters(
-                **quiet, mode='time', capture_time=config.capture_time, release_time=config.release_time)))
-            self.identifier = self._add(RpbsidIdentifier(context=context, overrides=_parameters(**quiet)))
+            self.plant = self._add(PlantSimulator(context=context))
+            self.excitation = self._add(Excitation(context=context))
+            self.trigger = self._add(CaptureTrigger(context=context))
+            self.identifier = self._add(RpbsidIdentifier(context=context))
             self.recorder = Recorder(bag, context=context)
             self._nodes.append(self.recorder)
             self.executor.add_node(self.recorder)
@@ -157,5 +153,11 @@ def foreign_arm(node: Node, own_writers: int, own_readers: int) -> bool:
                 or node.count_publishers('effort_controller/commands') > own_writers)
 
 
-def _parameters(**values: Any) -> list[Parameter]:
-    return [Parameter(name, value=value) for name, value in values.items()]
+def arguments(config: DemoParameters) -> list[str]:
+    """Return the nodes' parameters as ROS arguments; what the user gives after them wins."""
+    given = ['--ros-args']
+    for node, values in settings(config).items():
+        for leaf in leaves(NODES[node]):
+            if leaf.name in values:
+                given += ['-p', f'{node}:{leaf.name}:={written(leaf, values[leaf.name])}']
+    return [*given, '--']

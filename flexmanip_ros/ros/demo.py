@@ -25,6 +25,7 @@ from flexmanip_ros.errors import FlexmanipError, ParameterError
 from flexmanip_ros.parameters import configure, leaves
 from flexmanip_ros.parameters.demo import DemoParameters
 from flexmanip_ros.ros.composition import Composition, foreign_arm
+from flexmanip_ros.ros.composition import arguments as composition_arguments
 from flexmanip_ros.ros.demo_progress import Progress
 from flexmanip_ros.ros.demo_result import finish
 from flexmanip_ros.ros.spin import BAD_INPUT, Interrupt, first_line, make_executor, spin
@@ -57,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # A demonstration must never reach a robot on the network.
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     try:
-        _init(arguments, console)
+        _init([arguments[0], *composition_arguments(config), *arguments[1:]], console)
     except Exception as error:  # rcl raises types of its C extension for --ros-args and parameter files
         return _refuse(first_line(error), BAD_INPUT)
     try:

@@ -121,7 +121,7 @@ def _table(config: DemoParameters, estimates: Sequence[Estimate],
     before = [e for e in estimates if e.modes and (capture_ns is None or e.stamp_ns < capture_ns)]
     after = [e for e in estimates if e.modes and capture_ns is not None and e.stamp_ns >= capture_ns]
     for words, found, known in (('before', before, truth.before), ('after', after, truth.after)):
-        for k, mode in enumerate(found[-1].modes if found else ()):
+        for k, mode in enumerate(found[-1].modes[:len(known)] if found else ()):
             band = 1.96 * mode.frequency_std_hz
             low, high = mode.frequency_hz - band, mode.frequency_hz + band
             table.add_row(
