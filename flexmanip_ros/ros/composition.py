@@ -29,6 +29,8 @@ from flexmanip_ros.ros.spin import make_executor
 READERS = 3
 """Who reads joint_states here: identifier, trigger, recorder."""
 DISCOVERY_TIMEOUT = 20.0
+DRAIN_TIMEOUT = 30.0
+"""A busy machine works off its backlog; an idle one needs milliseconds."""
 
 
 class CompositionError(FlexmanipError):
@@ -117,13 +119,15 @@ class Composition:
         """Stop the plant and let everybody take what is still on the way."""
         self.plant.trigger_deactivate()
         self.excitation.trigger_deactivate()
-        limit = time.monotonic() + 2.0
-        while time.monotonic() < limit:
+        limit = time.monotonic() + DRAIN_TIMEOUT
+        while time.monotonic() < limit and not self._drained():
             self.executor.spin_once(timeout_sec=0.02)
-            sent = self.plant.samples
-            if (self.recorder.joint_states >= sent and self.identifier.state.counters.received >= sent
-                    and time.monotonic() > limit - 1.8):
-                return
+
+    def _drained(self) -> bool:
+        sent, recorder, identifier = self.plant.samples, self.recorder, self.identifier
+        return (recorder.joint_states + recorder.losses.lost >= sent
+                and identifier.state.counters.received + identifier.losses.lost >= sent
+                and sum(map(len, recorder.said.values())) >= identifier.published)
 
     def facts(self) -> Facts:
         """Return what the run came to."""

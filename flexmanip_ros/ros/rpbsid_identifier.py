@@ -54,6 +54,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self.state = pipeline.init()
         self.estimate: Estimate | None = None
         self.refused = 0
+        self.published = 0
         self.losses = LossCounter()
         self.meter = Meter()
         self._reader = JointStateReader()
@@ -110,6 +111,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self.estimate = estimate
             for name, value in messages.outgoing(estimate, self.config.payload_frame):
                 self.outputs[name].publish(to_message(value))
+                self.published += 1
 
     def _refuse(self, reason: str, words: str) -> None:
         self.refused += 1

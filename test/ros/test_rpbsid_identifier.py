@@ -1,0 +1,212 @@
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import InertiaStamped
+from ros_harness import Ros, overrides
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64, Float64MultiArray, Header
+from std_srvs.srv import Trigger
+
+from flexmanip_ros import messages, pipeline
+from flexmanip_ros.parameters import ExcitationParameters, PlantParameters
+from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.ros import conversions, qos
+from flexmanip_ros.ros.demo_result import compare, outgoing
+from flexmanip_ros.ros.rpbsid_identifier import RpbsidIdentifier
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+
+START_NS = 1_700_000_000_000_000_000
+CAPTURE = CaptureEvent(START_NS + 400_000_000, EventKind.CAPTURE)
+
+
+@lru_cache
+def recording(count: int = 700) -> tuple[JointRecord, ...]:
+    """Return joint states of the simulated arm that catches its object after 0.4 s."""
+    run = simulator.simulate(PlantParameters(), excitation.sequence(ExcitationParameters(), count),
+                             (CAPTURE,), START_NS)
+    return tuple(item for item in simulator.records(run) if isinstance(item, JointRecord))
+
+
+class Live:
+    """The identifier, what it is fed with and what it says."""
+
+    def __init__(self, ros: Ros, **values: Any) -> None:
+        self.ros = ros
+        self.said: dict[str, list[Any]] = {}
+        for name, kind, back in (
+                (messages.MODEL, Float64MultiArray, conversions.labelled_array),
+                (messages.MODES, Float64MultiArray, conversions.labelled_array),
+                (messages.PAYLOAD_MASS, Float64, lambda message: message.data),
+                (messages.PAYLOAD_ESTIMATE, Float64MultiArray, conversions.labelled_array),
+                (messages.PAYLOAD, InertiaStamped, conversions.inertia)):
+            heard = self.said[name] = []
+            ros.helper.create_subscription(
+                kind, f'/rpbsid_identifier/{name}',
+                lambda message, heard=heard, back=back: heard.append(back(message)), 1000)
+        self.diagnostics = ros.listen(DiagnosticArray, '/diagnostics', 10)
+        self.node = ros.managed(RpbsidIdentifier(context=ros.context, overrides=overrides(**values)))
+        self.joint_states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+        self.events = ros.publisher(Header, 'capture_event', qos.latched())
+        ros.wait(lambda: all(item.get_subscription_count() for item in self.node.outputs.values()))
+
+    def send(self, *records: JointRecord) -> None:
+        """Publish records and wait until they are taken, in portions that no queue overflows at."""
+        for first in range(0, len(records), 200):
+            part = records[first:first + 200]
+            before = self.node.state.counters.received
+            for record in part:
+                self.joint_states.publish(conversions.joint_state(record))
+            self.ros.wait(lambda before=before, part=part:
+                          self.node.state.counters.received >= before + len(part), what='samples to be taken')
+
+    def values(self) -> dict[str, str]:
+        """Return the latest diagnostic values."""
+        for message in reversed(self.diagnostics):
+            for status in message.status:
+                if status.name.startswith('rpbsid_identifier'):
+                    return {item.key: item.value for item in status.values}
+        return {}
+
+
+def replayed(live: Live, items: list[JointRecord | CaptureEvent]) -> dict[str, list[Any]]:
+    return outgoing(pipeline.run(live.node.config, items), live.node.config.payload_frame)
+
+
+def shuffled(record: JointRecord) -> JointRecord:
+    """Return the same joints in another order, among others that nobody asked for."""
+    names = ('gripper', 'link2_bend', 'joint2', 'wrist', 'link1_bend', 'joint1')
+    column = [record.names.index(name) if name in record.names else -1 for name in names]
+
+    def pick(values: np.ndarray) -> np.ndarray:
+        return np.array([values[k] if k >= 0 else np.nan for k in column])
+
+    return JointRecord(record.stamp_ns, names, pick(record.position), pick(record.velocity),
+                       pick(record.effort))
+
+
+def test_live_and_replay_give_the_same_bits(ros: Ros) -> None:
+    live = Live(ros)
+    samples = recording()
+    live.send(*samples[:300])
+    live.events.publish(conversions.header(CAPTURE))
+    ros.wait(lambda: live.node.state.timeline.waiting, what='the event')
+    live.send(*samples[300:])
+    expected = replayed(live, [*samples[:300], CAPTURE, *samples[300:]])
+    assert len(expected[messages.PAYLOAD_MASS]) > 20
+    ros.wait(lambda: all(len(live.said[name]) >= len(values) for name, values in expected.items()))
+    assert compare({name: values for name, values in live.said.items() if values}, expected) == ''
+
+
+def test_an_event_that_comes_late_is_applied_at_its_own_stamp(ros: Ros) -> None:
+    live = Live(ros)
+    samples = recording()
+    live.send(*samples[:500])
+    live.events.publish(conversions.header(CAPTURE))
+    ros.wait(lambda: live.node.state.timeline.rewinds == 1)
+    live.send(*samples[500:])
+    in_time = list(pipeline.run(live.node.config, [CAPTURE, *samples]))[-1].payload
+    late = live.node.estimate.payload
+    assert (late.mass, late.std) == (in_time.mass, in_time.std)
+
+
+def test_names_match_in_any_order_with_other_joints_between(ros: Ros) -> None:
+    live = Live(ros, payload_method='none')
+    live.send(*(shuffled(record) for record in recording(300)))
+    plain = replayed(live, list(recording(300)))
+    ros.wait(lambda: len(live.said[messages.MODEL]) >= len(plain[messages.MODEL]))
+    assert compare({name: values for name, values in live.said.items() if values}, plain) == ''
+
+
+def with_value(record: JointRecord, field: str, index: int, value: float) -> JointRecord:
+    arrays = {name: getattr(record, name).copy() for name in ('position', 'velocity', 'effort')}
+    arrays[field][index] = value
+    return JointRecord(record.stamp_ns, record.names, **arrays)
+
+
+def test_nan_in_a_configured_field_is_dropped_and_counted_and_elsewhere_it_does_not_matter(ros: Ros) -> None:
+    live = Live(ros, payload_method='none')
+    samples = list(recording(300))
+    samples[100] = with_value(samples[100], 'position', 2, np.nan)
+    samples[150] = with_value(samples[150], 'effort', 3, np.nan)
+    live.send(*samples)
+    assert live.node.state.counters.not_finite == 1
+    assert live.node.state.counters.accepted == 299
+    ros.wait(lambda: live.values().get('not_finite') == '1', what='the count in the diagnostics')
+    assert all(np.isfinite(model.data).all() for model in live.said[messages.MODEL])
+
+
+def test_a_message_of_unequal_sizes_is_dropped_and_counted(ros: Ros) -> None:
+    live = Live(ros, payload_method='none')
+    samples = list(recording(60))
+    bad = samples[30]
+    samples[30] = JointRecord(bad.stamp_ns, bad.names, bad.position[:3], bad.velocity, bad.effort)
+    live.send(*samples)
+    assert live.node.state.counters.unequal_sizes == 1
+    ros.wait(lambda: live.values().get('unequal_sizes') == '1')
+
+
+def test_a_joint_that_is_not_there_is_named(ros: Ros) -> None:
+    live = Live(ros, outputs=['elbow_bend/position', 'link1_bend/position'], payload_method='none', order=2)
+    live.send(*recording(20))
+    assert live.node.state.counters.missing_signal == 20
+    assert 'elbow_bend/position' in live.node.state.sampling.refusal.problem
+
+
+def test_a_late_joiner_gets_the_last_model_and_payload(ros: Ros) -> None:
+    live = Live(ros)
+    live.send(*recording(300))
+    ros.wait(lambda: live.said[messages.PAYLOAD])
+    for name, kind in ((messages.MODEL, Float64MultiArray), (messages.PAYLOAD_ESTIMATE, Float64MultiArray),
+                       (messages.PAYLOAD, InertiaStamped)):
+        late = ros.listen(kind, f'/rpbsid_identifier/{name}', qos.latched())
+        ros.wait(lambda late=late: late, what=f'the latched {name}')
+        assert late[0].layout == conversions.to_message(live.said[name][-1]).layout \
+            if kind is Float64MultiArray else late[0].header.frame_id == 'link2_tip'
+
+
+def test_reset_forgets_everything(ros: Ros) -> None:
+    live = Live(ros, payload_method='none')
+    live.send(*recording(200))
+    assert live.node.estimate is not None
+    assert ros.call(Trigger, 'rpbsid_identifier/reset').success
+    assert live.node.estimate is None
+    assert live.node.state.counters.received == 0
+
+
+def test_lost_messages_are_counted_from_the_publishers_numbers(ros: Ros) -> None:
+    live = Live(ros, payload_method='none')
+    live.send(*recording(50))
+    live.node.trigger_deactivate()
+    late = live.node.losses
+    for number in (60, 61, 65):
+        late.note(number)
+    assert late.lost == (60 - 50 - 1) + 3
+    late.note(1)
+    assert late.lost == 12
+
+
+def test_an_event_of_another_kind_is_refused_and_the_node_goes_on(ros: Ros) -> None:
+    live = Live(ros, payload_method='none')
+    live.events.publish(Header(frame_id='world'))
+    ros.wait(lambda: live.node.refused == 1)
+    live.send(*recording(50))
+    assert live.node.state.counters.accepted == 50
+
+
+@pytest.mark.parametrize('jump_s', [2, 3600])
+def test_a_clock_that_goes_back_resets_instead_of_mixing_two_times(ros: Ros, jump_s: int) -> None:
+    live = Live(ros, payload_method='none')
+    samples = recording(200)
+    live.send(*samples)
+    again = tuple(JointRecord(r.stamp_ns - jump_s * 10**9, r.names, r.position, r.velocity, r.effort)
+                  for r in samples)
+    live.send(*again)
+    assert live.node.state.counters.resets == 1
+    fresh = replayed(live, list(again))
+    ros.wait(lambda: len(live.said[messages.MODEL]) >= 2 * len(fresh[messages.MODEL]))
+    assert live.said[messages.MODEL][-1].data.tobytes() == fresh[messages.MODEL][-1].data.tobytes()
