@@ -125,9 +125,9 @@ class Composition:
 
     def _drained(self) -> bool:
         sent, recorder, identifier = self.plant.samples, self.recorder, self.identifier
-        return (recorder.joint_states + recorder.losses.lost >= sent
-                and identifier.state.counters.received + identifier.losses.lost >= sent
-                and sum(map(len, recorder.said.values())) >= identifier.published)
+        return bool(recorder.joint_states + recorder.losses.lost >= sent
+                    and identifier.state.counters.received + identifier.losses.lost >= sent
+                    and sum(map(len, recorder.said.values())) >= identifier.published)
 
     def facts(self) -> Facts:
         """Return what the run came to."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -31,10 +33,30 @@ def run(name: str, *arguments: str, timeout: float = 60.0) -> tuple[int, str, st
     return process.returncode, out, err
 
 
+@pytest.fixture
+def signals() -> Iterator[None]:
+    """Give the test run its signal handlers back."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def call(name: str, *arguments: str) -> int:
+    """Run the main function of a program in this process."""
+    main = importlib.import_module(f'flexmanip_ros.ros.{name}').main
+    try:
+        return int(main([name, *arguments]))
+    except SystemExit as left:
+        return int(left.code or 0)
+
+
 @pytest.mark.parametrize('name', [*NODES, 'demo'])
-def test_help_says_what_it_is_with_its_parameters(name: str) -> None:
-    code, out, err = run(name, '--help')
-    assert (code, err) == (0, '')
+def test_help_says_what_it_is_with_its_parameters(
+        name: str, signals: None, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(name, '--help') == 0
+    out, err = capsys.readouterr()
+    assert err == ''
     assert name in out
     assert 'default' in out if name == 'demo' else 'parameters:' in out
 
@@ -50,11 +72,18 @@ def test_help_says_what_it_is_with_its_parameters(name: str) -> None:
     ('demo', ['--capture-time', '7'], "'capture_time' is 7 s; it must come before the end"),
     ('demo', ['--duration', 'long'], 'invalid float value'),
 ])
-def test_bad_input_ends_with_one_clear_line_and_code_2(name: str, arguments: list[str], said: str) -> None:
-    code, _, err = run(name, *arguments)
-    assert code == 2
+def test_bad_input_ends_with_one_clear_line_and_code_2(
+        name: str, arguments: list[str], said: str, signals: None, capfd: pytest.CaptureFixture[str]) -> None:
+    assert call(name, *arguments) == 2
+    err = capfd.readouterr().err
     assert said in err
     assert 'Traceback' not in err
+
+
+def test_a_process_says_it_too() -> None:
+    code, out, err = run('capture_trigger', '--ros-args', '-p', 'lead_tim:=1.0')
+    assert (code, out) == (2, '')
+    assert err == "capture_trigger: unknown parameter 'lead_tim'; did you mean 'lead_time'?\n"
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
