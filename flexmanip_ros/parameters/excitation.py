@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.parameters.arm import ArmParameters
 from flexmanip_ros.parameters.field import check_all, parameter
 
 
@@ -28,6 +29,21 @@ class ExcitationParameters:
         4.0, 'multisine, PRBS and chirp repeat after this time', unit='s', low=0.01, high=600.0)
     bit_time: float = parameter(0.05, 'shortest pulse of the PRBS', unit='s', low=1e-4, high=60.0)
     seed: int = parameter(1, 'seed of multisine phases and PRBS', low=0)
+    allowed_angle: float = parameter(
+        0.0, 'the amplitudes are scaled together so that the chords of the empty arm turn just this far '
+        'within design_time; 0: amplitudes as given', unit='rad', low=0.0, high=3.0)
+    design_time: float = parameter(
+        6.0, 'length of the run that allowed_angle and the expected payload accuracy are for', unit='s',
+        low=0.1, high=60.0)
+    initial_angles: tuple[float, ...] = parameter(
+        (1.0471975511965976, 0.7853981633974483), 'chord angles at which the design is made', unit='rad',
+        size=2)
+    payload_mass: float = parameter(
+        20.0, 'payload for which the expected accuracy is told', unit='kg', low=0.0)
+    snr_db: float = parameter(
+        40.0, 'signal-to-noise ratio for which the expected accuracy is told', unit='dB',
+        low=-20.0, high=200.0)
+    arm: ArmParameters = field(default_factory=ArmParameters)
 
     def __post_init__(self) -> None:
         check_all(self)

@@ -19,18 +19,27 @@ CREST_PASSES = 200
 
 def torque(config: ExcitationParameters, k: int) -> Array:
     """Torque (2,) [N m] held from sample k on."""
-    return np.array([
-        config.offset[i] + config.amplitude[i] * _unit(config, i, k) for i in range(2)])
+    peak = amplitude(config)
+    return np.array([config.offset[i] + peak[i] * _unit(config, i, k) for i in range(2)])
 
 
 def sequence(config: ExcitationParameters, n: int) -> Array:
     """Torques (n, 2) [N m] of samples 0 .. n - 1: the same numbers as ``torque``."""
     columns = []
+    peak = amplitude(config)
     for i in range(2):
         table = _table(config.rate, config.shape, config.period[i], config.band, config.repeat_time,
                        config.bit_time, config.seed, i)
-        columns.append(config.offset[i] + config.amplitude[i] * table[np.arange(n) % table.size])
+        columns.append(config.offset[i] + peak[i] * table[np.arange(n) % table.size])
     return np.stack(columns, axis=1)
+
+
+def amplitude(config: ExcitationParameters) -> tuple[float, ...]:
+    """Peak torques (2,) [N m]: as given, or scaled to the allowed angle."""
+    if not config.allowed_angle:
+        return config.amplitude
+    from flexmanip_ros.plant.excitation_design import fitted_amplitude  # simulates, and so needs this module
+    return fitted_amplitude(config)
 
 
 def crest_factor(signal: Array) -> float:

@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros.parameters import ExcitationParameters
-from flexmanip_ros.plant import excitation
+from flexmanip_ros.plant import excitation, excitation_design
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.clock import SampleGrid
 from flexmanip_ros.ros.conversions import doubles
@@ -49,8 +49,10 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
         self._timer.cancel()
 
     def start(self) -> None:
-        """Compute one sample, so that nothing is compiled while the clock runs."""
+        """Compute one sample, so that nothing is late later; say what a designed torque will tell."""
         excitation.torque(self.config, 0)
+        if self.config.allowed_angle or self.config.shape in ('multisine', 'prbs', 'chirp'):
+            self.get_logger().info(excitation_design.describe(self.config))
 
     def activated(self) -> None:
         """Sample 0 is now."""
