@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 
@@ -78,8 +79,9 @@ class Scenario:
 
     def configuration(self, seed: int, estimator: str) -> Run:
         """Return everything one run needs; the same seed gives the same run."""
-        drawn = {name: _draw(self.vary[name], np.random.default_rng([seed, index]))
-                 for index, name in enumerate(sorted(self.vary))}
+        # A stream for each name: what else is varied does not change it.
+        drawn = {name: _draw(how, np.random.default_rng([seed, crc32(name.encode('utf-8'))]))
+                 for name, how in self.vary.items()}
         groups: dict[str, dict[str, Any]] = {
             name: dict(getattr(self, name)) for name in ('plant', 'excitation', 'identifier')}
         capture = self.capture_time
