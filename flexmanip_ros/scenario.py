@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 from zlib import crc32
 
@@ -97,8 +97,15 @@ class Scenario:
         groups['plant'].setdefault('seed', seed)
         plant = configure(PlantParameters, groups['plant'])
         groups['excitation']['rate'] = plant.rate
-        return Run(plant, configure(ExcitationParameters, groups['excitation']),
-                   configure(IdentifierParameters, groups['identifier']), capture, drawn)
+        torque = for_plant(configure(ExcitationParameters, groups['excitation']), plant)
+        identifier = configure(IdentifierParameters, groups['identifier'])
+        return Run(plant, torque, identifier, capture, drawn)
+
+
+def for_plant(torque: ExcitationParameters, plant: PlantParameters) -> ExcitationParameters:
+    """Return the torque as designed for the arm that is simulated."""
+    return replace(torque, arm=plant.arm, initial_angles=plant.initial_angles,
+                   payload_mass=plant.payload_mass, snr_db=plant.snr_db)
 
 
 @dataclass(frozen=True)

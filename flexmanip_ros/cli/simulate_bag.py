@@ -19,7 +19,8 @@ from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.io.table import check_place, write_file
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, flatten
 from flexmanip_ros.parameters.document import help_text
-from flexmanip_ros.plant import excitation, linearization, simulator
+from flexmanip_ros.plant import excitation, excitation_design, linearization, simulator
+from flexmanip_ros.scenario import for_plant
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
 PROG = 'simulate_bag'
@@ -51,6 +52,8 @@ def _parser() -> console.Parser:
     add('--payload', metavar='KG', type=float, help='mass of the object (parameter payload_mass)')
     add('--capture-time', metavar='SECONDS', type=float, default=3.0, help='default: 3; negative: never')
     add('--release-time', metavar='SECONDS', type=float, default=-1.0, help='default: never')
+    add('--expected', action='store_true',
+        help='say how accurate a payload estimate from this torque can be (takes some seconds)')
     add('--params', metavar='FILE.yaml', help='ROS parameter file with plant_simulator and excitation')
     add('--set', metavar='name=value', action='append', default=[],
         help=f'override one parameter; {PREFIX}NAME for the torque')
@@ -72,7 +75,7 @@ def configurations(given: argparse.Namespace) -> tuple[PlantParameters, Excitati
     plant = load(PlantParameters, 'plant_simulator', given.params, plant_items, optional=True)
     torque_items.append(f'rate={plant.rate!r}')  # one torque a sample
     torque = load(ExcitationParameters, 'excitation', given.params, torque_items, optional=True)
-    return plant, torque
+    return plant, for_plant(torque, plant)
 
 
 def _main(given: argparse.Namespace) -> int:
@@ -100,6 +103,8 @@ def _main(given: argparse.Namespace) -> int:
     known = truth(plant, torque, events)
     text = json.dumps(known, indent=1) + '\n'
     write_file(truth_path, lambda file: file.write(text.encode('utf-8')))
+    if given.expected:
+        print(excitation_design.describe(torque))
     print(f"wrote '{target}' ({count} samples, {given.duration:g} s) and '{truth_path}'")
     return console.SUCCESS
 
