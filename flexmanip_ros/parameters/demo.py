@@ -11,7 +11,6 @@ from flexmanip_ros.parameters.field import check_all, parameter
 
 IDENTIFIER: Mapping[str, Any] = {
     'order': 8, 'past_window': 20, 'future_window': 10, 'forgetting_factor': (0.9995, 0.9995, 0.9995),
-    'publish_rate': 20.0,
 }
 """What the demonstration changes of the identifier: two modes of each link, and a memory of 2 s that begins
 anew at the capture. With order 4 the third modes at 50 Hz push the lowest two up by 5 %."""

@@ -16,8 +16,9 @@ from flexmanip_ros import messages, pipeline
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.pictures import Truth, collect, overview_figure
 from flexmanip_ros.messages import Inertia, LabelledArray, Value
-from flexmanip_ros.parameters import IdentifierParameters, PlantParameters
+from flexmanip_ros.parameters import IdentifierParameters, PlantParameters, flatten
 from flexmanip_ros.parameters.demo import DemoParameters
+from flexmanip_ros.parameters.document import yaml_text
 from flexmanip_ros.plant.linearization import frequencies, vibration_model
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord
 
@@ -60,7 +61,11 @@ def finish(config: DemoParameters, facts: Facts, folder: Path, console: Console)
         count = sum(len(values) for values in facts.live.values())
         console.print(f'replay of the bag ({replay_s:.1f} s): all {count} live messages of the identifier, '
                       'bit for bit')
-    console.print(f"\nbag      {folder / 'bag'}\npicture  {picture}")
+    settings = folder / 'identifier.yaml'
+    settings.write_text(yaml_text('rpbsid_identifier', flatten(facts.identifier),
+                                  'The identifier as it ran in this demonstration.'), encoding='utf-8')
+    console.print(f"\nbag      {folder / 'bag'}\npicture  {picture}\n"
+                  f"again    identify_bag {folder / 'bag'} --params {settings}")
     return DIFFERENT if different or facts.problem else 0
 
 
