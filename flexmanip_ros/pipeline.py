@@ -119,6 +119,16 @@ def check_used(state: State) -> None:
         raise SignalError(refusal.problem, refusal.remedy)
 
 
+def reconfigure(config: IdentifierParameters, state: State) -> State:
+    """Go on with parameters that were changed while running (those declared ``live``)."""
+    if state.config is None:
+        return state
+    state = state._replace(config=replace(config, outputs=state.config.outputs))
+    if state.published < 0 or state.timeline is None:
+        return state
+    return state._replace(published=_instant(state, state.timeline.last_ns))
+
+
 def _event(state: State, event: CaptureEvent) -> State:
     if state.timeline is None or state.config is None:
         return state._replace(early=(*state.early, event))

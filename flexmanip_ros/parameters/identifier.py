@@ -27,7 +27,8 @@ class IdentifierParameters:
     past_window: int = parameter(10, 'past window p', unit='samples', low=1, high=200)
     future_window: int = parameter(5, 'future window f', unit='samples', low=1, high=200)
     forgetting_factor: tuple[float, ...] = parameter(
-        (0.99, 0.99, 0.99), 'forgetting factors beta 1..3 of the three least squares', low=0.5, high=1.0, size=3)
+        (0.99, 0.99, 0.99), 'forgetting factors beta 1..3 of the three least squares', low=0.5, high=1.0,
+        size=3, live=True)
     regularization: tuple[float, ...] = parameter(
         (0.1, 0.1, 0.1), 'regularization alpha 1..3 on internally scaled signals', low=1e-12, high=1e12, size=3)
     direct_feedthrough: bool = parameter(False, 'identify D instead of holding it at zero')
@@ -45,26 +46,33 @@ class IdentifierParameters:
         'regression, estimated like A and B (the paper; the only way of estimator paper)',
         choices=('riccati', 'regression'))
     forgetting: str = parameter(
-        'excitation', 'when old information is let go: excitation, as fast as new comes in; constant, at every '
-        'sample (the paper); innovation, only while the model does not fit',
+        'innovation', 'when old information is let go: innovation, only while the model does not fit; excitation, '
+        'as fast as new comes in; constant, at every sample (the paper)',
         choices=('excitation', 'constant', 'innovation'))
+    refinement: str = parameter(
+        'prediction_error', 'prediction_error: the subspace model starts a maximum-likelihood fit that is kept up '
+        'to date (estimator factor with forgetting innovation only), the noise model chosen by the data; '
+        'output_error: the same with K = 0, the best simulation; none',
+        choices=('prediction_error', 'output_error', 'none'))
     restart_on_event: bool = parameter(
-        True, 'restart the covariances of the least squares at a capture or release')
+        True, 'restart the covariances of the least squares at a capture or release', live=True)
     payload_method: str = parameter(
         'structured', 'how the payload is read', choices=('none', 'block', 'structured'))
     publish_rate: float = parameter(
-        50.0, 'estimates a second, on the grid of the stamps', unit='Hz', low=0.01, high=10000.0)
+        50.0, 'estimates a second, on the grid of the stamps', unit='Hz', low=0.01, high=10000.0,
+        live=True)
     gap_factor: float = parameter(
         1.5, 'a step between stamps longer than this many sample times is a gap (so is one as much shorter)',
-        low=1.05, high=1000.0)
+        low=1.05, high=1000.0, live=True)
     max_time_jump: float = parameter(
-        1.0, 'a jump back of the stamps by more than this resets the identifier', unit='s', low=0.001)
+        1.0, 'a jump back of the stamps by more than this resets the identifier', unit='s', low=0.001,
+        live=True)
     rewind_time: float = parameter(
         0.2, 'samples kept so that a late event is applied at its own stamp', unit='s', low=0.0, high=10.0)
     event_merge_time: float = parameter(
         0.1, 'a second event of the same kind within this time of the first is the same event', unit='s',
-        low=0.0, high=60.0)
-    payload_frame: str = parameter('link2_tip', 'frame_id of the published payload')
+        low=0.0, high=60.0, live=True)
+    payload_frame: str = parameter('link2_tip', 'frame_id of the published payload', live=True)
     arm: ArmParameters = field(default_factory=ArmParameters)
     payload: PayloadParameters = field(default_factory=PayloadParameters)
 

@@ -74,6 +74,10 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         warm_up(self.config)
         self._forget()
 
+    def configuration_changed(self, config: IdentifierParameters) -> None:
+        """Go on with what may change at run time."""
+        self.state = pipeline.reconfigure(config, self.state)
+
     def _forget(self) -> None:
         self.state = pipeline.init()
         self.estimate = None

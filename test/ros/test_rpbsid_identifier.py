@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import InertiaStamped
+from rclpy.parameter import Parameter
 from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
@@ -210,3 +211,20 @@ def test_a_clock_that_goes_back_resets_instead_of_mixing_two_times(ros: Ros, jum
     fresh = replayed(live, list(again))
     ros.wait(lambda: len(live.said[messages.MODEL]) >= 2 * len(fresh[messages.MODEL]))
     assert live.said[messages.MODEL][-1].data.tobytes() == fresh[messages.MODEL][-1].data.tobytes()
+
+
+def test_the_publishing_rate_changes_while_it_runs(ros: Ros) -> None:
+    live = Live(ros, payload_method='none')
+    samples = recording(700)
+    live.send(*samples[:350])
+    ros.wait(lambda: live.said[messages.MODEL])
+    (result,) = live.node.set_parameters([Parameter('publish_rate', value=250.0)])
+    assert result.successful
+    before = live.node.published
+    live.send(*samples[350:])
+    assert live.node.published - before == 2 * len({k // 4 for k in range(352, 700)})
+    (result,) = live.node.set_parameters([Parameter('publish_rate', value=-1.0)])
+    assert not result.successful
+    (result,) = live.node.set_parameters([Parameter('order', value=6)])
+    assert not result.successful
+    assert live.node.config.publish_rate == 250.0
