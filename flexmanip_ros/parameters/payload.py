@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.field import check_all, parameter
 
 
@@ -17,6 +18,8 @@ class PayloadParameters:
     dynamics: str = parameter(
         'nonlinear', '`structured`: nonlinear, follows the moving configuration; linear, keeps the first',
         choices=('nonlinear', 'linear'))
+    working_point: tuple[float, ...] = parameter(
+        (), "chord angles at which dynamics 'linear' stays; [] for the measured ones", unit='rad')
     stiffness_std: float = parameter(
         0.03, 'relative standard deviation of the bending stiffnesses, learned from the empty arm', low=0.0,
         high=1.0)
@@ -24,8 +27,15 @@ class PayloadParameters:
         0.005, 'standard deviation of the damping ratio, learned from the empty arm', low=0.0, high=1.0)
     capture_speed: float = parameter(
         0.3, 'how fast an object may move against the tip when it is caught', unit='m/s', low=0.0, high=100.0)
+    model_error: float = parameter(
+        0.0015, "relative error of the arm's inertia to reckon with where a sensor shows more than its noise",
+        low=0.0, high=1.0)
     memory_time: float = parameter(
         20.0, 'how long old samples count', unit='s', low=0.1, high=1e6)
 
     def __post_init__(self) -> None:
         check_all(self)
+        if len(self.working_point) not in (0, 2):
+            raise ParameterError(
+                f"parameter 'working_point' has {len(self.working_point)} elements",
+                'give two angles, or [] for the measured ones')

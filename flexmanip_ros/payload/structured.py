@@ -122,6 +122,8 @@ def _forget_payload(m: mem.Memory) -> None:
         f = m.S[payload].copy()
         square = float(f @ f)
         if square > 0.0:
+            if m.counts[mem.SINCE_EVENT] > mem.HORIZON:
+                m.score[mem.SEEMED] = m.x[payload] / np.sqrt(square)
             gain = m.S @ f / square
             m.x[:] -= gain * m.x[payload]
             m.S[:] -= np.outer(gain, f)
@@ -137,7 +139,7 @@ def _anchor(m: mem.Memory) -> None:
                     mem.BATCHES):
         m.counts[counter] = 0
     m.counts[mem.BLOCKS] = min(m.counts[mem.BLOCKS], 40)
-    m.score[:] = 0.0
+    m.score[:mem.SEEMED] = 0.0
     m.score[mem.DRIFT] = 1.0
     m.noise[:, mem.WEIGHT] = 0.0
     m.power[:] = 1.0
@@ -154,14 +156,14 @@ def _begin(config: IdentifierParameters, state: StructuredState) -> StructuredSt
     dt = float(np.median(steps))
     m = mem.memory(2 * model.motion.q.size + 5, len(model.roles))
     m.noise[:] = start.noise(model, Y)
-    m.counts[mem.BLOCKS] = 2
     start.first(config, model, m, Y[0])
+    start.freeze(config, model, np.mean([sample.angles for sample in samples], axis=0))
     _anchor(m)
     state = replace(
         state, memory=m, sensors=sensors(config, model, dt, start.diffusion(config, model, m)), waiting=(),
         last_ns=samples[0].stamp_ns, effort=samples[0].u.copy())
     for item in items:
-        state = event(config, state, item) if isinstance(item, CaptureEvent) else _run(config, state, (item,))
+        state = event(config, state, item) if isinstance(item, CaptureEvent) else step(config, state, item)
     return state
 
 

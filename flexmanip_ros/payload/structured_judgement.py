@@ -8,6 +8,7 @@ import numpy as np
 
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import memory as mem
+from flexmanip_ros.payload.signals import Quantity
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import Payload, Status
 
@@ -17,10 +18,14 @@ UNKNOWN_STD = 0.5
 """A payload whose logarithm is less certain than this is not known."""
 FEW = 50
 """Samples after an event before anything is claimed."""
-POWER_LIMIT = 3.0
+POWER_LIMIT = 2.0
 """Innovation power over white noise beyond which the model does not fit."""
-DRIFT_LIMIT = 6.0
-"""Mean squared move of the payload over its variance beyond which the model does not fit."""
+WIDENING_LIMIT = 2.5
+"""Factor on the standard deviation beyond which the model does not fit."""
+SEEMED_FREE = 2.0
+"""Standard deviations that an empty arm may seem to hold without a doubt of the model."""
+SETTLED = 1000
+"""Samples after which a restart is forgotten."""
 
 
 def judge(config: IdentifierParameters, model: Model | None, m: mem.Memory | None, restarts: int) -> Payload:
@@ -30,17 +35,23 @@ def judge(config: IdentifierParameters, model: Model | None, m: mem.Memory | Non
     if m is None:
         return Payload(0.0, math.inf, 0.0, math.inf, 1.0, Status.WARMING_UP)
     state = m.x.size - 5
-    inflation = drift(m)
-    std = float(np.sqrt(m.S[state] @ m.S[state]) * math.sqrt(inflation))
-    consistency = misfit(m)
+    scale = model.motion.scale
+    held = bool(m.counts[mem.HELD])
+    widening = math.sqrt(drift(m)) * max(1.0, abs(float(m.score[mem.SEEMED])) / SEEMED_FREE)
+    std = widening * float(np.sqrt(m.S[state] @ m.S[state]))
+    consistency = misfit(model, m)
     status = Status.TRACKING
-    if consistency > POWER_LIMIT or inflation > DRIFT_LIMIT:
+    if consistency > POWER_LIMIT or widening > WIDENING_LIMIT:
         status = Status.INCONSISTENT
     if m.counts[mem.SINCE_EVENT] < FEW:
         status = Status.WARMING_UP
-    if not m.counts[mem.HELD]:
-        return empty(float(m.x[state]), std, consistency, status)
-    mass = float(model.motion.scale * np.exp(min(m.x[state], 12.0)))
+    if restarts and m.counts[mem.SEEN] < SETTLED:
+        status = Status.DIVERGED
+    mass = float(scale * np.exp(min(m.x[state], 12.0))) if held else 0.0
+    inexact = config.payload.model_error * (mass + scale) if not exact(m) else 0.0
+    if not held:
+        return empty(float(m.x[state]), math.hypot(std, inexact), consistency, status)
+    std = math.hypot(std, inexact / mass)
     if std > UNKNOWN_STD and status is Status.TRACKING:
         status = Status.POORLY_EXCITED
     lower = max(0.0, mass * (1.0 - QUANTILE * std))
@@ -64,11 +75,22 @@ def drift(m: mem.Memory) -> float:
     return max(1.0, float(m.score[mem.DRIFT]) - 2.0 * math.sqrt(2.0 / batches))
 
 
-def misfit(m: mem.Memory) -> float:
-    """Innovation power over white noise, each sensor weighted by what it tells of the payload."""
-    weight = m.noise[:, mem.WEIGHT]
-    total = float(weight.sum())
+def exact(m: mem.Memory) -> bool:
+    """Whether no sensor shows more than its white noise: then the model is the arm, as far as one can see."""
+    doubt = 2.5 * math.sqrt(2.0 / max(int(m.counts[mem.BLOCKS]), 1))
+    ratio = m.noise[:, mem.EFFECTIVE] / np.maximum(m.noise[:, mem.WHITE], m.noise[:, mem.FLOOR])
+    return bool(np.all(ratio < 1.0 + doubt))
+
+
+def misfit(model: Model, m: mem.Memory) -> float:
+    """Innovation power over white noise, each sensor weighted by what it tells of the payload.
+
+    Rates are left out where there are displacements: they show the modes that the model leaves out, and have
+    been given a larger noise for it.
+    """
+    slow = np.array([role.quantity in (Quantity.ANGLE, Quantity.BEND) for role in model.roles])
     ratio = m.noise[:, mem.POWER] / np.maximum(m.noise[:, mem.WHITE], m.noise[:, mem.FLOOR])
-    if total <= 0.0:
-        return float(np.median(ratio))
-    return float(weight @ ratio / total)
+    weight = np.where(slow, m.noise[:, mem.WEIGHT], 0.0)
+    if not weight.sum() > 0.0:
+        return float(np.median(ratio[slow]))
+    return float(weight @ ratio / weight.sum())

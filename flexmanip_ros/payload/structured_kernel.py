@@ -154,7 +154,8 @@ def learn_noise(sensors: Sensors, m: Memory) -> None:
         row[BLOCK_SUM] = 0.0
         row[BLOCK_POWER] = 0.0
         # white noise has SLOW = POWER; a slow part that is no chance makes samples worth less
-        row[EFFECTIVE] = max(row[POWER], row[SLOW] - doubt * row[POWER], row[FLOOR])
+        # trust comes back slowly: the first guess, or a shock, may have been right
+        row[EFFECTIVE] = max(row[POWER], row[SLOW] - doubt * row[POWER], row[FLOOR], 0.7 * row[EFFECTIVE])
 
 
 @kernel

@@ -73,13 +73,12 @@ def first(config: IdentifierParameters, model: Model, m: mem.Memory, y: Array) -
     std[2 * n + 1:2 * n + 3] = max(config.payload.stiffness_std, CERTAIN)
     std[2 * n + 3:] = max(config.payload.damping_std, CERTAIN)
     m.S[:] = np.diag(std)
-    freeze(model, m.x[:n])
 
 
-def freeze(model: Model, q: Array) -> None:
-    """Set the mass matrices of a linear plant at the working point q, at rest."""
-    rest = np.zeros_like(q)
-    rest[:2] = q[:2]
+def freeze(config: IdentifierParameters, model: Model, angles: Array) -> None:
+    """Set the mass matrices of a linear plant at its working point, given or as measured (2,), unbent."""
+    rest = np.zeros(model.motion.q.size)
+    rest[:2] = config.payload.working_point or chords(config.arm, angles)
     nominal = model.motion.arm
     model.motion.M0[:] = mass_matrix(nominal, np.zeros(4), rest)
     model.motion.Mp[:] = mass_matrix(nominal, np.array([1.0, 0.0, 0.0, 0.0]), rest) - model.motion.M0
