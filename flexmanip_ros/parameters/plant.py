@@ -21,6 +21,9 @@ class PlantParameters:
         'nonlinear', 'nonlinear: assumed modes; linear: the same at the initial angles, without shortening '
         'and slope correction (the paper); finite_element: Hermite beams at the initial angles',
         choices=('nonlinear', 'linear', 'finite_element'))
+    tail_modes: int = parameter(
+        0, 'further modes of each link that ring along without back-effect (model nonlinear with '
+        'arm.slope_correction): encoder angles and rates right at few modes', low=0, high=20)
     elements: int = parameter(10, 'finite elements of each link (model finite_element)', low=2, high=60)
     locked: bool = parameter(False, 'hold both joints (encoder angles, or chords) at their initial angles')
     substeps: int = parameter(

@@ -8,7 +8,7 @@ import numpy as np
 
 from flexmanip_ros.plant.acceleration_kernel import acceleration, hold
 from flexmanip_ros.plant.compiled import kernel
-from flexmanip_ros.plant.output_kernel import measure
+from flexmanip_ros.plant.output_kernel import end_loads, measure, shake
 
 if TYPE_CHECKING:
     from flexmanip_ros.plant.manipulator import Manipulator, Workspace
@@ -26,7 +26,7 @@ def runge_kutta(
 ) -> bool:
     """Advance x = [q; qd] (2n,) by steps of h seconds under a held torque; False when it diverged.
 
-    held: (0 or 2, n) combinations of q that stay; scratch: (5, 2n), trial state and the four slopes.
+    held: (0 or 2, n) combinations of q that stay; scratch: (6, 2n), trial state and the four slopes.
     """
     size = x.size
     n = size // 2
@@ -44,10 +44,10 @@ def runge_kutta(
                     trial[r] = x[r] + reach * before[r]
             for r in range(n):
                 slope[r] = trial[n + r]
-            if not acceleration(arm, payload, trial[:n], trial[n:], effort, slope[n:], work):
+            if not acceleration(arm, payload, trial[:n], trial[n:size], effort, slope[n:size], work):
                 return False
             if held.shape[0]:
-                hold(work.M, held, slope[n:], work.held)
+                hold(work.M, held, slope[n:size], work.held)
         for r in range(size):
             x[r] += h / 6.0 * (scratch[1, r] + 2.0 * (scratch[2, r] + scratch[3, r]) + scratch[4, r])
             if not abs(x[r]) < LIMIT:
@@ -57,24 +57,31 @@ def runge_kutta(
 
 @kernel
 def run_nonlinear(
-    arm: Manipulator, payload: Array, slopes: Slopes, held: Array, x: Array, previous: Array,
-    efforts: Array, dt: float, steps: int, position: Array, velocity: Array, scratch: Array, loads: Array,
+    arm: Manipulator, payload: Array, slopes: Slopes, held: Array, x: Array, memory: Array,
+    efforts: Array, dt: float, steps: int, position: Array, velocity: Array, scratch: Array,
     work: Workspace,
 ) -> int:
     """Record each sample, then integrate to the next under its torque; return how many samples are good.
 
-    x (2n,) and previous (2,), the torque of the interval before, are advanced in place. efforts: (N, 2);
-    position, velocity: (N, 4) filled; scratch: (5, 2n), loads: (7,).
+    x (2n,) and memory (7 + 2 T,), see ``output_kernel.measure``, are advanced in place. efforts: (N, 2);
+    position, velocity: (N, 4) filled; scratch: (6, 2n).
     """
     n = x.size // 2
     count: int = efforts.shape[0]
+    qdd, before = scratch[0, :n], scratch[5, :7]
     for k in range(count):
-        measure(arm, payload, slopes, held, x[:n], x[n:], previous, position[k], velocity[k],
-                scratch[0, :n], loads, work)
+        measure(arm, slopes, x[:n], x[n:], memory, position[k], velocity[k])
+        if slopes.active and slopes.step.shape[0]:
+            if not acceleration(arm, payload, x[:n], x[n:], efforts[k], qdd, work):
+                return k
+            end_loads(arm, payload, slopes, x[:n], qdd, efforts[k], before)
         if not runge_kutta(arm, payload, held, x, efforts[k], dt / steps, steps, scratch, work):
             return k
-        previous[0] = efforts[k, 0]
-        previous[1] = efforts[k, 1]
+        if slopes.active:
+            if not acceleration(arm, payload, x[:n], x[n:], efforts[k], qdd, work):
+                return k
+            end_loads(arm, payload, slopes, x[:n], qdd, efforts[k], memory)
+            shake(slopes, before, memory)
     return count
 
 
@@ -85,7 +92,7 @@ def run_linear(
 ) -> int:
     """Record and step x = [dq; dq'] by x = A x + B u; outputs rest + C dq and C dq'. See run_nonlinear.
 
-    A: (2n, 2n), B: (2n, 2), C: (4, n), rest: (4,), scratch: (5, 2n).
+    A: (2n, 2n), B: (2n, 2), C: (4, n), rest: (4,), scratch: (6, 2n).
     """
     size = x.size
     n = size // 2
@@ -112,4 +119,4 @@ def run_linear(
 
 def scratch(size: int) -> Array:
     """Scratch rows for a state of the given size 2n."""
-    return np.zeros((5, size))
+    return np.zeros((6, max(size, 7)))

@@ -43,16 +43,21 @@ class LinearModel:
         """State at rest at the working point."""
         return np.zeros(2 * self.M0.shape[0])
 
+    def memory(self) -> Array:
+        """Nothing beside the state."""
+        return np.zeros(0)
+
+    def struck(self, x: Array, memory: Array, jump: Array) -> Array:
+        """See Model."""
+        return memory
+
     def advance(
-        self, x: Array, payload: Array, previous: Array, efforts: Array, position: Array, velocity: Array,
+        self, x: Array, payload: Array, memory: Array, efforts: Array, position: Array, velocity: Array,
     ) -> int:
         """See Model."""
         A, B = self.step_matrices(payload)
-        good = run_linear(
+        return run_linear(
             A, B, self.C, self.rest_output, x, efforts, position, velocity, self._scratch)
-        if good:
-            previous[:] = efforts[good - 1]
-        return good
 
     def step_matrices(self, payload: Array) -> tuple[Array, Array]:
         """Discrete (A (2n, 2n), B (2n, 2)) with a payload, kept for the last few payloads."""

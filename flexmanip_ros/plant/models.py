@@ -7,6 +7,7 @@ that stepping one by one and simulating at once give the same bits.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +20,9 @@ from flexmanip_ros.plant.capture import body_jacobian
 from flexmanip_ros.plant.finite_element import finite_element_model
 from flexmanip_ros.plant.integration_kernel import run_nonlinear, scratch
 from flexmanip_ros.plant.linear_model import linear_model
+from flexmanip_ros.plant.output_kernel import end_loads
 from flexmanip_ros.plant.slope_correction import slopes
+from flexmanip_ros.plant.tail import slopes_with_tail
 from flexmanip_ros.types import Array
 
 STEP_ANGLE = 0.1
@@ -39,10 +42,16 @@ class Model(Protocol):
     def rest(self) -> Array:
         """State (2n,) at rest at the initial angles."""
 
+    def memory(self) -> Array:
+        """What the outputs remember beside the state, at rest."""
+
+    def struck(self, x: Array, memory: Array, jump: Array) -> Array:
+        """Memory after the rates jumped by jump (n,)."""
+
     def advance(
-        self, x: Array, payload: Array, previous: Array, efforts: Array, position: Array, velocity: Array,
+        self, x: Array, payload: Array, memory: Array, efforts: Array, position: Array, velocity: Array,
     ) -> int:
-        """Record efforts.shape[0] samples and advance x and previous in place; return how many are good."""
+        """Record efforts.shape[0] samples and advance x and memory in place; return how many are good."""
 
     def mass_matrix(self, x: Array, payload: Array) -> Array:
         """M at the state, (n, n)."""
@@ -56,16 +65,16 @@ class NonlinearModel:
 
     def __init__(self, config: PlantParameters) -> None:
         self.arm = arm_dynamics.manipulator(config.arm)
-        self.slopes = slopes(config.arm, self.arm.kappa)
+        self.slopes = slopes_with_tail(
+            config.arm, config.initial_angles, self.arm.kappa, config.tail_modes, 1.0 / config.rate)
         if config.locked:  # the joints' reactions are loads of their own; clamped roots need more modes
-            self.slopes = self.slopes._replace(active=False)
+            self.slopes = slopes(replace(config.arm, slope_correction=False), self.arm.kappa)
         self.held = self.arm.output[:2].copy() if config.locked else np.zeros((0, 2 + 2 * self.arm.kappa))
         self._angles = config.initial_angles
         self._dt = 1.0 / config.rate
         self._steps = substeps(self.arm, config)
         self._work = arm_dynamics.workspace(self.arm.kappa)
         self._scratch = scratch(4 + 4 * self.arm.kappa)
-        self._loads = np.zeros(7)
 
     def rest(self) -> Array:
         """State at rest: chords at the initial angles, no bending."""
@@ -73,13 +82,25 @@ class NonlinearModel:
         x[:2] = self._angles
         return x
 
+    def memory(self) -> Array:
+        """Loads of the truncated modes, then places and rates of the tail."""
+        return np.zeros(7 + 2 * len(self.slopes.step))
+
+    def struck(self, x: Array, memory: Array, jump: Array) -> Array:
+        """The tail takes its part of an impulse at once; places and quasi-static loads do not jump."""
+        after = memory.copy()
+        loads = np.zeros(7)
+        end_loads(self.arm, np.zeros(4), self.slopes, x[:jump.size], jump, np.zeros(2), loads)
+        after[7 + len(self.slopes.step):] += self.slopes.load @ loads
+        return after
+
     def advance(
-        self, x: Array, payload: Array, previous: Array, efforts: Array, position: Array, velocity: Array,
+        self, x: Array, payload: Array, memory: Array, efforts: Array, position: Array, velocity: Array,
     ) -> int:
         """See Model."""
         return run_nonlinear(
-            self.arm, payload, self.slopes, self.held, x, previous, efforts, self._dt, self._steps,
-            position, velocity, self._scratch, self._loads, self._work)
+            self.arm, payload, self.slopes, self.held, x, memory, efforts, self._dt, self._steps,
+            position, velocity, self._scratch, self._work)
 
     def mass_matrix(self, x: Array, payload: Array) -> Array:
         """See Model."""

@@ -6,16 +6,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.plant.acceleration_kernel import acceleration, hold
 from flexmanip_ros.plant.compiled import kernel
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
-    from flexmanip_ros.plant.manipulator import Manipulator, Workspace
+    from flexmanip_ros.plant.manipulator import Manipulator
 
 
 class Slopes(NamedTuple):
-    """Quasi-static slopes of the modes beyond kappa (``slope_correction.py``)."""
+    """What the modes beyond kappa add to the outputs (``slope_correction.py``, ``tail.py``)."""
 
     active: bool
     flexibility: Array
@@ -24,40 +23,64 @@ class Slopes(NamedTuple):
     """(4, 2) end moments by joint torques."""
     hubs: Array
     """(4,) rotary inertias at root and tip of link 1, root and tip of link 2."""
+    step: Array
+    """(T, 2, 2) free motion of each oscillator of the tail over a sample."""
+    start: Array
+    """(T, 2) its motion by a unit force that falls to zero over the sample."""
+    end: Array
+    """(T, 2) the same for a force that rises from zero."""
+    load: Array
+    """(T, 7) forces on the oscillators by loads."""
+    output: Array
+    """(4, T) outputs by oscillators."""
 
 
 @kernel
 def measure(
-    arm: Manipulator, payload: Array, slopes: Slopes, held: Array, q: Array, qd: Array, previous: Array,
-    position: Array, velocity: Array, qdd: Array, loads: Array, work: Workspace,
+    arm: Manipulator, slopes: Slopes, q: Array, qd: Array, memory: Array, position: Array, velocity: Array,
 ) -> None:
     """Fill position and velocity (4,): joint1, joint2, link1_bend, link2_bend.
 
-    previous: torque (2,) of the interval that ends at this instant: at a jump of the torque the
-    truncated modes still show the one before; held: see ``integration_kernel``. Scratch: qdd (n,),
-    loads (7,).
+    memory (7 + 2 T,): loads of the truncated modes at the end of the last interval, under its torque (at a
+    jump of the torque they still show the one before), then places and rates of the tail's oscillators.
     """
+    T = slopes.step.shape[0]
     for r in range(4):
         place, rate = 0.0, 0.0
         for c in range(q.size):
             place += arm.output[r, c] * q[c]
             rate += arm.output[r, c] * qd[c]
+        for c in range(7):
+            place += slopes.flexibility[r, c] * memory[c]
+        for c in range(T):
+            place += slopes.output[r, c] * memory[7 + c]
+            rate += slopes.output[r, c] * memory[7 + T + c]
         position[r] = place
         velocity[r] = rate
-    if slopes.active and acceleration(arm, payload, q, qd, previous, qdd, work):
-        if held.shape[0]:
-            hold(work.M, held, qdd, work.held)
-        end_loads(arm, payload, slopes, q, qdd, previous, loads)
-        for r in range(4):
-            for c in range(7):
-                position[r] += slopes.flexibility[r, c] * loads[c]
+
+
+@kernel
+def shake(slopes: Slopes, before: Array, memory: Array) -> None:
+    """Move the tail over a sample while the loads go from before (7,) to memory[:7]."""
+    T = slopes.step.shape[0]
+    for a in range(T):
+        first, last = 0.0, 0.0
+        for c in range(7):
+            first += slopes.load[a, c] * before[c]
+            last += slopes.load[a, c] * memory[c]
+        z, rate = memory[7 + a], memory[7 + T + a]
+        step = slopes.step[a]
+        memory[7 + a] = (step[0, 0] * z + step[0, 1] * rate
+                         + slopes.start[a, 0] * first + slopes.end[a, 0] * last)
+        memory[7 + T + a] = (step[1, 0] * z + step[1, 1] * rate
+                             + slopes.start[a, 1] * first + slopes.end[a, 1] * last)
 
 
 @kernel
 def end_loads(
     arm: Manipulator, payload: Array, slopes: Slopes, q: Array, qdd: Array, effort: Array, loads: Array,
 ) -> None:
-    """Fill loads (7,) of the truncated modes, see ``slope_correction.flexibility``."""
+    """Fill loads[:7] of the truncated modes, see ``slope_correction.flexibility``."""
     k = arm.kappa
     base = arm.length[0] * np.cos(q[1] - q[0]) * qdd[0]
     turn1, turn2 = qdd[0], qdd[1]

@@ -14,6 +14,7 @@ import numpy as np
 from flexmanip_ros.parameters.arm import ArmParameters
 from flexmanip_ros.plant import linearization
 from flexmanip_ros.plant.output_kernel import Slopes
+from flexmanip_ros.plant.shape_integrals import output_matrix
 from flexmanip_ros.types import Array
 
 TERMS = 4000
@@ -23,9 +24,10 @@ TERMS = 4000
 def slopes(arm: ArmParameters, kappa: int) -> Slopes:
     """Precompute the correction of an arm with kappa modes; inactive when switched off."""
     return Slopes(
-        active=arm.slope_correction, flexibility=flexibility(arm, kappa),
-        moments=_moments(arm), hubs=np.array([
-            arm.hub_inertia[0], arm.joint_inertia, arm.hub_inertia[1], arm.tip_inertia]))
+        active=arm.slope_correction, flexibility=flexibility(arm, kappa), moments=_moments(arm),
+        hubs=np.array([arm.hub_inertia[0], arm.joint_inertia, arm.hub_inertia[1], arm.tip_inertia]),
+        step=np.zeros((0, 2, 2)), start=np.zeros((0, 2)), end=np.zeros((0, 2)), load=np.zeros((0, 7)),
+        output=np.zeros((4, 0)))
 
 
 def flexibility(arm: ArmParameters, kappa: int) -> Array:
@@ -35,33 +37,35 @@ def flexibility(arm: ArmParameters, kappa: int) -> Array:
     link 1, root and tip of link 2, then -theta1'', -theta2'' [rad/s^2] and -n2 . P'' [m/s^2].
     """
     L, EI = np.array(arm.link_length), np.array(arm.bending_stiffness)
-    root, tip = (f(arm, TERMS) for f in (linearization.root_slopes, linearization.tip_slopes))
-    stiffness = linearization.stiffness(arm, TERMS).reshape(2, TERMS)
-    j = np.arange(1, TERMS + 1)
-    bend = np.sin(np.pi * j * np.array(arm.sensor_position)[:, None])
-    mass = np.array(arm.linear_density) * L
-    rigid = -(mass * L)[:, None] * np.where(j % 2, -1.0, 1.0) / (j * np.pi)
-    mean = mass[:, None] * (1 - np.where(j % 2, -1.0, 1.0)) / (j * np.pi)
-    ends = np.stack([root, tip])
-    # shape (output: root slope, tip slope, bend; load: root moment, tip moment, turning, base; link)
-    left = slice(kappa, None)
-    F = np.zeros((3, 4, 2))
-    for o, out in enumerate((root, tip, bend)):
-        for i, load in enumerate((root, tip, rigid, mean)):
-            F[o, i] = np.sum((out * load / stiffness)[:, left], axis=1)
-    # slopes under end moments: the static beam less the modes kept (3 EI / L and 6 EI / L)
+    ends = np.stack([f(arm, TERMS) for f in (linearization.root_slopes, linearization.tip_slopes)])
+    stiffness = linearization.stiffness(arm, TERMS)
+    C = output_matrix(arm, *ends)[:, 2:]
+    beyond = np.tile(np.arange(TERMS) >= kappa, 2)
+    R: Array = (C / stiffness * beyond) @ load_weights(arm, TERMS)
+    # slopes by end moments fall with 1 / j^2 only: the static beam (L / 3 EI, L / 6 EI) less the modes kept
     total = np.array([[1 / 3, -1 / 6], [-1 / 6, 1 / 3]])
-    kept = np.einsum('oij,lij,ij->oli', ends[:, :, :kappa], ends[:, :, :kappa], 1 / stiffness[:, :kappa])
-    F[:2, :2] = total[:, :, None] * (L / EI) - kept
-    R = np.zeros((4, 7))
-    for output, rows in ((0, F[0]), (2, F[2])):
-        R[output, [0, 1, 4]] = rows[[0, 1, 2], 0]
-    for output, rows in ((1, F[0]), (3, F[2])):
-        R[output, [2, 3, 5, 6]] = rows[:, 1]
-    R[1, [0, 1, 4]] = -F[1, [0, 1, 2], 0]
-    if arm.angle_convention == 'chord':
-        R[:2] = 0.0
+    if arm.angle_convention == 'encoder':
+        kept = stiffness.reshape(2, TERMS)[:, :kappa]
+        few = ends[:, :, :kappa]
+        bent = [total * L[i] / EI[i] - (few[:, i] / kept[i]) @ few[:, i].T for i in range(2)]
+        R[0, :2] = bent[0][0]
+        R[1, :2] = -bent[0][1]
+        R[1, 2:4] = bent[1][0]
     return R
+
+
+def load_weights(arm: ArmParameters, modes: int) -> Array:
+    """Generalized forces of the modal coordinates by the seven loads, (2 modes, 7), see ``flexibility``."""
+    root, tip = linearization.root_slopes(arm, modes), linearization.tip_slopes(arm, modes)
+    mass = np.array(arm.linear_density) * np.array(arm.link_length)
+    j = np.arange(1, modes + 1)
+    sign = np.where(j % 2, -1.0, 1.0)
+    rigid = -(mass * np.array(arm.link_length))[:, None] * sign / (j * np.pi)
+    W = np.zeros((2 * modes, 7))
+    W[:modes, [0, 1, 4]] = np.column_stack([root[0], tip[0], rigid[0]])
+    W[modes:, [2, 3, 5, 6]] = np.column_stack([
+        root[1], tip[1], rigid[1], mass[1] * (1 - sign) / (j * np.pi)])
+    return W
 
 
 def _moments(arm: ArmParameters) -> Array:
