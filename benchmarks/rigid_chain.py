@@ -144,7 +144,7 @@ class Chain:
         return self.signals(P, PD, efforts)
 
     def signals(self, P: np.ndarray, PD: np.ndarray, efforts: np.ndarray) -> Record:
-        """Angles of the first rods (the second against the last of link 1) and mid-span bends from the chords."""
+        """Angles of the first rods, the second against the last of link 1, and bends from the chords."""
         r = self.rods
         position = np.zeros((P.shape[0], 4))
         velocity = np.zeros_like(position)

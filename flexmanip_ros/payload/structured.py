@@ -68,9 +68,12 @@ def advance(
     begin = 0
     for stop in [i for i, sample in enumerate(samples) if sample.gap and i > 0] + [len(samples)]:
         part = samples[begin:stop]
-        if part and part[0].gap:
-            state = _resume(config, state, part[0])
-        state = _run(config, state, part)
+        if state.memory is None:
+            state = advance(config, state, part)  # it restarted meanwhile
+        else:
+            if part and part[0].gap:
+                state = _resume(config, state, part[0])
+            state = _run(config, state, part)
         begin = stop
     return state
 
