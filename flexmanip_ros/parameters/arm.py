@@ -42,7 +42,8 @@ class ArmParameters:
     slope_correction: bool = parameter(
         True, 'add the truncated modes quasi-statically to the encoder angles (the paper: false)')
     sensor_position: tuple[float, ...] = parameter(
-        (0.5, 0.5), "place of each bend sensor as a fraction of its link's length", low=0.0, high=1.0, size=2)
+        (0.5, 0.5), "place of each bend sensor as a fraction of its link's length (its ends do not bend)",
+        low=1e-6, high=0.999999, size=2)
     effort_delay: int = parameter(
         0, 'samples by which effort lags (1: a message reports the torque of the previous interval)',
         unit='samples', low=0, high=10)
