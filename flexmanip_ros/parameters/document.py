@@ -99,7 +99,9 @@ def yaml_text(node: str, values: Mapping[str, Any] | None = None, heading: str =
         indent = '    ' + '  ' * len(path)
         lines += [f'{indent}# {line}' for line in textwrap.wrap(_comment(leaf), WIDTH - len(indent))]
         value = leaf.default if values is None else values[leaf.name]
-        lines.append(f'{indent}{name}: {written(leaf, value)}')
+        text = written(leaf, value)
+        # An empty list of numbers has no type in a ROS parameter file: it can only be left out.
+        lines.append(f'{indent}# {name}: []' if text == '[]' else f'{indent}{name}: {text}')
     return '\n'.join(lines) + '\n'
 
 
