@@ -1,0 +1,38 @@
+"""The arm in RViz: robot_state_publisher with a URDF made from the plant's parameters.
+
+ros2 launch flexmanip_ros view.launch.py params_file:=my_arm.yaml
+"""
+
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.conditions import IfCondition
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from flexmanip_ros.io.parameter_file import load
+from flexmanip_ros.parameters import PlantParameters
+from flexmanip_ros.plant.urdf import urdf
+from launch import LaunchDescription
+
+
+def describe(context):
+    """Make the URDF once the arguments are known."""
+    path = LaunchConfiguration('params_file').perform(context) or None
+    arm = load(PlantParameters, 'plant_simulator', path).arm
+    return [
+        Node(package='robot_state_publisher', executable='robot_state_publisher', output='screen',
+             parameters=[{'robot_description': urdf(arm)}],
+             remappings=[('joint_states', LaunchConfiguration('joint_states'))]),
+        Node(package='rviz2', executable='rviz2', arguments=['-f', 'base_link'],
+             condition=IfCondition(LaunchConfiguration('rviz'))),
+    ]
+
+
+def generate_launch_description():
+    """Return robot_state_publisher and, unless it is turned off, RViz."""
+    return LaunchDescription([
+        DeclareLaunchArgument('params_file', default_value='', description='parameter file with the arm'),
+        DeclareLaunchArgument('joint_states', default_value='joint_states',
+                              description='topic of the joint states'),
+        DeclareLaunchArgument('rviz', default_value='true', description='start RViz too'),
+        OpaqueFunction(function=describe),
+    ])
