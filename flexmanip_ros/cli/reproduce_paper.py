@@ -34,6 +34,8 @@ def _parser() -> console.Parser:
         PROG, "Regenerate the results of the paper's section 4, our estimators beside its own.", EXAMPLES)
     add = made.add_argument
     add('--runs', type=int, default=30, metavar='N', help='runs a case (default 30, as the paper)')
+    add('--case', action='append', choices=[case.name for case in paper.CASES], metavar='NAME',
+        help=f'only this case, may be repeated: {", ".join(case.name for case in paper.CASES)}')
     add('--first-seed', type=int, default=0, metavar='SEED', help='default: 0')
     add('--output', default='paper_reproduction', metavar='DIR', help='default: paper_reproduction')
     add('--workers', type=int, metavar='N', help='processes; default: one a core; 0: this one only')
@@ -66,7 +68,8 @@ def _main(given: argparse.Namespace) -> int:
         raise OutputError(f"folder '{folder}' cannot be made: {err.strerror}",
                           'give another --output') from err
     started = time.perf_counter()
-    tasks: list[Task] = [(case, given.first_seed + k) for k in range(given.runs) for case in paper.CASES]
+    cases = [case for case in paper.CASES if given.case is None or case.name in given.case]
+    tasks: list[Task] = [(case, given.first_seed + k) for k in range(given.runs) for case in cases]
     found: dict[Task, tuple[list[study.Row], dict[str, paper.Track]]] = {}
     with console.progress('reproducing', 'runs') as progress:
         for outcome in _compute(given.workers, tasks):

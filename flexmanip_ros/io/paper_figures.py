@@ -133,7 +133,8 @@ def error_bars(cases: Sequence[paper.Case], errors: Mapping[tuple[str, str], flo
         values = [errors.get((case.name, method.name), np.nan) for case in cases]
         places = np.arange(len(cases)) + (index - (len(paper.METHODS) - 1) / 2) * width
         drawn_bars = axes[0].bar(places, values, width, color=colour(method.name), label=method.name)
-        axes[0].bar_label(drawn_bars, ['' if np.isnan(value) else f'{value:.3g}' for value in values], fontsize=8)
+        said = ['' if np.isnan(value) else f'{value:.3g}' for value in values]
+        axes[0].bar_label(drawn_bars, said, fontsize=8)
     axes[0].set_yscale('log')
     axes[0].set_xticks(range(len(cases)), [case.title for case in cases])
     axes[0].set_ylabel('mean relative error,\n4 to 6 s [%]')

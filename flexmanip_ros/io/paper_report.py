@@ -45,6 +45,8 @@ def summary(rows: Sequence[study.Row]) -> list[dict[str, Any]]:
     for case in paper.CASES:
         for method in paper.METHODS:
             mine = [row for row in rows if (row['case'], row['method']) == (case.name, method.name)]
+            if not mine:
+                continue
             good = [row for row in mine if not row['error'] and row['error_percent'] is not None]
             errors = np.array([row['error_percent'] for row in good], dtype=np.float64)
             share, low, high = coverage(sum(bool(row['covered']) for row in good), len(good))
@@ -131,13 +133,17 @@ def _payloads(done: Study) -> list[Section]:
             (paper.PAYLOADS, ('7', '8', '9'), 'stable tracking, the error grows with the payload'),
             (paper.CONFIGURATIONS, ('14', '15', '16'), 'fast tracking in every configuration'),
             ((paper.FINITE_ELEMENT,), ('19', '19', '19'), 'the error is higher, the mass still tracked')):
+        there = [case for case in cases if any(done.tracks[case.name].values())]
+        if not there:
+            sections += [Section(f'Fig. {number}: not run', '') for number in dict.fromkeys(numbers)]
+            continue
         sections += [
             _section(f'Fig. {numbers[0]}: payload', f'The paper: {claim}. Band: 90 % of the runs.',
-                     figures.payload_tracks(cases, done.tracks)),
+                     figures.payload_tracks(there, done.tracks)),
             _section(f'Fig. {numbers[1]}: absolute error', 'From the capture on, median of the runs.',
-                     figures.error_tracks(cases, done.tracks)),
+                     figures.error_tracks(there, done.tracks)),
             _section(f'Fig. {numbers[2]}: average relative error', 'Mean of the runs, 4 to 6 s.',
-                     figures.error_bars(cases, errors))]
+                     figures.error_bars(there, errors))]
     return sections
 
 
