@@ -19,7 +19,8 @@ class Score:
 
     runs, failed: counts; mean_error_percent, median_error_percent: of the mean relative error in the window;
     rms_error_percent: of the last estimate; bias_kg: mean of its error; coverage_percent: how often its 95 %
-    interval held the truth, with the 95 % interval of that figure; us_per_sample: median cost.
+    interval held the truth, with the 95 % interval of that figure; us_per_sample: median cost; bound_ratio:
+    root mean square of the last error over its Cramer-Rao bound.
     """
 
     runs: int
@@ -32,6 +33,7 @@ class Score:
     coverage_low: float
     coverage_high: float
     us_per_sample: float
+    bound_ratio: float
 
 
 def relative_error_percent(masses: Array, true: float) -> float:
@@ -68,12 +70,15 @@ def score(rows: Sequence[Mapping[str, Any]]) -> Score:
     hits = sum(bool(row['covered']) for row in good)
     share, low, high = coverage(hits, len(good))
     costs = [row['us_per_sample'] for row in good if _number(row, 'us_per_sample') is not None]
+    ratios = [(row['payload_mass_kg'] - row['payload_true_kg']) / row['bound_std_kg'] for row in good
+              if _number(row, 'bound_std_kg')]
     return Score(
         runs=runs, failed=failed, mean_error_percent=_mean(window),
         median_error_percent=float(np.median(window)) if window.size else math.nan,
         rms_error_percent=math.sqrt(_mean(relative**2)) if relative.size else math.nan,
         bias_kg=_mean(errors), coverage_percent=share, coverage_low=low, coverage_high=high,
-        us_per_sample=float(np.median(costs)) if costs else math.nan)
+        us_per_sample=float(np.median(costs)) if costs else math.nan,
+        bound_ratio=math.sqrt(_mean(np.array(ratios) ** 2)) if ratios else math.nan)
 
 
 def _number(row: Mapping[str, Any], name: str, missing: Any = None) -> Any:

@@ -10,14 +10,18 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from flexmanip_ros import pipeline, study
+from flexmanip_ros.payload import bounds
+from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.plant.noise import std_for_snr
 from flexmanip_ros.scenario import Run, Scenario
-from flexmanip_ros.types import Array, Estimate, StateSpace
+from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, StateSpace
 
 ARM: Mapping[str, Any] = {
     'modes': 1, 'torque_convention': 'paper', 'angle_convention': 'chord', 'shortening': False,
@@ -74,6 +78,29 @@ METHODS = (
 )
 BEST_MODEL = 'restart'
 """The method whose state-space model is shown in the test responses and frequency tracks."""
+
+
+@lru_cache(maxsize=32)
+def bound(case: Case, method: str) -> float | None:
+    """Return the Cramer-Rao bound of the payload [kg] at the end of a run; None for the finite element plant.
+
+    ``structured`` knows the structure; the block extractions know nothing of (A, B), and theirs is the bound
+    of their own formula (docs of ``payload.bounds``).
+    """
+    if case.model != 'linear':
+        return None
+    run = scenario(case, METHODS[0]).configuration(0, METHODS[0].name)
+    quiet = replace(run.plant, noise='none')
+    torque = excitation.sequence(run.excitation, round(WINDOW[1] * quiet.rate))
+    clean = simulator.simulate(quiet, torque, (CaptureEvent(round(CAPTURE_TIME * 1e9), EventKind.CAPTURE),))
+    noise = std_for_snr(clean.position, clean.velocity, run.plant.snr_db)
+    first = round(CAPTURE_TIME * quiet.rate)
+    states = np.hstack([clean.position[first:, 2:], clean.velocity[first:, 2:]])
+    given = (quiet.arm, np.radians(case.angles_deg), case.payload, states, torque[first:],
+             np.concatenate([noise[2:4], noise[6:8]]), 1.0 / quiet.rate, (len(states),))
+    if method == 'structured':
+        return float(bounds.structure_known(*given)[0])
+    return float(bounds.structure_unknown(*given, known_mb=method == 'known M_b')[0])
 
 
 class Track(NamedTuple):

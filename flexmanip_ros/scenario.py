@@ -52,7 +52,8 @@ class Scenario:
 
     duration, capture_time, release_time: [s], a negative time means never; window: the mean relative error is
     taken between these times [s]; plant, excitation, identifier: dotted parameters; vary: what is drawn anew
-    for each seed; estimators: name -> identifier parameters of each estimator that sees the same samples.
+    for each seed; bound: add the Cramer-Rao bound to each row; estimators: name -> identifier parameters of
+    each estimator that sees the same samples.
     """
 
     name: str = 'study'
@@ -65,6 +66,7 @@ class Scenario:
     identifier: Mapping[str, Any] = field(default_factory=dict)
     vary: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     faults: Faults = field(default_factory=Faults)
+    bound: bool = True
     estimators: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: {'default': {}})
 
     def __post_init__(self) -> None:
@@ -139,9 +141,10 @@ def scenario(tree: Any) -> Scenario:
     for name in ('duration', 'capture_time', 'release_time'):
         if name in given:
             given[name] = _number(name, given[name])
-    for name in ('window',):
-        if name in given:
-            given[name] = _pair(name, given[name])
+    if 'window' in given:
+        given['window'] = _pair('window', given['window'])
+    if not isinstance(given.get('bound', True), bool):
+        raise ParameterError(f"'bound' of a scenario is {given['bound']!r:.60}", 'give true or false')
     return Scenario(**given)
 
 

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from flexmanip_ros import pipeline
+from flexmanip_ros.achievable import payload_std
 from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.faults import inject
+from flexmanip_ros.history import History
 from flexmanip_ros.metrics import relative_error_percent
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.plant import excitation, linearization, simulator
@@ -35,7 +37,8 @@ def trial(scenario: Scenario, seed: int) -> list[Row]:
             run = scenario.configuration(seed, name)
             row.update(drawn_columns(run.drawn))
             items = messages(scenario, run, seed)
-            row.update(measure(run.identifier, items, run.plant.payload_mass, scenario.window))
+            row.update(measure(run.identifier, items, run.plant.payload_mass, scenario.window,
+                               bound=scenario.bound))
             row.update(frequency_columns(run, row))
         except Exception as error:  # a defect in one estimator must not end a study of thousands
             row['error'] = describe(error)
@@ -63,10 +66,11 @@ def messages(scenario: Scenario, run: Run, seed: int) -> list[JointRecord | Capt
 
 
 def measure(config: IdentifierParameters, items: Sequence[JointRecord | CaptureEvent], true_kg: float | None,
-            window: tuple[float, float]) -> Row:
+            window: tuple[float, float], *, bound: bool = False) -> Row:
     """Identify and return the columns of a row.
 
-    true_kg: mass held after a capture; None when unknown. window: from and to [s] of the mean error.
+    true_kg: mass held after a capture; None when unknown. window: from and to [s] of the mean error;
+    bound: add the least standard deviation that the samples after the capture allow.
     """
     started = time.perf_counter()
     state, estimates = pipeline.init(), []
@@ -92,7 +96,19 @@ def measure(config: IdentifierParameters, items: Sequence[JointRecord | CaptureE
     row['payload_true_kg'] = true
     row['covered'] = None if true is None or low is None or high is None else bool(low <= true <= high)
     row['error_percent'] = None if true is None else _window_error(state, estimates, true, window)
+    if bound and held and config.payload_method != 'none':
+        mass = row['payload_mass_kg'] if true is None else true
+        row['bound_std_kg'] = _bound(config, items, row['capture_time_s'], mass, state.sampling.dt)
     return row
+
+
+def _bound(config: IdentifierParameters, items: Sequence[JointRecord | CaptureEvent], capture_time: float,
+           mass: float | None, dt: float) -> float | None:
+    history = History(config)
+    for item in items:
+        if isinstance(item, JointRecord):
+            history.add(item)
+    return None if mass is None else payload_std(config, history.signals(), capture_time, mass, dt)
 
 
 def _window_error(state: pipeline.State, estimates: Sequence[Estimate], true: float,

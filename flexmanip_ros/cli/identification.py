@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from flexmanip_ros import holdout, pipeline
+from flexmanip_ros.achievable import payload_std
 from flexmanip_ros.errors import BagError, FlexmanipError
 from flexmanip_ros.history import History, Signals
 from flexmanip_ros.io import bag
@@ -172,7 +173,10 @@ def _report(request: Request, summary: Summary, feed: _Feed, kept: list[Estimate
     assert request.report is not None
     config = state.config or request.config
     made = pictures.run(config, signals, kept, feed.events)
+    bound, mass = None, summary.payload_mass_kg
+    if summary.capture_time_s is not None and mass is not None:
+        bound = payload_std(config, signals, summary.capture_time_s, mass, state.sampling.dt)
     counts: dict[str, Any] = {**state.counters._asdict(), 'dropped': state.counters.dropped}
     report.identification_report(
         request.report, Path(request.bag).name, config, summary, made,
-        None if last is None else last.model, scores, counts, '' if fault is None else str(fault))
+        None if last is None else last.model, scores, counts, bound, '' if fault is None else str(fault))

@@ -137,13 +137,14 @@ def _compute(given: argparse.Namespace, todo: Sequence[tasks.Task]) -> Iterator[
 def describe(rows: Sequence[Row]) -> list[str]:
     """Return the scores of each estimator as lines for people."""
     lines = [f'{"estimator":24s} {"runs":>6s} {"failed":>6s} {"mean err %":>10s} {"median %":>9s} '
-             f'{"rms %":>8s} {"bias kg":>9s} {"95 % interval holds":>22s} {"us/sample":>9s}']
+             f'{"rms %":>8s} {"bias kg":>9s} {"95 % interval holds":>22s} '
+             f'{"rms/bound":>9s} {"us/sample":>9s}']
     for name in sorted({str(row.get('estimator', '')) for row in rows}):
         made = score([row for row in rows if str(row.get('estimator', '')) == name])
         held = f'{made.coverage_percent:.1f} % ({made.coverage_low:.1f}..{made.coverage_high:.1f})'
         lines.append(f'{name:24s} {made.runs:6d} {made.failed:6d} {made.mean_error_percent:10.4g} '
                      f'{made.median_error_percent:9.4g} {made.rms_error_percent:8.4g} {made.bias_kg:9.3g} '
-                     f'{held:>22s} {made.us_per_sample:9.1f}')
+                     f'{held:>22s} {made.bound_ratio:9.3g} {made.us_per_sample:9.1f}')
     return lines
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import io
+import math
 import os
 import sys
 import time
@@ -27,6 +28,8 @@ summary.csv. The same seeds give the same numbers.
 exit status: 0 on success, 2 on bad arguments, 130 when interrupted.
 """
 Task = tuple[paper.Case, int]
+SHOWN = ('mean error [%]', 'rms error at 6 s [%]', 'bound at 6 s [%]', '95 % interval holds [%]',
+         'time per sample [us]')
 
 
 def _parser() -> console.Parser:
@@ -103,13 +106,17 @@ def _failed(outcome: workers.Outcome) -> list[study.Row]:
 
 def describe(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the summary as lines for people."""
-    said = [f'{"case":40s} {"method":12s} {"error %":>9s} {"interval holds %":>17s} {"us/sample":>10s}']
+    said = [f'{"case":40s} {"method":12s} {"4-6 s, %":>9s} {"rms 6 s %":>9s} {"bound %":>9s} '
+            f'{"covered %":>11s} {"us/sample":>10s}']
     for line in lines:
-        names = ('mean error [%]', '95 % interval holds [%]', 'time per sample [us]')
-        values = [line[name] for name in names]
-        error, held, cost = ('-' if value is None or value != value else f'{value:.3g}' for value in values)
-        said.append(f'{line["case"]:40s} {line["method"]:12s} {error:>9s} {held:>17s} {cost:>10s}')
+        error, rms, least, held, cost = (_short(line[name]) for name in SHOWN)
+        said.append(f'{line["case"]:40s} {line["method"]:12s} {error:>9s} {rms:>9s} {least:>9s} {held:>11s} '
+                    f'{cost:>10s}')
     return said
+
+
+def _short(value: float | None) -> str:
+    return '-' if value is None or math.isnan(value) else f'{value:.3g}'
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -16,7 +16,7 @@ from flexmanip_ros.io.html import Section, page, picture, table, write
 from flexmanip_ros.metrics import coverage
 from flexmanip_ros.paper_response import identified_response, true_response
 from flexmanip_ros.plant import excitation, simulator
-from flexmanip_ros.types import CaptureEvent, EventKind
+from flexmanip_ros.types import Array, CaptureEvent, EventKind
 
 DEVIATIONS = (
     ('Table 1 (the arm) is lost', 'links of 3 m, 5 kg/m, 5000 N m^2; 10 kg at joint 2 and at the tip'),
@@ -49,10 +49,14 @@ def summary(rows: Sequence[study.Row]) -> list[dict[str, Any]]:
                 continue
             good = [row for row in mine if not row['error'] and row['error_percent'] is not None]
             errors = np.array([row['error_percent'] for row in good], dtype=np.float64)
+            final = np.array([100.0 * (row['payload_mass_kg'] / case.payload - 1.0) for row in good])
+            least = paper.bound(case, method.name)
             share, low, high = coverage(sum(bool(row['covered']) for row in good), len(good))
             lines.append({
                 'case': case.title, 'method': method.name, 'runs': len(mine), 'failed': len(mine) - len(good),
                 'mean error [%]': _of(errors, np.mean), 'median error [%]': _of(errors, np.median),
+                'rms error at 6 s [%]': _of(final, _rms),
+                'bound at 6 s [%]': None if least is None else 100.0 * least / case.payload,
                 '95 % interval holds [%]': share, 'from [%]': low, 'to [%]': high,
                 'frequency error [%]': _of(np.array([_frequency(row) for row in good]), np.nanmean),
                 'time per sample [us]': _of(np.array([row['us_per_sample'] for row in good]), np.median)})
@@ -169,6 +173,10 @@ def _frequency(row: study.Row) -> float:
     values = [row.get(f'frequency_error_percent_{k}') for k in (1, 2)]
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else np.nan
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _of(values: Any, how: Any) -> float | None:

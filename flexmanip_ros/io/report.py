@@ -18,10 +18,11 @@ from flexmanip_ros.types import StateSpace, Status
 
 def identification_report(
     path: str | Path, source: str, config: IdentifierParameters, summary: Summary, made: pictures.Run,
-    model: StateSpace | None, scores: Scores | None, messages: dict[str, int], fault: str = '',
+    model: StateSpace | None, scores: Scores | None, messages: dict[str, int], bound: float | None = None,
+    fault: str = '',
 ) -> None:
     """Write the report of identify_bag."""
-    sections = [Section('Result', _result(summary, made.signals.outputs, fault)),
+    sections = [Section('Result', _result(summary, made.signals.outputs, bound, fault)),
                 Section('Signals', picture(
                     pictures.signals_figure(made), 'torques and measured signals over time'))]
     if any(estimate.modes for estimate in made.estimates):
@@ -44,7 +45,7 @@ def identification_report(
     write(path, page(f'Identification of {source}', lead, sections))
 
 
-def _result(summary: Summary, outputs: Sequence[str], fault: str) -> str:
+def _result(summary: Summary, outputs: Sequence[str], bound: float | None, fault: str) -> str:
     rows: list[tuple[str, str]] = [('status', f'{summary.status}: {Status[summary.status].value}')]
     modes = zip(summary.frequencies_hz, summary.damping_ratios, strict=True)
     for k, (frequency, damping) in enumerate(modes):
@@ -53,6 +54,9 @@ def _result(summary: Summary, outputs: Sequence[str], fault: str) -> str:
         low, high = summary.payload_ci95_kg
         rows.append(('payload', f'{number(summary.payload_mass_kg)} kg, 95 % interval {number(low)} to '
                      f'{number(high)} kg, standard deviation {number(summary.payload_std_kg)} kg'))
+        if bound is not None:
+            rows.append(('best possible', f'standard deviation {number(bound, 3)} kg (Cramer-Rao bound of '
+                         'the samples after the capture, at the noise they show)'))
         rows.append(('residual power', f'{number(summary.consistency)} (1: noise only)'))
     for name, value in (('capture', summary.capture_time_s), ('release', summary.release_time_s)):
         if value is not None:
