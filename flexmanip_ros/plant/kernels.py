@@ -102,7 +102,7 @@ def add_link(
         Z, Y = work.Z, work.Y
         gyro = 0.0
         for j in range(k):
-            # Y_jm = (W_j eta)_m, Z_jml = sum_p Q_jpml eta_p
+            # Y_jm = (W_j eta)_m, Z_jmp = sum_t Q_jtmp eta_t, and Q_jtmp = Q_mpjt lies in order
             c2 = 0.0
             for m in range(k):
                 y = 0.0
@@ -110,7 +110,7 @@ def add_link(
                     y += arm.W[i, j, m, p] * q[o + p]
                     z = 0.0
                     for t in range(k):
-                        z += arm.Q[i, j, t, m, p] * q[o + t]
+                        z += arm.Q[i, m, p, j, t] * q[o + t]
                     Z[i, j, m, p] = z
                 Y[i, j, m] = y
                 c2 += arm.C2[i, j, m] * q[o + m]

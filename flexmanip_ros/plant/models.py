@@ -25,8 +25,8 @@ from flexmanip_ros.plant.slope_correction import slopes
 from flexmanip_ros.plant.tail import slopes_with_tail
 from flexmanip_ros.types import Array
 
-STEP_ANGLE = 0.1
-"""Largest angle [rad] the fastest mode turns in one integration step: its phase is then good to 1e-6."""
+STEP_ANGLE = 0.15
+"""Largest angle [rad] the fastest mode turns in one integration step: its phase is then good to 4e-6."""
 STABLE_ANGLE = 2.6
 """Runge-Kutta of fourth order is stable up to 2.78."""
 MOST_SUBSTEPS = 1000
