@@ -53,6 +53,15 @@ def complain(prog: str, error: BaseException | str) -> None:
     print(f'{prog}: {" ".join(str(error).split())}', file=sys.stderr)
 
 
+def require_pictures() -> None:
+    """Raise now, not after the work, when pictures are asked for and cannot be drawn."""
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as err:
+        raise FlexmanipError('a report needs matplotlib, which is not installed',
+                             "run 'pip install matplotlib', or leave --report away") from err
+
+
 def run(prog: str, body: Callable[[], int]) -> int:
     """Run a program: our errors become one line and exit 2, an interrupt exit 130."""
     with _terminate_as_interrupt():

@@ -11,6 +11,7 @@ from typing import Any
 
 from flexmanip_ros import holdout, pipeline
 from flexmanip_ros.achievable import payload_std
+from flexmanip_ros.cli.console import require_pictures
 from flexmanip_ros.errors import BagError, FlexmanipError
 from flexmanip_ros.history import History, Signals
 from flexmanip_ros.io import bag
@@ -56,7 +57,7 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
     started = time.perf_counter()
     if request.report is not None:
         check_place(request.report)
-        _require_pictures()
+        require_pictures()
     feed = _Feed(request, progress)
     kept: list[Estimate] = []
     state = pipeline.init()
@@ -155,14 +156,6 @@ def _dropped(state: pipeline.State) -> FlexmanipError | None:
     what = 'NaN or infinity in a configured signal' if counters.not_finite else 'arrays of unequal sizes'
     return BagError(f'{faulty} of {counters.received} messages hold {what} and were left out',
                     'look at the publisher of the joint states')
-
-
-def _require_pictures() -> None:
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as err:
-        raise FlexmanipError('--report needs matplotlib, which is not installed',
-                             "run 'pip install matplotlib', or leave --report away") from err
 
 
 def _report(request: Request, summary: Summary, feed: _Feed, kept: list[Estimate], signals: Signals,

@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from flexmanip_ros.cli import console, tasks, workers
+from flexmanip_ros.cli.console import require_pictures
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io.journal import Journal
 from flexmanip_ros.io.parameter_file import load, parse, parse_overrides
+from flexmanip_ros.io.table import check_place
 from flexmanip_ros.metrics import score
 from flexmanip_ros.parameters import IdentifierParameters, flatten
 from flexmanip_ros.scenario import Scenario, scenario
@@ -42,6 +44,7 @@ def _parser() -> console.Parser:
         help='seeds FIRST .. FIRST+N-1 of the scenario (default 100)')
     add('--first-seed', type=int, default=0, metavar='FIRST', help='default: 0')
     add('--output', default='study.csv', metavar='TABLE', help='.csv or .parquet (default study.csv)')
+    add('--report', metavar='REPORT.html', help='one page with scores and pictures')
     add('--workers', type=int, metavar='N', help='processes; default: one a core; 0: this one only')
     add('--scheduler', metavar='ADDRESS', help='send the runs to this Dask cluster instead')
     add('--params', metavar='FILE.yaml', help='parameter file of the identifier, for recordings')
@@ -58,6 +61,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> int:
     todo, identity = _plan(given)
+    if given.report is not None:
+        check_place(given.report)
+        require_pictures()
     interrupted = False
     with Journal(given.output, identity) as journal:
         done = {row[tasks.KEY] for row in journal.rows}
@@ -73,6 +79,10 @@ def _main(given: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             interrupted = True
         journal.finish(('estimator', 'seed', tasks.KEY))
+    if given.report is not None:
+        from flexmanip_ros.io import study_report  # matplotlib only when asked for
+
+        study_report.report(given.report, Path(given.source).stem, journal.rows)
     for line in describe(journal.rows):
         print(line)
     print(f"wrote '{given.output}' ({len(journal.rows)} rows)")

@@ -15,7 +15,7 @@ from typing import Any
 
 from flexmanip_ros import paper, study
 from flexmanip_ros.cli import console, workers
-from flexmanip_ros.errors import FlexmanipError, ParameterError
+from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io.table import OutputError, write_file
 
 PROG = 'reproduce_paper'
@@ -59,11 +59,9 @@ def work(task: Task) -> tuple[list[study.Row], dict[str, paper.Track]]:
 def _main(given: argparse.Namespace) -> int:
     if given.runs < 1:
         raise ParameterError(f'--runs is {given.runs}', 'give at least 1')
-    try:
-        from flexmanip_ros.io import paper_report
-    except ImportError as err:
-        raise FlexmanipError('the report needs matplotlib, which is not installed',
-                             "run 'pip install matplotlib'") from err
+    console.require_pictures()
+    from flexmanip_ros.io import paper_report
+
     folder = Path(given.output)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -91,6 +91,19 @@ def test_a_failed_run_is_a_row_with_its_error(scenario_file, tmp_path, capsys):
     assert 'diverged' in _rows(out)[0]['error']
 
 
+def test_the_report_shows_scores_runs_and_failures(tmp_path):
+    from flexmanip_ros.io.study_report import report
+
+    rows = [{'run': str(k), 'estimator': 'a', 'error': '', 'status': 'TRACKING', 'payload_true_kg': 20.0 + k,
+             'payload_mass_kg': 20.1 + k, 'payload_lower_kg': 19.9 + k, 'payload_upper_kg': 20.2 + k,
+             'covered': k > 0, 'error_percent': 0.5, 'us_per_sample': 50.0} for k in range(3)]
+    report(tmp_path / 'page.html', 'name', [*rows, {'run': '3', 'estimator': 'a', 'error': 'it <broke>'}])
+    text = (tmp_path / 'page.html').read_text(encoding='utf-8')
+    assert text.count('data:image/png') == 1
+    assert 'it &lt;broke&gt;' in text
+    assert 'Failed: 1' in text
+
+
 def test_parquet_holds_the_same_rows(scenario_file, tmp_path):
     parquet = pytest.importorskip('pyarrow.parquet')
     out = tmp_path / 'out.parquet'
