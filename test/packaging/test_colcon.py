@@ -14,10 +14,13 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 COLCON = Path(sys.executable).with_name('colcon')
 LEFT_OUT = shutil.ignore_patterns(
-    '.*', '__pycache__', 'build', 'install', 'log', '*.egg-info', 'demo_output', 'test', 'benchmarks'
+    '.*', '__pycache__', 'build', 'install', 'log', '*.egg-info', 'demo_output', 'benchmarks'
 )
 
-pytestmark = pytest.mark.skipif(not COLCON.exists(), reason='colcon is not installed; make test installs it')
+pytestmark = [
+    pytest.mark.skipif(not COLCON.exists(), reason='colcon is not installed; make test installs it'),
+    pytest.mark.timeout(600),  # kernels are compiled here, on a machine that may be busy
+]
 
 
 def run(command: str, folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -27,7 +30,7 @@ def run(command: str, folder: Path, **variables: str) -> subprocess.CompletedPro
     environment = kept | {'PATH': path, 'ROS_LOG_DIR': str(folder / 'ros_log'), 'COLCON_LOG_LEVEL': '40'}
     return subprocess.run(
         ['bash', '-c', command], cwd=folder, env=environment | variables, check=False,
-        capture_output=True, text=True, timeout=300, stdin=subprocess.DEVNULL,
+        capture_output=True, text=True, timeout=580, stdin=subprocess.DEVNULL,
     )
 
 
@@ -35,8 +38,6 @@ def workspace(folder: Path, *options: str, **variables: str) -> Path:
     """Build a copy of the package in ``folder`` and return it."""
     source = folder / 'src' / 'flexmanip_ros'
     shutil.copytree(ROOT, source, ignore=LEFT_OUT)
-    shutil.copytree(ROOT / 'test' / 'packaging', source / 'test' / 'packaging', ignore=LEFT_OUT)
-    shutil.copytree(ROOT / 'requirements', source / 'requirements', dirs_exist_ok=True)
     built = run(' '.join(['colcon build', *options]), folder, **variables)
     assert built.returncode == 0, built.stdout + built.stderr
     return folder
@@ -91,12 +92,12 @@ def test_an_installed_node_starts_and_ends_on_interrupt(installed: Path) -> None
 
 
 def test_colcon_test_really_runs_tests(installed: Path) -> None:
-    chosen = 'test/packaging/test_layers.py'
+    chosen = 'test/test_messages.py test/core/test_sampling.py'
     tested = run(f'colcon test --return-code-on-test-failure --pytest-args {chosen}', installed)
     assert tested.returncode == 0, tested.stdout + tested.stderr
     report = next((installed / 'build').rglob('pytest.xml'))
     suites = ElementTree.parse(report).getroot().iter('testsuite')
-    assert sum(int(suite.get('tests', '0')) for suite in suites) > 50
+    assert sum(int(suite.get('tests', '0')) for suite in suites) > 20
 
 
 def test_a_symlink_install_follows_the_source(tmp_path: Path) -> None:
