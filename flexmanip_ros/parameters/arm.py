@@ -21,8 +21,8 @@ class ArmParameters:
     bending_stiffness: tuple[float, ...] = parameter(
         (5000.0, 5000.0), "Young's modulus times second moment of area of each link", unit='N m^2',
         low=SMALLEST, size=2)
-    joint_mass: float = parameter(10.0, 'mass at the end of link 1', unit='kg', low=0.0)
-    tip_mass: float = parameter(10.0, 'mass at the end of link 2 before capture', unit='kg', low=0.0)
+    joint_mass: float = parameter(10.0, 'mass at the end of link 1', unit='kg', low=SMALLEST)
+    tip_mass: float = parameter(10.0, 'mass at the end of link 2 before capture', unit='kg', low=SMALLEST)
     hub_inertia: tuple[float, ...] = parameter(
         (0.0, 0.0), "rotary inertia of each joint's hub, turning with the root of its link", unit='kg m^2',
         low=0.0, size=2)

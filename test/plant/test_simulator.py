@@ -156,6 +156,9 @@ def test_an_unstable_step_is_refused_by_name() -> None:
 def test_a_length_density_or_stiffness_of_zero_is_refused_by_name(field: str) -> None:
     with pytest.raises(ParameterError, match=field):
         ArmParameters(**{field: (1.0, 0.0)})
+    for name in ('joint_mass', 'tip_mass'):
+        with pytest.raises(ParameterError, match=name):
+            ArmParameters(**{name: 0.0})
     with pytest.raises(ParameterError, match='modes'):
         ArmParameters(modes=0)
     with pytest.raises(ParameterError, match='sensor_position'):
