@@ -23,8 +23,8 @@ QUIET, LIVELY = 0.02, 0.2
 """Relative variation of the signals below which nothing is forgotten, above which forgetting is full."""
 LARGEST = 1e100
 """Numbers are brought to about 1 by the first value of their channel; beyond this the sample is refused."""
-SURPRISE = 2.0
-"""Innovation power above which the plant is taken to have changed."""
+EXPECTED, SURPRISE = 1.5, 3.0
+"""Innovation power below which the model fits, above which the plant is taken to have changed."""
 
 
 @njit(cache=True)
@@ -79,7 +79,7 @@ def memory(scalars: Array, counts: Array, beta: float, mode: int) -> float:
     """
     b = beta
     if mode == INNOVATION:
-        surprise = (scalars[POWER] - 1.0) / (SURPRISE - 1.0)
+        surprise = (scalars[POWER] - EXPECTED) / (SURPRISE - EXPECTED)
         b = 1.0 - (1.0 - beta) * min(max(surprise, 0.0), 1.0)
     quiet = QUIET
     lively = LIVELY

@@ -8,6 +8,7 @@ from scipy.linalg import solve_triangular
 from flexmanip_ros.identification import realization, uncertainty
 from flexmanip_ros.identification.memory_kernel import POWER, WEIGHT, WEIGHT2
 from flexmanip_ros.identification.moments import Realized, realize, triangle
+from flexmanip_ros.identification.refinement import Recursion
 from flexmanip_ros.identification.uncertainty import Identified, Tangent
 from flexmanip_ros.identification.varx import observability_controllability, open_loop_weight
 from flexmanip_ros.parameters import IdentifierParameters
@@ -69,6 +70,36 @@ def from_recursion(
         D=theta_y[:, n:] if d > past else np.zeros((m, r)), K=theta_x[:, n + r:], Xi=Xi, xi_u=xi_u, S=S, T=T,
         state=R[:, :past] @ T.T, residual=np.zeros((m, m)), regression=head,
         singular_values=values), R
+
+
+def from_fit(
+    config: IdentifierParameters, recursion: Recursion, scalars: Array, dt: float,
+) -> Identified:
+    """Publish the prediction-error fit with its own covariance."""
+    r, m, n = len(config.inputs), len(config.outputs), config.order
+    theta, structure, P = recursion.theta, recursion.structure, recursion.P
+    su, sy = recursion.scale[:r], recursion.scale[r:]
+    su, sy = np.where(su > 0.0, su, 1.0), np.where(sy > 0.0, sy, 1.0)
+    k = P.shape[1] - n
+    spread = recursion.widening * (P[:-n, :k] @ recursion.root[:k]).T
+    free = (True, True, structure.free_gain, structure.free_output, structure.free_direct)
+    shapes = ((n, n), (n, r), (n, m), (m, n), (m, r))
+    sizes = [a * b if is_free else 0 for (a, b), is_free in zip(shapes, free, strict=True)]
+    parts = np.split(spread, np.cumsum(sizes)[:-1], axis=1)
+    dA, dB, dK, dC, dD = (
+        (part if part.size else np.zeros((len(spread), a * b))).reshape(-1, a, b)
+        for part, (a, b) in zip(parts, shapes, strict=True))
+    along = Tangent(dA, dB, dC, dD, dK)
+    along = Tangent(*_in_units(*along, su, sy))
+    model = StateSpace(*_in_units(theta.A, theta.B, theta.C, theta.D, recursion.gain, su, sy), dt=dt)
+    model, moved_along, known = based(model, along)
+    assert moved_along is not None
+    values = np.linalg.svd(theta.C, compute_uv=False)
+    return Identified(
+        model=model, spread=moved_along.flat(), singular_values=np.asarray(values, dtype=np.float64),
+        excitation=float('nan'), condition=float('nan'), innovation_power=float(scalars[POWER]),
+        status=Status.TRACKING, innovation_covariance=recursion.covariance / np.outer(sy, sy),
+        known_basis=known, samples=recursion.weight)
 
 
 def publish(

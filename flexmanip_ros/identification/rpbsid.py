@@ -8,13 +8,13 @@ per sample bounded in both; decompositions happen only in ``identified``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.identification import factor_kernel, memory_kernel, paper_kernel, publication
+from flexmanip_ros.identification import factor_kernel, memory_kernel, paper_kernel, publication, refinement
 from flexmanip_ros.identification.memory_kernel import FILLED, POWER, PRIOR, USED, WEIGHT, WEIGHT2
 from flexmanip_ros.identification.moments import solve_regressor
 from flexmanip_ros.identification.uncertainty import Identified
@@ -33,7 +33,8 @@ class RpbsidState:
 
     z: (p (r + m),) past window, scaled; scale: (r + m,); mean: (2, r + m) slow means and peaks;
     variance: (m,) of the innovations, scaled; scalars, counts: see ``memory_kernel``;
-    memory: the arrays of the estimator, in the order its kernel takes them.
+    memory: the arrays of the estimator, in the order its kernel takes them; refined: the prediction-error
+    fit, None where it is off.
     """
 
     z: Array
@@ -43,12 +44,13 @@ class RpbsidState:
     scalars: Array
     counts: Array
     memory: tuple[Array, ...]
+    refined: refinement.Refined | None
 
     def copy(self) -> RpbsidState:
         """Return a state whose arrays may be overwritten."""
         return RpbsidState(
             self.z.copy(), self.scale.copy(), self.mean.copy(), self.variance.copy(), self.scalars.copy(),
-            self.counts.copy(), tuple(array.copy() for array in self.memory))
+            self.counts.copy(), tuple(array.copy() for array in self.memory), self.refined)
 
 
 def init(config: IdentifierParameters) -> RpbsidState:
@@ -60,7 +62,16 @@ def init(config: IdentifierParameters) -> RpbsidState:
     scalars[PRIOR] = scalars[POWER] = 1.0
     return RpbsidState(
         z=np.zeros(p * (r + m)), scale=np.zeros(r + m), mean=np.zeros((2, r + m)), variance=np.zeros(m),
-        scalars=scalars, counts=np.zeros(memory_kernel.COUNTS, dtype=np.int64), memory=memory)
+        scalars=scalars, counts=np.zeros(memory_kernel.COUNTS, dtype=np.int64), memory=memory,
+        refined=refinement.start(r + m) if _is_refined(config, r, m) else None)
+
+
+def _is_refined(config: IdentifierParameters, r: int, m: int) -> bool:
+    """Whether the prediction-error fit runs: it needs a growing memory and a model of bearable size."""
+    n = config.order
+    size = n * (n + r + 2 * m + 1) + m * r
+    return (config.refinement != 'none' and config.estimator == 'factor'
+            and config.forgetting == 'innovation' and size <= refinement.PARAMETERS)
 
 
 def _regressors(config: IdentifierParameters, r: int, m: int) -> int:
@@ -103,22 +114,61 @@ def advance(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array
             f'samples of shapes {U.shape} and {Y.shape} do not fit {r} inputs and {m} outputs',
             'give as many rows of both, one column per configured signal')
     new = state.copy()
-    mode = MODES[config.forgetting]
-    common: tuple[Any, ...] = (new.z, new.scale, new.mean, new.variance, new.scalars, new.counts)
+    done = 0
+    while done < len(U):
+        count = len(U) - done if new.refined is None else min(len(U) - done, refinement.due(new.refined))
+        _run(config, new, U[done:done + count], Y[done:done + count])
+        if new.refined is not None:
+            new = replace(new, refined=_refine(config, new, U[done:done + count], Y[done:done + count]))
+        done += count
+    return new
+
+
+def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array) -> None:
+    """Run the compiled kernel, overwriting the arrays of the state."""
+    recursive = config.estimator == 'paper'  # stale states: it must forget
+    mode = MODES['excitation' if recursive and config.forgetting == 'innovation' else config.forgetting]
+    common: tuple[Any, ...] = (
+        state.z, state.scale, state.mean, state.variance, state.scalars, state.counts)
     if config.estimator == 'paper':
         options: tuple[Any, ...] = (
             config.past_window, config.future_window, int(config.direct_feedthrough),
             int(config.weighted_observability), int(config.state_basis == 'tracked'),
             np.array(config.regularization), np.array(config.forgetting_factor), mode)
-        memory: tuple[Any, ...] = new.memory
+        memory: tuple[Any, ...] = state.memory
         paper_kernel.advance_paper(U, Y, *memory, *common, *options)
-    else:
-        R, row, scratch, peaks, prior = new.memory
-        factor_kernel.advance_factor(
-            U, Y, R, new.z, row, scratch, peaks, prior, new.scale, new.mean, new.variance, new.scalars,
-            new.counts, config.past_window, int(config.direct_feedthrough), config.regularization[0],
-            config.forgetting_factor[0], mode)
-    return new
+        return
+    R, row, scratch, peaks, prior = state.memory
+    factor_kernel.advance_factor(
+        U, Y, R, state.z, row, scratch, peaks, prior, state.scale, state.mean, state.variance, state.scalars,
+        state.counts, config.past_window, int(config.direct_feedthrough), config.regularization[0],
+        config.forgetting_factor[0], mode)
+
+
+def _refine(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array) -> refinement.Refined:
+    """Hand samples to the prediction-error fit and do the work that is due."""
+    refined = state.refined
+    assert refined is not None
+    samples = np.hstack([U, Y])
+    good = np.all(np.abs(samples) * state.scale <= memory_kernel.LARGEST, axis=1)  # false for nan
+    for k in np.flatnonzero(~good):
+        refined = refinement.break_window(refined)
+        samples, good = samples[k + 1:], good[k + 1:]
+        break
+    if not np.all(good):
+        samples = samples[np.flatnonzero(~good)[-1] + 1:]
+    refined = refinement.take(refined, samples)
+    try:
+        if refinement.is_fit_due(refined):
+            realized, _, scale = publication.from_factor(config, state.memory[0], state.scale)
+            refined = refinement.fit_all(
+                refined, realized, scale, config.direct_feedthrough,
+                'sensor' if config.refinement == 'output_error' else 'any')
+        elif refinement.is_block_due(refined):
+            refined = refinement.update(refined)
+    except np.linalg.LinAlgError:  # the subspace model remains; a new stretch begins
+        refined = refinement.start(samples.shape[1])
+    return refined
 
 
 def window_restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
@@ -127,6 +177,8 @@ def window_restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidSt
     new.counts[FILLED] = 0
     if config.estimator == 'paper':
         new.memory[-1][-1] = 0.0
+    if new.refined is not None:
+        return replace(new, refined=refinement.break_window(new.refined))
     return new
 
 
@@ -137,6 +189,8 @@ def restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
     ``regularization`` on signals of unit peak.
     """
     new = window_restart(config, state)
+    if new.refined is not None:
+        new = replace(new, refined=refinement.start(len(config.inputs) + len(config.outputs)))
     if not config.restart_on_event or not new.counts[USED]:
         return new
     new.counts[USED] = 0
@@ -161,6 +215,8 @@ def restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
 def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> Identified | None:
     """Return the model as of the last sample, or None before there is one. dt: sample time [s]."""
     d = _regressors(config, len(config.inputs), len(config.outputs))
+    if state.refined is not None and state.refined.recursion is not None:
+        return publication.from_fit(config, state.refined.recursion, state.scalars, dt)
     few = state.counts[USED] <= max(config.past_window, config.order)
     if few or not np.all(np.isfinite(state.memory[0])):
         return None

@@ -37,7 +37,7 @@ class IdentifierParameters:
         'paper: three recursive least squares at every sample', choices=('factor', 'paper'))
     state_basis: str = parameter(
         'singular', 'selection S of the state from observability x controllability: leading singular vectors '
-        '(estimator paper: as fixed); fixed, S = [I 0]; tracked, followed sample by sample (estimator paper only)',
+        '(estimator paper: as fixed); fixed, S = [I 0]; tracked, followed sample by sample (paper only)',
         choices=('singular', 'fixed', 'tracked'))
     weighted_observability: bool = parameter(
         True, 'select the state from the observability of the system (A) instead of the predictor (A - K C)')
@@ -46,14 +46,14 @@ class IdentifierParameters:
         'regression, estimated like A and B (the paper; the only way of estimator paper)',
         choices=('riccati', 'regression'))
     forgetting: str = parameter(
-        'innovation', 'when old information is let go: innovation, only while the model does not fit; excitation, '
-        'as fast as new comes in; constant, at every sample (the paper)',
+        'innovation', 'when old information is let go: innovation, only while the model does not fit; '
+        'excitation, as fast as new comes in; constant, at every sample (the paper)',
         choices=('excitation', 'constant', 'innovation'))
     refinement: str = parameter(
-        'prediction_error', 'prediction_error: the subspace model starts a maximum-likelihood fit that is kept up '
-        'to date (estimator factor with forgetting innovation only), the noise model chosen by the data; '
-        'output_error: the same with K = 0, the best simulation; none',
-        choices=('prediction_error', 'output_error', 'none'))
+        'output_error', 'maximum-likelihood fit started from the subspace model and kept up to date (estimator '
+        'factor with forgetting innovation only): output_error, K = 0 while the system is fitted, unless that '
+        'does not simulate; prediction_error, K free where the likelihood asks for it; none',
+        choices=('output_error', 'prediction_error', 'none'))
     restart_on_event: bool = parameter(
         True, 'restart the covariances of the least squares at a capture or release', live=True)
     payload_method: str = parameter(

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -19,8 +20,16 @@ ESTIMATORS = [
 
 
 def arrays(state: rpbsid.RpbsidState) -> list[np.ndarray]:
-    named = [getattr(state, field.name) for field in dataclasses.fields(state) if field.name != 'memory']
-    return [*named, *state.memory]
+    named = [getattr(state, field.name) for field in dataclasses.fields(state)]
+    return list(flat(named))
+
+
+def flat(item: object) -> Iterator[np.ndarray]:
+    if isinstance(item, (tuple, list)):
+        for part in item:
+            yield from flat(part)
+    elif item is not None:
+        yield np.asarray(item)
 
 
 def same(a: rpbsid.RpbsidState, b: rpbsid.RpbsidState) -> bool:
@@ -29,11 +38,12 @@ def same(a: rpbsid.RpbsidState, b: rpbsid.RpbsidState) -> bool:
 
 @pytest.mark.parametrize('choice', ESTIMATORS)
 def test_steps_and_one_advance_give_the_same_bits(choice):
+    count = 1100 if choice == {'estimator': 'factor'} else 60
     rng = np.random.default_rng(1)
     config = configuration(2, 3, order=3, past_window=4, future_window=3, **choice)
-    u, y = record(random_system(3, 2, 3, rng), 60, 0.1, rng)
+    u, y = record(random_system(3, 2, 3, rng), count, 0.1, rng)
     stepped = rpbsid.init(config)
-    for k in range(60):
+    for k in range(count):
         before = rpbsid.advance(config, stepped, u[:0], y[:0])
         after = rpbsid.step(config, stepped, u[k], y[k])
         assert same(before, stepped), 'a step leaves the state it was given as it was'

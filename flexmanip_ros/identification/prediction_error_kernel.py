@@ -1,0 +1,143 @@
+"""Compiled kernel of the prediction-error refinement: residuals and their derivatives along a stretch."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from flexmanip_ros.types import Array
+
+
+@njit(cache=True)
+def linearize(
+    U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, K: Array, x: Array, whiten: Array,
+    free_gain: int, free_output: int, free_direct: int, N: Array, g: Array, moments: Array, X: Array,
+) -> None:
+    """Run the predictor x+ = A x + B u + K e, e = y - C x - D u over (L, r), (L, m), and its derivatives.
+
+    Parameters in order: A, B row-major, K if free_gain, C if free_output, D if free_direct, then x at the start.
+    whiten: (m, m), whiten' whiten = inverse innovation covariance. On return x is the state after the last
+    sample, N (d, d) += J' J (upper triangle) and g (d,) += J' e with J the derivatives of the whitened
+    predictions, moments (m, m) += e e' and X (n, d) = dx/dparameters, started at [0 I] by the caller.
+    """
+    n, r, m = A.shape[0], B.shape[1], C.shape[0]
+    d = N.shape[0]
+    at_b = n * n
+    at_k = at_b + n * r
+    at_c = at_k + (n * m if free_gain else 0)
+    at_d = at_c + (m * n if free_output else 0)
+    closed = A - K @ C
+    J = np.empty((m, d))
+    Jw = np.empty((m, d))
+    ew = np.empty(m)
+    e = np.empty(m)
+    after = np.empty(n)
+    moved = np.empty((n, d))
+    for k in range(U.shape[0]):
+        for o in range(m):
+            total = Y[k, o]
+            for i in range(n):
+                total -= C[o, i] * x[i]
+            for i in range(r):
+                total -= D[o, i] * U[k, i]
+            e[o] = total
+        for o in range(m):
+            for j in range(d):
+                J[o, j] = 0.0
+            for i in range(n):
+                c = C[o, i]
+                if c != 0.0:
+                    for j in range(d):
+                        J[o, j] += c * X[i, j]
+            if free_output:
+                for i in range(n):
+                    J[o, at_c + o * n + i] += x[i]
+            if free_direct:
+                for i in range(r):
+                    J[o, at_d + o * r + i] += U[k, i]
+        for o in range(m):
+            ew[o] = 0.0
+            for j in range(d):
+                Jw[o, j] = 0.0
+            for i in range(m):
+                w = whiten[o, i]
+                if w != 0.0:
+                    ew[o] += w * e[i]
+                    for j in range(d):
+                        Jw[o, j] += w * J[i, j]
+            for i in range(m):
+                moments[o, i] += e[o] * e[i]
+        for o in range(m):
+            for i in range(d):
+                a = Jw[o, i]
+                g[i] += a * ew[o]
+                if a != 0.0:
+                    for j in range(i, d):
+                        N[i, j] += a * Jw[o, j]
+        for i in range(n):
+            for j in range(d):
+                moved[i, j] = 0.0
+            for q in range(n):
+                a = closed[i, q]
+                for j in range(d):
+                    moved[i, j] += a * X[q, j]
+            for j in range(n):
+                moved[i, i * n + j] += x[j]
+            for j in range(r):
+                moved[i, at_b + i * r + j] += U[k, j]
+            if free_gain:
+                for j in range(m):
+                    moved[i, at_k + i * m + j] += e[j]
+            for o in range(m):
+                gain = K[i, o]
+                if free_output:
+                    for j in range(n):
+                        moved[i, at_c + o * n + j] -= gain * x[j]
+                if free_direct:
+                    for j in range(r):
+                        moved[i, at_d + o * r + j] -= gain * U[k, j]
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += A[i, j] * x[j]
+            for j in range(r):
+                total += B[i, j] * U[k, j]
+            for j in range(m):
+                total += K[i, j] * e[j]
+            after[i] = total
+        for i in range(n):
+            x[i] = after[i]
+            for j in range(d):
+                X[i, j] = moved[i, j]
+
+
+@njit(cache=True)
+def residual_moments(
+    U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, K: Array, x: Array, moments: Array,
+) -> None:
+    """Run the predictor only: moments (m, m) += e e', x (n,) becomes the state after the last sample."""
+    n, r, m = A.shape[0], B.shape[1], C.shape[0]
+    e = np.empty(m)
+    after = np.empty(n)
+    for k in range(U.shape[0]):
+        for o in range(m):
+            total = Y[k, o]
+            for i in range(n):
+                total -= C[o, i] * x[i]
+            for i in range(r):
+                total -= D[o, i] * U[k, i]
+            e[o] = total
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += A[i, j] * x[j]
+            for j in range(r):
+                total += B[i, j] * U[k, j]
+            for j in range(m):
+                total += K[i, j] * e[j]
+            after[i] = total
+        for i in range(n):
+            x[i] = after[i]
+        for o in range(m):
+            for i in range(m):
+                moments[o, i] += e[o] * e[i]
