@@ -29,7 +29,8 @@ class Scores:
 def score(model: StateSpace | None, signals: Signals, start_s: float) -> Scores:
     """Hold a model still and score it on the samples from ``start_s`` on, up to the first gap.
 
-    The state at the start is estimated on the samples before it; simulation then uses no measured output.
+    The state at the start is estimated on the samples before it, by least squares over a free run of the
+    model and of its predictor; simulation then uses no measured output.
     Raises ParameterError when nothing is left to score, ModelError when there is no model.
     """
     time = signals.time
@@ -47,7 +48,17 @@ def score(model: StateSpace | None, signals: Signals, start_s: float) -> Scores:
     x0 = validation.state_at_end(model, signals.u[before:first], signals.y[before:first])
     with np.errstate(over='ignore', invalid='ignore'):  # an unstable model runs away: it scores 0
         simulated = validation.simulate(model, u, x0)
-        predicted = validation.predict(model, u, y, x0)
+        seen = np.hstack([signals.u[before:first], signals.y[before:first]])
+        filtered = validation.state_at_end(_predictor(model), seen, signals.y[before:first])
+        predicted = validation.predict(model, u, y, filtered)
     return Scores(
         validation.vaf(y, simulated), validation.vaf(y, predicted), time[first:after], y, simulated,
         predicted, after < time.size)
+
+
+def _predictor(model: StateSpace) -> StateSpace:
+    """Return the one-step predictor as a system with the inputs [u; y]."""
+    A = model.A - model.K @ model.C
+    B = np.hstack([model.B - model.K @ model.D, model.K])
+    D = np.hstack([model.D, np.zeros((model.C.shape[0], model.C.shape[0]))])
+    return StateSpace(A, B, model.C, D, np.zeros_like(model.K), model.dt)
