@@ -28,7 +28,7 @@ class PayloadParameters:
     capture_speed: float = parameter(
         0.3, 'how fast an object may move against the tip when it is caught', unit='m/s', low=0.0, high=100.0)
     model_error: float = parameter(
-        0.0015, "relative error of the arm's inertia to reckon with where a sensor shows more than its noise",
+        0.003, "relative error of the arm's inertia to reckon with where a sensor shows more than its noise",
         low=0.0, high=1.0)
     memory_time: float = parameter(
         20.0, 'how long old samples count', unit='s', low=0.1, high=1e6)

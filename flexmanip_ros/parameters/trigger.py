@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from flexmanip_ros.parameters.arm import ArmParameters
 from flexmanip_ros.parameters.field import check_all, parameter
+from flexmanip_ros.parameters.payload import PayloadParameters
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,21 @@ class TriggerParameters:
         unit='s', low=0.0, high=10.0, live=True)
     stale_after: float = parameter(
         1.0, 'a request is refused when no joint_states came for this long', unit='s', low=0.001, live=True)
+    inputs: tuple[str, ...] = parameter(
+        ('joint1/effort', 'joint2/effort'), 'torques, each NAME/FIELD of JointState (mode auto)')
+    outputs: tuple[str, ...] = parameter(
+        ('link1_bend/position', 'link2_bend/position', 'link1_bend/velocity', 'link2_bend/velocity'),
+        'bends, each NAME/FIELD of JointState (mode auto)')
+    angles: tuple[str, ...] = parameter(
+        ('joint1/position', 'joint2/position'), 'joint angles, each NAME/FIELD of JointState (mode auto)')
+    false_alarms_per_hour: float = parameter(
+        0.001, 'false alarms to allow where the model fits (mode auto); fewer takes longer', unit='1/h',
+        low=1e-12, high=1e4)
+    detection_window: float = parameter(
+        0.06, 'how far back an event may lie when it is found (mode auto): the longest delay', unit='s',
+        low=0.005, high=1.0)
+    arm: ArmParameters = field(default_factory=ArmParameters)
+    payload: PayloadParameters = field(default_factory=PayloadParameters)
 
     def __post_init__(self) -> None:
         check_all(self)

@@ -53,6 +53,8 @@ class Memory(NamedTuple):
     """(nx, nx) information gathered in the pass."""
     g: Array
     """(nx,) gradient gathered in the pass."""
+    innovation: Array
+    """(m, 2) the latest, and its variance before the update."""
     power: Array
     """(m,) mean squared normalised innovation of each sensor since the event, slowly forgotten."""
 
@@ -64,7 +66,7 @@ def memory(nx: int, m: int) -> Memory:
         counts=np.zeros(11, dtype=np.int64),
         score=np.zeros(5), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx),
         samples=np.zeros((HORIZON, 3 + m)), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
-        g=np.zeros(nx), power=np.ones(m))
+        g=np.zeros(nx), innovation=np.zeros((m, 2)), power=np.ones(m))
 
 
 def copy(state: Memory) -> Memory:

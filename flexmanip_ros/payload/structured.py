@@ -154,7 +154,7 @@ def _begin(config: IdentifierParameters, state: StructuredState) -> StructuredSt
     assert model is not None
     items = state.waiting
     samples = [item for item in items if isinstance(item, Sample)]
-    Y = _measurements(model, samples)
+    Y = measurements(model, samples)
     steps = np.diff([sample.stamp_ns for sample in samples]) * 1e-9
     dt = float(np.median(steps))
     m = mem.memory(2 * model.motion.q.size + 5, len(model.roles))
@@ -171,18 +171,27 @@ def _begin(config: IdentifierParameters, state: StructuredState) -> StructuredSt
 
 
 def _resume(config: IdentifierParameters, state: StructuredState, sample: Sample) -> StructuredState:
-    """After a gap: keep what is known of arm, payload and noise, look at the motion anew."""
+    """After a gap: start at the sample's measurements."""
+    assert state.model is not None
+    fresh = reopen(config, state, measurements(state.model, [sample])[0])
+    return replace(fresh, last_ns=sample.stamp_ns, effort=sample.u.copy())
+
+
+def reopen(
+    config: IdentifierParameters, state: StructuredState, y: Array | None = None,
+) -> StructuredState:
+    """Keep what is known of arm, payload and noise, look at the motion anew, from measurements y (m,)."""
     assert state.model is not None
     assert state.memory is not None
     m = mem.copy(state.memory)
     n = state.model.motion.q.size
     parameters, spread = m.x[2 * n:].copy(), m.S[2 * n:].copy()
-    start.first(config, state.model, m, _measurements(state.model, [sample])[0])
+    start.first(config, state.model, m, m.recent[:, 0] if y is None else y)
     m.x[2 * n:] = parameters
     m.S[2 * n:] = 0.0
     m.S[2 * n:, 2 * n:] = np.linalg.qr(spread.T)[1].T
     _anchor(m)
-    return replace(state, memory=m, last_ns=sample.stamp_ns, effort=sample.u.copy())
+    return replace(state, memory=m)
 
 
 def _run(config: IdentifierParameters, state: StructuredState, samples: Sequence[Sample]) -> StructuredState:
@@ -197,7 +206,7 @@ def _run(config: IdentifierParameters, state: StructuredState, samples: Sequence
     efforts = np.array([state.effort] + [sample.u for sample in samples])
     m = mem.copy(state.memory)
     taken = run(state.model.motion, state.sensors, m, np.maximum(np.diff(stamps), 0) * 1e-9, efforts[:-1],
-                _measurements(state.model, samples))
+                measurements(state.model, samples))
     if taken < len(samples):
         return _restart(config, state, samples[taken:])
     return replace(state, memory=m, last_ns=int(stamps[-1]), effort=efforts[-1])
@@ -214,8 +223,8 @@ def _restart(
     return advance(config, fresh, samples[1:])
 
 
-def _measurements(model: Model, samples: Sequence[Sample]) -> Array:
-    """Outputs and the angles that are not among them, (N, m)."""
+def measurements(model: Model, samples: Sequence[Sample]) -> Array:
+    """Return outputs and the angles that are not among them, (N, m)."""
     Y = np.array([sample.y for sample in samples])
     if not model.extra:
         return Y

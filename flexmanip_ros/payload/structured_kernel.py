@@ -103,6 +103,7 @@ def measure(motion: Motion, sensors: Sensors, m: Memory, effort: Array, y: Array
             spread += f[c] * f[c]
         variance = spread + r
         square = e * e / variance
+        m.innovation[i, 0], m.innovation[i, 1] = e, variance
         m.power[i] += (min(square, 25.0) - m.power[i]) / min(m.counts[SINCE_EVENT] + 100, 1000)
         residual = min(max(e / np.sqrt(variance), -5.0), 5.0) * np.sqrt(r)
         m.noise[i, BLOCK_SUM] += residual
@@ -286,6 +287,23 @@ def diffuse(sensors: Sensors, m: Memory, duration: float) -> None:
 
 
 @kernel
+def take(motion: Motion, sensors: Sensors, m: Memory, duration: float, effort: Array, y: Array) -> bool:
+    """Take one sample, ``duration`` after the one before; False when numbers left the finite range."""
+    if not predict(motion, m.x, m.S, effort, duration, m.counts[HELD] != 0):
+        return False
+    measure(motion, sensors, m, effort, y)
+    if not abs(m.x[m.x.size - 5]) < 1e9:
+        return False
+    m.counts[SINCE_EVENT] += 1
+    learn_noise(sensors, m)
+    if not refit(motion, sensors, m, duration, effort, y):
+        return False
+    judge_payload(sensors, m)
+    diffuse(sensors, m, duration)
+    return True
+
+
+@kernel
 def advance(
     motion: Motion, sensors: Sensors, m: Memory, durations: Array, efforts: Array, Y: Array,
 ) -> int:
@@ -294,16 +312,7 @@ def advance(
     Returns how many were taken; fewer than N when numbers left the finite range.
     """
     for k in range(Y.shape[0]):
-        if not predict(motion, m.x, m.S, efforts[k], durations[k], m.counts[HELD] != 0):
+        if not take(motion, sensors, m, durations[k], efforts[k], Y[k]):
             return k
-        measure(motion, sensors, m, efforts[k], Y[k])
-        if not abs(m.x[m.x.size - 5]) < 1e9:
-            return k
-        m.counts[SINCE_EVENT] += 1
-        learn_noise(sensors, m)
-        if not refit(motion, sensors, m, durations[k], efforts[k], Y[k]):
-            return k
-        judge_payload(sensors, m)
-        diffuse(sensors, m, durations[k])
     taken: int = Y.shape[0]
     return taken

@@ -1,0 +1,83 @@
+"""What the detector claims, on the plant it models."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from recording import ARM, BENDS, RATES, event, record
+
+from flexmanip_ros import detection
+from flexmanip_ros.parameters import PlantParameters, TriggerParameters
+from flexmanip_ros.plant import simulator
+from flexmanip_ros.types import EventKind, Sample
+
+
+def settings(outputs=BENDS + RATES, **parameters):
+    return TriggerParameters(mode='auto', arm=ARM, outputs=outputs, **parameters)
+
+
+def detect(config, samples, block=5):
+    """Events found, with the stamp at which each was told."""
+    state, found = detection.init(config), []
+    for start in range(0, len(samples), block):
+        part = samples[start:start + block]
+        state, events = detection.advance(config, state, part)
+        found.extend((one, part[-1].stamp_ns) for one in events)
+    return found
+
+
+@pytest.mark.parametrize('outputs', [BENDS, BENDS + RATES], ids=['displacements', 'with rates'])
+@pytest.mark.parametrize('seconds', [1.5, 1.723, 2.0])
+def test_a_capture_is_told_within_fifty_milliseconds_and_dated(outputs, seconds):
+    capture = event(seconds)
+    samples = record(seconds + 0.4, (capture,), outputs=outputs)
+    ((found, told),) = detect(settings(outputs), samples)
+    assert found.kind is EventKind.CAPTURE
+    assert told - capture.stamp_ns <= 50e6
+    assert abs(found.stamp_ns - capture.stamp_ns) <= 12e6
+
+
+def test_captures_and_releases_in_a_row_are_told_apart():
+    events = (event(1.2), event(2.1, EventKind.RELEASE), event(3.0))
+    found = detect(settings(), record(3.6, events))
+    assert [one.kind for one, _ in found] == [one.kind for one in events]
+    assert all(told - one.stamp_ns <= 60e6 for (_, told), one in zip(found, events, strict=True))
+
+
+def test_excitation_and_manoeuvres_alone_raise_no_alarm():
+    assert detect(settings(), record(8.0, scale=4.0), block=1000) == []
+    assert detect(settings(), record(4.0, scale=0.0, noise='std'), block=1000) == []
+
+
+def test_a_capture_at_rest_is_told_when_the_torque_resumes():
+    still = np.zeros((2000, 2))
+    efforts = np.vstack([still, np.tile([10.0, 5.0], (400, 1))])
+    noise = (1e-4, 1e-4, 2e-5, 2e-5, 1e-3, 1e-3, 7e-4, 7e-4)
+    parameters = PlantParameters(arm=ARM, payload_mass=20.0, noise='std', noise_std=noise)
+    trajectory = simulator.simulate(parameters, efforts, (event(1.0),))
+    Y = np.hstack([trajectory.position[:, 2:], trajectory.velocity[:, 2:]])
+    samples = [Sample(int(stamp), effort, y, angles) for stamp, effort, y, angles in zip(
+        trajectory.stamp_ns, trajectory.effort[:, :2], Y, trajectory.position[:, :2], strict=True)]
+    ((found, told),) = detect(settings(), samples)
+    assert found.kind is EventKind.CAPTURE
+    assert 2.0e9 < told <= 2.1e9
+
+
+def test_single_samples_give_the_events_of_a_block():
+    samples = record(1.6, (event(1.3),))
+    config = settings()
+    state, single = detection.init(config), []
+    for sample in samples:
+        state, one = detection.step(config, state, sample)
+        single.extend([one] if one is not None else [])
+    assert single == list(detection.advance(config, detection.init(config), samples)[1])
+
+
+def test_fewer_false_alarms_mean_a_higher_threshold():
+    often, rarely = (detection.threshold(settings(false_alarms_per_hour=rate), 1e-3) for rate in (1.0, 1e-6))
+    assert 30.0 < often < rarely < 100.0
+
+
+def test_signals_of_no_arm_detect_nothing():
+    config = settings(angles=())
+    assert detection.advance(config, detection.init(config), record(0.2))[1] == ()
