@@ -202,7 +202,8 @@ def test_the_same_work_goes_to_a_dask_cluster(scenario_file, tmp_path):
             time.sleep(0.05)
         address = json.loads(here.read_text())['address']
         started += [subprocess.Popen([*common, 'worker', address, '--nthreads', '1', '--no-nanny',
-                                      '--no-dashboard', '--host', '127.0.0.1'], **quiet) for _ in range(2)]
+                                      '--no-dashboard', '--host', '127.0.0.1',
+                                      '--death-timeout', '20'], **quiet) for _ in range(2)]
         far, near = tmp_path / 'far.csv', tmp_path / 'near.csv'
         assert _run(scenario_file, '--runs', 4, '--scheduler', address, '--output', far) == 0
         assert _run(scenario_file, '--runs', 4, '--workers', 0, '--output', near) == 0
@@ -211,7 +212,11 @@ def test_the_same_work_goes_to_a_dask_cluster(scenario_file, tmp_path):
         for process in reversed(started):
             process.terminate()
         for process in started:
-            process.wait(timeout=30)
+            try:
+                process.wait(timeout=20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 def test_a_cluster_that_is_not_there_is_one_clear_line(scenario_file, tmp_path, capsys, monkeypatch):
