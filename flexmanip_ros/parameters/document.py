@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from flexmanip_ros.parameters.controller import ControllerParameters
 from flexmanip_ros.parameters.excitation import ExcitationParameters
 from flexmanip_ros.parameters.field import Leaf, leaves
 from flexmanip_ros.parameters.identifier import IdentifierParameters
@@ -20,6 +21,7 @@ NODES: Mapping[str, type] = {
     'excitation': ExcitationParameters,
     'capture_trigger': TriggerParameters,
     'rpbsid_identifier': IdentifierParameters,
+    'payload_controller': ControllerParameters,
 }
 """Each node and the class that declares its parameters."""
 WIDTH = 100

@@ -1,0 +1,1 @@
+"""A controller that uses the payload estimate: joint hold and vibration damping."""

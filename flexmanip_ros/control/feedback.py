@@ -1,0 +1,102 @@
+"""State from measurements, and the linear quadratic regulator at a configuration with a payload.
+
+x = [theta, eta, theta', eta'] (2n,), n = 2 + 2 kappa: chord angles theta [rad] and modal coordinates eta [m]
+of ``arm.modes`` modes a link (with one mode alone the second and third of a real link are driven unstable).
+A link at rest under no torque is straight, so the regulator needs no integrator: the plane has no gravity.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve, solve_discrete_are
+
+from flexmanip_ros.errors import ModelError
+from flexmanip_ros.parameters.controller import ControllerParameters
+from flexmanip_ros.plant.linearization import (
+    blocks,
+    damping,
+    discretize,
+    root_slopes,
+    tip_slopes,
+)
+from flexmanip_ros.types import Array
+
+RATE_SCALE = 8.0
+"""A rate [1/s] costs as much as the deviation that is RATE_SCALE times smaller."""
+FLOOR = 1e-6
+"""Process noise on every state, so that the filter never stops to listen."""
+
+
+def observation(config: ControllerParameters) -> Array:
+    """Return T (4, n): [encoder angles, bends] = T [theta, eta], and the same for their rates."""
+    arm = config.arm
+    k = arm.modes
+    T = np.zeros((4, 2 + 2 * k))
+    T[:2, :2] = np.eye(2)
+    if arm.angle_convention == 'encoder':
+        root, tip = root_slopes(arm, k), tip_slopes(arm, k)
+        T[0, 2:2 + k] = root[0]
+        T[1, 0] = -1.0
+        T[1, 2:2 + k], T[1, 2 + k:] = -tip[0], root[1]
+    j = np.pi * np.arange(1, k + 1)
+    T[2, 2:2 + k] = np.sin(j * arm.sensor_position[0])
+    T[3, 2 + k:] = np.sin(j * arm.sensor_position[1])
+    return T
+
+
+def reference(config: ControllerParameters, angles: Array) -> Array:
+    """Return the chord angles (2,) of a straight arm whose encoders read ``angles`` (2,)."""
+    relative = config.arm.angle_convention == 'encoder'
+    return np.array([angles[0], angles[1] + angles[0] * relative])
+
+
+def model(config: ControllerParameters, between: float, payload: float) -> tuple[Array, Array]:
+    """Return (A (2n, 2n), B (2n, 2)) of one sample at theta2 - theta1 = ``between`` [rad], payload [kg]."""
+    k = config.arm.modes
+    b = blocks(config.arm, np.array([0.0, between]), payload, k)
+    n = 2 + 2 * k
+    M = np.block([[b.Ma, b.Mb], [b.Mb.T, b.Mc]])
+    K, D = np.zeros((n, n)), np.zeros((n, n))
+    K[2:, 2:], D[2:, 2:] = b.Kc, np.diag(damping(config.arm, k))
+    rows = cho_solve(cho_factor(M), np.hstack([-K, -D, np.vstack([b.B_theta, b.B_eta])]))
+    A = np.zeros((2 * n, 2 * n))
+    A[:n, n:], A[n:] = np.eye(n), rows[:, :2 * n]
+    B = np.vstack([np.zeros((n, 2)), rows[:, 2 * n:]])
+    return discretize(A, B, 1.0 / config.rate)
+
+
+class Design(NamedTuple):
+    """Everything made for one configuration and payload.
+
+    A (2n, 2n), B (2n, 2): one sample; G (2, 2n): torque = -G (x - x_ref); L (2n, 8): weight of the innovation
+    of [positions, rates]; the stationary linear quadratic regulator and Kalman filter.
+    """
+
+    A: Array
+    B: Array
+    G: Array
+    L: Array
+
+
+def design(config: ControllerParameters, between: float, payload: float) -> Design:
+    """Return the regulator and the filter. Raises ModelError when there is no stabilizing one."""
+    A, B = model(config, between, payload)
+    T = observation(config)
+    C = np.kron(np.eye(2), T)
+    scale = np.array([config.angle_scale] * 2 + [config.bend_scale] * (T.shape[1] - 2))
+    Q = np.diag(np.concatenate([1.0 / scale, 1.0 / (RATE_SCALE * scale)]) ** 2)
+    R = np.diag(1.0 / np.asarray(config.effort_scale) ** 2)
+    W = B @ np.diag(np.asarray(config.disturbance_std) ** 2) @ B.T
+    V = np.diag(np.asarray(config.noise_std) ** 2)
+    try:
+        P = solve_discrete_are(A, B, Q, R)
+        G: Array = solve(R + B.T @ P @ B, B.T @ P @ A, assume_a='pos')
+        S = solve_discrete_are(A.T, C.T, W + FLOOR * np.trace(W) * np.eye(len(A)), V)
+        L: Array = solve(C @ S @ C.T + V, C @ S, assume_a='pos').T
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ModelError(
+            f'there is no regulator at {between:.3f} rad with {payload:.3f} kg',
+            'change angle_scale, bend_scale or effort_scale') from error
+    return Design(A, B, G, L)

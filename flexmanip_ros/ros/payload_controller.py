@@ -1,0 +1,182 @@
+"""Node ``payload_controller``: holds the joints and damps vibration, with gains that follow the payload.
+
+subscribes  joint_states                        sensor_msgs/JointState  best effort; a torque for each sample
+            rpbsid_identifier/payload_estimate  std_msgs/Float64MultiArray  mass, std, interval, consistency
+            ~/added_efforts                     std_msgs/Float64MultiArray  torques to add (excitation) [N m]
+publishes   effort_controller/commands          std_msgs/Float64MultiArray  one torque per joint [N m]
+            /diagnostics                        diagnostic_msgs/DiagnosticArray  1 Hz
+
+An estimate changes the gains only when it is trusted: in range, confident, consistent; the gains follow it no
+faster than `payload_rate` and take over within `blend_time`. Without joint states for `stale_after`, and when
+the node is deactivated or stopped, it sends zero torque once. An example of a consumer, not a safety
+controller.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import numpy as np
+from rclpy.context import Context
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from flexmanip_ros.control import controller
+from flexmanip_ros.control.gate import PayloadEstimate, Verdict
+from flexmanip_ros.parameters.controller import ControllerParameters
+from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.conversions import JointStateReader, doubles
+from flexmanip_ros.ros.diagnostics import ERROR, STALE, WARN, Meter, Report
+from flexmanip_ros.ros.node import FlexmanipNode
+from flexmanip_ros.ros.spin import run
+from flexmanip_ros.types import Array, JointRecord
+
+NAME = 'payload_controller'
+LONG_GAP = 10
+"""Missing samples after which the filter starts anew instead of believing its prediction."""
+
+
+class PayloadController(FlexmanipNode[ControllerParameters]):
+    """One torque for every joint state."""
+
+    def __init__(self, *, context: Context | None = None, overrides: list[Parameter] | None = None,
+                 namespace: str | None = None, cli_args: list[str] | None = None) -> None:
+        super().__init__(NAME, ControllerParameters, context=context, overrides=overrides,
+                         namespace=namespace, cli_args=cli_args)
+        self.state: controller.ControllerState | None = None
+        self.dropped = 0
+        self.sent = 0
+        self._added, self._added_at = np.zeros(2), -np.inf
+        self._last_ns: int | None = None
+        self._arrived = np.inf
+        self._meter = Meter()
+        self._reader = JointStateReader()
+        self._names: tuple[str, ...] = ()
+        self._places: list[int] = []
+
+    def make_entities(self) -> None:
+        """Publisher, subscriptions, and the timer that notices silence."""
+        self._commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.command())
+        self._message = Float64MultiArray()
+        self.subscription(JointState, 'joint_states', self._on_joint_states, qos.sensor_input(), raw=True)
+        self.subscription(Float64MultiArray, 'rpbsid_identifier/payload_estimate', self._on_estimate,
+                          qos.latched())
+        self.subscription(Float64MultiArray, '~/added_efforts', self._on_added, qos.command())
+        self.create_timer(self.config.stale_after / 4.0, self._watch, clock=self._steady)
+
+    def start(self) -> None:
+        """Design the first gains."""
+        self.state = controller.init(self.config)
+
+    def activated(self) -> None:
+        """Hold from the next sample on."""
+        self.state = controller.init(self.config)
+        self._last_ns, self._arrived = None, np.inf
+
+    def deactivated(self) -> None:
+        """Leave the arm without torque."""
+        self._send(np.zeros(2))
+
+    def configuration_changed(self, config: ControllerParameters) -> None:
+        """Go to a new setpoint."""
+        if self.state is not None and (self.state.setpoint is not None or any(config.setpoint)):
+            self.state = controller.goto(self.state, np.asarray(config.setpoint))
+
+    def _on_joint_states(self, raw: bytes) -> None:
+        if not self.active or self.state is None:
+            return
+        with self._meter:
+            record = self._reader(raw)
+            measured = self._measured(record)
+            if measured is None:
+                self.dropped += 1
+                self.complain('joint_states', 'a joint state without finite position and velocity of '
+                              f'{", ".join((*self.config.joints, *self.config.bends))} was dropped')
+                return
+            if self._last_ns is not None and record.stamp_ns <= self._last_ns:
+                self.dropped += 1
+                return
+            self._arrived = time.monotonic()
+            longest_ns = LONG_GAP * 1e9 / self.config.rate
+            if self._last_ns is not None and record.stamp_ns - self._last_ns > longest_ns:
+                self.state = self.state._replace(x=None)
+            self._last_ns = record.stamp_ns
+            self.state, torque = controller.step(self.config, self.state, measured)
+            self._send(torque)
+
+    def _measured(self, record: JointRecord) -> controller.Measured | None:
+        """Pick the four signals by name; None when one is missing or not finite."""
+        count = len(record.names)
+        if record.names != self._names:
+            wanted = (*self.config.joints, *self.config.bends)
+            if not set(wanted) <= set(record.names):
+                return None
+            self._names, self._places = record.names, [record.names.index(name) for name in wanted]
+        if record.position.size != count or record.velocity.size != count:
+            return None
+        position, velocity = record.position[self._places], record.velocity[self._places]
+        if not np.isfinite(position.sum() + velocity.sum()):
+            return None
+        fresh = time.monotonic() - self._added_at <= self.config.stale_after
+        return controller.Measured(position, velocity, self._added if fresh else np.zeros(2))
+
+    def _on_estimate(self, message: Float64MultiArray) -> None:
+        if self.state is None or len(message.data) != 5:
+            return
+        before = self.state.verdict
+        self.state = controller.estimate(self.config, self.state, PayloadEstimate(*message.data))
+        if self.state.verdict is not before and self.state.verdict is not None:
+            self.get_logger().info(f'payload {message.data[0]:.2f} kg: {self.state.verdict.value}')
+
+    def _on_added(self, message: Float64MultiArray) -> None:
+        if len(message.data) != 2 or not np.isfinite(message.data).all():
+            self.complain('added_efforts', 'an added effort is not two finite torques; it was dropped')
+            self.dropped += 1
+            return
+        self._added, self._added_at = np.array(message.data), time.monotonic()
+
+    def _watch(self) -> None:
+        """Send zero torque once when the joint states fall silent."""
+        if not self.active or time.monotonic() - self._arrived <= self.config.stale_after:
+            return
+        self._arrived = np.inf
+        if self.state is not None:
+            self.state = self.state._replace(x=None)
+        self._send(np.zeros(2))
+        self.complain('silence', f'no joint_states for {self.config.stale_after:g} s: zero torque')
+
+    def _send(self, torque: Array) -> None:
+        self._message.data = doubles(torque)
+        self._commands.publish(self._message)
+        self.sent += 1
+
+    def report(self, report: Report) -> None:
+        """Rate, what is scheduled on, and what became of the latest estimate."""
+        report.values.update(self._meter.window())
+        report.values['dropped'] = self.dropped
+        if self.dropped:
+            report.worse(WARN, f'{self.dropped} messages dropped')
+        if self.active and report.values['rate_hz'] == 0.0:
+            report.worse(STALE, 'no joint_states')
+        elif self.active and abs(report.values['rate_hz'] / self.config.rate - 1.0) > 0.2:
+            report.worse(ERROR, f'{report.values["rate_hz"]:.0f} joint states a second, designed for '
+                         f'{self.config.rate:.0f}; set rate')
+        if self.state is None:
+            return
+        verdict = self.state.verdict
+        report.values.update(
+            scheduled_payload_kg=self.state.payload, trusted_payload_kg=self.state.trusted,
+            designs=self.state.designs, estimate='none' if verdict is None else verdict.value)
+        if verdict not in (None, Verdict.TRUSTED):
+            report.worse(WARN, f'payload estimate not trusted: {verdict.value}')
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(PayloadController, NAME, __doc__, ControllerParameters, argv)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from joint_states import joint_state
+from rclpy.parameter import Parameter
+from ros_harness import Ros, overrides
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from flexmanip_ros.control import controller
+from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.conversions import joint_record
+from flexmanip_ros.ros.payload_controller import PayloadController
+from flexmanip_ros.ros.plant_simulator import PlantSimulator
+
+
+def start(ros: Ros, readers: int = 1, **values: object) -> PayloadController:
+    node = ros.managed(PayloadController(context=ros.context, overrides=overrides(
+        **{'arm__modes': 1, 'stale_after': 5.0, **values})))
+    ros.wait(lambda: node._commands.get_subscription_count() >= readers)
+    return node
+
+
+def test_each_sample_gets_the_torque_of_the_core(ros: Ros) -> None:
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
+    node = start(ros)
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    for k in range(50):
+        states.publish(joint_state(k, ('link2_bend', 'joint1', 'other', 'joint2', 'link1_bend')))
+    ros.wait(lambda: len(heard) == 50)
+    state = controller.init(node.config)
+    for k, message in enumerate(heard):
+        record = joint_record(joint_state(k))
+        state, torque = controller.step(node.config, state, controller.Measured(
+            record.position, record.velocity, np.zeros(2)))
+        assert np.array(message.data).tobytes() == torque.tobytes()
+
+
+def test_bad_samples_get_no_torque_and_are_counted(ros: Ros) -> None:
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
+    node = start(ros)
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    good, nan, short, unnamed, late = (joint_state(k) for k in (5, 6, 7, 8, 4))
+    nan.position[2] = math.nan
+    short.velocity = []
+    unnamed.name = ['a', 'b', 'c', 'd']
+    for message in (good, nan, short, unnamed, late):
+        states.publish(message)
+    ros.wait(lambda: node.dropped == 4)
+    assert len(heard) == 1
+    assert np.isfinite(heard[0].data).all()
+
+
+def test_a_trusted_latched_estimate_changes_the_schedule_and_a_wild_one_does_not(ros: Ros) -> None:
+    estimates = ros.helper.create_publisher(
+        Float64MultiArray, 'rpbsid_identifier/payload_estimate', qos.latched())
+    estimates.publish(Float64MultiArray(data=[20.0, 0.1, 19.8, 20.2, 1.0]))
+    node = start(ros, readers=0)
+    ros.wait(lambda: node.state.trusted == 20.0, what='the estimate from before the start')
+    estimates.publish(Float64MultiArray(data=[80.0, 40.0, 0.0, 160.0, 1.0]))
+    ros.wait(lambda: node.state.verdict.name == 'UNSURE')
+    assert node.state.trusted == 20.0
+
+
+def test_silence_means_zero_torque_once(ros: Ros) -> None:
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
+    start(ros, stale_after=0.1, hold_present=False, setpoint=[1.0, 1.0])
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    for k in range(20):
+        states.publish(joint_state(k))
+    ros.wait(lambda: len(heard) == 21)
+    assert heard[-1].data.tolist() == [0.0, 0.0]
+    assert heard[-2].data.tolist() != [0.0, 0.0]
+
+
+def test_the_arm_is_brought_to_a_new_setpoint_live(ros: Ros) -> None:
+    common = {'arm__modes': 1, 'rate': 250.0}
+    node = start(ros, readers=0, rate=250.0, setpoint_rate=1.0)
+    heard = ros.listen(JointState, 'joint_states', qos.sensor_output())
+    plant = ros.add(PlantSimulator(context=ros.context, overrides=overrides(noise='none', **common)))
+    plant.trigger_configure()
+    ros.wait(lambda: plant.joint_states.get_subscription_count() == 2)
+    plant.trigger_activate()
+    ros.wait(lambda: len(heard) > 5)
+    goal = np.array(heard[0].position[:2]) + np.array([0.05, -0.05])
+    (result,) = node.set_parameters([Parameter('setpoint', value=goal.tolist())])
+    assert result.successful
+    ros.wait(lambda: np.abs(np.array(heard[-1].position[:2]) - goal).max() < 0.01, timeout=20.0)
+    assert plant.dropped_commands == 0
