@@ -46,6 +46,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         super().__init__(NAME, ControllerParameters, context=context, overrides=overrides,
                          namespace=namespace, cli_args=cli_args)
         self.state: controller.ControllerState | None = None
+        self._estimate: PayloadEstimate | None = None
         self.dropped = 0
         self.sent = 0
         self._added, self._added_at = np.zeros(2), -np.inf
@@ -74,6 +75,8 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         """Hold from the next sample on."""
         self.state = controller.init(self.config)
         self._last_ns, self._arrived = None, np.inf
+        if self._estimate is not None:
+            self._judge(self._estimate)
 
     def deactivated(self) -> None:
         """Leave the arm without torque."""
@@ -123,12 +126,20 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         return controller.Measured(position, velocity, self._added if fresh else np.zeros(2))
 
     def _on_estimate(self, message: Float64MultiArray) -> None:
-        if self.state is None or len(message.data) != 5:
+        if len(message.data) != 5:
+            self.complain('payload_estimate', 'a payload estimate has not 5 values; it was dropped')
+            self.dropped += 1
+            return
+        self._estimate = PayloadEstimate(*message.data)  # kept: a latched one may come before activation
+        self._judge(self._estimate)
+
+    def _judge(self, estimate: PayloadEstimate) -> None:
+        if self.state is None:
             return
         before = self.state.verdict
-        self.state = controller.estimate(self.config, self.state, PayloadEstimate(*message.data))
+        self.state = controller.estimate(self.config, self.state, estimate)
         if self.state.verdict is not before and self.state.verdict is not None:
-            self.get_logger().info(f'payload {message.data[0]:.2f} kg: {self.state.verdict.value}')
+            self.get_logger().info(f'payload {estimate.mass:.2f} kg: {self.state.verdict.value}')
 
     def _on_added(self, message: Float64MultiArray) -> None:
         if len(message.data) != 2 or not np.isfinite(message.data).all():
