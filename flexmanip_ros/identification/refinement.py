@@ -37,7 +37,7 @@ BLOCK = 256
 MEMORY = 1_000_000.0
 """Samples after which parameters may have drifted by their own standard deviation."""
 CLEAN = 1e-20
-"""Relative innovation power below which the subspace model has no bias worth removing."""
+"""Relative innovation power below which the subspace model has no bias worth removing; least power assumed."""
 UNEXPLAINED = 0.5
 """Share of an output's power that a fit with K = 0 may leave before it is taken not to simulate at all."""
 PARAMETERS = 160
@@ -130,16 +130,16 @@ def _dense(theta: Theta) -> Theta:
 
 
 def fit_all(
-    refined: Refined, realized: Realized | None, scale: Array, feedthrough: bool, noise: str,
+    refined: Refined, starts: list[Realized], scale: Array, feedthrough: bool, noise: str,
 ) -> Refined:
-    """Fit the whole stretch from the subspace model and from the fit before; the better one is kept.
+    """Fit the whole stretch from subspace models and from the fit before; the best one is kept.
 
     noise: ``sensor`` holds K = 0 while the system is fitted, ``any`` frees it where that is the better model.
     """
     samples = np.vstack(refined.chunks)
     found: list[tuple[Recursion, float]] = []
     floor = -np.inf
-    if realized is not None:
+    for realized in starts:
         begin, structure = candidate(realized, feedthrough)
         m = realized.C.shape[0]
         size = np.linalg.slogdet(realized.residual.T @ realized.residual / len(samples) + 1e-300 * np.eye(m))
@@ -148,12 +148,11 @@ def fit_all(
             return _next_phase(refined._replace(recursion=None))
         floor = float(size[1]) + realized.Xi.size * np.log(len(samples)) / len(samples)
         found += _fits(samples, begin, structure, scale, noise, floor)
-        floor -= 2.0 * float(np.sum(np.log(scale[-m:])))
     old = refined.recursion
     if old is not None:
         begin = old.theta._replace(x=np.zeros_like(old.theta.x))
         m = begin.C.shape[0]
-        own = floor + 2.0 * float(np.sum(np.log(old.scale[-m:])))
+        own = floor + 2.0 * float(np.sum(np.log(old.scale[-m:] / scale[-m:])))
         found += _fits(samples, begin, old.structure, old.scale, noise, own)
     best = min(found, key=lambda pair: pair[1])[0] if found else None
     return _next_phase(refined._replace(recursion=best))
@@ -196,7 +195,7 @@ def _fits(
         return []
     recursion = Recursion(
         theta=best.theta._replace(x=best.end), structure=chosen, scale=scale, P=best.directions,
-        root=_arrive(covariance_root(best.information), best.arrival), covariance=best.covariance,
+        root=_arrive(covariance_root(best.information), best.arrival), covariance=best.covariance + CLEAN * np.diag(power),
         weight=float(count), widening=_widening(U, Y, best, chosen), strikes=0,
         gain=best.theta.K if gain is None else gain)
     return [(recursion, cost - 2.0 * float(np.sum(np.log(scale[r:]))))]

@@ -160,10 +160,13 @@ def _refine(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array
     refined = refinement.take(refined, samples)
     try:
         if refinement.is_fit_due(refined):
-            realized, _, scale = publication.from_factor(config, state.memory[0], state.scale)
+            starts = [publication.from_factor(config, state.memory[0], state.scale)]
+            if config.order > len(config.outputs) and config.past_window > config.future_window:
+                longer = replace(config, future_window=config.past_window)
+                starts.append(publication.from_factor(longer, state.memory[0], state.scale))
             refined = refinement.fit_all(
-                refined, realized, scale, config.direct_feedthrough,
-                'sensor' if config.refinement == 'output_error' else 'any')
+                refined, [realized for realized, _, _ in starts if realized is not None], starts[0][2],
+                config.direct_feedthrough, 'sensor' if config.refinement == 'output_error' else 'any')
         elif refinement.is_block_due(refined):
             refined = refinement.update(refined)
     except np.linalg.LinAlgError:  # the subspace model remains; a new stretch begins
