@@ -12,6 +12,7 @@ from typing import Any
 from flexmanip_ros import holdout, pipeline
 from flexmanip_ros.achievable import payload_std
 from flexmanip_ros.cli.console import require_pictures
+from flexmanip_ros.detected_events import with_detected
 from flexmanip_ros.errors import BagError, FlexmanipError
 from flexmanip_ros.history import History, Signals
 from flexmanip_ros.io import bag
@@ -32,6 +33,8 @@ class Request:
     events: tuple[str, ...] = ('capture_event', 'capture_detected')
     capture_time: float | None = None
     release_time: float | None = None
+    detect: bool = False
+    """Find captures and releases in the signals."""
     validate_from: float | None = None
     output: str | None = None
     report: str | None = None
@@ -111,7 +114,8 @@ class _Feed:
         request = self._request
         try:
             topics = bag.Topics(request.joint_states, request.events)
-            for item in bag.read(request.bag, topics, self._progress):
+            items = bag.read(request.bag, topics, self._progress)
+            for item in with_detected(request.config, items) if request.detect else items:
                 yield from self._pass(item)
         except BagError as error:
             self.fault = error

@@ -48,6 +48,7 @@ def _parser() -> console.Parser:
         help='default: joint_states, in any namespace')
     add('--capture-event', metavar='TOPIC', action='append',
         help='default: capture_event and capture_detected beside the joint states')
+    add('--detect', action='store_true', help='find captures and releases in the signals')
     for kind in ('capture', 'release'):
         add(f'--{kind}-time', metavar='SECONDS', type=float,
             help=f'add a {kind} at this time from the first stamp')
@@ -65,7 +66,8 @@ def _main(given: argparse.Namespace) -> int:
     request = Request(
         given.bag, config, joint_states=given.joint_states,
         events=tuple(given.capture_event or ('capture_event', 'capture_detected')),
-        capture_time=given.capture_time, release_time=given.release_time, validate_from=given.validate_from,
+        capture_time=given.capture_time, release_time=given.release_time, detect=given.detect,
+        validate_from=given.validate_from,
         output=given.output, report=given.report)
     with console.progress('identifying', 'messages') as progress:
         result = identify(request, progress)

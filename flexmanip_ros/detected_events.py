@@ -1,0 +1,35 @@
+"""Messages with the captures and releases that their signals reveal, for recordings without a trigger."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from flexmanip_ros import detection, sampling
+from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
+from flexmanip_ros.types import CaptureEvent, JointRecord
+
+Item = JointRecord | CaptureEvent
+
+
+def with_detected(config: IdentifierParameters, items: Iterable[Item]) -> Iterator[Item]:
+    """Yield every message, and after the one that revealed it each event that was found.
+
+    The event carries the stamp of its onset; the pipeline goes back for it, as it does live.
+    """
+    clock = sampling.init()
+    state: detection.DetectionState | None = None
+    trigger = TriggerParameters()
+    for item in items:
+        yield item
+        if isinstance(item, CaptureEvent):
+            continue
+        clock, sampled = sampling.step(config, clock, item)
+        if clock.outputs is None:
+            continue
+        if state is None or sampled.reset:
+            trigger = TriggerParameters(
+                mode='auto', inputs=config.inputs, outputs=clock.outputs, angles=config.angles,
+                arm=config.arm, payload=config.payload)
+            state = detection.init(trigger)
+        state, events = detection.advance(trigger, state, sampled.samples)
+        yield from events
