@@ -112,7 +112,10 @@ def _start(config: TriggerParameters, state: DetectionState, sample: Sample) -> 
     w = max(kernel.SHORTEST + 2, round(config.detection_window / dt))
     n2 = 2 * state.filter.model.motion.q.size
     m = len(state.filter.model.roles)
+    rates = state.filter.sensors.rate if state.filter.sensors is not None else np.zeros(m, dtype=np.bool_)
     watch = kernel.Watch(
+        # rates show the modes that the model leaves out, at every step of the torque
+        used=rates if np.all(rates[:len(state.identifier.outputs)]) else ~rates,
         trace=np.zeros((w, m, kernel.CAUSES)), factors=np.zeros((w, kernel.CAUSES, kernel.CAUSES)),
         scores=np.zeros((w, kernel.CAUSES)), clock=np.zeros(6, dtype=np.int64),
         level=np.array([0.0, 0.0, 0.0, threshold(config, dt)]), history=np.zeros(2 * w),
