@@ -13,6 +13,7 @@ from typing import NamedTuple
 from flexmanip_ros import estimator, sampling, timeline
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.sampling import Counters
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Sample
 
 BLOCK = 256
@@ -35,7 +36,7 @@ class State(NamedTuple):
     """Index of the last publishing instant, counted from the first stamp."""
 
     @property
-    def counters(self) -> sampling.Counters:
+    def counters(self) -> Counters:
         """What became of the messages."""
         return self.sampling.counters
 
@@ -171,7 +172,8 @@ def _due(state: State, stamp_ns: int) -> bool:
 
 def _consume(state: State, samples: Iterable[Sample]) -> tuple[State, tuple[Estimate, ...]]:
     """Run samples through the estimators, stopping at each publishing instant."""
-    if state.timeline is None or state.config is None:
+    config, line = state.config, state.timeline
+    if config is None or line is None:
         return state, ()
     ready: list[Estimate] = []
     block: list[Sample] = []
@@ -179,10 +181,10 @@ def _consume(state: State, samples: Iterable[Sample]) -> tuple[State, tuple[Esti
         block.append(sample)
         if not _due(state, sample.stamp_ns):
             continue
-        line = timeline.advance(state.config, state.timeline, block)
+        line = timeline.advance(config, line, block)
         block = []
         state = state._replace(timeline=line, published=_instant(state, sample.stamp_ns))
-        ready.append(estimator.estimate(state.config, line.core, sample.stamp_ns, state.sampling.dt))
+        ready.append(estimator.estimate(config, line.core, sample.stamp_ns, state.sampling.dt))
     if block:
-        state = state._replace(timeline=timeline.advance(state.config, state.timeline, block))
+        state = state._replace(timeline=timeline.advance(config, line, block))
     return state, tuple(ready)
