@@ -22,7 +22,7 @@ from flexmanip_ros.types import CaptureEvent, EventKind, Sample
 
 SETTLE = 0.5
 """Seconds after the start or an event before the next can be told."""
-CONFIRM = 0.015
+CONFIRM = 0.01
 """Seconds from an alarm to its report: they date the onset."""
 PEAK_MEMORY = 20.0
 """Seconds in which a peak of the statistic is forgotten."""

@@ -37,10 +37,10 @@ class TriggerParameters:
     angles: tuple[str, ...] = parameter(
         ('joint1/position', 'joint2/position'), 'joint angles, each NAME/FIELD of JointState (mode auto)')
     false_alarms_per_hour: float = parameter(
-        0.001, 'false alarms to allow where the model fits (mode auto); fewer takes longer', unit='1/h',
+        0.05, 'false alarms to allow where the model fits (mode auto); fewer takes longer', unit='1/h',
         low=1e-12, high=1e4)
     detection_window: float = parameter(
-        0.06, 'how far back an event may lie when it is found (mode auto): the longest delay', unit='s',
+        0.1, 'how far back an event may lie when it is found (mode auto): the longest delay', unit='s',
         low=0.005, high=1.0)
     arm: ArmParameters = field(default_factory=ArmParameters)
     payload: PayloadParameters = field(default_factory=PayloadParameters)
