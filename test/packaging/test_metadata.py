@@ -177,3 +177,9 @@ def test_links_between_pages_lead_somewhere(page: str) -> None:
     for link in re.findall(r'\]\(([^)#\s]+)', text):
         if '://' not in link:
             assert ((ROOT / page).parent / link).exists(), f'{page} points to {link}'
+
+
+def test_every_page_is_in_the_contents() -> None:
+    contents = (ROOT / 'docs' / 'index.md').read_text(encoding='utf-8')
+    for page in PAGES[1:]:
+        assert page == 'docs/index.md' or f']({Path(page).name})' in contents
