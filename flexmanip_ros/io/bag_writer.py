@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from pathlib import Path
@@ -127,7 +128,8 @@ class BagWriter:
             try:
                 self._writer.close()
             except OSError as err:
-                self._writer.abort()
+                with contextlib.suppress(OSError):  # what is still buffered cannot be written either
+                    self._writer.abort()
                 raise BagError(f"bag '{self.path}' cannot be finished: {err.strerror}",
                                "free some space, then run 'ros2 bag reindex'; the messages are kept") from err
 

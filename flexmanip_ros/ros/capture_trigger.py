@@ -26,7 +26,8 @@ from std_srvs.srv import Trigger
 from flexmanip_ros.io import cdr
 from flexmanip_ros.parameters import TriggerParameters
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.conversions import header
+from flexmanip_ros.ros.auto_mode import Watcher, rehearse
+from flexmanip_ros.ros.conversions import JointStateReader, header
 from flexmanip_ros.ros.diagnostics import STALE, Meter, Report
 from flexmanip_ros.ros.node import FlexmanipNode
 from flexmanip_ros.ros.spin import run
@@ -49,6 +50,9 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         self._last_ns: int | None = None
         self._arrived = -1.0
         self._pending: tuple[CaptureEvent, ...] = ()
+        self._watcher: Watcher | None = None
+        self._reader = JointStateReader()
+        self.detected: list[CaptureEvent] = []
         self.announced: list[CaptureEvent] = []
 
     def make_entities(self) -> None:
@@ -59,8 +63,14 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         self.create_service(Trigger, '~/capture', self._on_capture)
         self.create_service(Trigger, '~/release', self._on_release)
 
+    def start(self) -> None:
+        """Compile or load what mode auto needs, before the first sample."""
+        if self.config.mode == 'auto':
+            rehearse(self.config)
+
     def activated(self) -> None:
-        """Count from the next sample."""
+        """Count from the next sample, and watch from there on."""
+        self._watcher = Watcher(self.config) if self.config.mode == 'auto' else None
         self._first_ns = self._last_ns = None
         self._pending = ()
 
@@ -80,6 +90,19 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
             while self._pending and stamp >= self._pending[0].stamp_ns - int(self.config.lead_time * 1e9):
                 self._announce(self._pending[0])
                 self._pending = self._pending[1:]
+            if self._watcher is not None:
+                self._watch(self._watcher, raw)
+
+    def _watch(self, watcher: Watcher, raw: bytes) -> None:
+        """Mode auto: tell what the sample reveals."""
+        dropped = watcher.counters.dropped
+        for event in watcher.take(self._reader(raw)):
+            self.detected_publisher.publish(header(event))
+            self.detected.append(event)
+            self.get_logger().info(f'{event.kind.value} detected at {event.stamp_ns * 1e-9:.6f}')
+        if watcher.counters.dropped > dropped and watcher.refusal is not None:
+            self.complain(watcher.refusal.reason,
+                          f'message dropped: {watcher.refusal.problem}; {watcher.refusal.remedy}')
 
     def _begin(self, stamp: int) -> None:
         """Plan the events of mode time from the first stamp."""
@@ -125,6 +148,10 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         report.values['mode'] = self.config.mode
         report.values['announced'] = len(self.announced)
         report.values['pending'] = len(self._pending)
+        if self._watcher is not None:
+            report.values['detected'] = len(self.detected)
+            report.values['dropped'] = self._watcher.counters.dropped
+            report.values['statistic'], report.values['threshold'] = self._watcher.statistic
         if self.active and report.values['rate_hz'] == 0.0:
             report.worse(STALE, 'no joint_states')
 

@@ -42,6 +42,9 @@ class Facts:
 
 def finish(config: DemoParameters, facts: Facts, folder: Path, console: Console) -> int:
     """Replay the bag, compare, draw and print; return the exit code."""
+    if facts.problem:
+        console.print(f"recording: {facts.problem}\nbag      {folder / 'bag'}")
+        return DIFFERENT
     began = time.monotonic()
     items = list(bag.read(folder / 'bag'))
     estimates = list(pipeline.run(facts.identifier, items))
@@ -53,8 +56,6 @@ def finish(config: DemoParameters, facts: Facts, folder: Path, console: Console)
     console.print(f'\n{facts.samples} samples in {facts.wall_s:.2f} s, {facts.lost} lost; '
                   f'identifier callback p99 {facts.callback_p99_us:.0f} us')
     console.print(_table(config, estimates, items, truth))
-    if facts.problem:
-        console.print(f'recording: {facts.problem}')
     if different:
         console.print(f'replay: {different}')
     else:
@@ -66,7 +67,7 @@ def finish(config: DemoParameters, facts: Facts, folder: Path, console: Console)
                                   'The identifier as it ran in this demonstration.'), encoding='utf-8')
     console.print(f"\nbag      {folder / 'bag'}\npicture  {picture}\n"
                   f"again    identify_bag {folder / 'bag'} --params {settings}")
-    return DIFFERENT if different or facts.problem else 0
+    return DIFFERENT if different else 0
 
 
 def outgoing(estimates: Iterable[Estimate], frame_id: str) -> dict[str, list[Value]]:

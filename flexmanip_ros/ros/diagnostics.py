@@ -69,6 +69,10 @@ class Meter:
         self._times_ns.append(time.perf_counter_ns() - self._entered_ns)
         self.total += 1
 
+    def idle_s(self) -> float:
+        """Return the seconds since the callback last began."""
+        return (time.perf_counter_ns() - self._entered_ns) * 1e-9
+
     def window(self) -> Mapping[str, float]:
         """Return rate [Hz] and callback time [us] since the last call, and start a new window."""
         now = time.monotonic_ns()

@@ -63,7 +63,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._message = Float64MultiArray()
         self.subscription(JointState, 'joint_states', self._on_joint_states, qos.sensor_input(), raw=True)
         self.subscription(Float64MultiArray, 'rpbsid_identifier/payload_estimate', self._on_estimate,
-                          qos.latched())
+                          qos.latched_input())
         self.subscription(Float64MultiArray, '~/added_efforts', self._on_added, qos.command())
         self.create_timer(self.config.stale_after / 4.0, self._watch, clock=self._steady)
 

@@ -61,7 +61,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         self.joint_states = self.publisher(JointState, 'joint_states', qos.sensor_output())
         self._message = JointState()
         self.subscription(Float64MultiArray, 'effort_controller/commands', self._on_command, qos.command())
-        self.subscription(Header, 'capture_event', self._on_event, qos.latched())
+        self.subscription(Header, 'capture_event', self._on_event, qos.latched_input())
         self.create_service(Trigger, '~/reset', self._on_reset)
         self._grid = SampleGrid(self, self.config.rate)
         self._timer = self.create_timer(1.0 / self.config.rate, self._tick, clock=self._grid.clock)

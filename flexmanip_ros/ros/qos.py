@@ -29,6 +29,11 @@ def latched() -> QoSProfile:
     return _profile(1, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
+def latched_input() -> QoSProfile:
+    """Read what is latched, deeper than it is written: two events in quick succession both arrive."""
+    return _profile(10, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
+
+
 def output() -> QoSProfile:
     """Everything else an identifier says."""
     return _profile(10, ReliabilityPolicy.RELIABLE)

@@ -71,7 +71,7 @@ class Recorder(Node):
     def _listen(self, kind: type, topic: str, convert: Callable[[Any], Value], *,
                 latched: bool = False) -> None:
         self.create_subscription(kind, topic, partial(self._on_message, topic, convert, latched),
-                                 qos.latched() if latched else self._deep)
+                                 qos.latched_input() if latched else self._deep)
 
     def _on_joint_states(self, raw: bytes, info: object) -> None:
         self.losses.note(sequence_number(info))

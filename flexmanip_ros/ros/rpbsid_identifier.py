@@ -66,7 +66,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self._joint_states = self.subscription(
             JointState, 'joint_states', with_info(self._on_joint_states), qos.sensor_input(), raw=True)
         for topic in ('capture_event', 'capture_detected'):
-            self.subscription(Header, topic, partial(self._on_event, topic), qos.latched())
+            self.subscription(Header, topic, partial(self._on_event, topic), qos.latched_input())
         self.create_service(Trigger, '~/reset', self._on_reset)
 
     def start(self) -> None:

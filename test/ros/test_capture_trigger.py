@@ -6,9 +6,14 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
+from flexmanip_ros.parameters import ExcitationParameters, PlantParameters
+from flexmanip_ros.plant import simulator
+from flexmanip_ros.plant.excitation import sequence
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.capture_trigger import CaptureTrigger
+from flexmanip_ros.ros.conversions import joint_state as joint_state_message
 from flexmanip_ros.ros.conversions import stamp_ns
+from flexmanip_ros.types import CaptureEvent, EventKind
 
 
 def test_an_event_at_a_set_time_is_stamped_from_the_first_sample_and_announced_ahead(ros: Ros) -> None:
@@ -68,3 +73,21 @@ def test_a_request_without_joint_states_is_refused_with_the_reason(ros: Ros) -> 
     assert not answer.success
     assert 'no joint_states' in answer.message
     assert node.announced == []
+
+
+def test_mode_auto_finds_a_capture_and_tells_it_where_the_plant_does_not_listen(ros: Ros) -> None:
+    node = ros.managed(CaptureTrigger(context=ros.context, overrides=overrides(mode='auto')))
+    commanded = ros.listen(Header, 'capture_event', qos.latched())
+    detected = ros.listen(Header, 'capture_detected', qos.latched())
+    publisher = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    count, capture = 2600, CaptureEvent(START_NS + 2_100_000_000, EventKind.CAPTURE)
+    run = simulator.simulate(PlantParameters(), sequence(ExcitationParameters(), count), (capture,), START_NS)
+    for k, record in enumerate(simulator.records(run)):
+        publisher.publish(joint_state_message(record))
+        if k % 200 == 199:
+            ros.wait(lambda k=k: node._watcher.counters.received == k + 1)
+    ros.wait(lambda: detected, what='the detected capture')
+    assert detected[0].frame_id == 'capture'
+    assert abs(stamp_ns(detected[0].stamp) - capture.stamp_ns) < 30_000_000
+    assert len(node.detected) == 1
+    assert commanded == []

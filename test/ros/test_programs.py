@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from flexmanip_ros.errors import BagError
 from flexmanip_ros.io import bag
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
@@ -136,3 +138,23 @@ def test_runs_never_share_a_folder(tmp_path: Path) -> None:
 
     (tmp_path / 'run_007').mkdir()
     assert [new_folder(tmp_path).name, new_folder(tmp_path).name] == ['run_008', 'run_009']
+
+
+def test_a_full_disk_ends_the_recording_with_the_reason_and_keeps_what_was_written(tmp_path: Path) -> None:
+    environment = {**os.environ, 'ROS_DOMAIN_ID': str(1 + (os.getpid() + 50) % 100)}
+    limit = 150_000  # bytes a file may have; the real error of a real write
+
+    def small_files() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    process = subprocess.run(
+        [sys.executable, '-m', 'flexmanip_ros.ros.demo', str(tmp_path), '--duration', '2',
+         '--capture-time', '1'],
+        env=environment, text=True, capture_output=True, timeout=120, preexec_fn=small_files, check=False)
+    assert process.returncode == 1, process.stdout + process.stderr
+    assert 'free some space' in process.stdout
+    assert 'Traceback' not in process.stderr
+    kept: list[object] = []
+    with pytest.raises(BagError):
+        kept.extend(bag.read(tmp_path / 'run_001' / 'bag'))
+    assert len(kept) > 100

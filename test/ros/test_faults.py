@@ -1,0 +1,154 @@
+"""What goes wrong in the field, with the real node over DDS: it recovers, counts, claims nothing wrong."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+from identifier_harness import CAPTURE, START_NS, Live, recording, replayed
+from ros_harness import Ros
+from sensor_msgs.msg import JointState
+
+from flexmanip_ros import messages
+from flexmanip_ros.ros import conversions, qos
+from flexmanip_ros.ros.demo_result import compare
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, Payload, Status
+
+TRUTH = 20.0
+
+
+def believed(live: Live) -> Payload:
+    """Return the latest payload; every payload ever said must be finite in mass."""
+    payload = live.node.estimate.payload
+    assert payload is not None
+    assert all(math.isfinite(mass) for mass in live.said[messages.PAYLOAD_MASS])
+    return payload
+
+
+def honest(payload: Payload, truth: float) -> bool:
+    """Say whether a payload is near the truth for its own width, or says that it is not to be believed."""
+    return (payload.status is not Status.TRACKING or not math.isfinite(payload.std)
+            or abs(payload.mass - truth) < max(6.0 * payload.std, 0.03 * TRUTH))
+
+
+def announce(ros: Ros, live: Live) -> None:
+    live.events.publish(conversions.header(CAPTURE))
+    ros.wait(lambda: live.node.state.timeline is None or live.node.state.timeline.latest)
+
+
+def test_a_publisher_that_dies_and_returns_is_a_gap_and_no_loss(ros: Ros) -> None:
+    live = Live(ros)
+    samples = recording(1500)
+    live.send(*samples[:300])
+    announce(ros, live)
+    live.send(*samples[300:700])
+    ros.helper.destroy_publisher(live.joint_states)
+    live.joint_states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    live.send(*samples[900:])
+    counters = live.node.state.counters
+    assert (counters.accepted, counters.gaps, live.node.losses.lost) == (1300, 1, 0)
+    assert honest(believed(live), TRUTH)
+    assert abs(believed(live).mass - TRUTH) < 0.1 * TRUTH
+
+
+def test_every_sample_twice_gives_the_numbers_of_every_sample_once(ros: Ros) -> None:
+    live = Live(ros, payload_method='none')
+    samples = recording(400)
+    live.send(*(sample for sample in samples for _ in range(2)))
+    once = replayed(live, list(samples))
+    assert live.node.state.counters.repeated_stamp == 400
+    ros.wait(lambda: len(live.said[messages.MODEL]) >= len(once[messages.MODEL]))
+    assert compare({name: values for name, values in live.said.items() if values}, once) == ''
+
+
+def test_samples_out_of_order_never_move_the_clock_back(ros: Ros) -> None:
+    live = Live(ros)
+    samples = list(recording(700))
+    announce(ros, live)
+    for k in range(100, 690, 50):
+        samples[k], samples[k + 1] = samples[k + 1], samples[k]
+    live.send(*samples)
+    counters = live.node.state.counters
+    assert counters.late_stamp == 12
+    assert counters.accepted == 688
+    assert live.node.state.timeline.last_ns == samples[-1].stamp_ns
+    assert honest(believed(live), TRUTH)
+
+
+def test_a_storm_of_nan_leaves_no_trace_but_its_count_and_a_gap(ros: Ros) -> None:
+    live = Live(ros)
+    samples = list(recording(1500))
+    announce(ros, live)
+    for k in range(600, 800):
+        bad = samples[k]
+        samples[k] = JointRecord(bad.stamp_ns, bad.names, np.full(4, np.nan), np.full(4, np.nan), bad.effort)
+    live.send(*samples)
+    counters = live.node.state.counters
+    assert (counters.not_finite, counters.gaps, counters.accepted) == (200, 1, 1300)
+    assert all(np.isfinite(model.data).all() for model in live.said[messages.MODEL])
+    assert honest(believed(live), TRUTH)
+    assert abs(believed(live).mass - TRUTH) < 0.1 * TRUTH
+
+
+def test_one_message_in_ten_lost_costs_accuracy_and_never_honesty(ros: Ros) -> None:
+    live = Live(ros)
+    announce(ros, live)
+    rng = np.random.default_rng(3)
+    samples = [sample for sample in recording(1500) if rng.random() > 0.1]
+    live.send(*samples)
+    counters = live.node.state.counters
+    assert counters.accepted == len(samples)
+    assert counters.gaps > 50
+    assert honest(believed(live), TRUTH)
+
+
+def test_bursts_with_pauses_between_change_nothing(ros: Ros) -> None:
+    live = Live(ros)
+    samples = recording(600)
+    for first in range(0, 600, 150):
+        live.send(*samples[first:first + 150])
+        time.sleep(0.05)  # a pause of the sender is what is tested
+    plain = replayed(live, list(samples))
+    ros.wait(lambda: len(live.said[messages.PAYLOAD_MASS]) >= len(plain[messages.PAYLOAD_MASS]))
+    assert compare({name: values for name, values in live.said.items() if values}, plain) == ''
+
+
+def test_a_flood_is_taken_or_counted_as_lost_to_the_last_message(ros: Ros) -> None:
+    live = Live(ros, payload_method='none')
+    samples = recording(4000)
+    for sample in samples:  # as fast as the publisher can: several times the usual rate
+        live.joint_states.publish(conversions.joint_state(sample))
+    ros.wait(lambda: live.node.state.timeline and live.node.meter.idle_s() > 0.5, timeout=60.0)
+    first = samples[0]
+    live.send(replace(first, stamp_ns=START_NS + 5_000_000_000))
+    node = live.node
+    ros.wait(lambda: node.state.counters.received + node.losses.lost == 4001, what='every message')
+    assert node.state.counters.accepted == node.state.counters.received
+
+
+def test_joints_that_get_other_names_in_mid_run_are_named_and_the_old_ones_taken_again(ros: Ros) -> None:
+    live = Live(ros, payload_method='none')
+    samples = recording(300)
+    live.send(*samples[:100])
+    names = ('shoulder', 'elbow', 'link1_bend', 'link2_bend')
+    live.send(*(JointRecord(s.stamp_ns, names, s.position, s.velocity, s.effort) for s in samples[100:150]))
+    assert 'joint1/effort' in live.node.state.sampling.refusal.problem
+    live.send(*samples[150:])
+    counters = live.node.state.counters
+    assert (counters.missing_signal, counters.accepted, counters.gaps) == (50, 250, 1)
+
+
+def test_a_release_without_a_capture_and_two_captures_claim_nothing_wrong(ros: Ros) -> None:
+    live = Live(ros)
+    samples = recording(900)
+    live.send(*samples[:200])
+    release = CaptureEvent(START_NS + 210_000_000, EventKind.RELEASE)
+    live.events.publish(conversions.header(release))
+    ros.wait(lambda: live.node.state.timeline.latest)
+    for stamp in (CAPTURE.stamp_ns, CAPTURE.stamp_ns + 1_000_000):
+        live.events.publish(conversions.header(CAPTURE._replace(stamp_ns=stamp)))
+    ros.wait(lambda: live.node.state.timeline.repeated_events == 1)
+    live.send(*samples[200:])
+    assert honest(believed(live), TRUTH)
