@@ -40,8 +40,10 @@ CLEAN = 1e-20
 """Relative innovation power below which the subspace model has no bias worth removing; least power assumed."""
 UNEXPLAINED = 0.5
 """Share of an output's power that a fit with K = 0 may leave before it is taken not to simulate at all."""
-PARAMETERS = 160
+PARAMETERS = 80
 """With more parameters than this the subspace model is published as it is."""
+PAUSE = 8192
+"""Samples from a fit that failed to the next attempt; a multiple of CHUNK."""
 MISFIT = 3.0
 """Residual power of a block that ends a recursion; twice in a row."""
 
@@ -89,6 +91,8 @@ def due(refined: Refined) -> int:
 def take(refined: Refined, samples: Array) -> Refined:
     """Store samples (k, r + m), k <= due(refined)."""
     current = refined.current.copy()
+    if refined.total < 0:
+        return refined._replace(total=refined.total + len(samples))
     at = refined.total % CHUNK
     current[at:at + len(samples)] = samples
     refined = refined._replace(current=current, total=refined.total + len(samples))
@@ -100,7 +104,7 @@ def take(refined: Refined, samples: Array) -> Refined:
 def is_fit_due(refined: Refined) -> bool:
     """Whether the whole stretch is to be fitted now: at FIRST samples and each time they double."""
     total = refined.total
-    if not refined.batch or not total or total % FIRST:
+    if not refined.batch or total <= 0 or total % FIRST:
         return False
     doublings = total // FIRST
     return doublings & (doublings - 1) == 0
@@ -182,16 +186,16 @@ def _fits(
     cost = np.inf if best is None else best.cost
     gain = None
     if best is None or _gain_asked_for(U, Y, best, chosen, penalty):
-        other = descend(U, Y, begin, free, ITERATIONS) if noise == 'any' or not simulates else None
+        other = descend(U, Y, begin, free, ITERATIONS) if noise == 'any' else None
         better = other is not None and other.cost + penalty < cost
         if other is not None and better and (not simulates or other.cost + penalty < floor):
             best, chosen, cost = other, free, other.cost + penalty
-        elif best is not None:
+        elif best is not None and simulates:
             for start_gain in (begin.K, np.zeros_like(begin.K)):
                 last = descend(U, Y, best.theta._replace(K=start_gain), free._replace(only_gain=True), ITERATIONS)
                 if last is not None and (gain is None or last.cost < score(U, Y, best.theta._replace(K=gain))[0]):
                     gain = last.theta.K
-    if best is None:
+    if best is None or not (simulates or chosen.free_gain):
         return []
     recursion = Recursion(
         theta=best.theta._replace(x=best.end), structure=chosen, scale=scale, P=best.directions,
@@ -206,8 +210,13 @@ def _next_phase(refined: Refined) -> Refined:
     if refined.total < LONGEST:
         return refined
     if refined.recursion is None:
-        return start(refined.current.shape[1])
+        return give_up(refined)
     return refined._replace(chunks=(), batch=False)
+
+
+def give_up(refined: Refined) -> Refined:
+    """Drop a fit that does not hold, and wait before the next: the plant may not be of this kind at all."""
+    return start(refined.current.shape[1])._replace(total=-PAUSE)
 
 
 def _arrive(root: Array, arrival: Array) -> Array:
@@ -267,7 +276,7 @@ def update(refined: Refined) -> Refined:
         information, gradient, _, arrival, _ = derivatives(U, Y, theta, old.structure, old.covariance, old.P)
         H = kept.T @ information @ kept
         if not np.all(np.isfinite(H)):
-            return refined._replace(recursion=None) if refined.batch else start(refined.current.shape[1])
+            return give_up(refined)
         values, vectors = np.linalg.eigh(0.5 * (H + H.T))
         values = 1.0 + np.maximum(values, 0.0)
         zeta = zeta + vectors @ ((vectors.T @ (kept.T @ gradient - zeta)) / values)
@@ -276,7 +285,7 @@ def update(refined: Refined) -> Refined:
     power = float(np.trace(np.linalg.solve(old.covariance, covariance))) / Y.shape[1]
     strikes = old.strikes + 1 if not power < MISFIT else 0
     if strikes >= 2 or not np.isfinite(power):
-        return refined._replace(recursion=None) if refined.batch else start(refined.current.shape[1])
+        return give_up(refined)
     root = kept @ (vectors / np.sqrt(values))
     _, _, _, arrival, end = derivatives(U, Y, theta, old.structure, old.covariance, old.P)
     share = len(U) / (old.weight + len(U))

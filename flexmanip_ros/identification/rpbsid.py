@@ -218,7 +218,9 @@ def restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
 def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> Identified | None:
     """Return the model as of the last sample, or None before there is one. dt: sample time [s]."""
     d = _regressors(config, len(config.inputs), len(config.outputs))
-    if state.refined is not None and state.refined.recursion is not None:
+    refined = state.refined
+    # a fit of few samples does not replace a model of many
+    if refined is not None and refined.recursion and 2 * refined.recursion.weight >= state.counts[USED]:
         return publication.from_fit(config, state.refined.recursion, state.scalars, dt)
     few = state.counts[USED] <= max(config.past_window, config.order)
     if few or not np.all(np.isfinite(state.memory[0])):
