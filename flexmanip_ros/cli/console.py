@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -64,7 +65,8 @@ def require_pictures() -> None:
 
 def run(prog: str, body: Callable[[], int]) -> int:
     """Run a program: our errors become one line and exit 2, an interrupt exit 130."""
-    with _terminate_as_interrupt():
+    with _terminate_as_interrupt(), warnings.catch_warnings():
+        warnings.simplefilter('ignore')  # numbers out of range have a status; stderr is for one line
         try:
             return body()
         except FlexmanipError as error:
