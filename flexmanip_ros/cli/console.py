@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import warnings
@@ -16,7 +17,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from flexmanip_ros.errors import FlexmanipError
 
-SUCCESS, BAD_INPUT, INTERRUPTED = 0, 2, 130
+SUCCESS, DEFECT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+TRACEBACK = 'FLEXMANIP_TRACEBACK'
+"""Environment variable that lets the traceback of a defect through."""
 Report = Callable[[int, int | None], None]
 """Called with what is done and what there is to do (None: unknown)."""
 
@@ -78,6 +81,12 @@ def run(prog: str, body: Callable[[], int]) -> int:
         except BrokenPipeError:
             sys.stderr.close()  # the reader of our output is gone; nothing is left to say
             return SUCCESS
+        except Exception as error:
+            if os.environ.get(TRACEBACK):
+                raise
+            complain(prog, f'a defect of this program: {type(error).__name__}: {error}; '
+                     f'please report it with the recording ({TRACEBACK}=1 shows where)')
+            return DEFECT
 
 
 @contextmanager

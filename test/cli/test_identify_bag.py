@@ -16,7 +16,7 @@ from flexmanip_ros.cli.identify_bag import main
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.parameters import IdentifierParameters, configure
-from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, Status
 
 START = 1_700_000_000_000_000_000
 KEYS = ['samples', 'gaps', 'sample_time_s', 'wall_s', 'status', 'frequencies_hz', 'damping_ratios',
@@ -218,3 +218,42 @@ def test_a_recording_of_nothing_but_nan_is_refused(capsys, tmp_path):
     assert (status, out) == (2, '')
     assert 'NaN' in err
     assert not (tmp_path / 'out').exists()
+
+
+def _at(*milliseconds: float) -> list[JointRecord]:
+    rng = np.random.default_rng(1)
+    return [JointRecord(round(at * 1e6), ('arm', 'motor'), rng.normal(size=2), rng.normal(size=2),
+                        rng.normal(size=2)) for at in milliseconds]
+
+
+GRIPPER = JointRecord(500_000, ('finger',), np.zeros(1), np.empty(0), np.empty(0))
+
+
+@pytest.mark.parametrize(('records', 'samples'), [
+    (_at(0), 1), (_at(0, 1), 2), (_at(*range(19)), 19),
+    ([*_at(*range(400)), *_at(*range(300))], None),
+    ([*_at(*range(100)), *_at(*range(200, 300))], 200),
+    ([record for pair in zip(_at(*range(200)), [GRIPPER] * 200, strict=True) for record in pair], 200),
+    (_at(*np.arange(300) + np.random.default_rng(2).normal(size=300) * 0.1), 300),
+    (_at(*np.arange(60) * 1e6), 60),
+], ids=['one', 'two', 'short', 'looped', 'hole', 'another publisher', 'jitter', 'slow'])
+def test_odd_recordings_give_a_status(capsys, tmp_path, records, samples):
+    with BagWriter(tmp_path / 'bag') as writer:
+        for k, record in enumerate(records):
+            writer.write('/joint_states', k, record)
+    status, out, err = _run(capsys, tmp_path / 'bag', *SETTINGS, '--json', '--output', tmp_path / 'out.csv')
+    assert (status, err) == (0, '')
+    found = json.loads(out)
+    assert samples is None or found['samples'] == samples
+    assert found['status'] in Status.__members__
+
+
+def test_a_defect_is_one_line_and_not_taken_for_bad_input(recording, capsys, monkeypatch):
+    def broken(*arguments: object) -> None:
+        raise ZeroDivisionError('somewhere')
+
+    monkeypatch.setattr(pipeline, 'replay', broken)
+    status, _, err = _run(capsys, recording, *SETTINGS)
+    assert status == 1
+    assert 'ZeroDivisionError: somewhere' in err
+    assert err.count('\n') == 1
