@@ -28,6 +28,8 @@ def simulation() -> list[Item]:
     efforts = excitation.sequence(ExcitationParameters(), SAMPLES)
     events = (CaptureEvent(SAMPLES // 3 * PERIOD_NS, EventKind.CAPTURE),
               CaptureEvent(SAMPLES // 3 * 2 * PERIOD_NS, EventKind.RELEASE))
+    gauged = replace(config, model='linear', sensors=replace(config.sensors, strain_cutoff=100.0))
+    simulator.simulate(gauged, efforts[:3])
     state = simulator.init(config)
     for torques in efforts[:3]:
         state, _ = simulator.step(config, state, torques)
