@@ -8,7 +8,7 @@ for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
 
 from hypothesis import HealthCheck, settings  # noqa: E402
 
-# A slow example says something about the machine, not about the claim. In CI the examples are the same each time.
+# A slow example says something about the machine, not about the claim. In CI they are the same each time.
 settings.register_profile(
     'flexmanip_ros', deadline=None, suppress_health_check=[HealthCheck.too_slow],
     derandomize=bool(os.environ.get('CI')),
