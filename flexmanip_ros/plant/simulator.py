@@ -112,7 +112,13 @@ def step(
 
 
 def attach(config: PlantParameters, state: PlantState) -> PlantState:
-    """Take the object of the parameters, before the next sample; a soft gripper begins to."""
+    """Take the object of the parameters, before the next sample; a soft gripper begins to.
+
+    What it still has to take of an object before is taken at once.
+    """
+    if state.taking is not None:
+        state = _take(config, state, state.taking.part(state.taking_left))
+        state = replace(state, taking=None, taking_left=0)
     parts = max(round(config.gripper_ramp * config.rate), 1)
     if parts == 1:
         return _take(config, state, free_object(config))

@@ -121,6 +121,18 @@ def test_two_captures_make_one_body() -> None:
     assert state.model.mass_matrix(state.x, state.payload) == pytest.approx(M, rel=1e-12, abs=1e-10)
 
 
+def test_a_second_object_does_not_cost_the_rest_of_the_first() -> None:
+    config = replace(CONFIG, gripper_ramp=0.02)
+    state = simulator.attach(config, moving(config))
+    for _ in range(5):
+        state, _ = simulator.step(config, state, np.zeros(2))
+    state = simulator.attach(config, state)
+    assert state.payload[0] == pytest.approx(20.0)
+    for _ in range(25):
+        state, _ = simulator.step(config, state, np.zeros(2))
+    assert state.payload[0] == pytest.approx(40.0)
+
+
 def test_a_soft_gripper_ends_with_the_whole_object() -> None:
     config = replace(BODY, gripper_ramp=0.05)
     state = simulator.attach(config, moving(config))

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from flexmanip_ros.errors import ModelError, ParameterError, SignalError
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
@@ -37,6 +39,26 @@ def test_stepping_and_simulating_give_the_same_bits(change: dict[str, object]) -
         assert np.array_equal(record.position, run.position[k])
         assert np.array_equal(record.velocity, run.velocity[k])
         assert np.array_equal(record.effort[:2], run.effort[k])
+
+
+@given(moments=st.lists(st.integers(-5, 70), max_size=4), ramp=st.sampled_from([0.0, 0.005, 0.03]),
+       seed=st.integers(0, 5))
+@settings(max_examples=25, deadline=None)
+def test_any_sequence_of_events_gives_the_same_bits(moments: list[int], ramp: float, seed: int) -> None:
+    config = replace(CLEAN, arm=ArmParameters(modes=1), noise='std', gripper_ramp=ramp, seed=seed)
+    kinds = [EventKind.CAPTURE, EventKind.CAPTURE, EventKind.RELEASE, EventKind.CAPTURE]
+    events = [CaptureEvent(moment * 1_000_000 - 300_000, kind)
+              for moment, kind in zip(sorted(moments), kinds, strict=False)]
+    run = simulator.simulate(config, WAVES[:60], events)
+    state, waiting = simulator.init(config), list(events)
+    for k in range(60):
+        while waiting and waiting[0].stamp_ns <= simulator.stamp(config, state):
+            change = simulator.attach if waiting.pop(0).kind is EventKind.CAPTURE else simulator.release
+            state = change(config, state)
+        state, record = simulator.step(config, state, WAVES[k])
+        assert record is not None
+        assert np.array_equal(record.position, run.position[k])
+        assert np.array_equal(record.velocity, run.velocity[k])
 
 
 def test_steps_do_not_change_the_state_they_start_from() -> None:
