@@ -141,6 +141,9 @@ def fit_all(
     noise: ``sensor`` holds K = 0 while the system is fitted, ``any`` frees it where that is the better model.
     """
     samples = np.vstack(refined.chunks)
+    m = starts[0].C.shape[0] if starts else 0
+    if starts and not np.all(np.ptp(samples[:, -m:], axis=0) > 0.0):
+        return _next_phase(refined._replace(recursion=None))  # a silent output tells nothing
     found: list[tuple[Recursion, float]] = []
     floor = -np.inf
     for realized in starts:
