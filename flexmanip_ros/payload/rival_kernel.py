@@ -49,7 +49,8 @@ def rigid(arm: RigidArm, x: Array, sums: Array, dt: float, efforts: Array, chord
                     drive = slope + w * level
                     row[stage] = target + (level + drive * dt) * decay
                     row[stage + 1] = (slope - w * drive * dt) * decay
-                    acceleration = w * w * (target - row[stage]) - 2.0 * w * row[stage + 1]
+                    # the mean over the sample: its end would show the staircase of the held input
+                    acceleration = (row[stage + 1] - slope) / dt if dt > 0.0 else 0.0
                     target = row[stage]
                 if part == 1:
                     if i == 0:
