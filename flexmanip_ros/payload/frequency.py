@@ -1,0 +1,101 @@
+"""Payload from the identified frequencies alone (the paper's future work), with a profile interval.
+
+The frequencies of the arm at its working point fall as the payload grows, ever more slowly: the interval is
+where the weighted misfit stays within 3.84 of its least, so it may reach to infinity on one side.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
+from flexmanip_ros.payload.angles import chords
+from flexmanip_ros.payload.block_interval import unknown
+from flexmanip_ros.plant.linearization import blocks
+from flexmanip_ros.types import Array, Mode, Payload, Status
+
+GRID = 400
+"""Payloads looked at."""
+LARGEST = 300.0
+"""Largest payload looked at, over the lightest tip mass."""
+LEVEL = 3.841458820694124
+"""95 % point of chi-square with one degree of freedom."""
+MISFIT = 10.8
+"""Least misfit beyond which the frequencies are not those of this arm (99.9 % with one degree of freedom)."""
+
+
+def frequencies(arm: ArmParameters, theta: Array, payloads: Array, count: int) -> Array:
+    """Return the lowest undamped frequencies [Hz], (payloads, count), at chords theta (2,)."""
+    empty, one = blocks(arm, theta), blocks(arm, theta, 1.0)
+    Ma = empty.Ma + payloads[:, None, None] * (one.Ma - empty.Ma)
+    coupling = np.broadcast_to(empty.Mb, (payloads.size, *empty.Mb.shape))
+    Mt = empty.Mc - empty.Mb.T @ np.linalg.solve(Ma, coupling)
+    root = np.sqrt(np.diag(empty.Kc))
+    # Kc is diagonal: eigenvalues of Kc^-1/2 Mt Kc^-1/2 are 1 / omega^2
+    periods = np.linalg.eigvalsh(Mt / np.outer(root, root))[:, ::-1]
+    return np.asarray(1.0 / np.sqrt(periods[:, :count]) / (2 * np.pi))
+
+
+def estimate(config: IdentifierParameters, modes: Sequence[Mode], angles: Array) -> Payload:
+    """Return the payload that fits the lowest two identified modes; angles: (2,) as measured; never a NaN.
+
+    Modes without a standard deviation give no interval, hence no estimate.
+    """
+    if angles.shape != (2,):
+        return unknown(Status.UNOBSERVABLE)
+    usable = sorted(mode for mode in modes if mode.frequency_hz > 0.0 and math.isfinite(mode.frequency_std_hz)
+                    and mode.frequency_std_hz > 0.0 and abs(mode.damping_ratio) < 1.0)[:2]
+    if not usable:
+        return unknown(Status.WARMING_UP)
+    arm = config.arm
+    lightest = arm.tip_mass + arm.linear_density[1] * arm.link_length[1] / 3
+    payloads = lightest * LARGEST * np.linspace(0.0, 1.0, GRID) ** 3
+    natural = np.array([mode.frequency_hz / math.sqrt(1.0 - mode.damping_ratio ** 2) for mode in usable])
+    std = np.array([mode.frequency_std_hz for mode in usable])
+    theta = chords(arm, angles)
+    misfit = _misfit(frequencies(arm, theta, payloads, len(usable)), natural, std)
+    best = int(np.argmin(misfit))
+    near = np.linspace(payloads[max(best - 1, 0)], payloads[min(best + 1, GRID - 1)], GRID)
+    fine = _misfit(frequencies(arm, theta, near, len(usable)), natural, std)
+    mass, least = float(near[np.argmin(fine)]), float(fine.min())
+    step = 1e-3 * (mass + lightest)
+    up, down = frequencies(arm, theta, np.array([mass + step, max(mass - step, 0.0)]), len(usable))
+    information = float(np.sum(((up - down) / (mass + step - max(mass - step, 0.0)) / std) ** 2))
+    widening = math.sqrt(max(1.0, least / max(len(usable) - 1, 1)))
+    deviation = widening / math.sqrt(information) if information > 0.0 else math.inf
+    lower, upper = _bounds(payloads, misfit - least, LEVEL * widening ** 2, mass, near, fine - least)
+    status = Status.TRACKING
+    if least > MISFIT:
+        status = Status.INCONSISTENT
+    elif deviation > max(mass, lightest):
+        status = Status.POORLY_EXCITED
+    return Payload(mass, deviation, lower, upper, max(least, 1.0), status)
+
+
+def _misfit(model: Array, natural: Array, std: Array) -> Array:
+    return np.asarray((((model - natural) / std) ** 2).sum(axis=1))
+
+
+def _bounds(
+    payloads: Array, rise: Array, level: float, mass: float, near: Array, fine: Array,
+) -> tuple[float, float]:
+    """Ends of the payloads whose misfit rises by less than ``level``; the grid is finer near the mass."""
+    grid = np.concatenate([payloads, near])
+    order = np.argsort(grid, kind='stable')
+    grid, height = grid[order], np.concatenate([rise, fine])[order]
+    inside = np.flatnonzero(height <= level)
+    if inside.size == 0:
+        return mass, mass
+    first, last = int(inside[0]), int(inside[-1])
+    lower = 0.0 if first == 0 else _crossing(grid, height, first - 1, first, level)
+    upper = math.inf if last == grid.size - 1 else _crossing(grid, height, last + 1, last, level)
+    return min(lower, mass), max(upper, mass)
+
+
+def _crossing(grid: Array, height: Array, outside: int, inside: int, level: float) -> float:
+    """Where the misfit crosses the level between two points."""
+    share = (level - height[inside]) / (height[outside] - height[inside])
+    return float(grid[inside] + share * (grid[outside] - grid[inside]))
