@@ -1,24 +1,30 @@
 """Run every compiled kernel once, so that the cache on disk is full before the first sample comes.
 
 Use: ``python -m flexmanip_ros.cli.warm_up`` after an installation into a place that is later read-only, or
-just to have the compiler's half minute behind you. `make setup` and `colcon build` do it.
+just to have the compiler's minute behind you. `make setup` and `colcon build` do it.
 """
 
 from __future__ import annotations
 
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+import numpy as np
+
 from flexmanip_ros import pipeline
+from flexmanip_ros.detected_events import with_detected
+from flexmanip_ros.identification import validation
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.plant import excitation, simulator
-from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, StateSpace
 
 Item = JointRecord | CaptureEvent
 
-SAMPLES = 200
+SAMPLES = 1200
+"""Enough for the refinement of the model to begin."""
 PERIOD_NS = 1_000_000
 
 
@@ -46,6 +52,15 @@ def estimation(method: str, items: list[Item]) -> None:
         state, _ = pipeline.step(config, state, item)
 
 
+def validation_scores() -> None:
+    """Run a made-up model over made-up signals in the three ways that a score needs."""
+    column = np.ones((2, 1))
+    model = StateSpace(np.eye(2) * 0.5, column, column.T.copy(), np.zeros((1, 1)), column, 1e-3)
+    u, y = np.ones((20, 1)), np.ones((20, 1))
+    validation.simulate(model, u)
+    validation.predict(model, u, y, validation.state_at_end(model, u, y))
+
+
 def recipes() -> Iterator[tuple[str, Callable[[], object]]]:
     """Yield the parts in the order in which they are wanted."""
     made: list[Item] = []
@@ -53,6 +68,8 @@ def recipes() -> Iterator[tuple[str, Callable[[], object]]]:
     yield 'identifier', lambda: estimation('none', made)
     yield 'payload from the blocks', lambda: estimation('block', made)
     yield 'payload from the dynamics', lambda: estimation('structured', made)
+    yield 'detection', lambda: deque(with_detected(IdentifierParameters(), made), maxlen=0)
+    yield 'validation', validation_scores
 
 
 def main() -> int:
