@@ -16,7 +16,7 @@ from scipy.linalg import cho_factor, cho_solve, eigvals
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.plant import PlantParameters
 from flexmanip_ros.plant import manipulator as arm_dynamics
-from flexmanip_ros.plant.capture import body_jacobian
+from flexmanip_ros.plant.capture import body_jacobian, free_object, joined
 from flexmanip_ros.plant.finite_element import finite_element_model
 from flexmanip_ros.plant.integration_kernel import run_nonlinear, scratch
 from flexmanip_ros.plant.linear_model import linear_model
@@ -113,11 +113,13 @@ class NonlinearModel:
 
 def build(config: PlantParameters) -> Model:
     """Make the plant the parameters ask for."""
-    if config.model == 'finite_element':
-        return finite_element_model(config)
-    if config.model == 'linear':
-        return linear_model(config)
-    return NonlinearModel(config)
+    if config.model == 'nonlinear':
+        return NonlinearModel(config)
+    model = (finite_element_model if config.model == 'finite_element' else linear_model)(config)
+    empty = np.zeros(4)
+    for payload in (empty, joined(empty, free_object(config))):  # so that a live capture is not late
+        model.step_matrices(payload)
+    return model
 
 
 def substeps(arm: arm_dynamics.Manipulator, config: PlantParameters) -> int:
