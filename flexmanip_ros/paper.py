@@ -16,7 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flexmanip_ros import pipeline, study
+from flexmanip_ros import paper_single_link as single_link
+from flexmanip_ros import pipeline, rivals, study
+from flexmanip_ros.parameters import ArmParameters, PlantParameters, configure
 from flexmanip_ros.payload import bounds
 from flexmanip_ros.plant import excitation, simulator
 from flexmanip_ros.plant.noise import std_for_snr
@@ -55,6 +57,8 @@ class Method:
     name: str
     words: str
     settings: Mapping[str, Any]
+    rival: str = ''
+    """Name in ``rivals`` of a method that is no part of the identifier."""
 
 
 PAYLOADS = (Case('payload_20', 20.0, (60.0, 45.0)), Case('payload_50', 50.0, (60.0, 45.0)),
@@ -66,6 +70,7 @@ FINITE_ELEMENT = Case('finite_element', 20.0, (45.0, 0.0), 'finite_element')
 CASES = (*PAYLOADS, *CONFIGURATIONS, FINITE_ELEMENT)
 
 _LONG = {'payload_method': 'block', 'forgetting_factor': [0.9995, 0.9995, 0.9995]}
+_WEIGHED = {'payload.gravity': single_link.GRAVITY, 'outputs': ['joint2/position'], 'order': 1}
 METHODS = (
     Method('paper', "the paper's settings: beta 0.99, no restart, block extraction", {
         'payload_method': 'block', 'estimator': 'paper', 'forgetting': 'constant',
@@ -73,21 +78,27 @@ METHODS = (
     Method('restart', 'ours: restart at the capture, beta 0.9995, block extraction', _LONG),
     Method('known M_b', 'ours: the same with the coupling block taken from the arm',
            {**_LONG, 'payload.known_coupling': True}),
+    Method('rigid RLS', "the paper's rival: recursive least squares on two rigid links", {}, 'rigid_rls'),
+    Method('algebraic', "the paper's rival on the same run: link 2, its moving base left out", {},
+           'algebraic'),
+    Method('algebraic, 1 link', 'as the paper runs it: a run of its own, link 2 alone on a fixed base under '
+           'gravity, which weighs the object', _WEIGHED, 'algebraic'),
     Method('structured', "ours: the arm's equations of motion (the default)", {
         'payload_method': 'structured', 'payload.dynamics': 'linear', 'refinement': 'none'}),
 )
+ALONE = 'algebraic, 1 link'
 BEST_MODEL = 'restart'
 """The method whose state-space model is shown in the test responses and frequency tracks."""
 
 
 @lru_cache(maxsize=32)
 def bound(case: Case, method: str) -> float | None:
-    """Return the Cramer-Rao bound of the payload [kg] at the end of a run; None for the finite element plant.
+    """Return the Cramer-Rao bound of the payload [kg] at the end of a run; None where a method has none.
 
     ``structured`` knows the structure; the block extractions know nothing of (A, B), and theirs is the bound
     of their own formula (docs of ``payload.bounds``).
     """
-    if case.model != 'linear':
+    if case.model != 'linear' or any(known.rival for known in METHODS if known.name == method):
         return None
     run = scenario(case, METHODS[0]).configuration(0, METHODS[0].name)
     quiet = replace(run.plant, noise='none')
@@ -116,7 +127,7 @@ class Track(NamedTuple):
 
 def scenario(case: Case, method: Method) -> Scenario:
     """Return the scenario of a case for one method."""
-    modes = 1 if case.model == 'linear' or method.settings['payload_method'] == 'block' else 3
+    modes = 3 if case.model != 'linear' and method.name == 'structured' else 1
     identifier: dict[str, Any] = {f'arm.{name}': value for name, value in ARM.items()}
     identifier |= {'arm.modes': modes, 'publish_rate': TRACK_RATE, **method.settings}
     return Scenario(
@@ -139,7 +150,8 @@ def run(case: Case, seed: int) -> tuple[list[study.Row], dict[str, Track]]:
             configured = made.configuration(seed, method.name)
             if items is None:
                 items = study.messages(made, configured, seed)
-            columns, tracks[method.name] = _measure(configured, items, case)
+            seen = _own_run(case, seed) if method.name == ALONE else items
+            columns, tracks[method.name] = _measure(configured, seen, case, method.rival)
             row.update(columns)
         except Exception as error:  # a defect in one method must not hide the others
             row['error'] = study.describe(error)
@@ -147,9 +159,18 @@ def run(case: Case, seed: int) -> tuple[list[study.Row], dict[str, Track]]:
     return rows, tracks
 
 
-def _measure(configured: Run, items: list[Any], case: Case) -> tuple[study.Row, Track]:
+def _own_run(case: Case, seed: int) -> list[Any]:
+    return single_link.messages(
+        configure(ArmParameters, ARM), math.radians(case.angles_deg[1]), case.payload, seed,
+        duration=WINDOW[1], capture_time=CAPTURE_TIME, snr_db=PlantParameters().snr_db)
+
+
+def _measure(configured: Run, items: list[Any], case: Case, rival: str = '') -> tuple[study.Row, Track]:
     started = time.perf_counter()
-    estimates = list(pipeline.run(configured.identifier, items))
+    if rival:
+        estimates = list(rivals.run(rival, configured.identifier, items))
+    else:
+        estimates = list(pipeline.run(configured.identifier, items))
     wall = time.perf_counter() - started
     row, track = _columns(estimates, case, configured)
     row['us_per_sample'] = 1e6 * wall / sum(1 for item in items if hasattr(item, 'names'))
