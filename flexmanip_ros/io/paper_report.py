@@ -25,8 +25,8 @@ DEVIATIONS = (
     ('Angles in Figs. 11 and 12', 'the identified model has the bends as outputs; the angles follow from it '
      'and the identified payload through the rigid rows of the equations of motion'),
     ('Signals are scaled inside, D = 0', 'unscaled, or with D estimated, the errors grow by factors'),
-    ('The algebraic method gets a run of its own (single link, gravity)', 'both: that run (rigid link held by '
-     'a stiff joint), and the two-link run that all others see'),
+    ('The algebraic method gets a run of its own (single link, gravity)', 'both: that run (rigid link held '
+     'by a stiff joint), and the two-link run that all others see'),
     ('Section 4.3 simulates in a commercial program', 'Hermite beam elements at the same working point'),
 )
 
