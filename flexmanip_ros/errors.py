@@ -31,5 +31,9 @@ class BagError(FlexmanipError):
     """A bag is missing, empty, truncated, of the wrong type, or cannot be written."""
 
 
+class CheckpointError(FlexmanipError):
+    """A saved state cannot be used: damaged, of another version, or of other parameters."""
+
+
 class ModelError(FlexmanipError):
     """A model cannot be built or solved (shapes, rank, divergence)."""

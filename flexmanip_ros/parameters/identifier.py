@@ -50,10 +50,15 @@ class IdentifierParameters:
         'excitation, as fast as new comes in; constant, at every sample (the paper)',
         choices=('excitation', 'constant', 'innovation'))
     refinement: str = parameter(
-        'output_error', 'maximum-likelihood fit started from the subspace model and kept up to date (estimator '
-        'factor with forgetting innovation only): output_error, K = 0 while the system is fitted, unless that '
-        'does not simulate; prediction_error, K free where the likelihood asks for it; none',
+        'output_error', 'maximum-likelihood fit started from the subspace model and kept up to date (needs '
+        'estimator factor, forgetting innovation): output_error, K = 0 while the system is fitted, dropped if '
+        'that does not simulate; prediction_error, K free where the likelihood asks for it; none',
         choices=('output_error', 'prediction_error', 'none'))
+    stable_model: bool = parameter(
+        False, 'publish no pole outside the unit circle: draw it back onto it')
+    decimation: int = parameter(
+        1, 'identify on every so many-th sample, all signals behind one anti-alias filter (the model then '
+        'steps as many sample times; set direct_feedthrough with it)', low=1, high=1000)
     restart_on_event: bool = parameter(
         True, 'restart the covariances of the least squares at a capture or release', live=True)
     payload_method: str = parameter(
@@ -73,6 +78,13 @@ class IdentifierParameters:
         0.1, 'a second event of the same kind within this time of the first is the same event', unit='s',
         low=0.0, high=60.0, live=True)
     payload_frame: str = parameter('link2_tip', 'frame_id of the published payload', live=True)
+    checkpoint_file: str = parameter(
+        '', 'the live node saves what it knows here, and resumes from it when it starts; empty: never')
+    checkpoint_period: float = parameter(
+        5.0, 'seconds between two saves; one more is made on deactivation', unit='s', low=0.1, high=86400.0)
+    checkpoint_max_age: float = parameter(
+        60.0, 'a saved state is used only when the first sample is no further than this from its last one',
+        unit='s', low=0.0, high=1e9)
     arm: ArmParameters = field(default_factory=ArmParameters)
     payload: PayloadParameters = field(default_factory=PayloadParameters)
 

@@ -26,11 +26,12 @@ from std_msgs.msg import Float64, Float64MultiArray, Header
 from std_srvs.srv import Trigger
 
 from flexmanip_ros import messages, pipeline
-from flexmanip_ros.errors import FlexmanipError
+from flexmanip_ros.errors import CheckpointError, FlexmanipError
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, capture_event, to_message
 from flexmanip_ros.ros.diagnostics import ERROR, STALE, WARN, LossCounter, Meter, Report
+from flexmanip_ros.ros.keeper import Keeper, too_old
 from flexmanip_ros.ros.node import FlexmanipNode, sequence_number, with_info
 from flexmanip_ros.ros.spin import run
 from flexmanip_ros.ros.warm_up import warm_up
@@ -58,6 +59,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self.losses = LossCounter()
         self.meter = Meter()
         self._reader = JointStateReader()
+        self._keeper: Keeper | None = None
+        self._resumed = False
 
     def make_entities(self) -> None:
         """Publishers, subscriptions and the reset service."""
@@ -73,6 +76,26 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         """Compile or load every kernel before the first sample; begin with nothing known."""
         warm_up(self.config)
         self._forget()
+        self._keeper = Keeper(self.config) if self.config.checkpoint_file else None
+        if self._keeper is not None:
+            self._resume(self._keeper)
+
+    def _resume(self, keeper: Keeper) -> None:
+        """Go on from the saved state, or say why not."""
+        try:
+            state = keeper.resume(self.config)
+        except CheckpointError as error:
+            self.get_logger().warning(str(error))
+            return
+        if state is not None:
+            self.state, self._resumed = state, True
+            self.get_logger().info(f'resumed after {state.counters.accepted} samples')
+
+    def deactivated(self) -> None:
+        """Save what is known."""
+        if self._keeper is not None:
+            self._keeper.finish()
+            self._keeper.save(self.config, self.state)
 
     def configuration_changed(self, config: IdentifierParameters) -> None:
         """Go on with what may change at run time."""
@@ -87,7 +110,19 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             return
         with self.meter:
             self.losses.note(sequence_number(info))
-            self._take(self._reader(raw))
+            record = self._reader(raw)
+            if self._resumed:
+                self._first_after_resume(record.stamp_ns)
+            self._take(record)
+            if self._keeper is not None and self._keeper.due():
+                self._keeper.save_meanwhile(self.config, self.state)
+
+    def _first_after_resume(self, stamp_ns: int) -> None:
+        """Drop a saved state that is too old for these samples: the arm may hold something else by now."""
+        self._resumed = False
+        if too_old(self.config, self.state, stamp_ns):
+            self.get_logger().warning('the saved state is older than checkpoint_max_age; it starts anew')
+            self._forget()
 
     def _on_event(self, topic: str, message: Header) -> None:
         if not self.active:
@@ -135,6 +170,10 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         values.update(counters._asdict())
         values['dropped'] = counters.dropped
         values['refused'] = self.refused
+        if self._keeper is not None:
+            values['checkpoints'] = self._keeper.saves
+            if self._keeper.problem:
+                report.worse(ERROR, self._keeper.problem)
         line = self.state.timeline
         if line is not None:
             values.update(late_events=line.late_events, repeated_events=line.repeated_events,

@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import flexmanip_ros
+from flexmanip_ros import pipeline
+from flexmanip_ros.errors import CheckpointError
+from flexmanip_ros.io import checkpoint
+from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
+from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.types import CaptureEvent, EventKind
+
+CONFIG = IdentifierParameters()
+
+
+def items(count: int = 500) -> list[Any]:
+    event = CaptureEvent(250_000_000, EventKind.CAPTURE)
+    run = simulator.simulate(PlantParameters(), excitation.sequence(ExcitationParameters(), count), (event,))
+    return list(simulator.records(run, (event,)))
+
+
+def stepped(state: pipeline.State, some: list[Any]) -> tuple[pipeline.State, list[Any]]:
+    found: list[Any] = []
+    for item in some:
+        state, estimates = pipeline.step(CONFIG, state, item)
+        found.extend(estimates)
+    return state, found
+
+
+def same(a: Any, b: Any) -> bool:
+    """Compare two values to the last bit."""
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and (a.dtype, a.shape) == (b.dtype, b.shape) \
+            and a.tobytes() == b.tobytes()
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    if dataclasses.is_dataclass(a) and not isinstance(a, Enum):
+        return all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
+    return bool(a == b) or a != a  # NaN
+
+
+def test_an_identifier_goes_on_from_its_file_with_the_same_bits(tmp_path: Path) -> None:
+    everything = items()
+    state, _ = stepped(pipeline.init(), everything[:400])
+    checkpoint.save(tmp_path / 'state', state)
+    resumed = checkpoint.load(tmp_path / 'state')
+    _, straight = stepped(state, everything[400:])
+    _, after = stepped(resumed, everything[400:])
+    assert len(straight) >= 5
+    assert all(map(same, straight, after))
+
+
+def test_no_file_is_no_state_and_a_save_leaves_no_scraps(tmp_path: Path) -> None:
+    assert checkpoint.load(tmp_path / 'nothing') is None
+    checkpoint.save(tmp_path / 'state', pipeline.init())
+    assert [path.name for path in tmp_path.iterdir()] == ['state']
+    assert checkpoint.load(tmp_path / 'state') == pipeline.init()
+
+
+@pytest.mark.parametrize('name', [
+    'os:system', 'builtins:eval', 'flexmanip_ros.io.checkpoint:save', 'flexmanip_ros.pipeline:step',
+    'subprocess:Popen', 'flexmanip_ros.io.checkpoint:Path', 'flexmanip_ros.cli.identify_bag:main',
+])
+def test_a_file_can_name_nothing_but_values_of_this_package(tmp_path: Path, name: str) -> None:
+    for kind, rest in (('named', {'items': ['true']}), ('data', {'parts': {}}), ('enum', {'member': 'x'})):
+        text = json.dumps({'version': flexmanip_ros.__version__, 'tree': {kind: name, **rest}}).encode()
+        (tmp_path / 'bad').write_bytes(checkpoint.sealed(text, b''))
+        with pytest.raises(CheckpointError, match='not written by this package'):
+            checkpoint.load(tmp_path / 'bad')
+
+
+def test_a_checkpoint_of_another_version_says_so(tmp_path: Path) -> None:
+    (tmp_path / 'old').write_bytes(checkpoint.sealed(b'{"version": "9.9.9", "tree": 1}', b''))
+    with pytest.raises(CheckpointError, match=r'version 9\.9\.9'):
+        checkpoint.load(tmp_path / 'old')
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match='cannot be written'):
+        checkpoint.save(tmp_path / 'no' / 'such' / 'folder', 1)
+
+
+WHOLE = checkpoint.encode(stepped(pipeline.init(), items(40))[0])
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, len(WHOLE) - 1), st.integers(1, 255), st.booleans())
+def test_any_damage_is_refused(at: int, change: int, cut: bool) -> None:
+    data = WHOLE[:at] if cut else WHOLE[:at] + bytes([WHOLE[at] ^ change]) + WHOLE[at + 1:]
+    with pytest.raises(CheckpointError):
+        checkpoint.decode(data)

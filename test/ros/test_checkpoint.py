@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from identifier_harness import CAPTURE, Live, recording, replayed
+from ros_harness import Ros
+
+from flexmanip_ros import messages
+from flexmanip_ros.ros import conversions
+from flexmanip_ros.ros.demo_result import compare
+
+
+def test_an_identifier_that_is_restarted_goes_on_as_if_it_had_only_missed_samples(
+        ros: Ros, tmp_path: Path) -> None:
+    file = str(tmp_path / 'state')
+    samples = recording(900)
+    first = Live(ros, checkpoint_file=file)
+    first.send(*samples[:300])
+    first.events.publish(conversions.header(CAPTURE))
+    ros.wait(lambda: first.node.state.timeline.waiting)
+    first.send(*samples[300:500])
+    ros.remove(first.node)
+    second = Live(ros, checkpoint_file=file)
+    second.send(*samples[550:])
+    straight = replayed(second, [*samples[:300], CAPTURE, *samples[300:500], *samples[550:]])
+    count = {name: len(values) for name, values in second.said.items()}
+    ros.wait(lambda: len(second.said[messages.PAYLOAD_MASS]) >= 17)
+    assert count[messages.PAYLOAD_MASS] >= 17
+    after = {name: values[1:] if name in (messages.MODEL, messages.PAYLOAD, messages.PAYLOAD_ESTIMATE)
+             and len(values) > len(second.said[messages.MODES]) else values
+             for name, values in second.said.items()}
+    tail = {name: straight[name][-len(values):] for name, values in after.items()}
+    assert compare(after, tail) == ''
+
+
+def test_states_are_saved_while_it_runs(ros: Ros, tmp_path: Path) -> None:
+    live = Live(ros, checkpoint_file=str(tmp_path / 'state'), checkpoint_period=0.1, payload_method='none')
+    live.send(*recording(200))
+    ros.wait(lambda: live.node._keeper.due(), what='the period')
+    live.send(*recording(400)[200:])
+    ros.wait(lambda: live.node._keeper.saves >= 1, what='a saved state')
+    assert (tmp_path / 'state').stat().st_size > 1000
+    live.node._keeper.finish()
+
+
+def test_a_state_of_other_parameters_or_damaged_or_old_is_not_used_and_the_node_starts_anew(
+        ros: Ros, tmp_path: Path) -> None:
+    file = tmp_path / 'state'
+    live = Live(ros, checkpoint_file=str(file), payload_method='none')
+    live.send(*recording(100))
+    ros.remove(live.node)
+    other = Live(ros, checkpoint_file=str(file), payload_method='none', order=6)
+    assert other.node.state.counters.received == 0
+    ros.remove(other.node)
+    same = Live(ros, checkpoint_file=str(file), payload_method='none', order=6, publish_rate=10.0)
+    same.send(*recording(60))
+    ros.remove(same.node)
+    old = Live(ros, checkpoint_file=str(file), payload_method='none', order=6)
+    assert old.node.state.counters.received == 60
+    late = replace(recording(1)[0], stamp_ns=recording(1)[0].stamp_ns + 3600 * 10**9)
+    old.joint_states.publish(conversions.joint_state(late))
+    ros.wait(lambda: old.node.state.counters.received == 1, what='a fresh start')
+    ros.remove(old.node)
+    file.write_bytes(file.read_bytes()[:-7])
+    damaged = Live(ros, checkpoint_file=str(file), payload_method='none', order=6)
+    assert damaged.node.state.counters.received == 0
