@@ -252,14 +252,16 @@ def elastic(arm: Manipulator, q: Array, work: Workspace) -> None:
             o = 2 + i * k
             EI = arm.stiffness[o] / arm.unit_stiffness[o]
             for j in range(k):
-                force = 0.0
-                for m in range(k):
+                for m in range(j + 1):
                     bend = 0.0
                     for p in range(k):
-                        row = 0.0
-                        for t in range(k):
+                        row = 0.5 * arm.quartic[i, j, m, p, p] * q[o + p]
+                        for t in range(p):
                             row += arm.quartic[i, j, m, p, t] * q[o + t]
                         bend += row * q[o + p]
-                    work.tangent[o + j, m] = 3.0 * EI * bend
-                    force += bend * q[o + m]
-                work.elastic[o + j] += EI * force
+                    bend *= 2.0 * EI
+                    work.tangent[o + j, m] = 3.0 * bend
+                    work.tangent[o + m, j] = 3.0 * bend
+                    work.elastic[o + j] += bend * q[o + m]
+                    if m != j:
+                        work.elastic[o + m] += bend * q[o + j]
