@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -72,9 +73,26 @@ def recipes() -> Iterator[tuple[str, Callable[[], object]]]:
     yield 'validation', validation_scores
 
 
+def drop_stale(package: Path) -> int:
+    """Delete compiled functions older than any kernel's source; return how many.
+
+    numba looks at the file of a function alone, not at those of the functions it calls.
+    """
+    newest = max(path.stat().st_mtime_ns for path in package.rglob('*.py')
+                 if 'kernel' in path.stem or path.stem == 'compiled')
+    stale = [path for path in package.rglob('__pycache__/*.nb[ic]') if path.stat().st_mtime_ns < newest]
+    for path in stale:
+        path.unlink(missing_ok=True)
+    return len(stale)
+
+
 def main() -> int:
     """Compile what can be compiled. Never an error: what fails here says so again where it is used."""
     begin = time.perf_counter()
+    try:
+        drop_stale(Path(__file__).parents[1])
+    except OSError as problem:  # a place that is read-only has no stale files of its own making
+        print(f'compiled functions are left as they are: {problem}', file=sys.stderr)
     for name, recipe in recipes():
         try:
             recipe()
