@@ -14,7 +14,8 @@ from setuptools.command.install import install
 NAME = 'flexmanip_ros'
 HERE = Path(__file__).resolve().parent
 NODES = (
-    'plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'payload_controller', 'demo',
+    'plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'payload_controller',
+    'payload_adapter', 'demo',
 )
 PROGRAMS = ('identify_bag', 'simulate_bag', 'reproduce_paper', 'monte_carlo')
 

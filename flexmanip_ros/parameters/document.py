@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from flexmanip_ros.parameters.adapter import AdapterParameters
 from flexmanip_ros.parameters.controller import ControllerParameters
 from flexmanip_ros.parameters.excitation import ExcitationParameters
 from flexmanip_ros.parameters.field import Leaf, leaves
@@ -22,6 +23,7 @@ NODES: Mapping[str, type] = {
     'capture_trigger': TriggerParameters,
     'rpbsid_identifier': IdentifierParameters,
     'payload_controller': ControllerParameters,
+    'payload_adapter': AdapterParameters,
 }
 """Each node and the class that declares its parameters."""
 WIDTH = 100

@@ -1,0 +1,163 @@
+"""Node ``payload_adapter``: hands a trusted payload to a robot driver.
+
+subscribes  rpbsid_identifier/payload_estimate  std_msgs/Float64MultiArray   whether to trust it
+            rpbsid_identifier/payload           geometry_msgs/InertiaStamped what to tell
+publishes   /diagnostics                        diagnostic_msgs/DiagnosticArray  1 Hz
+calls       the driver's service (`service`, `service_type`), whose request has a geometry_msgs/Inertia, or
+            `mass` and `center_of_gravity`; with `target_node` its SetParameters for `mass_parameter`
+
+A payload is told once it has been trusted for `settle_time`, and again when it changed by `min_change`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import time
+from typing import Any
+
+from geometry_msgs.msg import Inertia, InertiaStamped
+from rcl_interfaces.srv import SetParameters
+from rclpy.client import Client
+from rclpy.context import Context
+from rclpy.parameter import Parameter
+from std_msgs.msg import Float64MultiArray
+
+from flexmanip_ros.control import handover
+from flexmanip_ros.control.gate import PayloadEstimate
+from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.parameters.adapter import AdapterParameters
+from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.diagnostics import ERROR, WARN, Report
+from flexmanip_ros.ros.node import FlexmanipNode
+from flexmanip_ros.ros.spin import run
+
+NAME = 'payload_adapter'
+ANSWER_S = 5.0
+"""A driver that has not answered within this time is asked again."""
+
+
+class PayloadAdapter(FlexmanipNode[AdapterParameters]):
+    """Asks the driver, one request at a time."""
+
+    def __init__(self, *, context: Context | None = None, overrides: list[Parameter] | None = None,
+                 namespace: str | None = None, cli_args: list[str] | None = None) -> None:
+        super().__init__(NAME, AdapterParameters, context=context, overrides=overrides,
+                         namespace=namespace, cli_args=cli_args)
+        self.state = handover.HandoverState()
+        self.told = 0
+        self.problem = ''
+        self._inertia: Inertia | None = None
+        self._asked_at: float | None = None
+
+    def make_entities(self) -> None:
+        """Subscriptions and the client."""
+        if self.config.target_node:
+            self._client: Client = self.create_client(
+                SetParameters, f'{self.config.target_node}/set_parameters')
+        else:
+            kind = service_class(self.config.service_type)
+            self._client = self.create_client(kind, self.config.service)
+        self.subscription(InertiaStamped, 'rpbsid_identifier/payload', self._on_payload, qos.latched_input())
+        self.subscription(Float64MultiArray, 'rpbsid_identifier/payload_estimate', self._on_estimate,
+                          qos.latched_input())
+
+    def activated(self) -> None:
+        """Begin with nothing told."""
+        self.state, self._asked_at, self.problem = handover.HandoverState(), None, ''
+
+    def _on_payload(self, message: InertiaStamped) -> None:
+        self._inertia = message.inertia
+
+    def _on_estimate(self, message: Float64MultiArray) -> None:
+        if not self.active or len(message.data) != 5 or self._inertia is None:
+            return
+        now = time.monotonic()
+        self.state, due = handover.step(self.config, self.state, PayloadEstimate(*message.data), now)
+        waiting = self._asked_at is not None and now - self._asked_at < ANSWER_S
+        if due and not waiting:
+            self._tell(self._inertia, now)
+
+    def _tell(self, inertia: Inertia, now: float) -> None:
+        if not self._client.service_is_ready():
+            self.problem = f"service '{self._client.srv_name}' is not there"
+            self.complain('service', f'{self.problem}; start the driver, or correct the parameters')
+            self.state = handover.refused(self.state, now)
+            return
+        self._asked_at = now
+        request = self._request(inertia)
+        self._client.call_async(request).add_done_callback(lambda future: self._answered(future, inertia.m))
+
+    def _request(self, inertia: Inertia) -> Any:
+        if not self.config.target_node:
+            return fill(self._client.srv_type.Request(), inertia)
+        parameter = Parameter(self.config.mass_parameter, value=float(inertia.m))
+        return SetParameters.Request(parameters=[parameter.to_parameter_msg()])
+
+    def _answered(self, future: Any, mass: float) -> None:
+        self._asked_at = None
+        reason = refusal(future.result())
+        if reason:
+            self.problem = f'{mass:.3f} kg was refused: {reason}'
+            self.complain('refused', self.problem)
+            self.state = handover.refused(self.state, time.monotonic())
+            return
+        self.problem = ''
+        self.told += 1
+        self.state = handover.told(self.state, mass, time.monotonic())
+        self.get_logger().info(f'the driver took {mass:.3f} kg')
+
+    def report(self, report: Report) -> None:
+        """What was told, and what went wrong."""
+        report.values['told'] = self.told
+        report.values['told_mass_kg'] = 'none' if self.state.told_mass is None else self.state.told_mass
+        report.values['trusted'] = self.state.trusted_since is not None
+        if self.problem:
+            report.worse(ERROR, self.problem)
+        elif self.active and self.state.trusted_since is None:
+            report.worse(WARN, 'no payload that can be trusted')
+
+
+def service_class(name: str) -> Any:
+    """Return the class of a service type PACKAGE/srv/TYPE. Raises ParameterError when it is not installed."""
+    package, _, kind = name.split('/')
+    try:
+        return getattr(importlib.import_module(f'{package}.srv'), kind)
+    except (ImportError, AttributeError) as error:
+        raise ParameterError(f"service type '{name}' is not installed",
+                             f'install and source the package {package}') from error
+
+
+def fill(request: Any, inertia: Inertia) -> Any:
+    """Put a payload into a driver's request. Raises ParameterError when it has no place for one."""
+    fields = request.get_fields_and_field_types()
+    for name, kind in fields.items():
+        if kind == 'geometry_msgs/Inertia':
+            setattr(request, name, inertia)
+            return request
+    mass = next((name for name in ('mass', 'payload') if fields.get(name) in ('float', 'double')), None)
+    centre = next((name for name, kind in fields.items() if kind == 'geometry_msgs/Vector3'), None)
+    if mass is None:
+        raise ParameterError(f'a request with {", ".join(fields)} has no place for a payload',
+                             'give a service_type with a geometry_msgs/Inertia or a mass')
+    setattr(request, mass, float(inertia.m))
+    if centre is not None:
+        setattr(request, centre, inertia.com)
+    return request
+
+
+def refusal(response: Any) -> str:
+    """Return why a driver or a node said no; empty when it said yes."""
+    results = getattr(response, 'results', None)
+    answer = results[0] if results else response
+    good = getattr(answer, 'success', getattr(answer, 'successful', True))
+    return '' if good else getattr(answer, 'reason', getattr(answer, 'message', '')) or 'no reason given'
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(PayloadAdapter, NAME, __doc__, AdapterParameters, argv)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

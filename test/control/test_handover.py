@@ -1,0 +1,53 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from flexmanip_ros.control import handover
+from flexmanip_ros.control.gate import PayloadEstimate
+from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.parameters.adapter import AdapterParameters
+
+CONFIG = AdapterParameters(target_node='driver', settle_time=0.5, min_period=1.0)
+GOOD = PayloadEstimate(20.0, 0.1, 19.8, 20.2, 1.0)
+
+
+def told_times(estimates: list[tuple[float, PayloadEstimate]]) -> list[float]:
+    state, times = handover.HandoverState(), []
+    for now, found in estimates:
+        state, due = handover.step(CONFIG, state, found, now)
+        if due:
+            times.append(now)
+            state = handover.told(state, found.mass, now)
+    return times
+
+
+def test_a_payload_is_told_once_after_it_was_trusted_for_a_while() -> None:
+    assert told_times([(0.1 * k, GOOD) for k in range(50)]) == [0.5]
+
+
+def test_doubt_in_between_starts_the_wait_again() -> None:
+    doubt = GOOD._replace(std=5.0)
+    assert told_times([(0.1 * k, doubt if k == 4 else GOOD) for k in range(20)]) == pytest.approx([1.0])
+
+
+def test_another_payload_is_told_again_but_not_too_soon() -> None:
+    heavier = GOOD._replace(mass=30.0)
+    found = told_times([(0.1 * k, GOOD if k < 8 else heavier) for k in range(40)])
+    assert found == pytest.approx([0.5, 1.5])
+
+
+@pytest.mark.parametrize('bad', [
+    {'mass': math.nan}, {'std': math.inf}, {'mass': -1.0}, {'mass': 1000.0}, {'consistency': 50.0},
+    {'consistency': math.nan}, {'std': 3.0},
+])
+def test_what_cannot_be_trusted_is_never_told(bad: dict[str, float]) -> None:
+    assert told_times([(0.1 * k, GOOD._replace(**bad)) for k in range(50)]) == []
+
+
+def test_somebody_must_be_told() -> None:
+    with pytest.raises(ParameterError, match="'service' and 'target_node' are both empty"):
+        AdapterParameters(service='')
+    with pytest.raises(ParameterError, match='PACKAGE/srv/TYPE'):
+        AdapterParameters(service='set_payload', service_type='os.system')

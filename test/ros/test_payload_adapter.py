@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from geometry_msgs.msg import Inertia, InertiaStamped, Vector3
+from ros_harness import Ros, overrides
+from std_msgs.msg import Float64MultiArray
+
+from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.payload_adapter import PayloadAdapter, fill, refusal, service_class
+from flexmanip_ros.ros.plant_simulator import PlantSimulator
+
+
+def say(ros: Ros, mass: float, std: float) -> tuple[Any, Any]:
+    """Return publishers of a payload and its estimate, latched."""
+    payload = ros.helper.create_publisher(InertiaStamped, 'rpbsid_identifier/payload', qos.latched())
+    estimate = ros.helper.create_publisher(
+        Float64MultiArray, 'rpbsid_identifier/payload_estimate', qos.latched())
+    message = InertiaStamped()
+    message.inertia.m = mass
+    payload.publish(message)
+    ros.helper.create_timer(0.02, lambda: estimate.publish(
+        Float64MultiArray(data=[mass, std, mass - 2 * std, mass + 2 * std, 1.0])))
+    return payload, estimate
+
+
+def test_a_trusted_payload_becomes_a_parameter_of_another_node(ros: Ros) -> None:
+    plant = ros.managed(PlantSimulator(context=ros.context, overrides=overrides(rate=50.0, arm__modes=1)))
+    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
+        target_node='plant_simulator', settle_time=0.1)))
+    say(ros, 31.5, 0.1)
+    ros.wait(lambda: plant.config.payload_mass == 31.5, what='the parameter')
+    ros.wait(lambda: adapter.told == 1)
+    assert adapter.state.told_mass == 31.5
+
+
+def test_a_doubtful_payload_is_not_told(ros: Ros) -> None:
+    plant = ros.managed(PlantSimulator(context=ros.context, overrides=overrides(rate=50.0, arm__modes=1)))
+    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
+        target_node='plant_simulator', settle_time=0.0)))
+    heard = ros.listen(Float64MultiArray, 'rpbsid_identifier/payload_estimate', 10)
+    say(ros, 31.5, 9.0)
+    ros.wait(lambda: len(heard) > 20)
+    assert (plant.config.payload_mass, adapter.told) == (20.0, 0)
+
+
+def test_a_refusal_is_reported_with_its_reason_and_asked_again(ros: Ros) -> None:
+    ros.managed(PlantSimulator(context=ros.context, overrides=overrides(rate=50.0, arm__modes=1)))
+    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
+        target_node='plant_simulator', mass_parameter='rate', settle_time=0.0, min_period=0.05)))
+    say(ros, 31.5, 0.1)
+    ros.wait(lambda: 'read-only' in adapter.problem, what='the reason')
+    assert adapter.told == 0
+
+
+def test_a_driver_that_is_not_there_is_named(ros: Ros) -> None:
+    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
+        target_node='nobody', settle_time=0.0)))
+    say(ros, 31.5, 0.1)
+    ros.wait(lambda: 'nobody/set_parameters' in adapter.problem)
+
+
+def test_a_service_type_that_is_not_installed_is_named() -> None:
+    with pytest.raises(ParameterError, match="'ur_msgs/srv/SetPayload' is not installed; install and source"):
+        service_class('ur_msgs/srv/SetPayload')
+
+
+class WithInertia:
+    """The shape of a request, as generated messages describe themselves."""
+
+    fields = {'inertia': 'geometry_msgs/Inertia'}  # noqa: RUF012
+
+    def get_fields_and_field_types(self) -> dict[str, str]:
+        return self.fields
+
+
+class WithMass(WithInertia):
+    fields = {'mass': 'float', 'center_of_gravity': 'geometry_msgs/Vector3'}  # noqa: RUF012
+
+
+class WithNeither(WithInertia):
+    fields = {'data': 'boolean'}  # noqa: RUF012
+
+
+def test_a_request_is_filled_by_its_fields() -> None:
+    body = Inertia(m=20.0, com=Vector3(x=0.1))
+    assert fill(WithInertia(), body).inertia is body
+    filled = fill(WithMass(), body)
+    assert (filled.mass, filled.center_of_gravity.x) == (20.0, 0.1)
+    with pytest.raises(ParameterError, match='no place for a payload'):
+        fill(WithNeither(), body)
+
+
+def test_answers_of_drivers_and_nodes_are_understood() -> None:
+    class Answer:
+        success = False
+        message = 'too heavy'
+
+    assert refusal(Answer()) == 'too heavy'
+    Answer.success = True
+    assert refusal(Answer()) == ''
