@@ -1,6 +1,6 @@
 """An independent arm: each link a chain of rigid rods with torsion springs, no dynamics of the package.
 
-Not a benchmark itself; the payload benchmarks take their mismatched truth from here. Absolute rod angles p,
+The payload benchmarks take their mismatched truth from here. Absolute rod angles p,
 mass matrix a_ij cos(p_i - p_j), exact kinematics, momentum conserved at a capture.
 """
 

@@ -1,0 +1,88 @@
+"""What the payload benchmarks share: signals as samples, one followed capture, error and coverage of many."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, PayloadParameters
+from flexmanip_ros.payload import structured
+from flexmanip_ros.types import CaptureEvent, EventKind, Payload, Sample
+
+RESULTS = Path(__file__).resolve().parents[1] / 'results'
+BENDS = ('link1_bend/position', 'link2_bend/position')
+RATES = ('link1_bend/velocity', 'link2_bend/velocity')
+
+
+class Trial(NamedTuple):
+    """What was claimed at each mark of one run, and the truth."""
+
+    truth: float
+    found: tuple[Payload, ...]
+
+
+def configuration(
+    arm: ArmParameters, outputs: tuple[str, ...] = BENDS + RATES, **payload: Any,
+) -> IdentifierParameters:
+    """Identifier parameters with the payload group set."""
+    return IdentifierParameters(arm=arm, outputs=outputs, order=4, payload=PayloadParameters(**payload))
+
+
+def as_samples(position: np.ndarray, velocity: np.ndarray, effort: np.ndarray, dt: float,
+               outputs: tuple[str, ...] = BENDS + RATES) -> list[Sample]:
+    """Rows (N, 4) of joint1, joint2, link1_bend, link2_bend as samples of the outputs."""
+    parts = [position[:, 2:]] if BENDS[0] in outputs else []
+    parts += [velocity[:, 2:]] if RATES[0] in outputs else []
+    Y = np.hstack(parts)
+    return [Sample(round(k * dt * 1e9), effort[k, :2], Y[k], position[k, :2]) for k in range(len(Y))]
+
+
+def follow(
+    config: IdentifierParameters, samples: Sequence[Sample], capture: int, marks: Sequence[int], truth: float,
+) -> Trial:
+    """Run with the capture before sample ``capture``; estimates after each of ``marks`` samples from it."""
+    state = structured.advance(config, structured.init(config), samples[:capture])
+    state = structured.event(config, state, CaptureEvent(samples[capture].stamp_ns, EventKind.CAPTURE))
+    found, start = [], capture
+    for mark in marks:
+        state = structured.advance(config, state, samples[start:capture + mark])
+        start = capture + mark
+        found.append(structured.estimate(config, state))
+    return Trial(truth, tuple(found))
+
+
+def errors(trials: Sequence[Trial]) -> np.ndarray:
+    """Relative errors in percent, (trials, marks)."""
+    return np.array([[100 * (one.mass / trial.truth - 1) for one in trial.found] for trial in trials])
+
+
+def coverage(trials: Sequence[Trial]) -> np.ndarray:
+    """Share of runs with the truth inside the 95 % interval, (marks,)."""
+    inside = [[one.lower <= trial.truth <= one.upper for one in trial.found] for trial in trials]
+    return np.asarray(np.mean(inside, axis=0))
+
+
+def widths(trials: Sequence[Trial]) -> np.ndarray:
+    """Median half width of the interval in percent, (marks,)."""
+    half = [[50 * (one.upper - one.lower) / trial.truth for one in trial.found] for trial in trials]
+    return np.asarray(np.median(half, axis=0))
+
+
+def rms(values: np.ndarray) -> np.ndarray:
+    """Root mean square over the runs."""
+    return np.asarray(np.sqrt(np.mean(values ** 2, axis=0)))
+
+
+def numbers(values: Any, digits: int = 4) -> list[float]:
+    """Rounded, for tables and JSON."""
+    return [round(float(value), digits) for value in np.atleast_1d(values)]
+
+
+def write(name: str, rows: list[dict[str, Any]]) -> None:
+    """Write benchmarks/results/<name>.json."""
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / f'{name}.json').write_text(json.dumps(rows, indent=1) + '\n', encoding='utf-8')
