@@ -1,4 +1,4 @@
-"""The peers' side of identification_measured_arms.py: run by an interpreter that has sippy_unipi and nfoursid.
+"""The peers' side of identification_measured_arms.py: for an interpreter that has sippy_unipi and nfoursid.
 
 Use: python identification_peers.py RECORD.npz (keys u, y, half, orders); prints one JSON object.
 """
@@ -63,7 +63,8 @@ def main() -> None:
                 output_columns=[f'y{i}' for i in range(y.shape[1])], num_block_rows=20)
             found.subspace_identification()
             model, _ = found.system_identification(rank=int(n))
-            results[f'nfoursid n={n}'] = vaf(y[half:], simulate(model.a, model.b, model.c, model.d, u, y, half))
+            free = simulate(model.a, model.b, model.c, model.d, u, y, half)
+            results[f'nfoursid n={n}'] = vaf(y[half:], free)
         except Exception as problem:
             results[f'nfoursid n={n}'] = f'{type(problem).__name__}: {problem}'[:120]
     print(json.dumps(results))

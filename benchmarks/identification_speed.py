@@ -87,7 +87,8 @@ def main() -> None:
     sweeps(R, rows[:1], 0.999)
     R60 = np.eye(64)
     table = {
-        'bare 60 x 60 covariance update': best(lambda: bare_update(P, rows[:, :60], np.empty(60), 0.999), count),
+        'bare 60 x 60 covariance update': best(
+            lambda: bare_update(P, rows[:, :60], np.empty(60), 0.999), count),
         'least-squares step, 60 regressors, 4 outputs': best(
             lambda: sweeps(R60, np.ascontiguousarray(rows[:, :64]), 0.999), count),
         'identifier, update': identifier(10, 2, 4, count),

@@ -44,9 +44,10 @@ class Structure(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Result of a descent. directions: (d, k) coordinates that varied, information: (k, k) in them,
-    arrival: (n, k) derivative of the state after the stretch, end: (n,) that state, covariance: (m, m)
-    of the innovations, cost: log det of it.
+    """Result of a descent.
+
+    directions: (d, k) coordinates that varied, information: (k, k) in them, arrival: (n, k) derivative of
+    the state after the stretch, end: (n,) that state, covariance: (m, m) of the innovations, cost: log det.
     """
 
     theta: Theta

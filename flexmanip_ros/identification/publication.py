@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtrtrs
 
 from flexmanip_ros.identification import realization, uncertainty
 from flexmanip_ros.identification.memory_kernel import POWER, WEIGHT, WEIGHT2
@@ -73,7 +75,7 @@ def from_recursion(
 
 
 def from_fit(
-    config: IdentifierParameters, recursion: Recursion, scalars: Array, dt: float,
+    config: IdentifierParameters, recursion: Recursion, scalars: Array, excited: float, dt: float,
 ) -> Identified:
     """Publish the prediction-error fit with its own covariance."""
     r, m, n = len(config.inputs), len(config.outputs), config.order
@@ -92,12 +94,11 @@ def from_fit(
     along = Tangent(dA, dB, dC, dD, dK)
     along = Tangent(*_in_units(*along, su, sy))
     model = StateSpace(*_in_units(theta.A, theta.B, theta.C, theta.D, recursion.gain, su, sy), dt=dt)
-    model, moved_along, known = based(model, along)
+    model, moved_along, known = based(model, along, config.stable_model)
     assert moved_along is not None
-    values = np.linalg.svd(theta.C, compute_uv=False)
     return Identified(
-        model=model, spread=moved_along.flat(), singular_values=np.asarray(values, dtype=np.float64),
-        excitation=float('nan'), condition=float('nan'), innovation_power=float(scalars[POWER]),
+        model=model, spread=moved_along.flat(), singular_values=recursion.singular_values,
+        excitation=excited, condition=recursion.condition, innovation_power=float(scalars[POWER]),
         status=Status.TRACKING, innovation_covariance=recursion.covariance / np.outer(sy, sy),
         known_basis=known, samples=recursion.weight)
 
@@ -126,7 +127,7 @@ def publish(
     if parameters * entries <= LARGEST_SPREAD:
         along = uncertainty.tangent(R, realized, r, innovation * np.sqrt(scalars[WEIGHT2] / scalars[WEIGHT]))
         along = Tangent(*_in_units(*along, su, sy))
-    model, along, known = based(model, along)
+    model, along, known = based(model, along, config.stable_model)
     spread = along.flat() if along is not None else np.zeros((entries, 0))
     condition = float(np.linalg.cond(realized.state / np.linalg.norm(realized.state, axis=0)))
     power = float(scalars[POWER])
@@ -147,8 +148,15 @@ def _in_units(
     return A, B * su, C / sy[:, None], D * su / sy[:, None], K * sy
 
 
-def based(model: StateSpace, along: Tangent | None) -> tuple[StateSpace, Tangent | None, bool]:
-    """Bring model and tangent to the published basis: y = C x with the known C, else balanced."""
+def based(
+    model: StateSpace, along: Tangent | None, stable: bool = False,
+) -> tuple[StateSpace, Tangent | None, bool]:
+    """Bring model and tangent to the published basis: y = C x with the known C, else balanced.
+
+    stable: poles outside the unit circle are drawn back onto it.
+    """
+    if stable:
+        model = replace(model, A=realization.stabilized(model.A))
     W = realization.known_output_basis(model)
     known = W is not None
     if W is None:
@@ -176,17 +184,18 @@ def excitation(regression: Array) -> float:
 
     A few steps of power and inverse iteration on the triangular factor (d, d); to 10 % or so.
     """
-    size = np.linalg.norm(regression, axis=0)
-    if not np.all(size > 0.0) or not np.all(np.diag(regression)):
+    length: Array = np.sqrt(np.einsum('ij,ij->j', regression, regression))
+    if not np.all(length > 0.0) or not np.all(np.diag(regression)) or not np.all(np.isfinite(length)):
         return 0.0
-    F = regression / size
-    high = low = np.random.default_rng(0).standard_normal(F.shape[0])
+    F = np.asfortranarray(regression / length)
+    high: Array = np.random.default_rng(0).standard_normal((F.shape[0],))
+    low: Array = high
     for _ in range(4):
         high = F.T @ (F @ high)
-        high /= np.linalg.norm(high)
-        low = solve_triangular(F, solve_triangular(F, low, trans='T', check_finite=False), check_finite=False)
-        norm = np.linalg.norm(low)
-        if not np.isfinite(norm):
+        high = np.asarray(high / np.linalg.norm(high))
+        low = dtrtrs(F, dtrtrs(F, low, trans=1)[0])[0]
+        norm = float(np.linalg.norm(low))
+        if not np.isfinite(norm) or norm == 0.0:
             return 0.0
-        low /= norm
+        low = np.asarray(low / norm)
     return float((np.linalg.norm(F @ low) / np.linalg.norm(F @ high)) ** 2)

@@ -65,6 +65,18 @@ def continuous_state_matrix(A: Array, dt: float) -> Array | None:
     return log
 
 
+def stabilized(A: Array) -> Array:
+    """A (n, n) with every pole outside the unit circle drawn back onto it along its radius."""
+    values, vectors = np.linalg.eig(A)
+    radius = np.abs(values)
+    if np.all(radius <= 1.0):
+        return A
+    if np.linalg.cond(vectors) > WORST_BASIS:
+        return np.asarray(A / radius.max(), dtype=np.float64)
+    inside = values / np.maximum(radius, 1.0) * (1.0 - 1e-12)
+    return np.asarray(np.real(np.linalg.solve(vectors.T, (vectors * inside).T).T), dtype=np.float64)
+
+
 def known_output_basis(model: StateSpace) -> Array | None:
     """W (n, n) that brings the model to the basis in which the configured C is known, or None.
 

@@ -37,7 +37,7 @@ BLOCK = 256
 MEMORY = 1_000_000.0
 """Samples after which parameters may have drifted by their own standard deviation."""
 CLEAN = 1e-20
-"""Relative innovation power below which the subspace model has no bias worth removing; least power assumed."""
+"""Relative innovation power below which the subspace model has no bias worth removing; the least assumed."""
 UNEXPLAINED = 0.5
 """Share of an output's power that a fit with K = 0 may leave before it is taken not to simulate at all."""
 PARAMETERS = 80
@@ -49,9 +49,12 @@ MISFIT = 3.0
 
 
 class Recursion(NamedTuple):
-    """A fit that goes on. scale: (r + m,) of its signals; root: (k, k) S with S S' the covariance of the
-    coordinates P (d, k) and the state; covariance: (m, m) of the innovations, worth ``weight`` samples;
-    widening: factor on standard deviations from the scatter of the gradients.
+    """A fit that goes on.
+
+    scale: (r + m,) of its signals; root: (k, k) S with S S' the covariance of the coordinates P (d, k) and
+    the state; covariance: (m, m) of the innovations, worth ``weight`` samples; widening: factor on standard
+    deviations from the scatter of the gradients; gain: (n, m) published K, theta's own unless that is held;
+    singular_values, condition: of the subspace model the fit began with.
     """
 
     theta: Theta
@@ -64,11 +67,15 @@ class Recursion(NamedTuple):
     widening: float
     strikes: int
     gain: Array
+    singular_values: Array
+    condition: float
 
 
 class Refined(NamedTuple):
-    """What the refinement remembers: closed chunks (CHUNK, r + m) never written to again, the open one,
-    samples since the start, and the fit. batch: the fit still sees every sample since the start.
+    """What the refinement remembers.
+
+    Closed chunks (CHUNK, r + m) never written to again, the open one, samples since the start (negative:
+    still to wait), and the fit. batch: the fit still sees every sample since the start.
     """
 
     chunks: tuple[Array, ...]
@@ -162,6 +169,11 @@ def fit_all(
         own = floor + 2.0 * float(np.sum(np.log(old.scale[-m:] / scale[-m:])))
         found += _fits(samples, begin, old.structure, old.scale, noise, own)
     best = min(found, key=lambda pair: pair[1])[0] if found else None
+    if best is not None and starts:
+        size = np.linalg.norm(starts[0].state, axis=0)
+        best = best._replace(
+            singular_values=starts[0].singular_values,
+            condition=float(np.linalg.cond(starts[0].state / size)))
     return _next_phase(refined._replace(recursion=best))
 
 
@@ -194,18 +206,23 @@ def _fits(
         if other is not None and better and (not simulates or other.cost + penalty < floor):
             best, chosen, cost = other, free, other.cost + penalty
         elif best is not None and simulates:
-            for start_gain in (begin.K, np.zeros_like(begin.K)):
-                last = descend(U, Y, best.theta._replace(K=start_gain), free._replace(only_gain=True), ITERATIONS)
-                if last is not None and (gain is None or last.cost < score(U, Y, best.theta._replace(K=gain))[0]):
-                    gain = last.theta.K
+            gain = _gain_alone(U, Y, best.theta, begin.K, free._replace(only_gain=True))
     if best is None or not (simulates or chosen.free_gain):
         return []
     recursion = Recursion(
         theta=best.theta._replace(x=best.end), structure=chosen, scale=scale, P=best.directions,
-        root=_arrive(covariance_root(best.information), best.arrival), covariance=best.covariance + CLEAN * np.diag(power),
+        root=_arrive(covariance_root(best.information), best.arrival),
+        covariance=best.covariance + CLEAN * np.diag(power),
         weight=float(count), widening=_widening(U, Y, best, chosen), strikes=0,
-        gain=best.theta.K if gain is None else gain)
+        gain=best.theta.K if gain is None else gain, singular_values=np.zeros(0), condition=float('nan'))
     return [(recursion, cost - 2.0 * float(np.sum(np.log(scale[r:]))))]
+
+
+def _gain_alone(U: Array, Y: Array, theta: Theta, begin: Array, structure: Structure) -> Array | None:
+    """K (n, m) of the best predictor for a system that is held, from two starting points."""
+    tried = [descend(U, Y, theta._replace(K=K), structure, ITERATIONS) for K in (begin, np.zeros_like(begin))]
+    done = [fit for fit in tried if fit is not None]
+    return min(done, key=lambda fit: fit.cost).theta.K if done else None
 
 
 def _next_phase(refined: Refined) -> Refined:

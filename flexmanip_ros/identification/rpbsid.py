@@ -14,7 +14,14 @@ from typing import Any
 import numpy as np
 
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.identification import factor_kernel, memory_kernel, paper_kernel, publication, refinement
+from flexmanip_ros.identification import (
+    decimation,
+    factor_kernel,
+    memory_kernel,
+    paper_kernel,
+    publication,
+    refinement,
+)
 from flexmanip_ros.identification.memory_kernel import FILLED, POWER, PRIOR, USED, WEIGHT, WEIGHT2
 from flexmanip_ros.identification.moments import solve_regressor
 from flexmanip_ros.identification.uncertainty import Identified
@@ -34,7 +41,7 @@ class RpbsidState:
     z: (p (r + m),) past window, scaled; scale: (r + m,); mean: (2, r + m) slow means and peaks;
     variance: (m,) of the innovations, scaled; scalars, counts: see ``memory_kernel``;
     memory: the arrays of the estimator, in the order its kernel takes them; refined: the prediction-error
-    fit, None where it is off.
+    fit, None where it is off; decimator: the anti-alias filter, None where every sample is used.
     """
 
     z: Array
@@ -45,12 +52,14 @@ class RpbsidState:
     counts: Array
     memory: tuple[Array, ...]
     refined: refinement.Refined | None
+    decimator: decimation.Decimator | None
 
     def copy(self) -> RpbsidState:
         """Return a state whose arrays may be overwritten."""
         return RpbsidState(
             self.z.copy(), self.scale.copy(), self.mean.copy(), self.variance.copy(), self.scalars.copy(),
-            self.counts.copy(), tuple(array.copy() for array in self.memory), self.refined)
+            self.counts.copy(), tuple(array.copy() for array in self.memory), self.refined,
+            self.decimator)
 
 
 def init(config: IdentifierParameters) -> RpbsidState:
@@ -63,7 +72,8 @@ def init(config: IdentifierParameters) -> RpbsidState:
     return RpbsidState(
         z=np.zeros(p * (r + m)), scale=np.zeros(r + m), mean=np.zeros((2, r + m)), variance=np.zeros(m),
         scalars=scalars, counts=np.zeros(memory_kernel.COUNTS, dtype=np.int64), memory=memory,
-        refined=refinement.start(r + m) if _is_refined(config, r, m) else None)
+        refined=refinement.start(r + m) if _is_refined(config, r, m) else None,
+        decimator=decimation.start(config.decimation, r + m) if config.decimation > 1 else None)
 
 
 def _is_refined(config: IdentifierParameters, r: int, m: int) -> bool:
@@ -114,6 +124,10 @@ def advance(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array
             f'samples of shapes {U.shape} and {Y.shape} do not fit {r} inputs and {m} outputs',
             'give as many rows of both, one column per configured signal')
     new = state.copy()
+    if new.decimator is not None:
+        filtered, kept = decimation.decimate(new.decimator, np.hstack([U, Y]), config.decimation)
+        new = replace(new, decimator=filtered)
+        U, Y = np.ascontiguousarray(kept[:, :r]), np.ascontiguousarray(kept[:, r:])
     done = 0
     while done < len(U):
         count = len(U) - done if new.refined is None else min(len(U) - done, refinement.due(new.refined))
@@ -180,8 +194,10 @@ def window_restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidSt
     new.counts[FILLED] = 0
     if config.estimator == 'paper':
         new.memory[-1][-1] = 0.0
+    if new.decimator is not None:
+        new = replace(new, decimator=decimation.restart(new.decimator))
     if new.refined is not None:
-        return replace(new, refined=refinement.break_window(new.refined))
+        new = replace(new, refined=refinement.break_window(new.refined))
     return new
 
 
@@ -216,12 +232,17 @@ def restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
 
 
 def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> Identified | None:
-    """Return the model as of the last sample, or None before there is one. dt: sample time [s]."""
+    """Return the model as of the last sample, or None before there is one. dt: sample time [s].
+
+    With decimation the model steps ``decimation`` sample times.
+    """
+    dt *= config.decimation
     d = _regressors(config, len(config.inputs), len(config.outputs))
     refined = state.refined
     # a fit of few samples does not replace a model of many
     if refined is not None and refined.recursion and 2 * refined.recursion.weight >= state.counts[USED]:
-        return publication.from_fit(config, state.refined.recursion, state.scalars, dt)
+        return publication.from_fit(
+            config, refined.recursion, state.scalars, publication.excitation(state.memory[0][:d, :d]), dt)
     few = state.counts[USED] <= max(config.past_window, config.order)
     if few or not np.all(np.isfinite(state.memory[0])):
         return None

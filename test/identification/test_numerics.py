@@ -33,7 +33,8 @@ def test_a_minute_without_excitation_costs_nothing(mode, quiet):
     gain = system.C @ np.linalg.solve(np.eye(3) - system.A, system.B)
     level = {'silence': 0.0, 'constant': 1.0, 'noise': 0.0}[quiet] * np.array([0.5, -0.3])
     hush = 1e-3 * rng.standard_normal((count, 3)) if quiet == 'noise' else 0.0
-    state = rpbsid.advance(config, before, np.tile(level, (count, 1)), np.tile(gain @ level, (count, 1)) + hush)
+    rest = np.tile(level, (count, 1)), np.tile(gain @ level, (count, 1)) + hush
+    state = rpbsid.advance(config, before, *rest)
     assert all(np.all(np.isfinite(array)) for array in state.memory)
     if quiet == 'silence' or mode.get('forgetting') != 'constant':
         found = identified(config, state)

@@ -1,0 +1,71 @@
+"""Fewer samples a second for the identifier: one anti-alias filter for every signal, then every D-th sample.
+
+Inputs and outputs go through the same linear-phase filter, so the linear relation between them stays as it
+was; only the course of the input between the kept samples is lost (a direct term takes up most of that).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from flexmanip_ros.types import Array
+
+TAPS = 8
+"""Length of the filter in kept sample times."""
+
+
+class Decimator(NamedTuple):
+    """taps: (L,) filter; history: (L - 1, r + m) latest samples; seen: samples since the last gap."""
+
+    taps: Array
+    history: Array
+    seen: int
+
+
+def start(factor: int, width: int) -> Decimator:
+    """Begin with an empty filter. factor: D >= 2; width: r + m."""
+    length = TAPS * factor + 1
+    cutoff = 0.8 / factor  # of the Nyquist frequency
+    taps = np.hamming(length) * np.sinc(cutoff * (np.arange(length) - (length - 1) / 2.0))
+    taps /= taps.sum()
+    return Decimator(taps, np.zeros((length - 1, width)), 0)
+
+
+def restart(decimator: Decimator) -> Decimator:
+    """Forget the samples: nothing is filtered across a gap or an event."""
+    return decimator._replace(seen=0)
+
+
+def decimate(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimator, Array]:
+    """Take samples (k, r + m); return the filtered ones that are due (0.., r + m).
+
+    A sample that is not finite starts the filter anew and is handed on as it is, so that the identifier
+    sees the break.
+    """
+    kept: list[Array] = []
+    good = np.all(np.isfinite(samples), axis=1)
+    begin = 0
+    for k in [*np.flatnonzero(~good).tolist(), len(samples)]:
+        decimator, some = _run(decimator, samples[begin:k], factor)
+        kept.append(some)
+        if k < len(samples):
+            decimator = restart(decimator)
+            kept.append(samples[k:k + 1])
+        begin = k + 1
+    return decimator, np.vstack(kept)
+
+
+def _run(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimator, Array]:
+    """Filter finite samples of one stretch."""
+    taps, history, seen = decimator
+    joint = np.vstack([history, samples])
+    order = len(taps) - 1
+    # joint[order + i] has number seen + i + 1 since the gap; kept when the filter is full and it is due
+    numbers = seen + 1 + np.arange(len(samples))
+    due = np.flatnonzero((numbers > order) & ((numbers - order - 1) % factor == 0))
+    out = np.empty((len(due), samples.shape[1]))
+    for row, i in enumerate(due):
+        out[row] = taps @ joint[i:i + order + 1]
+    return decimator._replace(history=joint[len(joint) - order:], seen=seen + len(samples)), out

@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from linear_arm import benchmark, configuration, random_system, record, shared_data, sorted_poles
+
+from flexmanip_ros.identification import rpbsid, validation
+from flexmanip_ros.identification.realization import stabilized, to_continuous, to_discrete
+
+
+def test_stable_model_has_no_pole_outside_the_circle():
+    rng = np.random.default_rng(1)
+    A = rng.standard_normal((6, 6))
+    assert np.abs(np.linalg.eigvals(A)).max() > 1.0
+    values = np.linalg.eigvals(stabilized(A))
+    assert np.abs(values).max() <= 1.0
+    inside = 0.5 * A / np.abs(np.linalg.eigvals(A)).max()
+    assert np.array_equal(stabilized(inside), inside)
+
+
+def test_stable_model_is_published_when_asked_for():
+    rng = np.random.default_rng(2)
+    u, y = np.zeros((2, 300, 1))
+    u[:] = rng.standard_normal(u.shape)
+    for k in range(2, 300):
+        y[k] = 1.81 * y[k - 1] - 0.808 * y[k - 2] + u[k - 1]  # poles 1.01 and 0.8
+    for stable in (False, True):
+        config = configuration(
+            1, 1, order=2, past_window=6, future_window=4, stable_model=stable, refinement='none',
+            regularization=[1e-9] * 3)
+        found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), u, y), 0.01)
+        assert found is not None
+        assert (np.abs(np.linalg.eigvals(found.model.A)).max() <= 1.0) == stable
+
+
+def test_suggested_order_is_the_order_of_the_plant():
+    rng = np.random.default_rng(3)
+    for n in (2, 4):
+        u, y = record(random_system(n, 2, 2, rng), 4000, 1e-3, rng)
+        config = configuration(2, 2, order=3, past_window=8, future_window=6, refinement='none')
+        found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), u, y), 0.01)
+        assert found is not None
+        assert found.suggested_order == n
+
+
+def test_decimated_identification_finds_the_slow_poles():
+    study = benchmark('identification_paper_settings')
+    u, y = study.response(20.0, (60.0, 45.0), 'paper', 40.0, 0, capture=0, samples=3000)
+    config = configuration(2, 4, order=4, decimation=8, direct_feedthrough=True, regularization=[1e-6] * 3)
+    state = rpbsid.advance(config, rpbsid.init(config), u, y)
+    found = rpbsid.identified(config, state, 1e-3)
+    assert found is not None
+    assert found.model.dt == pytest.approx(8e-3)
+    hertz = np.sort(np.abs(np.angle(np.linalg.eigvals(found.model.A)))[::2]) / (2 * np.pi * 8e-3)
+    assert np.allclose(hertz, [5.63428, 6.55037], rtol=2e-3)
+    stepped = rpbsid.init(config)
+    for k in range(400):
+        stepped = rpbsid.step(config, stepped, u[k], y[k])
+    at_once = rpbsid.advance(config, rpbsid.init(config), u[:400], y[:400])
+    assert np.array_equal(stepped.memory[0], at_once.memory[0])
+
+
+def test_continuous_and_discrete_are_inverse():
+    rng = np.random.default_rng(4)
+    Ac, Bc = rng.standard_normal((4, 4)), rng.standard_normal((4, 2))
+    A, B = to_discrete(Ac, Bc, 0.05)
+    back = to_continuous(A, B, 0.05)
+    assert np.allclose(back[0], Ac)
+    assert np.allclose(back[1], Bc)
+
+
+def test_state_at_end_continues_the_record():
+    rng = np.random.default_rng(5)
+    system = random_system(4, 2, 1, rng)
+    u, y = record(system, 300, 0.0, rng)
+    x = validation.state_at_end(system, u[:200], y[:200])
+    assert np.allclose(validation.simulate(system, u[200:], x), y[200:], atol=1e-8)
+    assert validation.vaf(y, y + 1.0) == pytest.approx(100.0)
+
+
+@pytest.mark.parametrize(('order', 'future'), [(4, 5), (6, 10)])
+def test_measured_arm_is_simulated_to_98_percent(order, future):
+    shared_data('daisy_robot_arm')
+    study = benchmark('identification_measured_arms')
+    u, y = study.record('daisy_robot_arm', 1)
+    scores = study.ours(u, y, 512, {'order': order, 'future_window': future})
+    assert scores['simulation'][0] >= 98.0
+    assert scores['prediction'][0] >= 98.0
+
+
+def test_long_fit_recursion_tracks_and_an_event_starts_it_anew():
+    rng = np.random.default_rng(6)
+    system = random_system(2, 1, 2, rng)
+    u, y = record(system, 3500, 0.0, rng)
+    y = y + 0.1 * np.std(y, axis=0) * rng.standard_normal(y.shape)
+    config = configuration(1, 2, order=2, past_window=4, future_window=2)
+    state = rpbsid.advance(config, rpbsid.init(config), u, y)
+    assert state.refined is not None
+    assert not state.refined.batch
+    assert state.refined.recursion is not None
+    assert state.refined.recursion.weight > 3000
+    found = rpbsid.identified(config, state, 0.01)
+    assert found is not None
+    assert np.abs(sorted_poles(found.model.A) - sorted_poles(system.A)).max() < 0.01
+    gap = rpbsid.advance(config, rpbsid.window_restart(config, state), u[:600], y[:600])
+    assert gap.refined is not None
+    assert gap.refined.recursion is not None
+    found = rpbsid.identified(config, gap, 0.01)
+    assert found is not None
+    assert np.abs(sorted_poles(found.model.A) - sorted_poles(system.A)).max() < 0.01
+    restarted = rpbsid.restart(config, state)
+    assert restarted.refined is not None
+    assert restarted.refined.recursion is None

@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from linear_arm import benchmark, configuration, random_system, record
+
+from flexmanip_ros.identification import rpbsid
+from flexmanip_ros.identification.modal import modes
+from flexmanip_ros.identification.moments import realize
+from flexmanip_ros.identification.publication import based, from_factor
+from flexmanip_ros.identification.uncertainty import Tangent, tangent, variance
+from flexmanip_ros.types import StateSpace
+
+
+@pytest.mark.parametrize(
+    ('n', 'm', 'feedthrough'), [(3, 3, False), (4, 2, False), (2, 2, True), (4, 1, False)])
+def test_tangent_is_the_derivative_with_respect_to_the_regression(n, m, feedthrough):
+    rng = np.random.default_rng(n + m)
+    u, y = record(random_system(n, 2, m, rng), 4000, 1e-6, rng)
+    config = configuration(2, m, order=n, past_window=20, future_window=5, direct_feedthrough=feedthrough,
+                           refinement='none', regularization=[1e-8] * 3)
+    state = rpbsid.advance(config, rpbsid.init(config), u, y)
+    realized, R, _ = from_factor(config, state.memory[0], state.scale)
+    assert realized is not None
+    along = tangent(R, realized, 2, np.eye(m))
+    d = realized.regression.shape[0]
+    poles = np.linalg.eigvals(realized.A)
+    worst = 0.0
+    for _ in range(3):
+        omega = rng.standard_normal(m * d)
+        # dXi = Omega regression^-T, put into the moments as regression dXi' under the outputs' columns
+        change = np.zeros_like(R)
+        change[:d, -m:] = omega.reshape(m, d).T
+        step = 1e-7 * np.abs(R[:d, -m:]).max()
+        both = [realize(R + sign * step * change, 2, m, n, 5, feedthrough=feedthrough, weighted=True)
+                for sign in (1.0, -1.0)]
+        shift = [np.array([np.linalg.eigvals(b.A)[np.argmin(np.abs(np.linalg.eigvals(b.A) - pole))]
+                           for pole in poles]) for b in both if b is not None]
+        numeric = (shift[0] - shift[1]) / (2 * step)
+        values, right = np.linalg.eig(realized.A)
+        left = np.linalg.inv(right)
+        analytic = np.array([left[i] @ np.tensordot(omega, along.A, 1) @ right[:, i] for i in range(n)])
+        order = [int(np.argmin(np.abs(values - pole))) for pole in poles]
+        size = max(np.abs(numeric).max(), 1e-6)
+        worst = max(worst, float(np.abs(numeric - analytic[order]).max() / size))
+    assert worst < 0.05  # what is left is the misfit of the noisy regression, of second order
+
+
+def test_change_of_basis_carries_the_tangent():
+    rng = np.random.default_rng(11)
+    system = random_system(4, 1, 2, rng)
+    system = dataclasses.replace(system, A=np.eye(4) + 0.05 * (system.A - np.eye(4)))
+    base = tuple(np.zeros((1, *getattr(system, name).shape)) for name in 'ABCDK')
+    for part in base[:3]:
+        part[:] = rng.standard_normal(part.shape)
+    moved, along, known = based(system, Tangent(*base))
+    assert known
+    assert along is not None
+    assert np.allclose(moved.C, [[1, 0, 0, 0], [0, 1, 0, 0]], atol=1e-9)
+    step = 1e-6
+    shifted = []
+    for sign in (1, -1):
+        other = StateSpace(*(getattr(system, name) + sign * step * part[0]
+                             for name, part in zip('ABCDK', base, strict=True)), dt=system.dt)
+        shifted.append(based(other, None)[0])
+    for name in 'ABC':
+        numeric = (getattr(shifted[0], name) - getattr(shifted[1], name)) / (2 * step)
+        assert np.allclose(numeric, getattr(along, name)[0], atol=1e-4 * (1 + np.abs(numeric).max())), name
+
+
+def test_variance_of_a_matrix_entry_is_the_diagonal_of_the_covariance():
+    rng = np.random.default_rng(12)
+    u, y = record(random_system(2, 1, 2, rng), 1000, 0.05, rng)
+    config = configuration(1, 2, order=2, past_window=4, future_window=2)
+    found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), u, y), 0.01)
+    assert found is not None
+    covariance = found.spread @ found.spread.T
+    gradient = np.zeros((2, 1))
+    gradient[1, 0] = 1.0
+    assert variance(found, B=gradient) == pytest.approx(covariance[5, 5])
+
+
+def test_intervals_cover_at_40_and_20_db():
+    study = benchmark('identification_coverage')
+    for snr_db in (40.0, 20.0):
+        row = study.study(8, snr_db, 0.01)
+        assert min(row['coverage_percent']) >= 60.0, row  # 8 runs: less than 1 in 1000 by chance
+        assert np.all(np.abs(row['bias'][:4]) < 1.5 * np.array(row['scatter'][:4])), row
+
+
+def test_modes_of_a_known_model():
+    dt, w, zeta = 1e-3, 2 * np.pi * 6.0, 0.02
+    s = complex(-zeta * w, w * np.sqrt(1 - zeta ** 2))
+    pole = np.exp(s * dt)
+    A = np.array([[pole.real, pole.imag], [-pole.imag, pole.real]])
+    rng = np.random.default_rng(0)
+    u, y = record(random_system(2, 1, 2, rng), 500, 0.05, rng)
+    config = configuration(1, 2, order=2, past_window=4, future_window=2)
+    found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), u, y), dt)
+    assert found is not None
+    (mode,) = modes(found._replace(model=dataclasses.replace(found.model, A=A)))
+    assert mode.frequency_hz == pytest.approx(6.0 * np.sqrt(1 - zeta ** 2))
+    assert mode.damping_ratio == pytest.approx(zeta)
+    assert mode.frequency_std_hz > 0
