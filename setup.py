@@ -17,7 +17,7 @@ NODES = (
     'plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'payload_controller',
     'payload_adapter', 'demo',
 )
-PROGRAMS = ('identify_bag', 'simulate_bag', 'reproduce_paper', 'monte_carlo')
+PROGRAMS = ('identify_bag', 'simulate_bag', 'reproduce_paper', 'monte_carlo', 'write_urdf')
 
 
 def share_files() -> list[tuple[str, list[str]]]:

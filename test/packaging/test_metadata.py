@@ -142,6 +142,12 @@ def test_every_program_imports_and_is_callable(distribution: Distribution) -> No
         assert callable(getattr(importlib.import_module(module), function))
 
 
+def test_every_module_with_a_main_is_a_program(distribution: Distribution) -> None:
+    modules = [*(ROOT / 'flexmanip_ros/ros').glob('*.py'), *(ROOT / 'flexmanip_ros/cli').glob('*.py')]
+    mains = {path.stem for path in modules if '\ndef main(' in path.read_text(encoding='utf-8')}
+    assert mains - {'warm_up', 'write_parameters'} == set(programs(distribution))
+
+
 def test_every_package_is_installed(distribution: Distribution) -> None:
     folders = {path.parent for path in (ROOT / 'flexmanip_ros').rglob('*.py')}
     assert set(distribution.packages) == {'.'.join(folder.relative_to(ROOT).parts) for folder in folders}
