@@ -1,0 +1,64 @@
+"""The SROS 2 policy against what the nodes really open: too wide or too narrow fails."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ros_harness import Ros, overrides
+
+from flexmanip_ros.ros.capture_trigger import CaptureTrigger
+from flexmanip_ros.ros.excitation import Excitation
+from flexmanip_ros.ros.payload_adapter import PayloadAdapter
+from flexmanip_ros.ros.payload_controller import PayloadController
+from flexmanip_ros.ros.plant_simulator import PlantSimulator
+from flexmanip_ros.ros.rpbsid_identifier import RpbsidIdentifier
+
+POLICY = Path(__file__).resolve().parents[2] / 'config' / 'sros2' / 'policy.xml'
+NODES = (PlantSimulator, Excitation, CaptureTrigger, RpbsidIdentifier, PayloadController, PayloadAdapter)
+DRIVER = 'io_and_status_controller/set_payload'
+
+
+def allowed(name: str) -> dict[str, set[str]]:
+    """Return what the policy lets a node do, as full names."""
+    (profile,) = ElementTree.parse(POLICY).findall(f".//enclave[@path='/flexmanip_ros/{name}']//profile")
+    assert profile.attrib == {'ns': '/', 'node': name}
+    found: dict[str, set[str]] = {'publish': set(), 'subscribe': set(), 'reply': set(), 'request': set()}
+    for group in profile:
+        ((kind, verdict),) = group.attrib.items()
+        assert verdict == 'ALLOW'
+        for item in group:
+            assert item.text is not None
+            assert '*' not in item.text
+            found[kind].add('/' + item.text.replace('~', name))
+    return found
+
+
+def opened(node: Any) -> dict[str, set[str]]:
+    """Return what a node has open on the graph."""
+    name = node.get_name()
+    lists = {
+        'publish': node.get_publisher_names_and_types_by_node,
+        'subscribe': node.get_subscriber_names_and_types_by_node,
+        'reply': node.get_service_names_and_types_by_node,
+        'request': node.get_client_names_and_types_by_node,
+    }
+    return {kind: {topic for topic, _ in look(name, '/')} for kind, look in lists.items()}
+
+
+@pytest.mark.parametrize('cls', NODES)
+def test_the_policy_allows_exactly_what_a_node_opens(ros: Ros, cls: Any) -> None:
+    # The driver's service type is not installed here; a parameter service stands at its place.
+    given = overrides(target_node='driver') if cls is PayloadAdapter else None
+    node = ros.managed(cls(context=ros.context, overrides=given))
+    real = opened(node)
+    if cls is PayloadAdapter:
+        real['request'] = {name.replace('/driver/set_parameters', '/' + DRIVER) for name in real['request']}
+    assert real == allowed(node.get_name())
+
+
+def test_every_node_has_an_enclave_of_its_own() -> None:
+    paths = [item.attrib['path'] for item in ElementTree.parse(POLICY).findall('.//enclave')]
+    assert len(paths) == len(set(paths)) == len(NODES)
