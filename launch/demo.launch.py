@@ -5,13 +5,13 @@
 With the executable `demo` the same nodes share one process, a bag is recorded and a picture drawn.
 """
 
+from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 from flexmanip_ros.parameters.demo import IDENTIFIER
-from launch import LaunchDescription
 
 PACKAGE = 'flexmanip_ros'
 ARGUMENTS = (

@@ -6,13 +6,12 @@ ros2 launch flexmanip_ros identify.launch.py params_file:=my_arm.yaml joint_stat
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
+from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
-
-from launch import LaunchDescription
 
 PACKAGE = 'flexmanip_ros'
 

@@ -3,6 +3,7 @@
 ros2 launch flexmanip_ros view.launch.py params_file:=my_arm.yaml
 """
 
+from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
@@ -11,7 +12,6 @@ from launch_ros.actions import Node
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.plant.urdf import urdf
-from launch import LaunchDescription
 
 
 def describe(context):

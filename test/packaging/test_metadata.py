@@ -102,10 +102,20 @@ def test_every_import_has_a_rosdep_key() -> None:
         assert key in declared(), f'{sorted(files)} import {name}: package.xml lacks {key}'
 
 
+def launched() -> set[str]:
+    """Return the other packages whose executables our launch files start."""
+    texts = [path.read_text(encoding='utf-8') for path in (ROOT / 'launch').glob('*.py')]
+    return {name for text in texts for name in re.findall(r"package='(\w+)'", text)} - {'flexmanip_ros'}
+
+
+def test_every_launched_package_is_a_dependency() -> None:
+    assert launched() <= declared()
+
+
 def test_every_rosdep_key_is_for_something_imported() -> None:
     used = {LIBRARIES.get(name, (name, ''))[0] for name in third_party()}
     tools = {'python3-pytest', 'python3-hypothesis'}
-    assert declared() - used - tools == set()
+    assert declared() - used - tools - launched() == set()
 
 
 def test_every_import_is_locked() -> None:
