@@ -16,6 +16,7 @@ from flexmanip_ros.identification.memory_kernel import (
     COUNTS,
     FILLED,
     GAMMA,
+    OPEN,
     PRIOR,
     SCALARS,
     USED,
@@ -24,6 +25,7 @@ from flexmanip_ros.identification.memory_kernel import (
     accept,
     judge,
     memory,
+    push,
     remember,
 )
 from flexmanip_ros.types import Array
@@ -115,6 +117,10 @@ def advance_factor(
         remember(new, mean, scalars, p)
         if counts[FILLED] >= p:
             b = memory(scalars, counts, beta, mode)
+            if scalars[OPEN] == 0.0:
+                push(z, new)
+                counts[FILLED] += 1
+                continue
             for i in range(past):
                 row[i] = z[i]
             for i in range(width):
@@ -128,8 +134,5 @@ def advance_factor(
             judge(row[q - m:], variance, scalars, counts, b, regressors)
             rotate(R, row, regressors, q, root)
             counts[USED] += 1
-        for i in range(past - width):
-            z[i] = z[i + width]
-        for i in range(width):
-            z[past - width + i] = new[i]
+        push(z, new)
         counts[FILLED] += 1

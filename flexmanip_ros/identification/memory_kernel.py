@@ -8,9 +8,10 @@ from numba import njit
 
 from flexmanip_ros.types import Array
 
-WEIGHT, WEIGHT2, PRIOR, ENERGY, LATELY, POWER, GAMMA, FORGET = 0, 1, 2, 3, 4, 5, 6, 7
+WEIGHT, WEIGHT2, PRIOR, ENERGY, LATELY, POWER, GAMMA, OPEN = 0, 1, 2, 3, 4, 5, 6, 7
 """Sum of weights, sum of squared weights, weight left of the prior, variation of the signals as
-remembered and lately (unit: squared peaks), innovation power, last conversion factor, last beta."""
+remembered and lately (unit: squared peaks), innovation power, last conversion factor, how far the last
+sample counted (0: not)."""
 SCALARS = 8
 FILLED, USED, SEEN, REJECTED = 0, 1, 2, 3
 """Samples in a row without a gap, regressions since the restart, samples since reset, samples refused."""
@@ -19,8 +20,9 @@ COUNTS = 4
 CONSTANT, EXCITATION, INNOVATION = 0, 1, 2
 """Modes of forgetting, see ``memory``."""
 
-QUIET, LIVELY = 0.02, 0.2
-"""Relative variation of the signals below which nothing is forgotten, above which forgetting is full."""
+QUIET, LIVELY = 0.005, 0.05
+"""Relative variation of the signals below which nothing is learnt or forgotten, above which forgetting is
+full."""
 LARGEST = 1e100
 """Numbers are brought to about 1 by the first value of their channel; beyond this the sample is refused."""
 EXPECTED, SURPRISE = 1.5, 3.0
@@ -54,6 +56,17 @@ def accept(u: Array, y: Array, new: Array, scale: Array, counts: Array) -> bool:
 
 
 @njit(cache=True)
+def push(z: Array, new: Array) -> None:
+    """Move the past window z (p (r + m),) on by one sample (r + m,)."""
+    width = new.shape[0]
+    past = z.shape[0]
+    for i in range(past - width):
+        z[i] = z[i + width]
+    for i in range(width):
+        z[past - width + i] = new[i]
+
+
+@njit(cache=True)
 def remember(new: Array, mean: Array, scalars: Array, p: int) -> None:
     """Follow the variation of the signals: mean (2, r + m) holds slow means and running peaks."""
     rate = 1.0 / (20.0 * p)
@@ -74,7 +87,8 @@ def memory(scalars: Array, counts: Array, beta: float, mode: int) -> float:
     """Return the forgetting factor of this sample.
 
     Old information is let go only as far as new information comes in: with signals that vary less
-    than 2 % of what is remembered (silence, saturation, a constant torque) nothing is forgotten.
+    than half a percent of what is remembered (silence, saturation, a constant torque) nothing is forgotten,
+    and nothing learnt: a sensor at its stop says something false about the dynamics.
     Mode INNOVATION forgets only while the innovations are larger than the model expects.
     """
     b = beta
@@ -91,7 +105,7 @@ def memory(scalars: Array, counts: Array, beta: float, mode: int) -> float:
     rate = max(1.0 - b, 1.0 / (counts[USED] + 1.0)) * open_
     scalars[ENERGY] += rate * (scalars[LATELY] - scalars[ENERGY])
     b = 1.0 - (1.0 - b) * open_
-    scalars[FORGET] = b
+    scalars[OPEN] = open_
     return b
 
 

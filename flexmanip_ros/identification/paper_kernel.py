@@ -11,6 +11,7 @@ from flexmanip_ros.identification.factor_kernel import GROWTH
 from flexmanip_ros.identification.memory_kernel import (
     FILLED,
     GAMMA,
+    OPEN,
     PRIOR,
     USED,
     WEIGHT,
@@ -18,6 +19,7 @@ from flexmanip_ros.identification.memory_kernel import (
     accept,
     judge,
     memory,
+    push,
     remember,
 )
 from flexmanip_ros.types import Array
@@ -173,6 +175,11 @@ def advance_paper(
         remember(new, mean, scalars, p)
         if counts[FILLED] >= p:
             b = memory(scalars, counts, beta[0], mode)
+            if scalars[OPEN] == 0.0:
+                last[n + width] = 0.0
+                push(z, new)
+                counts[FILLED] += 1
+                continue
             share = (1.0 - b) / (1.0 - beta[0]) if beta[0] < 1.0 else 1.0
             for i in range(past):
                 phi1[i] = z[i]
@@ -223,8 +230,5 @@ def advance_paper(
             counts[USED] += 1
         else:
             last[n + width] = 0.0
-        for i in range(past - width):
-            z[i] = z[i + width]
-        for i in range(width):
-            z[past - width + i] = new[i]
+        push(z, new)
         counts[FILLED] += 1

@@ -171,6 +171,8 @@ def _refine(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array
         break
     if not np.all(good):
         samples = samples[np.flatnonzero(~good)[-1] + 1:]
+    if state.counts[USED] and state.scalars[memory_kernel.OPEN] == 0.0:  # nothing to learn while all is quiet
+        return refinement.break_window(refined) if refined.total % refinement.CHUNK else refined
     refined = refinement.take(refined, samples)
     try:
         if refinement.is_fit_due(refined):
