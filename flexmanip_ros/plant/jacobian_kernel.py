@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.plant.acceleration_kernel import acceleration
+from flexmanip_ros.plant.acceleration_kernel import acceleration, steepness
 from flexmanip_ros.plant.compiled import kernel
 from flexmanip_ros.plant.kernels import assemble
 from flexmanip_ros.plant.link_jacobian_kernel import link_jacobian, point_jacobian
@@ -214,6 +214,21 @@ def solve_columns(L: Array, X: Array) -> None:
 
 
 @kernel
+def steep_jacobian(arm: Manipulator, q: Array, effort: Array, dq: Array) -> None:
+    """Subtract the derivative of ``acceleration_kernel.steepen`` by q from dq (n, n)."""
+    k = arm.kappa
+    root1, tip1, root2 = steepness(arm, q)
+    for j in range(k):
+        r1, r2 = 2 + j, 2 + k + j
+        first = arm.torque[r1, 0] * root1 * effort[0]
+        second = arm.torque[r1, 1] * tip1 * effort[1]
+        third = arm.torque[r2, 1] * root2 * effort[1]
+        for m in range(k):
+            dq[r1, 2 + m] -= first * arm.root_slope[0, m] + second * arm.tip_slope[0, m]
+            dq[r2, 2 + k + m] -= third * arm.root_slope[1, m]
+
+
+@kernel
 def acceleration_jacobian(
     arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array,
     qdd: Array, dq: Array, dqd: Array, dp: Array, work: Workspace,
@@ -221,7 +236,7 @@ def acceleration_jacobian(
     """Fill qdd (n,) and dqdd/dq, dqdd/dqd (n, n), dqdd/dp (n, 4), p = [mass, inertia, EI1, EI2].
 
     The damping counts as independent of EI. False when M is not positive definite. M's Cholesky
-    factor stays in work.M, so dqdd/dtau is its solution for the columns of arm.torque.
+    factor stays in work.M, so dqdd/dtau is its solution for the columns of ``manipulator.torque_at(arm, q)``.
     """
     if not acceleration(arm, payload, q, qd, effort, qdd, work):
         return False
@@ -238,6 +253,7 @@ def acceleration_jacobian(
                 dp[r, 2 + i] = work.elastic[r] * arm.unit_stiffness[r] / arm.stiffness[r]
                 for m in range(k):
                     dq[r, o + m] += work.tangent[r, m]
+        steep_jacobian(arm, q, effort, dq)
     solve_columns(work.M, dq)
     solve_columns(work.M, dqd)
     solve_columns(work.M, dp)

@@ -28,7 +28,7 @@ import numpy as np
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters.arm import ArmParameters
 from flexmanip_ros.plant import linearization
-from flexmanip_ros.plant.acceleration_kernel import acceleration
+from flexmanip_ros.plant.acceleration_kernel import acceleration, steepen
 from flexmanip_ros.plant.jacobian_kernel import acceleration_jacobian, bias_jacobian
 from flexmanip_ros.plant.kernels import assemble, elastic
 from flexmanip_ros.plant.shape_integrals import link_tables, output_matrix, quartic, rotary
@@ -173,6 +173,17 @@ def coriolis_matrix(arm: Manipulator, payload: Array, q: Array, qd: Array) -> Ar
     work = workspace(arm.kappa)
     bias_jacobian(arm, payload, q, qd, np.zeros_like(q), work.left, work.right, work)
     return work.right / 2
+
+
+def torque_at(arm: Manipulator, q: Array) -> Array:
+    """Return the generalized forces of unit joint torques at q, (n, 2)."""
+    B = arm.torque.copy()
+    if arm.shortening:
+        for i, unit in enumerate(np.eye(2)):
+            column = B[:, i].copy()
+            steepen(arm, np.asarray(q, float), unit, column)
+            B[:, i] = column
+    return B
 
 
 def energy(arm: Manipulator, payload: Array, q: Array, qd: Array) -> float:

@@ -14,7 +14,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.plant import manipulator as dynamics
-from flexmanip_ros.plant.jacobian_kernel import bias_jacobian
+from flexmanip_ros.plant.jacobian_kernel import bias_jacobian, steep_jacobian
 from flexmanip_ros.types import Array
 
 
@@ -29,7 +29,7 @@ class Linearization(NamedTuple):
     K_E: Array
     """Derivative of the bias by q."""
     K: Array
-    """Derivative of the elastic forces by q."""
+    """Derivative of the elastic forces less the torques' by q."""
     D: Array
     B: Array
     acceleration: Array
@@ -66,8 +66,11 @@ def linearize(
     work = dynamics.workspace(arm.kappa)
     both, rates = np.empty((n, n)), np.empty((n, n))
     bias_jacobian(arm, payload, q, qd, qdd, both, rates, work)
+    K = dynamics.elastic_tangent(arm, q)
+    if arm.shortening:
+        steep_jacobian(arm, q, effort, K)
     at_rest = np.empty((n, n))
     bias_jacobian(arm, payload, q, qd, np.zeros(n), at_rest, rates, work)
     return Linearization(
         M=dynamics.mass_matrix(arm, payload, q), C_E=rates, K_M=both - at_rest, K_E=at_rest,
-        K=dynamics.elastic_tangent(arm, q), D=np.diag(arm.damping), B=arm.torque.copy(), acceleration=qdd)
+        K=K, D=np.diag(arm.damping), B=dynamics.torque_at(arm, q), acceleration=qdd)

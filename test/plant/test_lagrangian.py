@@ -33,6 +33,23 @@ def test_equations_of_motion_follow_from_the_lagrangian(
         assert ours == pytest.approx(lagrangian.evaluate(derived, q, qd, qdd), rel=1e-9, abs=1e-8)
 
 
+@pytest.mark.parametrize('shortening', [False, True])
+def test_torques_work_on_the_tangents(shortening: bool) -> None:
+    """Generalized forces are the derivatives of the joints' own angles, the tangents' asin(w')."""
+    arm = manipulator.manipulator(ArmParameters(shortening=shortening), 3)
+    rng = np.random.default_rng(1)
+    q = rng.normal(size=8) * 0.02
+
+    def angles(q: np.ndarray) -> np.ndarray:
+        slopes = np.array([arm.root_slope[0] @ q[2:5], arm.tip_slope[0] @ q[2:5], arm.root_slope[1] @ q[5:]])
+        root1, tip1, root2 = slopes + slopes**3 / 6 if shortening else slopes
+        return np.array([q[0] + root1, q[1] + root2 - q[0] - tip1])
+
+    h = 1e-5
+    expected = [(angles(q + h * e) - angles(q - h * e)) / (2 * h) for e in np.eye(8)]
+    assert manipulator.torque_at(arm, q) == pytest.approx(np.array(expected), rel=1e-8, abs=1e-9)
+
+
 def test_torques_do_the_work_of_their_joint_angles() -> None:
     """Virtual work: tau1 turns link 1's root, tau2 link 2's root against link 1's tip."""
     arm = manipulator.manipulator(ArmParameters(), 3)

@@ -50,7 +50,7 @@ def test_each_term_is_the_derivative_it_names() -> None:
         C_E = slope(lambda d: manipulator.bias(ARM, PAYLOAD, q, qd + d))
         K_E = slope(lambda d: manipulator.bias(ARM, PAYLOAD, q + d, qd))
         K_M = slope(lambda d: manipulator.mass_matrix(ARM, PAYLOAD, q + d) @ point.acceleration)
-        K = slope(lambda d: manipulator.elastic_forces(ARM, q + d))
+        K = slope(lambda d: manipulator.elastic_forces(ARM, q + d) - manipulator.torque_at(ARM, q + d) @ TAU)
         for got, want in ((point.C_E, C_E), (point.K_E, K_E), (point.K_M, K_M), (point.K, K)):
             assert got[:, c] == pytest.approx(want, rel=1e-5, abs=1e-6 * max(np.abs(got).max(), 1.0))
 
