@@ -30,6 +30,8 @@ class PayloadParameters:
     model_error: float = parameter(
         0.003, "relative error of the arm's inertia to reckon with where a sensor shows more than its noise",
         low=0.0, high=1.0)
+    rotary_inertia: bool = parameter(
+        False, "`structured`: estimate the object's rotary inertia as well, where the signals tell it")
     gravity: float = parameter(
         0.0, 'along -y, for the algebraic method alone; the paper runs it with 9.81', unit='m/s^2', low=0.0)
     memory_time: float = parameter(

@@ -18,7 +18,7 @@ from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import memory as mem
 from flexmanip_ros.payload import structured_start as start
 from flexmanip_ros.payload.block_extraction import masses
-from flexmanip_ros.payload.motion_kernel import predict
+from flexmanip_ros.payload.motion_kernel import PARAMETERS, predict
 from flexmanip_ros.payload.structured_model import build, sensors
 from flexmanip_ros.plant.linearization import blocks, discretize, vibration_model
 from flexmanip_ros.types import Array
@@ -95,12 +95,14 @@ def nonlinear(
     if model is None:
         raise ModelError('the configured signals cannot give a payload', 'name both torques and both angles')
     n = model.motion.q.size
-    m = mem.memory(2 * n + 5, len(model.roles))
+    m = mem.memory(2 * n + PARAMETERS, len(model.roles))
     start.first(config, model, m, np.zeros(len(model.roles)))
     m.x[:2] = theta
     m.x[n:n + 2] = 0.0 if rates is None else rates
     m.x[2 * n] = np.log(max(payload, 1e-9) / model.motion.scale)
     m.S[2 * n, 2 * n] = 10.0 * start.PAYLOAD_STD
+    if config.payload.rotary_inertia:
+        m.S[2 * n + 5, 2 * n + 5] = start.PAYLOAD_STD
     start.freeze(config, model, theta)
     seen = sensors(config, model, dt, np.zeros(m.x.size))
     information = np.zeros((m.x.size, m.x.size))

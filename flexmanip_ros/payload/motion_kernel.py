@@ -1,7 +1,8 @@
 """Compiled motion of the structured filter: the arm's equations carry the mean, their Jacobian the spread.
 
-The state is [q (n), qd (n), parameters (5)], parameters = [payload, ln stiffness factor 1, 2, damping
-ratio 1, 2]. The spread is a square root S (nx, nx), covariance = S S'; it moves as S <- F S.
+The state is [q (n), qd (n), parameters (6)], parameters = [payload, ln stiffness factor 1, 2, damping
+ratio 1, 2, ln rotary inertia]. The spread is a square root S (nx, nx), covariance = S S'; it moves as
+S <- F S.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from flexmanip_ros.types import Array
 if TYPE_CHECKING:
     from flexmanip_ros.plant.manipulator import Manipulator, Workspace
 
-PARAMETERS = 5
-"""Payload, two stiffness factors (logarithm), two damping ratios."""
+PARAMETERS = 6
+"""Payload, two stiffness factors (logarithm), two damping ratios, rotary inertia (logarithm)."""
 
 
 class Motion(NamedTuple):
@@ -33,10 +34,14 @@ class Motion(NamedTuple):
     """(n, n) mass matrix of the empty arm at the working point, used when frozen."""
     Mp: Array
     """(n, n) its derivative by the payload."""
+    Mi: Array
+    """(n, n) its derivative by the payload's rotary inertia."""
     stiffness: Array
     """(n,) nominal K."""
     damping: Array
     """(n,) D at a damping ratio of one."""
+    inertia: float
+    """Rotary inertia [kg m^2] of state zero; 0: a point mass."""
     scale: float
     """Payload [kg] of state zero when something is held."""
     least: float
@@ -69,6 +74,9 @@ def set_parameters(motion: Motion, x: Array, held: bool) -> None:
     n = motion.q.size
     k = (n - 2) // 2
     motion.payload[0] = payload_mass(motion, x[2 * n], held)
+    motion.payload[1] = 0.0
+    if held and motion.inertia > 0.0:
+        motion.payload[1] = motion.inertia * np.exp(min(x[2 * n + 5], 12.0))
     for link in range(2):
         factor_EI = np.exp(x[2 * n + 1 + link])
         ratio = x[2 * n + 3 + link]
@@ -86,7 +94,8 @@ def accelerate(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array) -
     n = q.size
     for r in range(n):
         for c in range(r + 1):
-            M[r, c] = motion.M0[r, c] + motion.payload[0] * motion.Mp[r, c]
+            M[r, c] = motion.M0[r, c]
+            M[r, c] += motion.payload[0] * motion.Mp[r, c] + motion.payload[1] * motion.Mi[r, c]
     if not factor(M):
         return False
     for r in range(n):
@@ -98,26 +107,27 @@ def accelerate(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array) -
 
 @kernel
 def linearize(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array, held: bool) -> bool:
-    """Fill qdd and its derivatives: motion.dq, motion.dqd (n, n) and motion.G (n, 5) by the parameters."""
+    """Fill qdd and its derivatives: motion.dq, motion.dqd (n, n) and motion.G (n, 6) by the parameters."""
     n = q.size
     k = (n - 2) // 2
     arm, M, a, G = motion.arm, motion.work.M, motion.a, motion.G
     if motion.frozen:
         if not accelerate(motion, q, qd, effort, qdd):
             return False
-        for c in range(n + 1):
+        for c in range(n + 2):
             for r in range(n):
                 a[r] = 0.0
-            if c == n:
+            if c >= n:
+                share = motion.Mp if c == n else motion.Mi
                 for r in range(n):
                     for j in range(n):
-                        a[r] -= motion.Mp[max(r, j), min(r, j)] * qdd[j]
+                        a[r] -= share[r, j] * qdd[j]
             else:
                 a[c] = -arm.stiffness[c]
             solve(M, a)
             for r in range(n):
-                if c == n:
-                    motion.dp[r, 0] = a[r]
+                if c >= n:
+                    motion.dp[r, c - n] = a[r]
                 else:
                     motion.dq[r, c] = a[r]
                     bends = arm.stiffness[c] > 0.0
@@ -128,6 +138,7 @@ def linearize(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array, he
     rate = motion.payload[0] if held else 1.0
     for r in range(n):
         G[r, 0] = motion.dp[r, 0] * rate
+        G[r, 5] = motion.dp[r, 1] * motion.payload[1]
     for link in range(2):
         for part in range(2):
             for r in range(n):

@@ -13,7 +13,7 @@ import numpy as np
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import memory as mem
 from flexmanip_ros.payload import structured_start as start
-from flexmanip_ros.payload.motion_kernel import predict
+from flexmanip_ros.payload.motion_kernel import PARAMETERS, predict
 from flexmanip_ros.payload.structured_judgement import judge
 from flexmanip_ros.payload.structured_kernel import Sensors
 from flexmanip_ros.payload.structured_kernel import advance as run
@@ -99,19 +99,20 @@ def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
 
 def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: EventKind) -> float:
     """Reopen what an event changes: the rates, and what is held. Returns the payload let go [kg]."""
-    payload = m.x.size - 5
+    payload = m.x.size - PARAMETERS
     held = bool(m.counts[mem.HELD])
     before = float(model.motion.scale * np.exp(min(m.x[payload], 12.0))) if held else 0.0
     columns = start.jump(config, model, m)
-    opened = np.zeros((m.x.size, 1))
+    opened = np.zeros((m.x.size, 2))
     if kind is EventKind.CAPTURE:
         if not held:
             _forget_payload(m)  # the arm was empty: what it seemed to hold were its errors
-        opened[payload] = start.PAYLOAD_STD
+        opened[payload, 0] = start.PAYLOAD_STD
+        opened[-1, 1] = start.PAYLOAD_STD if config.payload.rotary_inertia else 0.0
         m.counts[mem.HELD] = 1
     else:
         _forget_payload(m)
-        opened[payload] = start.EMPTY_STD * model.motion.scale + 0.3 * before
+        opened[payload, 0] = start.EMPTY_STD * model.motion.scale + 0.3 * before
         m.counts[mem.HELD] = 0
     m.S[:] = start.widen(m.S, np.hstack([columns, opened]))
     _anchor(m)
@@ -120,7 +121,7 @@ def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: Eve
 
 def _forget_payload(m: mem.Memory) -> None:
     """Condition an empty arm on holding exactly nothing; drop what is known of a payload that is let go."""
-    payload = m.x.size - 5
+    payload = m.x.size - PARAMETERS
     if not m.counts[mem.HELD]:
         f = m.S[payload].copy()
         square = float(f @ f)
@@ -130,8 +131,9 @@ def _forget_payload(m: mem.Memory) -> None:
             gain = m.S @ f / square
             m.x[:] -= gain * m.x[payload]
             m.S[:] -= np.outer(gain, f)
-    m.x[payload] = 0.0
-    m.S[payload] = 0.0
+    for gone in (payload, m.x.size - 1):
+        m.x[gone] = 0.0
+        m.S[gone] = 0.0
 
 
 def _anchor(m: mem.Memory) -> None:
@@ -157,7 +159,7 @@ def _begin(config: IdentifierParameters, state: StructuredState) -> StructuredSt
     Y = measurements(model, samples)
     steps = np.diff([sample.stamp_ns for sample in samples]) * 1e-9
     dt = float(np.median(steps))
-    m = mem.memory(2 * model.motion.q.size + 5, len(model.roles))
+    m = mem.memory(2 * model.motion.q.size + PARAMETERS, len(model.roles))
     m.noise[:] = start.noise(model, Y)
     start.first(config, model, m, Y[0])
     start.freeze(config, model, np.mean([sample.angles for sample in samples], axis=0))

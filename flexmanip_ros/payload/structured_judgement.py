@@ -8,6 +8,7 @@ import numpy as np
 
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import memory as mem
+from flexmanip_ros.payload.motion_kernel import PARAMETERS
 from flexmanip_ros.payload.signals import Quantity
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import Payload, Status
@@ -16,6 +17,8 @@ QUANTILE = 1.959963984540054
 """Of the normal distribution, for 95 %."""
 UNKNOWN_STD = 0.5
 """A payload whose logarithm is less certain than this is not known."""
+VAGUE_STD = 0.2
+"""A rotary inertia whose logarithm is less certain than this is not told."""
 FEW = 50
 """Samples after an event before anything is claimed."""
 POWER_LIMIT = 2.0
@@ -34,12 +37,13 @@ def judge(config: IdentifierParameters, model: Model | None, m: mem.Memory | Non
         return Payload(0.0, math.inf, 0.0, math.inf, 1.0, Status.UNOBSERVABLE)
     if m is None:
         return Payload(0.0, math.inf, 0.0, math.inf, 1.0, Status.WARMING_UP)
-    state = m.x.size - 5
+    state = m.x.size - PARAMETERS
     scale = model.motion.scale
     held = bool(m.counts[mem.HELD])
-    widening = math.sqrt(drift(m)) * max(1.0, abs(float(m.score[mem.SEEMED])) / SEEMED_FREE)
-    std = widening * float(np.sqrt(m.S[state] @ m.S[state]))
     consistency = misfit(model, m)
+    widening = math.sqrt(drift(m)) * max(1.0, abs(float(m.score[mem.SEEMED])) / SEEMED_FREE)
+    widening *= math.sqrt(max(1.0, consistency / POWER_LIMIT))
+    std = widening * float(np.sqrt(m.S[state] @ m.S[state]))
     status = Status.TRACKING
     if consistency > POWER_LIMIT or widening > WIDENING_LIMIT:
         status = Status.INCONSISTENT
@@ -56,7 +60,25 @@ def judge(config: IdentifierParameters, model: Model | None, m: mem.Memory | Non
         status = Status.POORLY_EXCITED
     lower = max(0.0, mass * (1.0 - QUANTILE * std))
     upper = mass * math.exp(min(QUANTILE * std, 20.0))
-    return Payload(mass, mass * std, lower, upper, consistency, status)
+    inertia, status = rotary(model, m, widening, status)
+    return Payload(mass, mass * std, lower, upper, consistency, status, inertia=inertia)
+
+
+def rotary(
+    model: Model, m: mem.Memory, widening: float, status: Status,
+) -> tuple[tuple[float, float, float, float, float, float], Status]:
+    """Return the payload's inertia about its centre of mass, refused with a status where it is not known.
+
+    A planar arm feels the turning about z alone; the rest stays zero.
+    """
+    nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if model.motion.inertia == 0.0:
+        return nothing, status
+    std = widening * float(np.sqrt(m.S[-1] @ m.S[-1]))
+    if std > VAGUE_STD:
+        return nothing, Status.POORLY_EXCITED if status is Status.TRACKING else status
+    about_z = float(model.motion.inertia * np.exp(min(m.x[-1], 12.0)))
+    return (0.0, 0.0, 0.0, 0.0, 0.0, about_z), status
 
 
 def empty(seeming: float, std: float, consistency: float, status: Status) -> Payload:

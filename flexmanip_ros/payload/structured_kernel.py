@@ -39,7 +39,7 @@ from flexmanip_ros.payload.memory import (
     WEIGHT,
     WHITE,
 )
-from flexmanip_ros.payload.motion_kernel import predict
+from flexmanip_ros.payload.motion_kernel import PARAMETERS, predict
 from flexmanip_ros.payload.square_root_kernel import (
     absorb_measurement,
     absorb_noise,
@@ -91,7 +91,7 @@ class Sensors(NamedTuple):
 @kernel
 def measure(motion: Motion, sensors: Sensors, m: Memory, effort: Array, y: Array) -> None:
     """Update the filter with one sample and gather what its innovations say of noise and payload."""
-    payload = m.x.size - 5
+    payload = m.x.size - PARAMETERS
     x, S, f = m.x, m.S, sensors.f
     n = motion.q.size
     for i in range(y.size):
@@ -217,7 +217,7 @@ def pass_sample(motion: Motion, sensors: Sensors, m: Memory) -> bool:
 def finish_pass(m: Memory) -> bool:
     """Step to the minimum, and hand state and spread at the last sample to the filter."""
     nx = m.x.size
-    payload = nx - 5
+    payload = nx - PARAMETERS
     if not factor_information(m.N):
         return False
     for i in range(nx):
@@ -292,7 +292,7 @@ def take(motion: Motion, sensors: Sensors, m: Memory, duration: float, effort: A
     if not predict(motion, m.x, m.S, effort, duration, m.counts[HELD] != 0):
         return False
     measure(motion, sensors, m, effort, y)
-    if not abs(m.x[m.x.size - 5]) < 1e9:
+    if not abs(m.x[m.x.size - PARAMETERS]) < 1e9:
         return False
     m.counts[SINCE_EVENT] += 1
     learn_noise(sensors, m)

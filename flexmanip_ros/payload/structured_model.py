@@ -56,10 +56,13 @@ def motion(config: IdentifierParameters) -> Motion:
     unit = manipulator(replace(config.arm, damping_ratio=0.5)).damping / 0.5
     arm = nominal._replace(stiffness=nominal.stiffness.copy(), damping=nominal.damping.copy())
     lightest = config.arm.tip_mass + config.arm.linear_density[1] * config.arm.link_length[1] / 3
+    rotary = lightest if config.payload.rotary_inertia else 0.0
     fastest = max(pinned_frequencies(config.arm)) * 2 * np.pi * (nominal.kappa + 0.25) ** 2
     return Motion(
         arm=arm, work=workspace(nominal.kappa), frozen=config.payload.dynamics == 'linear',
-        M0=np.zeros((n, n)), Mp=np.zeros((n, n)), stiffness=nominal.stiffness, damping=unit,
+        M0=np.zeros((n, n)), Mp=np.zeros((n, n)), Mi=np.zeros((n, n)), stiffness=nominal.stiffness,
+        damping=unit,
+        inertia=rotary * (0.1 * config.arm.link_length[1]) ** 2,
         scale=lightest, least=-0.5 * lightest, substeps=STEP_ANGLE / fastest, payload=np.zeros(4),
         a=np.zeros(n), q=np.zeros(n), k=np.zeros((8, n)), dq=np.zeros((n, n)), dqd=np.zeros((n, n)),
         dp=np.zeros((n, 4)),

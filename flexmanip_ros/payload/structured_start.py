@@ -59,7 +59,7 @@ def first(config: IdentifierParameters, model: Model, m: mem.Memory, y: Array) -
             shape = model.motion.arm.output[2 + role.link, 2 + role.link * k]
             m.x[2 + role.link * k] = y[i] * shape / (shape ** 2 + 0.1)
     m.x[:2] = chords(config.arm, angles)
-    m.x[2 * n + 3:] = config.arm.damping_ratio
+    m.x[2 * n + 3:2 * n + 5] = config.arm.damping_ratio
     std = np.zeros(m.x.size)
     std[:2], std[n:n + 2] = ANGLE_STD, RATE_STD
     for link, (L, EI, rho) in enumerate(zip(config.arm.link_length, config.arm.bending_stiffness,
@@ -71,7 +71,7 @@ def first(config: IdentifierParameters, model: Model, m: mem.Memory, y: Array) -
         std[n + part.start:n + part.stop] = BEND_STD * L * (np.pi / L) ** 2 * np.sqrt(EI / rho)
     std[2 * n] = EMPTY_STD * model.motion.scale
     std[2 * n + 1:2 * n + 3] = max(config.payload.stiffness_std, CERTAIN)
-    std[2 * n + 3:] = max(config.payload.damping_std, CERTAIN)
+    std[2 * n + 3:2 * n + 5] = max(config.payload.damping_std, CERTAIN)
     m.S[:] = np.diag(std)
 
 
@@ -82,6 +82,7 @@ def freeze(config: IdentifierParameters, model: Model, angles: Array) -> None:
     nominal = model.motion.arm
     model.motion.M0[:] = mass_matrix(nominal, np.zeros(4), rest)
     model.motion.Mp[:] = mass_matrix(nominal, np.array([1.0, 0.0, 0.0, 0.0]), rest) - model.motion.M0
+    model.motion.Mi[:] = mass_matrix(nominal, np.array([0.0, 1.0, 0.0, 0.0]), rest) - model.motion.M0
 
 
 def widen(S: Array, columns: Array) -> Array:
@@ -97,7 +98,8 @@ def jump(config: IdentifierParameters, model: Model, m: mem.Memory) -> Array:
     set_parameters(model.motion, m.x, held)
     q = m.x[:n]
     if model.motion.frozen:
-        M = model.motion.M0 + model.motion.payload[0] * model.motion.Mp
+        M = (model.motion.M0 + model.motion.payload[0] * model.motion.Mp
+             + model.motion.payload[1] * model.motion.Mi)
         q = np.concatenate([q[:2], np.zeros(n - 2)])
     else:
         M = mass_matrix(model.motion.arm, model.motion.payload, q)
@@ -122,5 +124,6 @@ def diffusion(config: IdentifierParameters, model: Model, m: mem.Memory) -> Arra
     gained[n:n + 2] = 1e-4 / T
     gained[n + 2:2 * n] = 1e-5 / T * np.array(config.arm.link_length).max()
     gained[2 * n] = (1e-4 if m.counts[mem.HELD] else 1e-3) / T
-    gained[2 * n + 1:] = 1e-4 / T
+    gained[2 * n + 1:2 * n + 5] = 1e-4 / T
+    gained[2 * n + 5] = 1e-3 / T if config.payload.rotary_inertia else 0.0
     return gained

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from recording import ARM, BENDS, RATES, config, event, record
 
+from flexmanip_ros.parameters import PayloadParameters
 from flexmanip_ros.payload import structured
 from flexmanip_ros.types import EventKind, Status
 
@@ -194,3 +195,22 @@ def test_rates_alone_are_enough_with_the_angles(caught):
     found = structured.estimate(config(outputs=RATES), run(config(outputs=RATES), samples, (event(1.5),)))
     assert abs(found.mass - 20.0) < 4 * found.std
     assert found.mass == pytest.approx(20.0, rel=0.02)
+
+
+def test_rotary_inertia_is_estimated_where_asked_and_an_unmodelled_one_found_out():
+    samples = record(3.0, (event(1.5),), payload=40.0, payload_inertia=2.0)
+    asked = config(payload=PayloadParameters(rotary_inertia=True))
+    found = structured.estimate(asked, run(asked, samples, (event(1.5),)))
+    assert found.mass == pytest.approx(40.0, rel=0.01)
+    assert found.inertia[5] == pytest.approx(2.0, rel=0.02)
+    blind = structured.estimate(config(), run(config(), samples, (event(1.5),)))
+    assert blind.status is Status.INCONSISTENT
+    assert blind.lower < 40.0 < blind.upper
+
+
+def test_rotary_inertia_is_refused_where_the_signals_do_not_tell_it():
+    asked = config(payload=PayloadParameters(rotary_inertia=True))
+    samples = record(2.0, (event(1.5),), payload=40.0, payload_inertia=0.001, scale=0.0, noise='std')
+    found = structured.estimate(asked, run(asked, samples, (event(1.5),)))
+    assert found.inertia == (0.0,) * 6
+    assert found.status is not Status.TRACKING
