@@ -49,6 +49,24 @@ def sweeps(R: np.ndarray, rows: np.ndarray, root: float) -> None:
         rotate(R, row, 0, R.shape[1], root)
 
 
+WARM_UP = 4096
+"""Samples before the clock starts: the fits of the first stretch are over."""
+
+
+def motion(r: int, m: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Random steps of the inputs (N, r) and the noisy response (N, m) of a lightly damped system, order 4."""
+    rng = np.random.default_rng(0)
+    blocks = [0.999 * np.array([[np.cos(w), np.sin(w)], [-np.sin(w), np.cos(w)]]) for w in (0.036, 0.043)]
+    A = np.block([[blocks[0], np.zeros((2, 2))], [np.zeros((2, 2)), blocks[1]]])
+    B, C = rng.standard_normal((4, r)), np.vstack([np.eye(4), rng.standard_normal((4, 4))])[:m]
+    u = rng.standard_normal((count // 100 + 1, r)).repeat(100, axis=0)[:count]
+    x, y = np.zeros(4), np.empty((count, m))
+    for k in range(count):
+        y[k] = C @ x
+        x = A @ x + B @ u[k]
+    return u, y + 0.01 * np.std(y, axis=0) * rng.standard_normal(y.shape)
+
+
 def best(work, count: int, repeats: int = 7) -> float:  # type: ignore[no-untyped-def]
     """Shortest time of one sample [us]."""
     times = []
@@ -61,12 +79,12 @@ def best(work, count: int, repeats: int = 7) -> float:  # type: ignore[no-untype
 
 def identifier(p: int, r: int, m: int, count: int, publish: int = 0, **values: object) -> float:
     """Time of one sample [us]; publish: a model every so many samples."""
-    rng = np.random.default_rng(0)
     config = configure(IdentifierParameters, {
         'inputs': [f'in{i}/effort' for i in range(r)], 'outputs': [f'out{i}/position' for i in range(m)],
-        'order': min(4, 5 * m), 'past_window': p, 'future_window': 5, **values})
-    u, y = rng.standard_normal((count, r)), rng.standard_normal((count, m))
-    start = rpbsid.advance(config, rpbsid.init(config), u[:4 * p], y[:4 * p])
+        'order': 4, 'past_window': p, 'future_window': 5, **values})
+    u, y = motion(r, m, count + WARM_UP)
+    start = rpbsid.advance(config, rpbsid.init(config), u[:WARM_UP], y[:WARM_UP])
+    u, y = u[WARM_UP:], y[WARM_UP:]
 
     def work() -> None:
         state = start
@@ -91,6 +109,7 @@ def main() -> None:
             lambda: bare_update(P, rows[:, :60], np.empty(60), 0.999), count),
         'least-squares step, 60 regressors, 4 outputs': best(
             lambda: sweeps(R60, np.ascontiguousarray(rows[:, :64]), 0.999), count),
+        'identifier, update, no refinement': identifier(10, 2, 4, count, refinement='none'),
         'identifier, update': identifier(10, 2, 4, count),
         'identifier, update and a model every 20 samples': identifier(10, 2, 4, 4000, publish=20),
         "paper's recursion, update": identifier(10, 2, 4, count // 4, estimator='paper'),
@@ -102,7 +121,7 @@ def main() -> None:
     if 'short' not in sys.argv:
         for p in (10, 20, 50, 100):
             for m in (1, 2, 4, 8):
-                value = identifier(p, 2, m, max(200, 40000 // p))
+                value = identifier(p, 2, m, max(200, 40000 // p), refinement='none')
                 growth.append({'past_window': p, 'outputs': m, 'us': value})
                 print(f'p = {p:<4} m = {m:<3}{value:10.2f} us', flush=True)
     target = Path(__file__).parent / 'results' / 'identification_speed.json'

@@ -108,15 +108,20 @@ def directions(theta: Theta, structure: Structure) -> Array:
     return both
 
 
+def run(U: Array, Y: Array, theta: Theta) -> tuple[Array, Array]:
+    """Innovation covariance (m, m) over the stretch, and the state (n,) after it."""
+    m = Y.shape[1]
+    moments, end = np.zeros((m, m)), theta.x.copy()
+    residual_moments(U, Y, *theta[:5], end, moments)
+    covariance = moments / len(U)
+    return covariance + 1e-14 * max(np.trace(covariance), 1e-300) * np.eye(m), end
+
+
 def score(U: Array, Y: Array, theta: Theta) -> tuple[float, Array]:
     """Log det of the innovation covariance (infinite when the predictor runs away), and the covariance."""
-    m = Y.shape[1]
-    moments = np.zeros((m, m))
-    residual_moments(U, Y, *theta[:5], theta.x.copy(), moments)
-    if not np.all(np.isfinite(moments)):
-        return np.inf, moments
-    covariance = moments / len(U)
-    covariance += 1e-14 * max(np.trace(covariance), 1e-300) * np.eye(m)
+    covariance, _ = run(U, Y, theta)
+    if not np.all(np.isfinite(covariance)):
+        return np.inf, covariance
     return float(np.linalg.slogdet(covariance)[1]), covariance
 
 

@@ -23,7 +23,7 @@ from flexmanip_ros.identification.prediction_error import (
     descend,
     directions,
     moved,
-    score,
+    run,
 )
 from flexmanip_ros.types import Array
 
@@ -54,7 +54,7 @@ class Recursion(NamedTuple):
     scale: (r + m,) of its signals; root: (k, k) S with S S' the covariance of the coordinates P (d, k) and
     the state; covariance: (m, m) of the innovations, worth ``weight`` samples; widening: factor on standard
     deviations from the scatter of the gradients; gain: (n, m) published K, theta's own unless that is held;
-    singular_values, condition: of the subspace model the fit began with.
+    singular_values, condition: of the subspace model the fit began with; lost: the state is unknown.
     """
 
     theta: Theta
@@ -69,6 +69,7 @@ class Recursion(NamedTuple):
     gain: Array
     singular_values: Array
     condition: float
+    lost: bool = False
 
 
 class Refined(NamedTuple):
@@ -292,7 +293,8 @@ def update(refined: Refined) -> Refined:
     k = old.root.shape[0]
     kept = old.root * np.sqrt(1.0 + len(U) / MEMORY)
     zeta, theta = np.zeros(k), old.theta
-    for _ in range(2):
+    arrival = np.zeros((0, k))
+    for _ in range(2 if old.lost else 1):  # a state that was lost makes the first derivatives poor
         information, gradient, _, arrival, _ = derivatives(U, Y, theta, old.structure, old.covariance, old.P)
         H = kept.T @ information @ kept
         if not np.all(np.isfinite(H)):
@@ -301,17 +303,16 @@ def update(refined: Refined) -> Refined:
         values = 1.0 + np.maximum(values, 0.0)
         zeta = zeta + vectors @ ((vectors.T @ (kept.T @ gradient - zeta)) / values)
         theta = moved(old.theta, old.P @ (kept @ zeta), old.structure)
-    _, covariance = score(U, Y, theta)
+    covariance, end = run(U, Y, theta)
     power = float(np.trace(np.linalg.solve(old.covariance, covariance))) / Y.shape[1]
     strikes = old.strikes + 1 if not power < MISFIT else 0
     if strikes >= 2 or not np.isfinite(power):
         return give_up(refined)
     root = kept @ (vectors / np.sqrt(values))
-    _, _, _, arrival, end = derivatives(U, Y, theta, old.structure, old.covariance, old.P)
     share = len(U) / (old.weight + len(U))
     recursion = old._replace(
         theta=theta._replace(x=end), root=_arrive(root, arrival), strikes=strikes,
-        gain=theta.K if old.structure.free_gain else old.gain,
+        gain=theta.K if old.structure.free_gain else old.gain, lost=False,
         covariance=(1.0 - share) * old.covariance + share * covariance,
         weight=min(old.weight + len(U), MEMORY))
     return refined._replace(chunks=refined.chunks if refined.batch else (), recursion=recursion)
@@ -329,4 +330,4 @@ def break_window(refined: Refined) -> Refined:
     root[:k - n, :k - n] = triangle(old.root[:k - n].T).T[:, :k - n]
     root[k - n:, k - n:] = 10.0 * np.eye(n)  # signals are at unit power
     theta = old.theta._replace(x=np.zeros(n))
-    return fresh._replace(batch=False, recursion=old._replace(theta=theta, root=root))
+    return fresh._replace(batch=False, recursion=old._replace(theta=theta, root=root, lost=True))
