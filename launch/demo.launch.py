@@ -51,6 +51,6 @@ def generate_launch_description():
         _node('capture_trigger', {
             'mode': 'time', 'capture_time': _number('capture_time'),
             'release_time': _number('release_time')}),
-        _node('excitation', {'rate': _number('rate')}),
+        _node('excitation', {'rate': _number('rate'), 'clock': 'joint_states'}),
         _node('plant_simulator', {'rate': _number('rate'), 'payload_mass': _number('payload_mass')}),
     ])

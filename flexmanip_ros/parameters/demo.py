@@ -44,7 +44,7 @@ def settings(config: DemoParameters) -> dict[str, dict[str, Any]]:
     return {
         'plant_simulator': {'rate': config.rate, 'payload_mass': config.payload_mass,
                             'snr_db': config.snr_db, 'seed': config.seed},
-        'excitation': {'rate': config.rate},
+        'excitation': {'rate': config.rate, 'clock': 'joint_states'},
         'capture_trigger': {'mode': 'time', 'capture_time': config.capture_time,
                             'release_time': config.release_time},
         'rpbsid_identifier': dict(IDENTIFIER),

@@ -26,8 +26,8 @@ from flexmanip_ros.ros.recorder import Recorder
 from flexmanip_ros.ros.rpbsid_identifier import RpbsidIdentifier
 from flexmanip_ros.ros.spin import make_executor
 
-READERS = 3
-"""Who reads joint_states here: identifier, trigger, recorder."""
+READERS = 4
+"""Who reads joint_states here: identifier, trigger, excitation, recorder."""
 DISCOVERY_TIMEOUT = 20.0
 DRAIN_TIMEOUT = 30.0
 """A busy machine works off its backlog; an idle one needs milliseconds."""

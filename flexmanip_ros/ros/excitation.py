@@ -1,10 +1,11 @@
 """Node ``excitation``: a torque source that makes the arm tell what it carries.
 
-publishes  effort_controller/commands  std_msgs/Float64MultiArray  one torque per joint [N m], at `rate`
-           /diagnostics                diagnostic_msgs/DiagnosticArray  1 Hz
+subscribes  joint_states                sensor_msgs/JointState  only with `clock: joint_states`
+publishes   effort_controller/commands  std_msgs/Float64MultiArray  one torque per joint [N m], at `rate`
+            /diagnostics                diagnostic_msgs/DiagnosticArray  1 Hz
 
-Sample k of the torque belongs k / rate seconds after activation. When the node is deactivated or stopped it
-sends zero torque once.
+Sample k of the torque belongs k / rate seconds after activation, or after the first joint state (`clock`).
+When the node is deactivated or stopped it sends zero torque once.
 """
 
 from __future__ import annotations
@@ -14,8 +15,11 @@ import sys
 import numpy as np
 from rclpy.context import Context
 from rclpy.parameter import Parameter
+from rclpy.timer import Timer
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from flexmanip_ros.io import cdr
 from flexmanip_ros.parameters import ExcitationParameters
 from flexmanip_ros.plant import excitation, excitation_design
 from flexmanip_ros.ros import qos
@@ -38,15 +42,20 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
                          namespace=namespace, cli_args=cli_args)
         self._meter = Meter()
         self._last = -1
+        self._first_ns: int | None = None
         self.skipped = 0
 
     def make_entities(self) -> None:
-        """Publisher and timer."""
+        """Publisher, and the timer or the subscription that sets the pace."""
         self.commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.command())
         self._message = Float64MultiArray()
         self._grid = SampleGrid(self, self.config.rate)
-        self._timer = self.create_timer(1.0 / self.config.rate, self._tick, clock=self._grid.clock)
-        self._timer.cancel()
+        self._timer: Timer | None = None
+        if self.config.clock == 'joint_states':
+            self.subscription(JointState, 'joint_states', self._on_joint_states, qos.sensor_input(), raw=True)
+        else:
+            self._timer = self.create_timer(1.0 / self.config.rate, self._tick, clock=self._grid.clock)
+            self._timer.cancel()
 
     def start(self) -> None:
         """Compute one sample, so that nothing is late later; say what a designed torque will tell."""
@@ -56,13 +65,15 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
 
     def activated(self) -> None:
         """Sample 0 is now."""
-        self._last = -1
-        self._grid.begin()
-        self._timer.reset()
+        self._last, self._first_ns = -1, None
+        if self._timer is not None:
+            self._grid.begin()
+            self._timer.reset()
 
     def deactivated(self) -> None:
         """Leave the arm without torque."""
-        self._timer.cancel()
+        if self._timer is not None:
+            self._timer.cancel()
         self._grid.stop()
         self._send(np.zeros(2))
 
@@ -74,11 +85,28 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
             if latest < 0:  # simulated time went back
                 self._grid.begin()
                 self._last, latest = -1, 0
-            if latest == self._last:
+            self._instant(latest)
+
+    def _on_joint_states(self, raw: bytes) -> None:
+        """Send the torque that the arm needs at the sample after this one."""
+        if not self.active:
+            return
+        with self._meter:
+            try:
+                stamp = cdr.stamp_ns(raw)
+            except cdr.CdrError:
+                self.complain('encoding', 'a JointState of another encoding than CDR was dropped')
                 return
-            self.skipped += max(latest - self._last - 1, 0)
-            self._last = latest
-            self._send(excitation.torque(self.config, latest))
+            if self._first_ns is None or stamp < self._first_ns:
+                self._first_ns, self._last = stamp, -1
+            self._instant(round((stamp - self._first_ns) * 1e-9 * self.config.rate) + 1)
+
+    def _instant(self, latest: int) -> None:
+        if latest == self._last:
+            return
+        self.skipped += max(latest - self._last - 1, 0)
+        self._last = latest
+        self._send(excitation.torque(self.config, latest))
 
     def _send(self, torque: Array) -> None:
         self._message.data = doubles(torque)

@@ -34,8 +34,8 @@ from flexmanip_ros.ros.spin import run
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 NAME = 'plant_simulator'
-CATCH_UP = 100
-"""Samples made in one run of the timer at most, so that commands and services get their turn."""
+CATCH_UP = 5
+"""Samples made in one run of the timer at most, so that commands get their turn between them."""
 
 
 class PlantSimulator(FlexmanipNode[PlantParameters]):

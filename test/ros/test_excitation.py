@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import numpy as np
+from joint_states import joint_state
 from rclpy.parameter import Parameter
 from ros_harness import Ros, overrides
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros.plant.excitation import torque
@@ -43,3 +45,16 @@ def test_nothing_is_sent_before_it_is_active(ros: Ros) -> None:
     ros.wait(lambda: node.commands.get_subscription_count() == 1)
     node._tick()
     assert heard == []
+
+
+def test_torques_keep_in_step_with_the_stamps_of_the_arm_whenever_they_come(ros: Ros) -> None:
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands', qos.sensor_output())
+    node = ros.managed(Excitation(context=ros.context, overrides=overrides(
+        clock='joint_states', period=[0.02, 0.01])))
+    ros.wait(lambda: node.commands.get_subscription_count() == 1)
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    for k in range(100):
+        states.publish(joint_state(k))
+    ros.wait(lambda: len(heard) == 100)
+    for k, message in enumerate(heard):
+        assert message.data.tolist() == torque(node.config, k + 1).tolist()

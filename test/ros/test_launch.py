@@ -1,0 +1,100 @@
+"""The launch files against the package: executables, parameters, arguments. `launch` itself is not on PyPI."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flexmanip_ros.parameters import leaves
+from flexmanip_ros.parameters.document import NODES
+
+ROOT = Path(__file__).resolve().parents[2]
+FILES = sorted((ROOT / 'launch').glob('*.launch.py'))
+
+
+class Call:
+    """Stands for any class of the launch packages and keeps what it was made with."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.args, self.kwargs = args, kwargs
+
+
+class Node(Call):
+    """A launched node."""
+
+
+class DeclareLaunchArgument(Call):
+    """An argument that is declared."""
+
+
+class LaunchConfiguration(Call):
+    """An argument that is used."""
+
+
+@pytest.fixture
+def described(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Return what a launch file describes."""
+    classes = {
+        'launch': ['LaunchDescription'], 'launch.actions': ['DeclareLaunchArgument'],
+        'launch.conditions': ['IfCondition'], 'launch.substitutions': ['LaunchConfiguration'],
+        'launch_ros': [], 'launch_ros.actions': ['Node'],
+        'launch_ros.parameter_descriptions': ['ParameterFile', 'ParameterValue'],
+        'ament_index_python': [], 'ament_index_python.packages': [],
+    }
+    known = {'Node': Node, 'DeclareLaunchArgument': DeclareLaunchArgument,
+             'LaunchConfiguration': LaunchConfiguration}
+    for name, members in classes.items():
+        module: Any = types.ModuleType(name)
+        for member in members:
+            setattr(module, member, known.get(member, Call))
+        monkeypatch.setitem(sys.modules, name, module)
+    packages: Any = sys.modules['ament_index_python.packages']
+    packages.get_package_share_directory = lambda package: str(ROOT)
+    return list(runpy.run_path(str(request.param))['generate_launch_description']().args[0])
+
+
+def everything(value: Any) -> list[Any]:
+    """Return a value and all that is inside it."""
+    if isinstance(value, Call):
+        return [value, *everything(value.args), *everything(list(value.kwargs.values()))]
+    if isinstance(value, dict):
+        return everything(list(value.values()))
+    if isinstance(value, (list, tuple)):
+        return [item for part in value for item in everything(part)]
+    return [value]
+
+
+@pytest.mark.parametrize('described', FILES, indirect=True, ids=lambda path: path.name)
+def test_every_node_and_parameter_is_of_the_package(described: list[Any]) -> None:
+    nodes = [item for item in described if isinstance(item, Node)]
+    assert nodes
+    for node in nodes:
+        assert node.kwargs['package'] == 'flexmanip_ros'
+        declared = {leaf.name: leaf for leaf in leaves(NODES[node.kwargs['executable']])}
+        for group in node.kwargs['parameters']:
+            for name, value in (group.items() if isinstance(group, dict) else ()):
+                if name == 'use_sim_time':
+                    continue
+                assert name in declared
+                wanted = list if declared[name].is_array else declared[name].kind
+                assert isinstance(value, Call) or isinstance(value, wanted)
+                if isinstance(value, Call):
+                    assert value.kwargs['value_type'] is wanted
+
+
+@pytest.mark.parametrize('described', FILES, indirect=True, ids=lambda path: path.name)
+def test_every_argument_is_declared_described_and_used(described: list[Any]) -> None:
+    arguments = [item for item in described if isinstance(item, DeclareLaunchArgument)]
+    names = {item.args[0] for item in arguments}
+    used = {item.args[0] for item in everything(described) if isinstance(item, LaunchConfiguration)}
+    assert names == used
+    assert all(item.kwargs['description'] for item in arguments)
+
+
+def test_the_shared_parameter_file_is_there() -> None:
+    assert (ROOT / 'config' / 'rpbsid_identifier.yaml').is_file()
