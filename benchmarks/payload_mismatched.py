@@ -1,6 +1,6 @@
 """Claim: on arms that are not the model `structured` stays within the targets, and its 95 % intervals cover.
 
-Independent rigid-rod chains (28 hinges a link) on other arms, payloads and motions; the two recorded physics
+Independent rigid-rod chains (22 hinges a link) on other arms, payloads and motions; the two recorded physics
 bags (skipped where absent); joints that turn 30 degrees at 30 dB; finite elements at 45/0 degrees; stiffness
 3 % wrong in the parameters after 2 s of empty motion. kappa = 3; errors and coverage 1 and 3 s after capture.
 
@@ -58,7 +58,7 @@ def chain_trials(
     snr_db: float, factors: tuple[float, float], runs: int,
 ) -> list[trials.Trial]:
     """Follow a capture 2 s into the run of a chain."""
-    record = Chain(arm, 28).simulate(np.radians(degrees), torque, 5000, {2000: payload})
+    record = Chain(arm, 22).simulate(np.radians(degrees), torque, 5000, {2000: payload})
     stiffness = tuple(EI * factor for EI, factor in zip(arm.bending_stiffness, factors, strict=True))
     config = trials.configuration(replace(arm, bending_stiffness=stiffness))
     done = []
