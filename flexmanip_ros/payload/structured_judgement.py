@@ -23,7 +23,7 @@ FEW = 50
 """Samples after an event before anything is claimed."""
 POWER_LIMIT = 2.0
 """Innovation power over white noise beyond which the model does not fit."""
-WIDENING_LIMIT = 2.5
+WIDENING_LIMIT = 4.0
 """Factor on the standard deviation beyond which the model does not fit."""
 SEEMED_FREE = 2.0
 """Standard deviations that an empty arm may seem to hold without a doubt of the model."""
