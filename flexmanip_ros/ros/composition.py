@@ -41,9 +41,11 @@ class Composition:
     """Plant, excitation, trigger, identifier and recorder; made, started, and ended as one."""
 
     def __init__(self, config: DemoParameters, bag: Path, context: Context | None = None) -> None:
-        """Create every node and open the bag; nothing runs yet."""
+        """Create every node; nothing runs and nothing is written yet."""
         self.config = config
         self._nodes: list[Node] = []
+        self._bag, self._context = bag, context
+        self._recorder: Recorder | None = None
         self._started = 0.0
         self.executor: Executor = make_executor(context)
         try:
@@ -51,9 +53,6 @@ class Composition:
             self.excitation = self._add(Excitation(context=context))
             self.trigger = self._add(CaptureTrigger(context=context))
             self.identifier = self._add(RpbsidIdentifier(context=context))
-            self.recorder = Recorder(bag, context=context)
-            self._nodes.append(self.recorder)
-            self.executor.add_node(self.recorder)
         except BaseException:
             self.close()
             raise
@@ -74,8 +73,15 @@ class Composition:
             if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
                 raise CompositionError(f'{node.get_name()} could not be configured', 'see its log above')
 
+    @property
+    def recorder(self) -> Recorder:
+        """The recorder; there is one from ``connect`` on."""
+        assert self._recorder is not None
+        return self._recorder
+
     def connect(self, interrupted: Callable[[], bool]) -> None:
-        """Wait until every reader is matched with its writer, and make sure that nobody else is there."""
+        """Open the bag, wait until every reader is matched with its writer, and that nobody else is there."""
+        self._recorder = self._add(Recorder(self._bag, context=self._context))
         limit = time.monotonic() + DISCOVERY_TIMEOUT
         while not self._matched():
             if interrupted():

@@ -78,6 +78,7 @@ def _run(config: DemoParameters, folder: Path, console: Console, interrupt: Inte
     interrupt.install()
     try:
         composition.configure()
+        interrupt.graceful = True  # from here on there is a bag to be closed
         composition.connect(lambda: interrupt.raised)
         console.print(
             f'Ready after {time.monotonic() - began:.1f} s: plant_simulator, excitation, capture_trigger, '
@@ -90,6 +91,7 @@ def _run(config: DemoParameters, folder: Path, console: Console, interrupt: Inte
         facts = composition.facts()
     finally:
         composition.close()
+    interrupt.graceful = False
     if interrupt.raised:
         console.print(f"interrupted after {facts.seconds:.1f} s; the bag so far is '{folder / 'bag'}'")
         return interrupt.exit_code

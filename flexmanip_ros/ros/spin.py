@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -35,14 +36,15 @@ def make_executor(context: Context | None = None) -> Executor:
 
 
 class Interrupt:
-    """SIGINT and SIGTERM as a flag while spinning, as an exit before that.
+    """SIGINT and SIGTERM: at once while there is nothing to put in order, as a flag from ``graceful`` on.
 
-    exit_with_signal: end with 128 + the signal's number, as a program that did not finish its work.
+    At once means without Python's own way out: an exception in the midst of the compiler ends in a maze of
+    tracebacks. exit_with_signal: end with 128 + the signal's number, as a program whose work is unfinished.
     """
 
     def __init__(self, *, exit_with_signal: bool = False) -> None:
         self.raised = False
-        self.spinning = False
+        self.graceful = False
         self.exit_code = 0
         self._exit_with_signal = exit_with_signal
 
@@ -54,22 +56,22 @@ class Interrupt:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.raised = True
         self.exit_code = 128 + number if self._exit_with_signal else 0
-        if not self.spinning:
-            raise SystemExit(self.exit_code)
+        if not self.graceful:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(self.exit_code)
 
 
 def spin(executor: Executor, context: Context | None, interrupt: Interrupt,
          until: Callable[[], bool] = lambda: False) -> None:
-    """Run callbacks until a signal, the end of the context, or ``until``."""
-    interrupt.spinning = True
+    """Run callbacks until a signal, the end of the context, or ``until``; signals are graceful from here."""
+    interrupt.graceful = True
     try:
         # A bare spin() of the events executor runs no callback in rclpy 7.1.
         while not interrupt.raised and rclpy.ok(context=context) and not until():
             executor.spin_once(timeout_sec=POLL_S)
     except ExternalShutdownException:
         return
-    finally:
-        interrupt.spinning = False
 
 
 def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cls: type,
