@@ -17,6 +17,8 @@ OK = 0
 WARN = 1
 ERROR = 2
 STALE = 3
+_SEVERITY = (OK, WARN, STALE, ERROR)
+"""Silence is told before a warning, a known error before silence."""
 
 
 @dataclass
@@ -29,7 +31,7 @@ class Report:
 
     def worse(self, level: int, words: str) -> None:
         """Note a problem."""
-        self.level = max(self.level, level)
+        self.level = max(self.level, level, key=_SEVERITY.index)
         self.words.append(words)
 
     def message(self, node_name: str, stamp: Time) -> DiagnosticArray:
