@@ -114,6 +114,8 @@ def run(U: Array, Y: Array, theta: Theta) -> tuple[Array, Array]:
     moments, end = np.zeros((m, m)), theta.x.copy()
     residual_moments(U, Y, *theta[:5], end, moments)
     covariance = moments / len(U)
+    if not np.all(np.isfinite(covariance)):
+        return covariance, end
     return covariance + 1e-14 * max(np.trace(covariance), 1e-300) * np.eye(m), end
 
 
@@ -148,11 +150,11 @@ def derivatives(
     return P.T @ N @ P, P.T @ g, moments, X @ P, end
 
 
-def _forgets(theta: Theta, count: int) -> bool:
-    """Whether the predictor A - K C does not grow over the stretch."""
+def forgets(theta: Theta, count: int) -> bool:
+    """Whether the predictor A - K C has let go of a state error after ``count`` samples."""
     if not all(np.all(np.isfinite(part)) for part in theta):
         return False
-    return float(np.abs(np.linalg.eigvals(theta.A - theta.K @ theta.C)).max()) < 1.0 + 1.0 / count
+    return float(np.abs(np.linalg.eigvals(theta.A - theta.K @ theta.C)).max()) < 1.0 - 1.0 / count
 
 
 def descend(U: Array, Y: Array, theta: Theta, structure: Structure, iterations: int) -> Fit | None:
@@ -176,7 +178,7 @@ def descend(U: Array, Y: Array, theta: Theta, structure: Structure, iterations: 
         for _ in range(6):
             step = np.linalg.solve(scaled + damping * np.eye(len(size)), gradient / size) / size
             trial = moved(theta, P @ step, structure)
-            steady = not structure.free_gain or _forgets(trial, len(U))
+            steady = not structure.free_gain or forgets(trial, len(U))
             trial_cost, trial_covariance = score(U, Y, trial) if steady else (np.inf, covariance)
             gain = cost - trial_cost
             if gain > 0.0:

@@ -1,0 +1,219 @@
+"""The prediction-error fit of a whole stretch: starting points, noise model, what the result is worth."""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+from flexmanip_ros.identification.moments import Realized
+from flexmanip_ros.identification.prediction_error import (
+    Fit,
+    Structure,
+    Theta,
+    covariance_root,
+    derivatives,
+    descend,
+    directions,
+    forgets,
+)
+from flexmanip_ros.types import Array
+
+ITERATIONS = 12
+CLEAN = 1e-20
+"""Relative innovation power below which the subspace model has no bias worth removing; the least assumed."""
+UNEXPLAINED = 0.5
+"""Share of an output's power that a fit with K = 0 may leave before it is taken not to simulate at all."""
+
+
+class Recursion(NamedTuple):
+    """A fit that goes on.
+
+    scale: (r + m,) of its signals; root: (k, k) S with S S' the covariance of the coordinates P (d, k) and
+    the state; covariance: (m, m) of the innovations, worth ``weight`` samples; widening: factor on standard
+    deviations from the scatter of the gradients; gain: (n, m) published K, theta's own unless that is held;
+    singular_values, condition: of the subspace model the fit began with; lost: the state is unknown.
+    """
+
+    theta: Theta
+    structure: Structure
+    scale: Array
+    P: Array
+    root: Array
+    covariance: Array
+    weight: float
+    widening: float
+    strikes: int
+    gain: Array
+    singular_values: Array
+    condition: float
+    lost: bool = False
+
+
+class Attempt(NamedTuple):
+    """A fit from one starting point. cost: penalized, in the units of the samples; begin: its first K."""
+
+    fit: Fit
+    structure: Structure
+    scale: Array
+    cost: float
+    wants_gain: bool
+    begin: Array
+
+
+def candidate(realized: Realized, feedthrough: bool) -> tuple[Theta, Structure]:
+    """Starting point from the subspace model, C held when it can fix the basis."""
+    n, m = realized.A.shape[0], realized.C.shape[0]
+    theta = Theta(realized.A, realized.B, realized.C, realized.D, realized.K, np.zeros(n))
+    if n == m and np.linalg.cond(realized.C) < 1e6:
+        W = realized.C
+        A = np.asarray(np.linalg.solve(W.T, (W @ realized.A).T).T, dtype=np.float64)
+        theta = Theta(A, W @ realized.B, np.eye(n), realized.D, W @ realized.K, np.zeros(n))
+        return _dense(theta), Structure(False, feedthrough, False)
+    return _dense(theta), Structure(True, feedthrough, False)
+
+
+def _dense(theta: Theta) -> Theta:
+    return Theta(*(np.ascontiguousarray(part) for part in theta))
+
+
+def fit_stretch(
+    samples: Array, starts: list[Realized], old: Recursion | None, scale: Array, feedthrough: bool,
+    noise: str,
+) -> Recursion | None:
+    """Fit samples (N, r + m) from subspace models and from the fit before; the best one is kept.
+
+    scale: (r + m,) of the subspace models' signals; noise: ``sensor`` holds K = 0 while the system is fitted,
+    ``any`` frees it where that is the better model. None where nothing simulates the stretch.
+    """
+    m = starts[0].C.shape[0] if starts else 0
+    if starts and not np.all(np.ptp(samples[:, -m:], axis=0) > 0.0):
+        return None  # a silent output tells nothing
+    power = np.sum((samples[:, -m:] * scale[-m:]) ** 2, axis=0)
+    floor, found = -np.inf, []
+    for realized in starts:
+        moments = realized.residual.T @ realized.residual
+        if np.all(np.diag(moments) <= CLEAN * power):
+            return None
+        size = np.linalg.slogdet(moments / len(samples) + 1e-300 * np.eye(m))[1]
+        floor = float(size) + realized.Xi.size * np.log(len(samples)) / len(samples)
+        begin, structure = candidate(realized, feedthrough)
+        found.append(_attempt(samples, begin, structure, scale, noise, floor))
+    if old is not None:
+        begin = old.theta._replace(x=np.zeros_like(old.theta.x), K=old.gain)
+        own = floor + 2.0 * float(np.sum(np.log(old.scale[-m:] / scale[-m:]))) if starts else floor
+        found.append(_attempt(samples, begin, old.structure, old.scale, noise, own))
+    done = [attempt for attempt in found if attempt is not None]
+    if not done:
+        return None
+    recursion = _recursion(samples, min(done, key=lambda attempt: attempt.cost))
+    if not starts:
+        return recursion
+    length = np.linalg.norm(starts[0].state, axis=0)
+    return recursion._replace(
+        singular_values=starts[0].singular_values,
+        condition=float(np.linalg.cond(starts[0].state / np.where(length > 0.0, length, 1.0))))
+
+
+def _signals(samples: Array, scale: Array, r: int) -> tuple[Array, Array]:
+    return np.ascontiguousarray(samples[:, :r] * scale[:r]), np.ascontiguousarray(samples[:, r:] * scale[r:])
+
+
+def _attempt(
+    samples: Array, begin: Theta, structure: Structure, scale: Array, noise: str, floor: float,
+) -> Attempt | None:
+    """Fit from one starting point.
+
+    With K = 0 first: that is the maximum likelihood for sensor noise, and for any noise a model that
+    simulates well. A free gain takes its place only where it raises the likelihood beyond its price and the
+    order suffices, judged by the long regression (floor, its penalized cost): a model of too low an order
+    with a free gain would predict the next sample at the expense of everything slower.
+    """
+    n, r = begin.B.shape
+    U, Y = _signals(samples, scale, r)
+    m, count = Y.shape[1], len(U)
+    penalty = n * m * np.log(count) / count
+    chosen = structure._replace(free_gain=False, only_gain=False)
+    best = descend(U, Y, begin._replace(K=np.zeros_like(begin.K)), chosen, ITERATIONS)
+    simulates = best is not None and bool(
+        np.all(np.diag(best.covariance) < UNEXPLAINED * np.mean(Y ** 2, axis=0)))
+    cost = np.inf if best is None else best.cost
+    wanted = False
+    if noise == 'any' or simulates:
+        wanted = best is None or _gain_asked_for(U, Y, best, chosen, penalty)
+    if wanted and noise == 'any':
+        free = chosen._replace(free_gain=True)
+        other = descend(U, Y, begin, free, ITERATIONS)
+        better = other is not None and other.cost + penalty < cost
+        if other is not None and better and (not simulates or other.cost + penalty < floor):
+            best, chosen, cost, simulates, wanted = other, free, other.cost + penalty, True, False
+    if best is None or not simulates:
+        return None
+    shift = 2.0 * float(np.sum(np.log(scale[r:])))
+    return Attempt(best, chosen, scale, cost - shift, wanted, begin.K)
+
+
+def _recursion(samples: Array, attempt: Attempt) -> Recursion:
+    """What goes on from the best attempt; a gain asked for is fitted last, to the system as it is."""
+    fit, structure = attempt.fit, attempt.structure
+    U, Y = _signals(samples, attempt.scale, fit.theta.B.shape[1])
+    gain = None
+    if attempt.wants_gain:
+        alone = structure._replace(free_gain=True, only_gain=True)
+        gain = _gain_alone(U, Y, fit.theta, attempt.begin, alone)
+    return Recursion(
+        theta=fit.theta._replace(x=fit.end), structure=structure, scale=attempt.scale, P=fit.directions,
+        root=arrive(covariance_root(fit.information), fit.arrival),
+        covariance=fit.covariance + CLEAN * np.diag(np.mean(Y ** 2, axis=0)), weight=float(len(U)),
+        widening=_widening(U, Y, fit, structure), strikes=0, gain=fit.theta.K if gain is None else gain,
+        singular_values=np.zeros(0), condition=float('nan'))
+
+
+def _gain_alone(U: Array, Y: Array, theta: Theta, begin: Array, structure: Structure) -> Array | None:
+    """K (n, m) of the best predictor for a system that is held, from two starting points."""
+    tried = [descend(U, Y, theta._replace(K=K), structure, ITERATIONS) for K in (begin, np.zeros_like(begin))]
+    done = [fit for fit in tried if fit is not None and forgets(fit.theta, len(U))]
+    return min(done, key=lambda fit: fit.cost).theta.K if done else None
+
+
+def arrive(root: Array, arrival: Array) -> Array:
+    """Covariance root of [coordinates; state at the end] from that with the state at the start."""
+    n = arrival.shape[0]
+    moved_root: Array = np.vstack([root[:root.shape[0] - n], arrival @ root])
+    return moved_root
+
+
+def _gain_asked_for(U: Array, Y: Array, fit: Fit, structure: Structure, penalty: float) -> bool:
+    """Score test of K = 0 at the fit: whether a gain would raise the likelihood by more than it costs."""
+    full = structure._replace(free_gain=True)
+    P = directions(fit.theta, full)
+    information, gradient, _, _, _ = derivatives(U, Y, fit.theta, full, fit.covariance, P)
+    if not np.all(np.isfinite(information)):
+        return True
+    root = covariance_root(information)
+    gain = float(np.sum((root.T @ gradient) ** 2))
+    return gain > penalty * len(U)
+
+
+def _widening(U: Array, Y: Array, fit: Fit, structure: Structure, pieces: int = 16) -> float:
+    """Scatter of the gradient over pieces of the stretch, as a factor on its standard deviation, >= 1.
+
+    With white innovations the gradients of the pieces scatter as the information says; correlated or
+    swelling residuals make them scatter more.
+    """
+    theta = fit.theta
+    root = covariance_root(fit.information)
+    sums = []
+    X: Array | None = None
+    edges = np.linspace(0, len(U), pieces + 1).astype(int)
+    for a, b in itertools.pairwise(edges):
+        _, gradient, _, X, end = derivatives(
+            U[a:b], Y[a:b], theta, structure, fit.covariance, fit.directions, X)
+        sums.append(root.T @ gradient)
+        theta = theta._replace(x=end)
+    gradients = np.array(sums)
+    freedom = fit.information.shape[0]
+    power = float(np.sum(gradients ** 2)) / freedom
+    noise = np.sqrt(2.0 / (freedom * pieces))
+    return float(np.sqrt(power)) if power > 1.0 + 4.0 * noise else 1.0
