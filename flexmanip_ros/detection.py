@@ -26,8 +26,8 @@ CONFIRM = 0.01
 """Seconds from an alarm to its report: they date the onset."""
 PEAK_MEMORY = 20.0
 """Seconds in which a peak of the statistic is forgotten."""
-INDEPENDENT = 5
-"""Samples between looks that are as good as independent, for the rate of false alarms."""
+INDEPENDENT = 0.5
+"""Samples a look that is as good as independent, over all onsets of the window (for the false alarms)."""
 SPEED, ACCELERATION, JERK = 0.3, 5.0, 200.0
 """Prior deviations of what the tip's light mass would gain: impulse [m/s], step [m/s^2], ramp [m/s^3]."""
 
@@ -117,7 +117,7 @@ def _start(config: TriggerParameters, state: DetectionState, sample: Sample) -> 
         # rates show the modes that the model leaves out, at every step of the torque
         used=rates if np.all(rates[:len(state.identifier.outputs)]) else ~rates,
         trace=np.zeros((w, m, kernel.CAUSES)), factors=np.zeros((w, kernel.CAUSES, kernel.CAUSES)),
-        scores=np.zeros((w, kernel.CAUSES)), clock=np.zeros(6, dtype=np.int64),
+        scores=np.zeros((w, kernel.CAUSES)), past=np.zeros((w, m)), clock=np.zeros(6, dtype=np.int64),
         level=np.array([0.0, 0.0, 0.0, threshold(config, dt)]), history=np.zeros(2 * w),
         statistic=np.zeros(w), flow=np.zeros((n2, n2)), state=np.zeros((2, n2, 2)))
     return replace(state, watch=watch, dt=dt, stamps=stamps[-w:])

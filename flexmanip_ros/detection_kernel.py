@@ -53,6 +53,8 @@ class Watch(NamedTuple):
     """(w, 6, 6) Cholesky factor of I + information at each lag."""
     scores: Array
     """(w, 6) gathered for each onset, a ring."""
+    past: Array
+    """(w, m) innovations over their variance, a ring."""
     clock: NDArray[np.int64]
     """(6,) counters."""
     level: Array
@@ -135,6 +137,24 @@ def traces(
             for c in range(2):
                 state[0, i, c] = state[1, i, c]
     information(m, watch)
+    rescore(watch)
+
+
+@kernel
+def rescore(watch: Watch) -> None:
+    """Gather every onset's score anew: scores and information must come from the same traces."""
+    w = watch.trace.shape[0]
+    newest = watch.clock[NEWEST]
+    for lag in range(watch.clock[FILLED]):
+        onset = (newest - lag) % w
+        score = watch.scores[onset]
+        for a in range(CAUSES):
+            score[a] = 0.0
+        for since in range(lag + 1):
+            for i in range(watch.trace.shape[1]):
+                e = watch.past[(onset + since) % w, i]
+                for a in range(CAUSES):
+                    score[a] += watch.trace[since, i, a] * e
 
 
 @kernel
@@ -165,14 +185,16 @@ def look(m: Memory, watch: Watch, scratch: Array) -> None:
     clock[FILLED] = min(clock[FILLED] + 1, w)
     for a in range(CAUSES):
         watch.scores[clock[NEWEST], a] = 0.0
+    for i in range(watch.trace.shape[1]):
+        variance = max(m.innovation[i, 1], m.noise[i, EFFECTIVE])
+        limit = 5.0 * np.sqrt(variance)
+        watch.past[clock[NEWEST], i] = min(max(m.innovation[i, 0], -limit), limit) / variance
     best, best_lag = 0.0, 0
     for lag in range(clock[FILLED]):
         onset = (clock[NEWEST] - lag) % w
         score = watch.scores[onset]
         for i in range(watch.trace.shape[1]):
-            variance = max(m.innovation[i, 1], m.noise[i, EFFECTIVE])
-            limit = 5.0 * np.sqrt(variance)
-            e = min(max(m.innovation[i, 0], -limit), limit) / variance
+            e = watch.past[clock[NEWEST], i]
             for a in range(CAUSES):
                 score[a] += watch.trace[lag, i, a] * e
         if lag + 1 < SHORTEST:
