@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
@@ -142,3 +144,39 @@ def residual_moments(
         for o in range(m):
             for i in range(m):
                 moments[o, i] += e[o] * e[i]
+
+
+@njit(cache=True)
+def condition(H: Array, root: Array, gradient: Array, step: Array) -> None:
+    """Update in square-root form: root (k, k) <- root L^-T with L L' = I + H, step = (I + H)^-1 gradient.
+
+    H: (k, k) symmetric, overwritten with L (lower); gradient, step: (k,). A library's routine would start
+    threads for this.
+    """
+    k = H.shape[0]
+    for i in range(k):
+        H[i, i] += 1.0
+        for j in range(i + 1):
+            total = H[i, j]
+            for q in range(j):
+                total -= H[i, q] * H[j, q]
+            if i == j:
+                H[i, i] = math.sqrt(max(total, 1.0))  # I + H is never below I
+            else:
+                H[i, j] = total / H[j, j]
+    for i in range(k):
+        total = gradient[i]
+        for q in range(i):
+            total -= H[i, q] * step[q]
+        step[i] = total / H[i, i]
+    for i in range(k - 1, -1, -1):
+        total = step[i]
+        for q in range(i + 1, k):
+            total -= H[q, i] * step[q]
+        step[i] = total / H[i, i]
+    for row in range(root.shape[0]):
+        for i in range(k):
+            total = root[row, i]
+            for q in range(i):
+                total -= H[i, q] * root[row, q]
+            root[row, i] = total / H[i, i]

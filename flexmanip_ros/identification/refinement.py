@@ -14,6 +14,7 @@ import numpy as np
 
 from flexmanip_ros.identification.moments import Realized, triangle
 from flexmanip_ros.identification.prediction_error import derivatives, moved, run
+from flexmanip_ros.identification.prediction_error_kernel import condition
 from flexmanip_ros.identification.stretch import Recursion, arrive, fit_stretch
 from flexmanip_ros.types import Array
 
@@ -119,22 +120,21 @@ def update(refined: Refined) -> Refined:
     k = old.root.shape[0]
     kept = old.root * np.sqrt(1.0 + len(U) / MEMORY)
     zeta, theta = np.zeros(k), old.theta
-    arrival = np.zeros((0, k))
+    arrival, root = np.zeros((0, k)), kept
     for _ in range(2 if old.lost else 1):  # a state that was lost makes the first derivatives poor
         information, gradient, _, arrival, _ = derivatives(U, Y, theta, old.structure, old.covariance, old.P)
         H = kept.T @ information @ kept
         if not np.all(np.isfinite(H)):
             return give_up(refined)
-        values, vectors = np.linalg.eigh(0.5 * (H + H.T))
-        values = 1.0 + np.maximum(values, 0.0)
-        zeta = zeta + vectors @ ((vectors.T @ (kept.T @ gradient - zeta)) / values)
+        root, step = kept.copy(), np.empty(k)
+        condition(H, root, kept.T @ gradient - zeta, step)
+        zeta = zeta + step
         theta = moved(old.theta, old.P @ (kept @ zeta), old.structure)
     covariance, end = run(U, Y, theta)
     power = float(np.trace(np.linalg.solve(old.covariance, covariance))) / Y.shape[1]
     strikes = old.strikes + 1 if not power < MISFIT else 0
     if strikes >= 2 or not np.isfinite(power):
         return give_up(refined)
-    root = kept @ (vectors / np.sqrt(values))
     share = len(U) / (old.weight + len(U))
     recursion = old._replace(
         theta=theta._replace(x=end), root=arrive(root, arrival), strikes=strikes,
