@@ -114,7 +114,7 @@ def advance_factor(
     for k in range(U.shape[0]):
         if not accept(U[k], Y[k], new, scale, counts):
             continue
-        remember(new, mean, scalars, p)
+        remember(new, mean, scalars, counts, p)
         if counts[FILLED] >= p:
             b = memory(scalars, counts, beta, mode)
             if scalars[OPEN] == 0.0:

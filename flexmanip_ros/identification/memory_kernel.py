@@ -67,8 +67,13 @@ def push(z: Array, new: Array) -> None:
 
 
 @njit(cache=True)
-def remember(new: Array, mean: Array, scalars: Array, p: int) -> None:
-    """Follow the variation of the signals: mean (2, r + m) holds slow means and running peaks."""
+def remember(new: Array, mean: Array, scalars: Array, counts: Array, p: int) -> None:
+    """Follow the variation of the signals: mean (2, r + m) holds slow means and running peaks.
+
+    The means start at the first sample: a signal that stands still has no variation, whatever its level.
+    """
+    if counts[SEEN] - counts[REJECTED] == 1:
+        mean[0] = new
     rate = 1.0 / (20.0 * p)
     energy = 0.0
     for i in range(new.shape[0]):
@@ -100,13 +105,16 @@ def memory(scalars: Array, counts: Array, beta: float, mode: int) -> float:
     if mode == CONSTANT:  # as the paper has it; only what would end in 0/0 is kept out
         quiet = 1e-12
         lively = 1e-11
-    ratio = scalars[LATELY] / scalars[ENERGY] if scalars[ENERGY] > 0.0 else 1.0
+    if scalars[ENERGY] > 0.0:
+        ratio = scalars[LATELY] / scalars[ENERGY]
+    else:  # the first sample: signals that have stood still since the start say nothing
+        ratio = 1.0 if scalars[LATELY] > 0.0 else 0.0
     open_ = min(max((ratio - quiet) / (lively - quiet), 0.0), 1.0)
     rate = max(1.0 - b, 1.0 / (counts[USED] + 1.0)) * open_
     scalars[ENERGY] += rate * (scalars[LATELY] - scalars[ENERGY])
     b = 1.0 - (1.0 - b) * open_
     scalars[OPEN] = open_
-    return b
+    return float(b)
 
 
 @njit(cache=True)

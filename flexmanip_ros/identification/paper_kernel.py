@@ -172,7 +172,7 @@ def advance_paper(
         if not accept(U[k], Y[k], new, scale, counts):
             last[n + width] = 0.0
             continue
-        remember(new, mean, scalars, p)
+        remember(new, mean, scalars, counts, p)
         if counts[FILLED] >= p:
             b = memory(scalars, counts, beta[0], mode)
             if scalars[OPEN] == 0.0:
