@@ -47,7 +47,8 @@ def resolve(
         return fault
     wanted = config.outputs if outputs is None else outputs
     if outputs is None and config.outputs == _SHRINKABLE:
-        wanted = tuple(name for name in wanted if _find(name, record) is not None) or wanted
+        kept = (name for name in wanted if not _is_unfilled(name, record))
+        wanted = tuple(kept) or wanted
     groups: list[tuple[tuple[str, int], ...]] = []
     needs_angles = config.payload_method != 'none'
     for group, names in (('inputs', config.inputs), ('outputs', wanted),
@@ -91,6 +92,12 @@ def _find(signal: str, record: JointRecord) -> tuple[str, int] | None:
     if joint not in record.names or getattr(record, field).size == 0:
         return None
     return field, record.names.index(joint)
+
+
+def _is_unfilled(signal: str, record: JointRecord) -> bool:
+    """Whether the joint is there and its field is empty; a joint that is not there is a wrong name."""
+    joint, _, field = signal.rpartition('/')
+    return joint in record.names and getattr(record, field).size == 0
 
 
 def _missing(group: str, signal: str, record: JointRecord) -> Refusal:

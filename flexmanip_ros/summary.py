@@ -58,9 +58,10 @@ def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -
 
 
 def event_time(state: pipeline.State, kind: EventKind) -> float | None:
-    """Return when the latest event of a kind was, from the first sample's stamp [s]."""
+    """Return when the latest event of a kind was, from the first sample's stamp [s]; None if not reached."""
     stamp = state.stamp_of(kind)
-    return None if stamp is None else (stamp - state.first_ns) / 1e9
+    waits = state.timeline is not None and any(event.kind is kind for event in state.timeline.waiting)
+    return None if stamp is None or waits else (stamp - state.first_ns) / 1e9
 
 
 def _known(value: float) -> float | None:

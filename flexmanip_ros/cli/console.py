@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import signal
 import sys
@@ -18,6 +19,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from flexmanip_ros.errors import FlexmanipError
 
 SUCCESS, DEFECT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+LONGEST = 1e9
+"""Seconds; beyond it a stamp in nanoseconds may not be one."""
 TRACEBACK = 'FLEXMANIP_TRACEBACK'
 """Environment variable that lets the traceback of a defect through."""
 Report = Callable[[int, int | None], None]
@@ -30,6 +33,17 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and where help is; exit 2."""
         self.exit(BAD_INPUT, f'{self.prog}: {message}; see {self.prog} --help\n')
+
+
+def seconds(text: str) -> float:
+    """Return a time given as an argument [s]. Raises ArgumentTypeError when it is none."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= LONGEST:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a time in seconds")
+    return value
 
 
 def parser(prog: str, words: str, epilog: str) -> Parser:

@@ -50,6 +50,8 @@ class Result:
     written: tuple[str, ...]
     fault: FlexmanipError | None
     interrupted: bool = False
+    remark: str = ''
+    """What a user should know of a recording that could be used: messages left out, events not reached."""
 
 
 def identify(request: Request, progress: bag.Progress | None = None) -> Result:
@@ -94,7 +96,7 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
     return Result(
         summary, () if last is None else last.modes, state.sampling.outputs or request.config.outputs,
         tuple(str(place) for place in (request.output, request.report) if place is not None), fault,
-        feed.interrupted)
+        feed.interrupted, _remark(state))
 
 
 class _Feed:
@@ -160,6 +162,26 @@ def _dropped(state: pipeline.State) -> FlexmanipError | None:
     what = 'NaN or infinity in a configured signal' if counters.not_finite else 'arrays of unequal sizes'
     return BagError(f'{faulty} of {counters.received} messages hold {what} and were left out',
                     'look at the publisher of the joint states')
+
+
+def _remark(state: pipeline.State) -> str:
+    """Say in one line what was left out or applied at another time than it says; empty when all was used."""
+    counters, line = state.counters, state.timeline
+    left_out = [f'{count} {why}' for count, why in (
+        (counters.missing_signal, 'without a configured signal'),
+        (counters.late_stamp, 'with a stamp older than the one before'),
+        (counters.repeated_stamp, 'with the stamp of the one before')) if count]
+    said = [f'of {counters.received} messages {", ".join(left_out)} were left out'] if left_out else []
+    if counters.resets:
+        said.append(f'the stamps jumped back or changed their rate {counters.resets} times; '
+                    'the result is of what came after')
+    if line is not None:
+        said += [f'a {event.kind.value} is announced for after the last sample and was not applied'
+                 for event in line.waiting]
+        if line.late_events:
+            said.append(f'{line.late_events} events arrived more than rewind_time after their stamp; '
+                        'they were applied on arrival')
+    return '; '.join(said)
 
 
 def _report(request: Request, summary: Summary, feed: _Feed, kept: list[Estimate], signals: Signals,

@@ -23,8 +23,9 @@ EXAMPLES = """examples:
       --set 'outputs=[arm/position]' --set order=4 --validate-from 5
   identify_bag recording --output estimates.csv --json
 
-exit status: 0 on success; 2 on bad input or arguments, with one line on stderr. Of a damaged recording
-everything before the fault is used and written, then the fault is reported.
+exit status: 0 on success (a line on stderr says what was left out); 2 on bad input or arguments, with one
+line on stderr. Of a damaged recording everything before the fault is used and written, then the
+fault is reported.
 
 parameters (in --params under rpbsid_identifier or /**, or with --set):
 """
@@ -39,7 +40,7 @@ def _parser() -> console.Parser:
     add('--params', metavar='FILE.yaml', help='ROS parameter file for rpbsid_identifier')
     add('--set', metavar='name=value', action='append', default=[],
         help='override one parameter (YAML value)')
-    add('--validate-from', metavar='SECONDS', type=float,
+    add('--validate-from', metavar='SECONDS', type=console.seconds,
         help='identify before this time from the first stamp, score the model on the rest')
     add('--output', metavar='OUT', help='estimates: .csv or .npz a table, anything else a rosbag2 recording')
     add('--report', metavar='REPORT.html', help='one page with pictures and tables')
@@ -50,7 +51,7 @@ def _parser() -> console.Parser:
         help='default: capture_event and capture_detected beside the joint states')
     add('--detect', action='store_true', help='find captures and releases in the signals')
     for kind in ('capture', 'release'):
-        add(f'--{kind}-time', metavar='SECONDS', type=float,
+        add(f'--{kind}-time', metavar='SECONDS', type=console.seconds,
             help=f'add a {kind} at this time from the first stamp')
     return made
 
@@ -79,6 +80,8 @@ def _main(given: argparse.Namespace) -> int:
         kept = ''.join(f"; what was identified is in '{place}'" for place in result.written)
         console.complain(PROG, f'{result.fault}{kept}')
         return console.INTERRUPTED if result.interrupted else console.BAD_INPUT
+    if result.remark:
+        console.complain(PROG, result.remark)
     return console.SUCCESS
 
 

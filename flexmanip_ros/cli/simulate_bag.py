@@ -47,11 +47,12 @@ def _parser() -> console.Parser:
         EXAMPLES + help_text(PlantParameters) + MORE + help_text(ExcitationParameters))
     add = made.add_argument
     add('bag', metavar='BAG', help='the recording to make; must not exist')
-    add('--duration', metavar='SECONDS', type=float, default=6.0, help='default: 6')
+    add('--duration', metavar='SECONDS', type=console.seconds, default=6.0, help='default: 6')
     add('--seed', metavar='N', type=int, help='seed of the noise (parameter seed)')
     add('--payload', metavar='KG', type=float, help='mass of the object (parameter payload_mass)')
-    add('--capture-time', metavar='SECONDS', type=float, default=3.0, help='default: 3; negative: never')
-    add('--release-time', metavar='SECONDS', type=float, default=-1.0, help='default: never')
+    add('--capture-time', metavar='SECONDS', type=console.seconds, default=3.0,
+        help='default: 3; negative: never')
+    add('--release-time', metavar='SECONDS', type=console.seconds, default=-1.0, help='default: never')
     add('--expected', action='store_true',
         help='say how accurate a payload estimate from this torque can be (takes some seconds)')
     add('--params', metavar='FILE.yaml', help='ROS parameter file with plant_simulator and excitation')

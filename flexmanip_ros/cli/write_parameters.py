@@ -1,6 +1,6 @@
 """Write config/*.yaml and docs/parameters.md from the declared parameters.
 
-Use: ``python -m flexmanip_ros.cli.write_parameters [REPOSITORY]``
+Use: ``python -m flexmanip_ros.cli.write_parameters [REPOSITORY]``; it writes into a checkout only.
 """
 
 from __future__ import annotations
@@ -9,7 +9,10 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from flexmanip_ros.cli import console
 from flexmanip_ros.parameters.document import NODES, markdown, yaml_text
+
+PROG = 'write_parameters'
 
 
 def documents() -> Iterator[tuple[str, str]]:
@@ -22,8 +25,12 @@ def documents() -> Iterator[tuple[str, str]]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write what differs; say what was written."""
-    given = sys.argv[1:] if arguments is None else list(arguments)
-    root = Path(given[0]) if given else Path(__file__).resolve().parents[2]
+    made = console.parser(PROG, 'Write config/*.yaml and docs/parameters.md from the declarations.', '')
+    made.add_argument('repository', metavar='REPOSITORY', nargs='?', type=Path,
+                      default=Path(__file__).resolve().parents[2], help='default: where this package is')
+    root: Path = made.parse_args(arguments).repository
+    if not root.is_dir():
+        made.error(f"directory '{root}' does not exist")
     for name, text in documents():
         path = root / name
         if path.is_file() and path.read_text(encoding='utf-8') == text:

@@ -140,8 +140,9 @@ def _check_one(leaf: Leaf, value: Any) -> Any:
     if converted is None:
         wanted = _plural(leaf) if leaf.is_array else _singular(leaf)
         raise ParameterError(f"parameter '{leaf.name}' is {value!r}", f'give {wanted}')
-    if isinstance(converted, float) and math.isnan(converted):
-        raise ParameterError(f"parameter '{leaf.name}' is not a number", f'give {_range_words(leaf)}')
+    if isinstance(converted, float) and not math.isfinite(converted):
+        what = 'not a number' if math.isnan(converted) else 'infinite'
+        raise ParameterError(f"parameter '{leaf.name}' is {what}", f'give {_range_words(leaf)}, finite')
     if leaf.choices and converted not in leaf.choices:
         raise ParameterError(
             f"parameter '{leaf.name}' is {converted!r}", f'choose one of {", ".join(leaf.choices)}')

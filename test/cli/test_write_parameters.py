@@ -47,3 +47,13 @@ def test_the_files_are_written_once(tmp_path, capsys):
     assert 'config/rpbsid_identifier.yaml' in capsys.readouterr().out
     assert main([str(tmp_path)]) == 0
     assert capsys.readouterr().out == ''
+
+
+@pytest.mark.parametrize('argument', ['--help', '--unknown', 'no/such/folder'])
+def test_an_argument_that_is_no_checkout_writes_nothing(argument, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main([argument])
+    assert ended.value.code == (0 if argument == '--help' else 2)
+    assert list(tmp_path.iterdir()) == []
+    assert capsys.readouterr()

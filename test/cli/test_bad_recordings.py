@@ -1,0 +1,130 @@
+"""identify_bag on recordings and arguments of clumsy users: one line, never a crash or a confident number."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flexmanip_ros.cli import simulate_bag
+from flexmanip_ros.cli.identify_bag import main
+from flexmanip_ros.io.bag_writer import BagWriter
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+
+START = 1_700_000_000_000_000_000
+MS = 1_000_000
+NAMES = ('joint1', 'joint2', 'link1_bend', 'link2_bend')
+PLAIN = '--set=payload_method=none'
+
+
+def _records(count: int = 300, names: tuple[str, ...] = NAMES) -> list[JointRecord]:
+    rng = np.random.default_rng(5)
+    return [JointRecord(START + k * MS, names, *rng.normal(size=(3, 4))) for k in range(count)]
+
+
+def _still(count: int, level: float) -> list[JointRecord]:
+    values = level * np.array([0.3, 0.2, 0.01, 0.02])
+    return [JointRecord(START + k * MS, NAMES, values, values, values) for k in range(count)]
+
+
+def _bag(path: Path, records: list[JointRecord], *events: CaptureEvent, at: int = 0) -> Path:
+    with BagWriter(path, flush_period=None) as writer:
+        for k, record in enumerate(records):
+            for event in events if k == at else ():
+                writer.write('/capture_event', START + k * MS, event)
+            writer.write('/joint_states', START + k * MS, record)
+    return path
+
+
+def _run(capsys, *arguments: object) -> tuple[int, dict, str]:
+    status = main([*(str(argument) for argument in arguments), '--json'])
+    seen = capsys.readouterr()
+    assert seen.err.count('\n') <= 1
+    found = json.loads(seen.out.splitlines()[-1], parse_constant=pytest.fail) if seen.out else {}
+    return status, found, seen.err
+
+
+@pytest.mark.parametrize('level', [0.0, 1.0, -1e9, 1e-12])
+@pytest.mark.parametrize('settings', [[], ['--set=estimator=paper'], ['--set=forgetting=constant']])
+def test_signals_that_stand_still_are_never_tracking(capsys, tmp_path, level, settings):
+    path = _bag(tmp_path / 'bag', _still(700, level))
+    status, found, err = _run(capsys, path, PLAIN, *settings)
+    assert (status, err) == (0, '')
+    assert found['status'] == 'POORLY_EXCITED'
+    assert found['frequencies_hz'] == []
+
+
+def test_messages_that_lose_a_signal_on_the_way_are_counted_aloud(capsys, tmp_path):
+    records = _records()
+    short = [JointRecord(r.stamp_ns, r.names, r.position, np.empty(0), r.effort) for r in records]
+    status, found, err = _run(capsys, _bag(tmp_path / 'bag', records[:200] + short[200:]), PLAIN)
+    assert status == 0
+    assert found['samples'] == 200
+    assert 'of 300 messages 100 without a configured signal were left out' in err
+
+
+def test_messages_out_of_order_are_counted_aloud(capsys, tmp_path):
+    records = _records()
+    swapped = [records[k ^ 1] for k in range(len(records))]
+    _, _, err = _run(capsys, _bag(tmp_path / 'bag', swapped), PLAIN)
+    assert '150 with a stamp older than the one before' in err
+    twice = [record for record in records for _ in (0, 1)]
+    _, found, err = _run(capsys, _bag(tmp_path / 'twice', twice), PLAIN)
+    assert found['samples'] == 300
+    assert '300 with the stamp of the one before' in err
+
+
+def test_a_looped_recording_says_that_the_last_pass_counts(capsys, tmp_path):
+    records = _records(1200)
+    _, _, err = _run(capsys, _bag(tmp_path / 'bag', records + records), PLAIN)
+    assert 'the stamps jumped back' in err
+
+
+def test_a_joint_that_is_not_there_is_an_error_also_among_the_default_outputs(capsys, tmp_path):
+    path = _bag(tmp_path / 'bag', _records(names=('joint1', 'joint2', 'link1_bend', 'link2_strain')))
+    status, found, err = _run(capsys, path)
+    assert (status, found) == (2, {})
+    assert "'link2_bend/position'" in err
+    assert 'link2_strain' in err
+
+
+def test_a_capture_after_the_end_is_not_claimed(capsys, tmp_path):
+    event = CaptureEvent(START + 400 * MS, EventKind.CAPTURE)
+    status, found, err = _run(capsys, _bag(tmp_path / 'bag', _records(), event), PLAIN)
+    assert status == 0
+    assert found['capture_time_s'] is None
+    assert 'not applied' in err
+
+
+def test_an_event_without_a_stamp_is_applied_on_arrival_and_said(capsys, tmp_path):
+    status, _, err = _run(capsys, _bag(tmp_path / 'bag', _records(700), CaptureEvent(0, EventKind.CAPTURE),
+                                       at=600), PLAIN)
+    assert status == 0
+    assert '1 events arrived more than rewind_time after their stamp' in err
+
+
+@pytest.mark.parametrize('option', ['--validate-from', '--capture-time', '--release-time'])
+@pytest.mark.parametrize('value', ['nan', 'inf', '-inf', '1e300', 'soon', ''])
+def test_a_time_that_is_none_is_one_line_and_exit_2(capsys, tmp_path, option, value):
+    with pytest.raises(SystemExit) as ended:
+        main([str(tmp_path), f'{option}={value}'])
+    assert ended.value.code == 2
+    err = capsys.readouterr().err
+    assert f"'{value}' is not a time in seconds" in err
+    assert err.count('\n') == 1
+
+
+def test_simulate_bag_wants_times_too(capsys, tmp_path):
+    with pytest.raises(SystemExit) as ended:
+        simulate_bag.main([str(tmp_path / 'bag'), '--capture-time=nan'])
+    assert ended.value.code == 2
+    assert 'not a time' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('value', ['.inf', '-.inf', '.nan'])
+def test_a_parameter_that_is_not_finite_is_refused(capsys, tmp_path, value):
+    status, _, err = _run(capsys, tmp_path, '--set', f'arm.link_length=[{value}, 3.0]')
+    assert status == 2
+    assert "'arm.link_length'" in err
