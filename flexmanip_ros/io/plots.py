@@ -32,6 +32,9 @@ DPI = 120
 POINTS = 2000
 """A line is thinned to its envelope above this many points."""
 
+MODES_APART = 4.0
+"""Ratio to the lowest frequency above which a mode does not set the range of a plot."""
+
 Event = tuple[float, EventKind]
 Known = tuple[float, float, Sequence[float]]
 """From and to [s], and the frequencies [Hz] that are true between."""
@@ -117,9 +120,36 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int,
             ax.plot([begin, end], [frequency] * 2, color=TRUTH_COLOUR, linestyle=(0, (4, 3)), linewidth=1.1,
                     label='true' if index == k == 0 else None)
     if count:
-        limit(ax, values[:, :, 0], [f for _, _, known in truth for f in known])
+        known_all = [f for _, _, known in truth for f in known]
+        if known_all:  # what is true sets the range, so that a change of it is seen
+            room = max(max(known_all) - min(known_all), 0.1 * max(known_all))
+            ax.set_ylim(min(known_all) - room, max(known_all) + room)
+        else:
+            limit(ax, _lowest(values[:, :, 0]), [])
+        _note_beyond(ax, values[-1, :, 0])
     ax.set_ylabel('frequency\n[Hz]')
     legend(ax)
+
+
+def _lowest(values: Array) -> Array:
+    """Return the frequencies (T, k) that set the range, those far above the lowest as NaN.
+
+    Noise gives modes far above those of the arm; a range that holds them hides what a capture changes.
+    """
+    settled = values[values.shape[0] // 2:]
+    low = settled[np.isfinite(settled)]
+    if low.size == 0:
+        return values
+    return np.where(values <= MODES_APART * np.percentile(low, 5), values, np.nan)
+
+
+def _note_beyond(ax: Any, last: Array) -> None:
+    """Say in a corner which modes of the last estimate lie outside the range."""
+    low, high = ax.get_ylim()
+    beyond = [f'{value:.1f}' for value in last if np.isfinite(value) and not low <= value <= high]
+    if beyond:
+        ax.annotate(f'outside: {", ".join(beyond)} Hz', (1.0, 0.97), ha='right', va='top', fontsize=9,
+                    xycoords='axes fraction', color='#555555')
 
 
 def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,

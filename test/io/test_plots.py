@@ -1,0 +1,48 @@
+"""What a stranger must be able to see in a picture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip('matplotlib')
+
+from flexmanip_ros.io import plots
+from flexmanip_ros.types import Estimate, Mode, Status
+
+BEFORE, AFTER = (5.76, 6.89), (5.63, 6.55)
+
+
+def _estimates(extra: float | None = None) -> list[Estimate]:
+    rows = []
+    for k in range(200):
+        found = [*(BEFORE if k < 100 else AFTER), *([] if extra is None else [extra])]
+        rows.append(Estimate(k * 10_000_000, Status.TRACKING, None, tuple(Mode(f, 0.01, 0.01) for f in found),
+                             None))
+    return rows
+
+
+def _drawn(estimates, truth=()):
+    _, (ax,) = plots.figure(1, [2.0])
+    plots.frequencies(ax, estimates, 0, truth)
+    return ax, [text.get_text() for text in ax.texts]
+
+
+@pytest.mark.parametrize('truth', [(), [(0.0, 1.0, BEFORE), (1.0, 2.0, AFTER)]])
+def test_a_mode_of_the_noise_does_not_hide_what_a_capture_changes(truth):
+    ax, said = _drawn(_estimates(extra=50.0), truth)
+    low, high = ax.get_ylim()
+    assert low < min(AFTER)
+    assert max(BEFORE) < high
+    assert high - low < 5.0
+    assert said == ['outside: 50.0 Hz']
+
+
+def test_nothing_is_said_of_modes_outside_when_there_are_none():
+    assert _drawn(_estimates())[1] == []
+
+
+def test_estimates_without_modes_can_be_drawn():
+    nothing = [Estimate(k, Status.WARMING_UP, None, (), None) for k in range(3)]
+    assert _drawn(nothing)[1] == []
+    _drawn([Estimate(0, Status.TRACKING, None, (Mode(np.nan, np.nan),), None)])
