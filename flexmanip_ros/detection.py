@@ -38,6 +38,8 @@ class DetectionState:
 
     identifier: IdentifierParameters
     filter: structured.StructuredState
+    kept: tuple[int, ...]
+    """Outputs that are looked at."""
     watch: kernel.Watch | None = None
     dt: float = 0.0
     stamps: tuple[int, ...] = ()
@@ -46,10 +48,13 @@ class DetectionState:
 
 def init(config: TriggerParameters) -> DetectionState:
     """Start with an empty arm."""
+    # rates show the modes that the model leaves out, at every step of the torque
+    kept = tuple(i for i, name in enumerate(config.outputs) if not name.endswith('/velocity'))
+    kept = kept or tuple(range(len(config.outputs)))
     settings = IdentifierParameters(
-        inputs=config.inputs, outputs=config.outputs, angles=config.angles, arm=config.arm,
-        payload=config.payload, order=1)
-    return DetectionState(settings, structured.init(settings))
+        inputs=config.inputs, outputs=tuple(config.outputs[i] for i in kept), angles=config.angles,
+        arm=config.arm, payload=config.payload, order=1)
+    return DetectionState(settings, structured.init(settings), kept)
 
 
 def step(
@@ -65,7 +70,7 @@ def advance(
 ) -> tuple[DetectionState, tuple[CaptureEvent, ...]]:
     """Take samples in the order of their stamps; return the events found, the same as one by one."""
     found: list[CaptureEvent] = []
-    left = list(samples)
+    left = [replace(sample, y=sample.y[list(state.kept)]) for sample in samples]
     while left and state.filter.model is not None:
         if state.watch is None or state.filter.memory is None:
             state = _start(config, state, left[0])
@@ -112,10 +117,7 @@ def _start(config: TriggerParameters, state: DetectionState, sample: Sample) -> 
     w = max(kernel.SHORTEST + 2, round(config.detection_window / dt))
     n2 = 2 * state.filter.model.motion.q.size
     m = len(state.filter.model.roles)
-    rates = state.filter.sensors.rate if state.filter.sensors is not None else np.zeros(m, dtype=np.bool_)
     watch = kernel.Watch(
-        # rates show the modes that the model leaves out, at every step of the torque
-        used=rates if np.all(rates[:len(state.identifier.outputs)]) else ~rates,
         trace=np.zeros((w, m, kernel.CAUSES)), factors=np.zeros((w, kernel.CAUSES, kernel.CAUSES)),
         scores=np.zeros((w, kernel.CAUSES)), past=np.zeros((w, m)), clock=np.zeros(6, dtype=np.int64),
         level=np.array([0.0, 0.0, 0.0, threshold(config, dt)]), history=np.zeros(2 * w),

@@ -45,8 +45,6 @@ NEWEST, FILLED, SINCE_TRACES, QUIET, HISTORY, ALARMED = range(6)
 class Watch(NamedTuple):
     """What the detector remembers; w onsets in the window, m sensors."""
 
-    used: NDArray[np.bool_]
-    """(m,) whether a sensor is looked at."""
     trace: Array
     """(w, m, 6) innovation at each lag after an onset, per unit of prior standard deviation."""
     factors: Array
@@ -113,8 +111,6 @@ def traces(
     for lag in range(w):
         for i in range(sensors_count):
             offset = n if sensors.rate[i] else 0
-            if not watch.used[i]:
-                continue
             for c in range(2):
                 value = 0.0
                 for j in range(n):
