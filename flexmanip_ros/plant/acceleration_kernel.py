@@ -83,30 +83,27 @@ def hold(L: Array, held: Array, qdd: Array, columns: Array) -> None:
 
 
 @kernel
-def steepness(arm: Manipulator, q: Array) -> tuple[float, float, float]:
-    """Return the slopes at root and tip of link 1 and at the root of link 2 [-]."""
-    k = arm.kappa
-    root1, tip1, root2 = 0.0, 0.0, 0.0
-    for j in range(k):
-        root1 += arm.root_slope[0, j] * q[2 + j]
-        tip1 += arm.tip_slope[0, j] * q[2 + j]
-        root2 += arm.root_slope[1, j] * q[2 + k + j]
-    return root1, tip1, root2
-
-
-@kernel
-def steepen(arm: Manipulator, q: Array, effort: Array, force: Array) -> None:
-    """Add what torques gain where a link is steep, of the order of V4.
+def steepen(
+    root_slope: Array, tip_slope: Array, torque: Array, q: Array, effort: Array, force: Array,
+) -> None:
+    """Add to force (n,) what torques gain where a link is steep, of the order of V4.
 
     A joint turns by the angle asin(w') of the tangent, so that its torque works on eta through
-    w' (1 + w'^2 / 2). Nothing in the paper's convention, whose torques bend nothing.
+    w' (1 + w'^2 / 2). Nothing in the paper's convention, whose torques bend nothing. The arrays are the
+    Manipulator's; passing it whole would cost more than the arithmetic.
     """
-    root1, tip1, root2 = steepness(arm, q)
-    for j in range(arm.kappa):
-        r1, r2 = 2 + j, 2 + arm.kappa + j
-        force[r1] += 0.5 * (arm.torque[r1, 0] * root1 * root1 * effort[0]
-                            + arm.torque[r1, 1] * tip1 * tip1 * effort[1])
-        force[r2] += 0.5 * arm.torque[r2, 1] * root2 * root2 * effort[1]
+    k = root_slope.shape[1]
+    root1, tip1, root2 = 0.0, 0.0, 0.0
+    for j in range(k):
+        root1 += root_slope[0, j] * q[2 + j]
+        tip1 += tip_slope[0, j] * q[2 + j]
+        root2 += root_slope[1, j] * q[2 + k + j]
+    first = 0.5 * root1 * root1 * effort[0]
+    second = 0.5 * tip1 * tip1 * effort[1]
+    third = 0.5 * root2 * root2 * effort[1]
+    for j in range(k):
+        force[2 + j] += torque[2 + j, 0] * first + torque[2 + j, 1] * second
+        force[2 + k + j] += torque[2 + k + j, 1] * third
 
 
 @kernel
@@ -126,6 +123,6 @@ def acceleration(
         qdd[r] = (arm.torque[r, 0] * effort[0] + arm.torque[r, 1] * effort[1]
                   - work.E[r] - work.elastic[r] - arm.damping[r] * qd[r])
     if arm.shortening:
-        steepen(arm, q, effort, qdd)
+        steepen(arm.root_slope, arm.tip_slope, arm.torque, q, effort, qdd)
     solve(work.M, qdd)
     return True

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.plant.acceleration_kernel import acceleration, steepness
+from flexmanip_ros.plant.acceleration_kernel import acceleration
 from flexmanip_ros.plant.compiled import kernel
 from flexmanip_ros.plant.kernels import assemble
 from flexmanip_ros.plant.link_jacobian_kernel import link_jacobian, point_jacobian
@@ -214,18 +214,24 @@ def solve_columns(L: Array, X: Array) -> None:
 
 
 @kernel
-def steep_jacobian(arm: Manipulator, q: Array, effort: Array, dq: Array) -> None:
+def steep_jacobian(
+    root_slope: Array, tip_slope: Array, torque: Array, q: Array, effort: Array, dq: Array,
+) -> None:
     """Subtract the derivative of ``acceleration_kernel.steepen`` by q from dq (n, n)."""
-    k = arm.kappa
-    root1, tip1, root2 = steepness(arm, q)
+    k = root_slope.shape[1]
+    root1, tip1, root2 = 0.0, 0.0, 0.0
+    for j in range(k):
+        root1 += root_slope[0, j] * q[2 + j]
+        tip1 += tip_slope[0, j] * q[2 + j]
+        root2 += root_slope[1, j] * q[2 + k + j]
     for j in range(k):
         r1, r2 = 2 + j, 2 + k + j
-        first = arm.torque[r1, 0] * root1 * effort[0]
-        second = arm.torque[r1, 1] * tip1 * effort[1]
-        third = arm.torque[r2, 1] * root2 * effort[1]
+        first = torque[r1, 0] * root1 * effort[0]
+        second = torque[r1, 1] * tip1 * effort[1]
+        third = torque[r2, 1] * root2 * effort[1]
         for m in range(k):
-            dq[r1, 2 + m] -= first * arm.root_slope[0, m] + second * arm.tip_slope[0, m]
-            dq[r2, 2 + k + m] -= third * arm.root_slope[1, m]
+            dq[r1, 2 + m] -= first * root_slope[0, m] + second * tip_slope[0, m]
+            dq[r2, 2 + k + m] -= third * root_slope[1, m]
 
 
 @kernel
@@ -253,7 +259,7 @@ def acceleration_jacobian(
                 dp[r, 2 + i] = work.elastic[r] * arm.unit_stiffness[r] / arm.stiffness[r]
                 for m in range(k):
                     dq[r, o + m] += work.tangent[r, m]
-        steep_jacobian(arm, q, effort, dq)
+        steep_jacobian(arm.root_slope, arm.tip_slope, arm.torque, q, effort, dq)
     solve_columns(work.M, dq)
     solve_columns(work.M, dqd)
     solve_columns(work.M, dp)

@@ -181,7 +181,7 @@ def torque_at(arm: Manipulator, q: Array) -> Array:
     if arm.shortening:
         for i, unit in enumerate(np.eye(2)):
             column = B[:, i].copy()
-            steepen(arm, np.asarray(q, float), unit, column)
+            steepen(arm.root_slope, arm.tip_slope, arm.torque, np.asarray(q, float), unit, column)
             B[:, i] = column
     return B
 

@@ -68,7 +68,7 @@ def linearize(
     bias_jacobian(arm, payload, q, qd, qdd, both, rates, work)
     K = dynamics.elastic_tangent(arm, q)
     if arm.shortening:
-        steep_jacobian(arm, q, effort, K)
+        steep_jacobian(arm.root_slope, arm.tip_slope, arm.torque, q, effort, K)
     at_rest = np.empty((n, n))
     bias_jacobian(arm, payload, q, qd, np.zeros(n), at_rest, rates, work)
     return Linearization(
