@@ -30,7 +30,8 @@ class IdentifierParameters:
         (0.99, 0.99, 0.99), 'forgetting factors beta 1..3 of the three least squares', low=0.5, high=1.0,
         size=3, live=True)
     regularization: tuple[float, ...] = parameter(
-        (0.1, 0.1, 0.1), 'regularization alpha 1..3 on internally scaled signals', low=1e-12, high=1e12, size=3)
+        (0.1, 0.1, 0.1), 'regularization alpha 1..3 on internally scaled signals',
+        low=1e-12, high=1e12, size=3)
     direct_feedthrough: bool = parameter(False, 'identify D instead of holding it at zero')
     estimator: str = parameter(
         'factor', 'factor: moments in one triangular factor, solved when a model is asked for; '
@@ -51,8 +52,8 @@ class IdentifierParameters:
         choices=('excitation', 'constant', 'innovation'))
     refinement: str = parameter(
         'output_error', 'maximum-likelihood fit started from the subspace model and kept up to date (needs '
-        'estimator factor, forgetting innovation): output_error, K = 0 while the system is fitted, dropped if '
-        'that does not simulate; prediction_error, K free where the likelihood asks for it; none',
+        'estimator factor, forgetting innovation): output_error, K = 0 while the system is fitted, dropped '
+        'if that does not simulate; prediction_error, K free where the likelihood asks for it; none',
         choices=('output_error', 'prediction_error', 'none'))
     stable_model: bool = parameter(
         False, 'publish no pole outside the unit circle: draw it back onto it')
@@ -100,7 +101,8 @@ class IdentifierParameters:
                 f"parameter 'angles' names {len(self.angles)} signals", "name two, or [''] for none")
         if self.state_basis == 'tracked' and self.estimator != 'paper':
             raise ParameterError(
-                "parameter 'state_basis' is 'tracked'", "set estimator to 'paper', or choose singular or fixed")
+                "parameter 'state_basis' is 'tracked'",
+                "set estimator to 'paper', or choose singular or fixed")
         if self.future_window > self.past_window:
             raise ParameterError(
                 f"parameter 'future_window' is {self.future_window}",
@@ -116,6 +118,7 @@ def _check_signals(group: str, names: tuple[str, ...]) -> None:
         joint, _, what = name.rpartition('/')
         if not joint or what not in FIELDS:
             raise ParameterError(
-                f"parameter '{group}' names '{name}'", f'write NAME/FIELD with FIELD one of {", ".join(FIELDS)}')
+                f"parameter '{group}' names '{name}'",
+                f'write NAME/FIELD with FIELD one of {", ".join(FIELDS)}')
     if len(set(names)) != len(names):
         raise ParameterError(f"parameter '{group}' names a signal twice", 'name each signal once')

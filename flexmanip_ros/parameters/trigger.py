@@ -22,7 +22,8 @@ class TriggerParameters:
     release_time: float = parameter(
         -1.0, 'release this long after the first sample (mode time); negative: never', unit='s', low=-1.0)
     lead_time: float = parameter(
-        0.5, 'an event at a set time is announced this long before its stamp, so that nobody hears of it late',
+        0.5, 'an event at a set time is announced this long before its stamp, so that nobody hears of it '
+        'late',
         unit='s', low=0.0, high=10.0)
     service_delay: float = parameter(
         0.02, 'a requested event takes effect this long after the request (the time a gripper needs)',
