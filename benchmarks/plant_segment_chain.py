@@ -1,6 +1,6 @@
 """Kappa = 3 with shortening, slope correction and tail follows a chain of 40 segments a link within 0.5 %.
 
-Bends and encoder angles, 6 s at large angles under the same torques; the chain is simulated by MuJoCo.
+Bends and encoder angles, 3 s at large angles under the same torques; the chain is simulated by MuJoCo.
 Relative root-mean-square differences over the run, each signal by its own deviation from the mean. The
 chain: pieces of length L / 40 (half ones at the ends) joined by hinges of stiffness EI / (L / 40), so that
 bending is summed by the midpoint rule, damping proportional to stiffness as in the plant. MuJoCo's implicit
@@ -109,7 +109,7 @@ def difference(a: np.ndarray, b: np.ndarray) -> list[float]:
 def main() -> int:
     """Run the cases, print and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--time', type=float, default=6.0, help='seconds simulated a case')
+    parser.add_argument('--time', type=float, default=3.0, help='seconds simulated a case')
     options = parser.parse_args()
     results = []
     names = ' '.join(f'{name:>10}' for name in simulator.JOINT_NAMES)
