@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 PARAMETERS = 6
 """Payload, two stiffness factors (logarithm), two damping ratios, rotary inertia (logarithm)."""
+SERIES = 12
+"""Terms of the motion's exponential: 1e-9 of the fastest mode at one radian a step."""
+SPREAD_SERIES = 6
+"""Terms of the spread's: it weighs, and need not be exact."""
 
 
 class Motion(NamedTuple):
@@ -159,38 +163,43 @@ def predict(motion: Motion, x: Array, S: Array, effort: Array, duration: float, 
     set_parameters(motion, x, held)
     steps = max(int(np.ceil(duration / motion.substeps)), 1)
     for _ in range(steps):
-        if not runge_kutta(motion, x, effort, duration / steps, held):
+        if not exponential_step(motion, x, effort, duration / steps, held):
             return False
         spread(motion, S, duration / steps)
     return True
 
 
 @kernel
-def runge_kutta(motion: Motion, x: Array, effort: Array, h: float, held: bool) -> bool:
-    """One step of fourth order; the linearisation is left in motion as of the midpoint."""
+def exponential_step(motion: Motion, x: Array, effort: Array, h: float, held: bool) -> bool:
+    """x <- x + h phi_1(h F) f(x): exact where the motion is linear; the linearisation is left in motion.
+
+    The vibration turns too far in one sample for a step of Runge and Kutta: their damping of the fastest mode
+    read as 0.3 % of payload. What this step neglects is the curvature of the slow, weak nonlinearity
+    (exponential Rosenbrock-Euler method; phi_1(z) = (exp z - 1) / z by its series).
+    """
     n = motion.q.size
-    k, trial = motion.k, motion.q
     q, qd = x[:n], x[n:2 * n]
-    if not accelerate(motion, q, qd, effort, k[0]):
+    term, following, total = motion.k[4:6], motion.k[6:8], motion.k[1:3]
+    if not linearize(motion, q, qd, effort, motion.k[0], held):
         return False
     for i in range(n):
-        trial[i] = q[i] + 0.5 * h * qd[i]
-        k[4, i] = qd[i] + 0.5 * h * k[0, i]
-    if not accelerate(motion, trial, k[4], effort, k[1]):
-        return False
+        term[0, i] = total[0, i] = qd[i]
+        term[1, i] = total[1, i] = motion.k[0, i]
+    for order in range(2, SERIES + 2):
+        weight = h / order
+        for i in range(n):
+            following[0, i] = weight * term[1, i]
+            value = 0.0
+            for j in range(n):
+                value += motion.dq[i, j] * term[0, j] + motion.dqd[i, j] * term[1, j]
+            following[1, i] = weight * value
+        for part in range(2):
+            for i in range(n):
+                term[part, i] = following[part, i]
+                total[part, i] += following[part, i]
     for i in range(n):
-        trial[i] = q[i] + 0.5 * h * k[4, i]
-        k[5, i] = qd[i] + 0.5 * h * k[1, i]
-    if not linearize(motion, trial, k[5], effort, k[2], held):
-        return False
-    for i in range(n):
-        trial[i] = q[i] + h * k[5, i]
-        k[6, i] = qd[i] + h * k[2, i]
-    if not accelerate(motion, trial, k[6], effort, k[3]):
-        return False
-    for i in range(n):
-        x[i] += h / 6.0 * (qd[i] + 2.0 * (k[4, i] + k[5, i]) + k[6, i])
-        x[n + i] += h / 6.0 * (k[0, i] + 2.0 * (k[1, i] + k[2, i]) + k[3, i])
+        x[i] += h * total[0, i]
+        x[n + i] += h * total[1, i]
         if not abs(x[i]) + abs(x[n + i]) < 1e6:
             return False
     return True
@@ -198,7 +207,7 @@ def runge_kutta(motion: Motion, x: Array, effort: Array, h: float, held: bool) -
 
 @kernel
 def spread(motion: Motion, S: Array, h: float) -> None:
-    """S <- F S, F the fourth-order Taylor series of the linearised flow over h."""
+    """S <- F S, F the Taylor series of the linearised flow over h."""
     n = motion.q.size
     nx = S.shape[1]
     X, Y = motion.X, motion.Y
@@ -206,7 +215,7 @@ def spread(motion: Motion, S: Array, h: float) -> None:
         for c in range(nx):
             X[i, c] = S[i, c]
     weight = 1.0
-    for order in range(1, 5):
+    for order in range(1, SPREAD_SERIES + 1):
         for i in range(n):
             for c in range(nx):
                 Y[i, c] = X[n + i, c]
