@@ -17,7 +17,8 @@ class ExcitationParameters:
     rate: float = parameter(1000.0, 'commands a second', unit='Hz', low=1.0, high=100000.0)
     clock: str = parameter(
         'wall', 'wall: torques follow the time since activation; joint_states: the stamps since the first '
-        'joint state, in step with a simulated arm that lags on a busy machine', choices=('wall', 'joint_states'))
+        'joint state, in step with a simulated arm that lags on a busy machine',
+        choices=('wall', 'joint_states'))
     shape: str = parameter(
         'square', 'form of the torque', choices=('square', 'multisine', 'prbs', 'chirp', 'zero'))
     amplitude: tuple[float, ...] = parameter(
