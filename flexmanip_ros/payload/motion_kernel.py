@@ -171,7 +171,7 @@ def predict(motion: Motion, x: Array, S: Array, effort: Array, duration: float, 
 
 @kernel
 def exponential_step(motion: Motion, x: Array, effort: Array, h: float, held: bool) -> bool:
-    """x <- x + h phi_1(h F) f(x): exact where the motion is linear; the linearisation is left in motion.
+    """Advance x <- x + h phi_1(h F) f(x): exact where the motion is linear. Leaves the linearisation.
 
     The vibration turns too far in one sample for a step of Runge and Kutta: their damping of the fastest mode
     read as 0.3 % of payload. What this step neglects is the curvature of the slow, weak nonlinearity
