@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 from flexmanip_ros import detection, sampling
+from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
 from flexmanip_ros.types import CaptureEvent, JointRecord
 
@@ -16,6 +18,11 @@ def with_detected(config: IdentifierParameters, items: Iterable[Item]) -> Iterat
 
     The event carries the stamp of its onset; the pipeline goes back for it, as it does live.
     """
+    if not config.angles:
+        raise ParameterError('captures cannot be found in the signals without angles',
+                             'name the joints in parameter angles, or give --capture-time')
+    # The angles are needed here whether or not a payload is estimated.
+    config = replace(config, payload_method='structured')
     clock = sampling.init()
     state: detection.DetectionState | None = None
     trigger = TriggerParameters()

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.identification import rpbsid
+from flexmanip_ros.identification.memory_kernel import FILLED
 from flexmanip_ros.identification.modal import modes
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, structured
@@ -56,14 +57,14 @@ def event(config: IdentifierParameters, core: Core, event: CaptureEvent) -> Core
 
 def estimate(config: IdentifierParameters, core: Core, stamp_ns: int, dt: float) -> Estimate:
     """Read model, modes and payload out of the estimators; the costly part, done at the publishing rate."""
-    found = rpbsid.identified(config, core.rpbsid, dt)
+    found, without = _identified(config, core.rpbsid, dt)
     payload = None
     if config.payload_method == 'structured' and core.structured is not None:
         payload = structured.estimate(config, core.structured)
     elif config.payload_method == 'block' and found is not None:
         payload = block_extraction.estimate(config, found, core.angles)
     if found is None:
-        return Estimate(stamp_ns, Status.WARMING_UP, None, (), payload)
+        return Estimate(stamp_ns, without, None, (), payload)
     status = found.status
     if payload is not None and status is Status.TRACKING:
         status = payload.status
@@ -71,3 +72,15 @@ def estimate(config: IdentifierParameters, core: Core, stamp_ns: int, dt: float)
         stamp_ns, status, found.model, modes(found), payload, excitation=found.excitation,
         condition=found.condition, singular_values=found.singular_values,
         innovation_power=found.innovation_power)
+
+
+def _identified(config: IdentifierParameters, state: rpbsid.RpbsidState, dt: float
+                ) -> tuple[rpbsid.Identified | None, Status]:
+    """Return the model, and what to say while there is none: too few samples, or signals that stand still."""
+    try:
+        found = rpbsid.identified(config, state, dt)
+    except np.linalg.LinAlgError:  # signals that barely move, or in one direction only
+        return None, Status.POORLY_EXCITED
+    parameters = config.past_window * (len(config.inputs) + len(config.outputs)) + len(config.inputs)
+    enough = state.counts[FILLED] > 2 * parameters + config.past_window
+    return found, Status.POORLY_EXCITED if enough else Status.WARMING_UP

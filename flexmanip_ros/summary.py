@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from flexmanip_ros import pipeline
-from flexmanip_ros.types import Estimate, EventKind
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -
 def event_time(state: pipeline.State, kind: EventKind) -> float | None:
     """Return when the latest event of a kind was, from the first sample's stamp [s]; None if not reached."""
     stamp = state.stamp_of(kind)
-    waits = state.timeline is not None and any(event.kind is kind for event in state.timeline.waiting)
-    return None if stamp is None or waits else (stamp - state.first_ns) / 1e9
+    waiting = () if state.timeline is None else state.timeline.waiting
+    return None if stamp is None or CaptureEvent(stamp, kind) in waiting else (stamp - state.first_ns) / 1e9
 
 
 def _known(value: float) -> float | None:

@@ -13,7 +13,7 @@ from flexmanip_ros import holdout, pipeline
 from flexmanip_ros.achievable import payload_std
 from flexmanip_ros.cli.console import require_pictures
 from flexmanip_ros.detected_events import with_detected
-from flexmanip_ros.errors import BagError, FlexmanipError
+from flexmanip_ros.errors import BagError, FlexmanipError, ParameterError
 from flexmanip_ros.history import History, Signals
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.outputs import Outputs, TableOutput, open_output
@@ -31,6 +31,8 @@ class Request:
     config: IdentifierParameters
     joint_states: str = 'joint_states'
     events: tuple[str, ...] = ('capture_event', 'capture_detected')
+    events_required: bool = False
+    """The event topics were asked for by name: one that is not there is an error."""
     capture_time: float | None = None
     release_time: float | None = None
     detect: bool = False
@@ -63,6 +65,8 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
     if request.report is not None:
         check_place(request.report)
         require_pictures()
+        if request.output is not None and Path(request.output).resolve() == Path(request.report).resolve():
+            raise ParameterError(f"--output and --report are both '{request.report}'", 'give two names')
     feed = _Feed(request, progress)
     kept: list[Estimate] = []
     state = pipeline.init()
@@ -96,7 +100,7 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
     return Result(
         summary, () if last is None else last.modes, state.sampling.outputs or request.config.outputs,
         tuple(str(place) for place in (request.output, request.report) if place is not None), fault,
-        feed.interrupted, _remark(state))
+        feed.interrupted, _remark(state, feed.foreign))
 
 
 class _Feed:
@@ -105,6 +109,10 @@ class _Feed:
     def __init__(self, request: Request, progress: bag.Progress | None) -> None:
         self.fault: FlexmanipError | None = None
         self.interrupted = False
+        self.foreign = 0
+        """Messages that hold none of the configured joints."""
+        config = request.config
+        self._joints = {name.rpartition('/')[0] for name in (*config.inputs, *config.outputs, *config.angles)}
         self.first_ns: int | None = None
         self.events: list[CaptureEvent] = []
         wanted = request.report is not None or request.validate_from is not None
@@ -115,7 +123,7 @@ class _Feed:
     def __iter__(self) -> Iterator[bag.Item]:
         request = self._request
         try:
-            topics = bag.Topics(request.joint_states, request.events)
+            topics = bag.Topics(request.joint_states, request.events, request.events_required)
             items = bag.read(request.bag, topics, self._progress)
             for item in with_detected(request.config, items) if request.detect else items:
                 yield from self._pass(item)
@@ -127,6 +135,7 @@ class _Feed:
 
     def _pass(self, item: bag.Item) -> Iterator[bag.Item]:
         if isinstance(item, JointRecord):
+            self.foreign += self._joints.isdisjoint(item.names)
             if self.history is not None:
                 self.history.add(item)
             if self.first_ns is None:
@@ -164,11 +173,14 @@ def _dropped(state: pipeline.State) -> FlexmanipError | None:
                     'look at the publisher of the joint states')
 
 
-def _remark(state: pipeline.State) -> str:
-    """Say in one line what was left out or applied at another time than it says; empty when all was used."""
+def _remark(state: pipeline.State, foreign: int) -> str:
+    """Say in one line what was left out or applied at another time than it says; empty when all was used.
+
+    foreign: messages of other publishers on the same topic, which nobody misses.
+    """
     counters, line = state.counters, state.timeline
     left_out = [f'{count} {why}' for count, why in (
-        (counters.missing_signal, 'without a configured signal'),
+        (counters.missing_signal - foreign, 'without a configured signal'),
         (counters.late_stamp, 'with a stamp older than the one before'),
         (counters.repeated_stamp, 'with the stamp of the one before')) if count]
     said = [f'of {counters.received} messages {", ".join(left_out)} were left out'] if left_out else []
@@ -177,7 +189,7 @@ def _remark(state: pipeline.State) -> str:
                     'the result is of what came after')
     if line is not None:
         said += [f'a {event.kind.value} is announced for after the last sample and was not applied'
-                 for event in line.waiting]
+                 for event in line.waiting if event in line.latest]
         if line.late_events:
             said.append(f'{line.late_events} events arrived more than rewind_time after their stamp; '
                         'they were applied on arrival')

@@ -67,6 +67,7 @@ def _main(given: argparse.Namespace) -> int:
     request = Request(
         given.bag, config, joint_states=given.joint_states,
         events=tuple(given.capture_event or ('capture_event', 'capture_detected')),
+        events_required=given.capture_event is not None,
         capture_time=given.capture_time, release_time=given.release_time, detect=given.detect,
         validate_from=given.validate_from,
         output=given.output, report=given.report)

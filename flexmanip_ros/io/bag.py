@@ -30,6 +30,7 @@ class Topics:
 
     joint_states: str = 'joint_states'
     events: tuple[str, ...] = ('capture_event', 'capture_detected')
+    events_required: bool = False
 
 
 def read(path: str | Path, topics: Topics | None = None, progress: Progress | None = None) -> Iterator[Item]:
@@ -182,6 +183,10 @@ class _Decoder:
             event = _resolve(name, near, HEADER, self.path)
             if event is not None:
                 self.kinds[event] = HEADER
+            elif complete and self.topics.events_required:
+                listed = ', '.join(sorted(topic for topic, kind in there.items() if kind == HEADER)) or 'none'
+                raise BagError(f"bag '{self.path}' has no topic '{name}'",
+                               f'the event topics there are: {listed}')
         return any(topic in self.kinds for topic in there)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+import stat
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -109,7 +110,13 @@ def write_file(path: str | Path, fill: Callable[[Any], Any]) -> None:
 def check_place(path: str | Path) -> None:
     """Raise OutputError now, not after a long run, when a file cannot be written there."""
     folder = Path(path).absolute().parent
-    if Path(path).is_dir():
+    try:
+        is_directory = stat.S_ISDIR(os.stat(path).st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        is_directory = not str(path)
+    except OSError as err:
+        raise OutputError(f"'{path}' cannot be written: {err.strerror}", 'give another place') from err
+    if is_directory:
         raise OutputError(f"'{path}' is a directory", 'give a file name')
     if not folder.is_dir():
         raise OutputError(f"directory '{folder}' does not exist", 'make it first, or give another place')

@@ -128,3 +128,40 @@ def test_a_parameter_that_is_not_finite_is_refused(capsys, tmp_path, value):
     status, _, err = _run(capsys, tmp_path, '--set', f'arm.link_length=[{value}, 3.0]')
     assert status == 2
     assert "'arm.link_length'" in err
+
+
+def test_an_event_topic_asked_for_by_name_must_be_there(capsys, tmp_path):
+    path = _bag(tmp_path / 'bag', _records(), CaptureEvent(START + 100 * MS, EventKind.CAPTURE))
+    status, found, err = _run(capsys, path, PLAIN, '--capture-event', '/capture_evnt')
+    assert (status, found) == (2, {})
+    assert "no topic '/capture_evnt'; the event topics there are: /capture_event" in err
+
+
+def test_messages_of_another_publisher_are_missed_by_nobody(capsys, tmp_path):
+    grip = [JointRecord(START + k * MS + 1, ('finger',), *np.zeros((3, 1))) for k in range(300)]
+    both = [record for pair in zip(_records(), grip, strict=True) for record in pair]
+    assert _run(capsys, _bag(tmp_path / 'bag', both), PLAIN)[2] == ''
+
+
+@pytest.mark.parametrize('option', ['--output', '--report'])
+def test_a_name_too_long_is_said_before_the_work(capsys, tmp_path, option):
+    for name in ('x' * 300, 'x' * 300 + '.csv'):
+        path = _bag(tmp_path / f'bag{len(name)}', _records())
+        status, _, err = _run(capsys, path, PLAIN, option, tmp_path / name)
+        assert status == 2
+        assert 'too long' in err
+
+
+def test_output_and_report_cannot_be_one_file(capsys, tmp_path):
+    path = _bag(tmp_path / 'bag', _records())
+    status, _, err = _run(capsys, path, PLAIN, '--output', tmp_path / 'a.csv', '--report', tmp_path / 'a.csv')
+    assert status == 2
+    assert 'give two names' in err
+
+
+def test_detection_needs_angles_but_no_payload_method(capsys, tmp_path):
+    path = _bag(tmp_path / 'bag', _records())
+    assert _run(capsys, path, PLAIN, '--detect')[0] == 0
+    status, _, err = _run(capsys, path, PLAIN, '--set=angles=[]', '--detect')
+    assert status == 2
+    assert 'without angles' in err
