@@ -10,6 +10,7 @@ import numpy as np
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.memory_kernel import FILLED
 from flexmanip_ros.identification.modal import modes
+from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, structured
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, Sample, Status
@@ -64,18 +65,18 @@ def estimate(config: IdentifierParameters, core: Core, stamp_ns: int, dt: float)
     elif config.payload_method == 'block' and found is not None:
         payload = block_extraction.estimate(config, found, core.angles)
     if found is None:
-        return Estimate(stamp_ns, without, None, (), payload)
+        return Estimate(stamp_ns, without, None, (), payload, model_status=without)
     status = found.status
-    if payload is not None and status is Status.TRACKING:
-        status = payload.status
+    if payload is not None and (status is Status.TRACKING or config.payload_method == 'structured'):
+        status = payload.status  # a structured payload does not rest on the model
     return Estimate(
         stamp_ns, status, found.model, modes(found), payload, excitation=found.excitation,
         condition=found.condition, singular_values=found.singular_values,
-        innovation_power=found.innovation_power)
+        innovation_power=found.innovation_power, model_status=found.status)
 
 
 def _identified(config: IdentifierParameters, state: rpbsid.RpbsidState, dt: float
-                ) -> tuple[rpbsid.Identified | None, Status]:
+                ) -> tuple[Identified | None, Status]:
     """Return the model, and what to say while there is none: too few samples, or signals that stand still."""
     try:
         found = rpbsid.identified(config, state, dt)

@@ -46,6 +46,13 @@ def seconds(text: str) -> float:
     return value
 
 
+def whole(text: str) -> int:
+    """Return a seed or count given as an argument. Raises ArgumentTypeError when it is none."""
+    if not text.strip().isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 up")
+    return int(text)
+
+
 def parser(prog: str, words: str, epilog: str) -> Parser:
     """Return a parser whose examples keep their lines."""
     return Parser(prog=prog, description=words, epilog=epilog, allow_abbrev=False,

@@ -94,6 +94,8 @@ def describe(result: Result) -> list[str]:
     lines += [f'{name:12s} at {time:.3f} s' for name, time in (
         ('capture', summary.capture_time_s), ('release', summary.release_time_s)) if time is not None]
     lines.append(f'status       {summary.status}: {Status[summary.status].value}')
+    if summary.model_status not in (summary.status, Status.TRACKING.name):
+        lines.append(f'model        {summary.model_status}: {Status[summary.model_status].value}')
     for k, mode in enumerate(result.modes):
         spread = f' +- {1.96 * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else ''
         lines.append(f'mode {k + 1}       {mode.frequency_hz:.4f}{spread} Hz, '

@@ -42,7 +42,7 @@ def _parser() -> console.Parser:
     add('source', metavar='SCENARIO.yaml|FOLDER', help='what to repeat, or where the recordings are')
     add('--runs', type=int, default=100, metavar='N',
         help='seeds FIRST .. FIRST+N-1 of the scenario (default 100)')
-    add('--first-seed', type=int, default=0, metavar='FIRST', help='default: 0')
+    add('--first-seed', type=console.whole, default=0, metavar='FIRST', help='default: 0')
     add('--output', default='study.csv', metavar='TABLE', help='.csv or .parquet (default study.csv)')
     add('--report', metavar='REPORT.html', help='one page with scores and pictures')
     add('--workers', type=int, metavar='N', help='processes; default: one a core; 0: this one only')

@@ -39,7 +39,7 @@ def _parser() -> console.Parser:
     add('--runs', type=int, default=30, metavar='N', help='runs a case (default 30, as the paper)')
     add('--case', action='append', choices=[case.name for case in paper.CASES], metavar='NAME',
         help=f'only this case, may be repeated: {", ".join(case.name for case in paper.CASES)}')
-    add('--first-seed', type=int, default=0, metavar='SEED', help='default: 0')
+    add('--first-seed', type=console.whole, default=0, metavar='SEED', help='default: 0')
     add('--output', default='paper_reproduction', metavar='DIR', help='default: paper_reproduction')
     add('--workers', type=int, metavar='N', help='processes; default: one a core; 0: this one only')
     return made

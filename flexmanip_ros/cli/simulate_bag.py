@@ -82,13 +82,15 @@ def configurations(given: argparse.Namespace) -> tuple[PlantParameters, Excitati
 def _main(given: argparse.Namespace) -> int:
     plant, torque = configurations(given)
     if not 0.0 < given.duration <= 1e6:
-        raise ParameterError(f'--duration is {given.duration:g}', 'give seconds above 0')
+        raise ParameterError(f'--duration is {given.duration:g}', 'give seconds above 0, up to 1e6')
     count = max(round(given.duration * plant.rate), 1)
     events = tuple(
         CaptureEvent(START_NS + round(at * 1e9), kind)
         for at, kind in ((given.capture_time, EventKind.CAPTURE), (given.release_time, EventKind.RELEASE))
         if 0.0 <= at < given.duration)
     target = Path(given.bag)
+    if not target.name:
+        raise BagError(f"'{given.bag}' is no name for a recording", 'give the name of a directory to make')
     truth_path = target.with_name(target.name + '.truth.json')
     if target.exists():
         raise BagError(f"'{target}' exists already", 'remove it or give another name')

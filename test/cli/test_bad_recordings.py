@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexmanip_ros.cli import simulate_bag
+from flexmanip_ros.cli import monte_carlo, reproduce_paper, simulate_bag
 from flexmanip_ros.cli.identify_bag import main
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
@@ -165,3 +165,19 @@ def test_detection_needs_angles_but_no_payload_method(capsys, tmp_path):
     status, _, err = _run(capsys, path, PLAIN, '--set=angles=[]', '--detect')
     assert status == 2
     assert 'without angles' in err
+
+
+@pytest.mark.parametrize('bag', ['', '.', '/'])
+def test_simulate_bag_wants_a_name_to_make(capsys, bag):
+    assert simulate_bag.main([bag]) == 2
+    err = capsys.readouterr().err
+    assert 'defect' not in err
+    assert err.count('\n') == 1
+
+
+@pytest.mark.parametrize('program', [monte_carlo, reproduce_paper])
+def test_a_seed_that_is_none_is_refused_before_the_runs(capsys, program):
+    with pytest.raises(SystemExit) as ended:
+        program.main([*(['scenario.yaml'] if program is monte_carlo else []), '--first-seed=-5'])
+    assert ended.value.code == 2
+    assert "'-5' is not a whole number" in capsys.readouterr().err
