@@ -29,10 +29,13 @@ class Summary:
     release_time_s: float | None
     vaf_simulation_percent: tuple[float | None, ...] | None = None
     vaf_prediction_percent: tuple[float | None, ...] | None = None
+    model_status: str = 'TRACKING'
+    """What the model is worth, where ``status`` is that of the payload; for people, not in the JSON."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the values as JSON has them: no NaN, no infinity, lists instead of tuples."""
-        return {item.name: _json(getattr(self, item.name)) for item in fields(self)}
+        return {item.name: _json(getattr(self, item.name)) for item in fields(self)
+                if item.name != 'model_status'}
 
 
 def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -> Summary:
@@ -46,6 +49,7 @@ def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -
         sample_time_s=_known(state.sampling.dt or math.nan),
         wall_s=wall_s,
         status='WARMING_UP' if estimate is None else estimate.status.name,
+        model_status='WARMING_UP' if estimate is None else estimate.model_status.name,
         frequencies_hz=tuple(mode.frequency_hz for mode in modes),
         damping_ratios=tuple(mode.damping_ratio for mode in modes),
         payload_mass_kg=None if payload is None else _known(payload.mass),

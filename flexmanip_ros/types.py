@@ -63,6 +63,7 @@ class Status(Enum):
     TRACKING = 'tracking'
     POORLY_EXCITED = 'the signals carry too little information; move the arm or raise the torque'
     ILL_CONDITIONED = 'the regression is nearly singular; lower the order or the past window'
+    ORDER_TOO_LOW = 'the signals hold more dynamics than the order; raise the order'
     SAMPLE_GAP = 'samples are missing; the regressor window restarted'
     INCONSISTENT = 'the residuals do not fit the model; the interval was widened'
     NO_PAYLOAD_METHOD = 'no payload is estimated (payload_method: none)'
@@ -134,4 +135,6 @@ class Estimate:
     singular_values: Array | None = None
     """Singular values of observability x controllability, for the choice of the order."""
     innovation_power: float = float('nan')
+    model_status: Status = Status.TRACKING
+    """What the model is worth; ``status`` is that of the payload where one is estimated beside the model."""
     """Mean squared innovation over the variance expected [-]."""

@@ -43,6 +43,8 @@ class Realized(NamedTuple):
     regression: Array
     """(d, d) upper triangular factor of the regressors' moments, ridge included."""
     singular_values: Array
+    neglected: Array
+    """(m,) innovation variance that the order leaves out, over that of the VARX (0: nothing is left out)."""
 
 
 def triangle(tall: Array) -> Array:
@@ -155,7 +157,10 @@ def realize(
         rest = following - np.hstack([state, u]) @ ABK[:, :n + r].T
         K = riccati_gain(ABK[:, :n], CD[:, :n], rest, innovation, K)
     D = CD[:, n:] if feedthrough else np.zeros((m, r))
+    most = np.einsum('ij,ij->j', residual, residual)
+    extra = np.einsum('ij,ij->j', innovation, innovation) - most
     return Realized(
         A=ABK[:, :n], B=ABK[:, n:n + r], C=CD[:, :n], D=D, K=K, Xi=Xi, xi_u=xi_u, S=S, T=T,
         state=state, residual=residual, regression=head, singular_values=values,
+        neglected=np.divide(np.maximum(extra, 0.0), most, out=np.zeros(m), where=most > 0.0),
     )

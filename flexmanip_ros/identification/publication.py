@@ -21,6 +21,10 @@ LARGEST_SPREAD = 4_000_000
 UNEXPLAINED = 0.9
 """Share of the outputs' power left to the innovations above which there is nothing to identify."""
 WORST_CONDITION = 1e12
+NEGLECTED = 0.005
+"""Share of an innovation's variance that the order may leave out before the order is called too low."""
+SIGNIFICANT = 25.0
+"""Likelihood ratio (doubled logarithm) beyond which what is left out is no chance."""
 
 
 def from_factor(config: IdentifierParameters, R: Array, scale: Array) -> tuple[Realized | None, Array, Array]:
@@ -71,7 +75,7 @@ def from_recursion(
         A=theta_x[:, :n], B=theta_x[:, n:n + r], C=theta_y[:, :n],
         D=theta_y[:, n:] if d > past else np.zeros((m, r)), K=theta_x[:, n + r:], Xi=Xi, xi_u=xi_u, S=S, T=T,
         state=R[:, :past] @ T.T, residual=np.zeros((m, m)), regression=head,
-        singular_values=values), R
+        singular_values=values, neglected=np.zeros(m)), R
 
 
 def from_fit(
@@ -129,6 +133,10 @@ def publish(
         along = Tangent(*_in_units(*along, su, sy))
     model, along, known = based(model, along, config.stable_model)
     spread = along.flat() if along is not None else np.zeros((entries, 0))
+    ratio = float(effective * np.log1p(realized.neglected).sum())
+    too_low = ratio > SIGNIFICANT and float(realized.neglected.max()) > NEGLECTED
+    if too_low:  # a model that misses dynamics is off by more than its noise
+        spread = spread * np.sqrt(ratio)
     condition = float(np.linalg.cond(realized.state / np.linalg.norm(realized.state, axis=0)))
     power = float(scalars[POWER])
     covariance = innovation.T @ innovation
@@ -137,7 +145,8 @@ def publish(
     return Identified(
         model=model, spread=spread, singular_values=realized.singular_values,
         excitation=excitation(realized.regression), condition=condition, innovation_power=power,
-        status=judge(used, d, condition, unexplained), innovation_covariance=covariance / np.outer(sy, sy),
+        status=judge(used, d, condition, unexplained, too_low),
+        innovation_covariance=covariance / np.outer(sy, sy),
         known_basis=known, samples=float(effective))
 
 
@@ -168,7 +177,7 @@ def based(
     return moved, along, known
 
 
-def judge(used: int, parameters: int, condition: float, unexplained: float) -> Status:
+def judge(used: int, parameters: int, condition: float, unexplained: float, too_low: bool) -> Status:
     """Name what the model is worth."""
     if used < 2 * parameters:
         return Status.WARMING_UP
@@ -176,6 +185,8 @@ def judge(used: int, parameters: int, condition: float, unexplained: float) -> S
         return Status.ILL_CONDITIONED
     if unexplained > UNEXPLAINED:
         return Status.POORLY_EXCITED
+    if too_low:
+        return Status.ORDER_TOO_LOW
     return Status.TRACKING
 
 

@@ -47,6 +47,8 @@ def identification_report(
 
 def _result(summary: Summary, outputs: Sequence[str], bound: float | None, fault: str) -> str:
     rows: list[tuple[str, str]] = [('status', f'{summary.status}: {Status[summary.status].value}')]
+    if summary.model_status not in (summary.status, Status.TRACKING.name):
+        rows.append(('model', f'{summary.model_status}: {Status[summary.model_status].value}'))
     modes = zip(summary.frequencies_hz, summary.damping_ratios, strict=True)
     for k, (frequency, damping) in enumerate(modes):
         rows.append((f'mode {k + 1}', f'{frequency:.4f} Hz, damping ratio {damping:.4f}'))

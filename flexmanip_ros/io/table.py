@@ -45,6 +45,7 @@ def columns(estimates: Sequence[Estimate], start_ns: int | None = None) -> dict[
         'stamp_ns': stamps,
         'time_s': (stamps - start) * 1e-9,
         'status': np.array([estimate.status.name for estimate in estimates], dtype=np.str_),
+        'model_status': np.array([estimate.model_status.name for estimate in estimates], dtype=np.str_),
         'frequency_hz': modes[:, :, 0], 'damping_ratio': modes[:, :, 1],
         'frequency_std_hz': modes[:, :, 2], 'damping_ratio_std': modes[:, :, 3],
         'payload_mass_kg': payload[:, 0], 'payload_std_kg': payload[:, 1],

@@ -193,6 +193,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         status = Status.WARMING_UP if estimate is None else estimate.status
         payload = None if estimate is None else estimate.payload
         report.values['status'] = status.name
+        model = Status.WARMING_UP if estimate is None else estimate.model_status
+        report.values['model_status'] = model.name
         report.values['converged'] = status in (Status.TRACKING, Status.NO_PAYLOAD_METHOD)
         report.values['consistent'] = payload is None or payload.status is not Status.INCONSISTENT
         if status not in (Status.TRACKING, Status.WARMING_UP, Status.NO_PAYLOAD_METHOD):

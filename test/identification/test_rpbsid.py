@@ -12,6 +12,7 @@ from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.memory_kernel import FILLED, REJECTED, USED
 from flexmanip_ros.identification.pbsid import pbsid
 from flexmanip_ros.identification.realization import markov
+from flexmanip_ros.types import Status
 
 ESTIMATORS = [
     {'estimator': 'factor'}, {'estimator': 'factor', 'state_basis': 'fixed', 'direct_feedthrough': True},
@@ -127,3 +128,13 @@ def test_samples_of_the_wrong_size_are_an_error():
     config = configuration(2, 1, order=1, past_window=3, future_window=1)
     with pytest.raises(SignalError, match='2 inputs and 1 outputs'):
         rpbsid.step(config, rpbsid.init(config), np.zeros(1), np.zeros(1))
+
+
+@pytest.mark.parametrize(('order', 'status'), [(2, Status.ORDER_TOO_LOW), (4, Status.TRACKING)])
+def test_a_model_that_leaves_dynamics_out_says_so(order, status):
+    rng = np.random.default_rng(5)
+    u, y = record(random_system(4, 2, 2, rng), 3000, 0.1, rng)
+    config = configuration(2, 2, order=order, refinement='none')
+    found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), u, y), 0.01)
+    assert found is not None
+    assert found.status is status
