@@ -6,6 +6,7 @@ and in the modules that draw, so everything else works without it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -171,7 +172,9 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
     limit(ax, table, [mass for _, _, mass in truth[-1:]] if zoom else [0.0, *(mass for _, _, mass in truth)])
     last = table[-1] if len(held) and np.isfinite(table[-1]).all() else None
     if last is not None and not zoom:
-        words = f'{last[0]:.4g} kg, 95 %: {last[1]:.4g} to {last[2]:.4g} kg'
+        width = max(float(last[2] - last[1]), 1e-6)
+        digits = min(max(1 - math.floor(math.log10(width)), 0), 6)  # two of the interval's width
+        words = f'{last[0]:.{digits}f} kg, 95 %: {last[1]:.{digits}f} to {last[2]:.{digits}f} kg'
         ax.annotate(words, (1.0, 0.03), ha='right', va='bottom', xycoords='axes fraction',
                     color=PAYLOAD_COLOUR, fontsize=10, fontweight='bold')
     ax.set_ylabel('payload, close up\n[kg]' if zoom else 'payload\n[kg]')

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip('matplotlib')
 
 from flexmanip_ros.io import plots
-from flexmanip_ros.types import Estimate, Mode, Status
+from flexmanip_ros.types import Estimate, Mode, Payload, Status
 
 BEFORE, AFTER = (5.76, 6.89), (5.63, 6.55)
 
@@ -46,3 +46,13 @@ def test_estimates_without_modes_can_be_drawn():
     nothing = [Estimate(k, Status.WARMING_UP, None, (), None) for k in range(3)]
     assert _drawn(nothing)[1] == []
     _drawn([Estimate(0, Status.TRACKING, None, (Mode(np.nan, np.nan),), None)])
+
+
+@pytest.mark.parametrize(('lower', 'upper', 'words'), [
+    (19.991, 20.017, '20.004 kg, 95 %: 19.991 to 20.017 kg'), (12.0, 31.0, '20 kg, 95 %: 12 to 31 kg'),
+    (0.0, 755.9, '20 kg, 95 %: 0 to 756 kg')])
+def test_an_interval_keeps_the_digits_that_tell_its_ends_apart(lower, upper, words):
+    held = Payload(20.004, 0.006, lower, upper, 1.0, Status.TRACKING)
+    _, (ax,) = plots.figure(1, [2.0])
+    plots.payload(ax, [Estimate(k, Status.TRACKING, None, (), held) for k in range(3)], 0)
+    assert [text.get_text() for text in ax.texts] == [words]
