@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from flexmanip_ros.identification import rpbsid
-from flexmanip_ros.identification.memory_kernel import FILLED
+from flexmanip_ros.identification.memory_kernel import FILLED, USED
 from flexmanip_ros.identification.modal import modes
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, structured
-from flexmanip_ros.types import Array, CaptureEvent, Estimate, Sample, Status
+from flexmanip_ros.types import Array, CaptureEvent, Estimate, Payload, Sample, Status
 
 
 class Core(NamedTuple):
@@ -57,7 +58,7 @@ def event(config: IdentifierParameters, core: Core, event: CaptureEvent) -> Core
 
 
 def estimate(config: IdentifierParameters, core: Core, stamp_ns: int, dt: float) -> Estimate:
-    """Read model, modes and payload out of the estimators; the costly part, done at the publishing rate."""
+    """Read model, modes and payload out of the estimators; the model is the costly part."""
     found, without = _identified(config, core.rpbsid, dt)
     payload = None
     if config.payload_method == 'structured' and core.structured is not None:
@@ -66,13 +67,29 @@ def estimate(config: IdentifierParameters, core: Core, stamp_ns: int, dt: float)
         payload = block_extraction.estimate(config, found, core.angles)
     if found is None:
         return Estimate(stamp_ns, without, None, (), payload, model_status=without)
-    status = found.status
-    if payload is not None and (status is Status.TRACKING or config.payload_method == 'structured'):
-        status = payload.status  # a structured payload does not rest on the model
     return Estimate(
-        stamp_ns, status, found.model, modes(found), payload, excitation=found.excitation,
-        condition=found.condition, singular_values=found.singular_values,
+        stamp_ns, _overall(config, found.status, payload), found.model, modes(found), payload,
+        excitation=found.excitation, condition=found.condition, singular_values=found.singular_values,
         innovation_power=found.innovation_power, model_status=found.status)
+
+
+def follow(config: IdentifierParameters, core: Core, stamp_ns: int, last: Estimate) -> Estimate:
+    """Return an estimate with the model of the last one; only a structured payload is read anew."""
+    payload = last.payload if core.structured is None else structured.estimate(config, core.structured)
+    return replace(last, stamp_ns=stamp_ns, payload=payload, model_is_new=False,
+                   status=_overall(config, last.model_status, payload))
+
+
+def samples_used(core: Core) -> int:
+    """Return how many samples the model rests on."""
+    return int(core.rpbsid.counts[USED])
+
+
+def _overall(config: IdentifierParameters, model: Status, payload: Payload | None) -> Status:
+    """What to say of both: of the payload where it does not rest on the model, else of the weaker."""
+    if payload is not None and (model is Status.TRACKING or config.payload_method == 'structured'):
+        return payload.status
+    return model
 
 
 def _identified(config: IdentifierParameters, state: rpbsid.RpbsidState, dt: float

@@ -130,7 +130,8 @@ def outgoing(estimate: Estimate, frame_id: str) -> Iterator[tuple[str, Value]]:
     Never a NaN; an interval without bound is said as infinite, and then no driver is told a payload.
     """
     model = estimate.model
-    if model is not None and all(np.isfinite(part).all() for part in model_parts(model)):
+    parts = model_parts(model) if model is not None and estimate.model_is_new else ()
+    if model is not None and parts and all(np.isfinite(part).all() for part in parts):
         yield MODEL, model_matrix(model)
         yield MODES, modes_matrix(estimate.modes)
     payload = estimate.payload

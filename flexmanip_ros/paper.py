@@ -129,7 +129,8 @@ def scenario(case: Case, method: Method) -> Scenario:
     """Return the scenario of a case for one method."""
     modes = 3 if case.model != 'linear' and method.name == 'structured' else 1
     identifier: dict[str, Any] = {f'arm.{name}': value for name, value in ARM.items()}
-    identifier |= {'arm.modes': modes, 'publish_rate': TRACK_RATE, **method.settings}
+    identifier |= {'arm.modes': modes}
+    identifier |= {'publish_rate': TRACK_RATE, 'model_rate': TRACK_RATE, **method.settings}
     return Scenario(
         name=case.name, capture_time=CAPTURE_TIME, window=WINDOW,
         plant={**{f'arm.{name}': value for name, value in ARM.items()}, 'model': case.model,

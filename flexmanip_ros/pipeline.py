@@ -22,6 +22,14 @@ PATIENCE = 2000
 """Messages without a single usable one after which a replay gives up."""
 
 
+class Reading(NamedTuple):
+    """A model as it was read: its estimate, the samples it rested on, and the index of its instant."""
+
+    estimate: Estimate
+    samples: int
+    instant: int
+
+
 class State(NamedTuple):
     """All that the identifier remembers."""
 
@@ -34,6 +42,8 @@ class State(NamedTuple):
     first_ns: int = 0
     published: int = -1
     """Index of the last publishing instant, counted from the first stamp."""
+    reading: Reading | None = None
+    """The last estimate whose model was read anew."""
 
     @property
     def counters(self) -> Counters:
@@ -127,7 +137,8 @@ def reconfigure(config: IdentifierParameters, state: State) -> State:
     state = state._replace(config=replace(config, outputs=state.config.outputs))
     if state.published < 0 or state.timeline is None:
         return state
-    return state._replace(published=_instant(state, state.timeline.last_ns))
+    last = _instant(state, state.timeline.last_ns, config.publish_rate)
+    return state._replace(published=last, reading=None)
 
 
 def _event(state: State, event: CaptureEvent) -> State:
@@ -161,13 +172,35 @@ def _begin(config: IdentifierParameters, state: State, first_ns: int) -> State:
     return state
 
 
-def _instant(state: State, stamp_ns: int) -> int:
-    assert state.config is not None
-    return int((stamp_ns - state.first_ns) * state.config.publish_rate * 1e-9 + 1e-6)
+def _instant(state: State, stamp_ns: int, rate: float) -> int:
+    """Index of the instant at or before a stamp on the grid of a rate [Hz] from the first stamp on."""
+    return int((stamp_ns - state.first_ns) * rate * 1e-9 + 1e-6)
 
 
 def _due(state: State, stamp_ns: int) -> bool:
-    return _instant(state, stamp_ns) > state.published
+    assert state.config is not None
+    return _instant(state, stamp_ns, state.config.publish_rate) > state.published
+
+
+def _read(config: IdentifierParameters, state: State, core: estimator.Core, stamp_ns: int
+          ) -> tuple[State, Estimate]:
+    """Return the estimate at a stamp, its model read anew when that is due.
+
+    That is by ``model_rate``, and with every estimate for as long after an event as the event may arrive late:
+    so any order of arrival reads models at the same stamps.
+    """
+    assert state.timeline is not None
+    settling = 2.0 * config.rewind_time + 1.0 / config.publish_rate
+    changes = (state.first_ns, *(event.stamp_ns for event in state.timeline.latest))
+    young = any(0 <= stamp_ns - change <= settling * 1e9 for change in changes)
+    instant = _instant(state, stamp_ns, config.model_rate)
+    used = estimator.samples_used(core)
+    last = state.reading
+    if last is not None and not young and instant <= last.instant and last.samples <= used:
+        return state, estimator.follow(config, core, stamp_ns, last.estimate)
+    estimate = estimator.estimate(config, core, stamp_ns, state.sampling.dt)
+    reading = Reading(estimate, used, instant) if estimate.model is not None else None
+    return state._replace(reading=reading), estimate
 
 
 def _consume(state: State, samples: Iterable[Sample]) -> tuple[State, tuple[Estimate, ...]]:
@@ -183,8 +216,10 @@ def _consume(state: State, samples: Iterable[Sample]) -> tuple[State, tuple[Esti
             continue
         line = timeline.advance(config, line, block)
         block = []
-        state = state._replace(timeline=line, published=_instant(state, sample.stamp_ns))
-        ready.append(estimator.estimate(config, line.core, sample.stamp_ns, state.sampling.dt))
+        state = state._replace(
+            timeline=line, published=_instant(state, sample.stamp_ns, config.publish_rate))
+        state, estimate = _read(config, state, line.core, sample.stamp_ns)
+        ready.append(estimate)
     if block:
         state = state._replace(timeline=timeline.advance(config, line, block))
     return state, tuple(ready)

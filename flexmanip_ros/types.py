@@ -137,4 +137,6 @@ class Estimate:
     innovation_power: float = float('nan')
     model_status: Status = Status.TRACKING
     """What the model is worth; ``status`` is that of the payload where one is estimated beside the model."""
+    model_is_new: bool = True
+    """Whether model and modes were read at this stamp, or are those of an estimate before."""
     """Mean squared innovation over the variance expected [-]."""

@@ -67,6 +67,9 @@ class IdentifierParameters:
     publish_rate: float = parameter(
         50.0, 'estimates a second, on the grid of the stamps', unit='Hz', low=0.01, high=10000.0,
         live=True)
+    model_rate: float = parameter(
+        5.0, 'how often a second model and modes are read anew (they are costly); just after an event with '
+        'every estimate, as the structured payload always is', unit='Hz', low=0.01, high=10000.0, live=True)
     gap_factor: float = parameter(
         1.5, 'a step between stamps longer than this many sample times is a gap (so is one as much shorter)',
         low=1.05, high=1000.0, live=True)

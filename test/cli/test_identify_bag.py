@@ -107,7 +107,7 @@ def test_a_table_holds_what_the_pipeline_says(recording, capsys, tmp_path):
 def test_a_recording_of_the_estimates_holds_what_the_node_would_publish(recording, capsys, tmp_path):
     assert _run(capsys, recording, *SETTINGS, '--output', tmp_path / 'out')[0] == 0
     estimates = pipeline.run(configure(IdentifierParameters, OTHER), bag.read(recording))
-    last = [estimate for estimate in estimates if estimate.model is not None][-1]
+    last = [estimate for estimate in estimates if estimate.model is not None and estimate.model_is_new][-1]
     store = get_typestore(Stores.ROS2_JAZZY)
     with Reader(tmp_path / 'out') as reader:
         stored = {connection.topic: (stamp, store.deserialize_cdr(raw, connection.msgtype))

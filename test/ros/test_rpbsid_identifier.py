@@ -151,7 +151,7 @@ def test_a_clock_that_goes_back_resets_instead_of_mixing_two_times(ros: Ros, jum
 
 
 def test_the_publishing_rate_changes_while_it_runs(ros: Ros) -> None:
-    live = Live(ros, payload_method='none')
+    live = Live(ros, payload_method='none', model_rate=250.0)
     samples = recording(700)
     live.send(*samples[:350])
     ros.wait(lambda: live.said[messages.MODEL])
