@@ -22,9 +22,9 @@ from flexmanip_ros.plant.compiled import kernel
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
+    from flexmanip_ros.payload.measurement_kernel import Sensors
     from flexmanip_ros.payload.memory import Memory
     from flexmanip_ros.payload.motion_kernel import Motion
-    from flexmanip_ros.payload.structured_kernel import Sensors
 
 CAUSES = 6
 """Impulse, step and ramp of the force at the tip, along x and y."""

@@ -13,9 +13,9 @@ import numpy as np
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import memory as mem
 from flexmanip_ros.payload import structured_start as start
+from flexmanip_ros.payload.measurement_kernel import Sensors
 from flexmanip_ros.payload.motion_kernel import PARAMETERS, predict
 from flexmanip_ros.payload.structured_judgement import judge
-from flexmanip_ros.payload.structured_kernel import Sensors
 from flexmanip_ros.payload.structured_kernel import advance as run
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload, Sample

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
+from flexmanip_ros.payload.measurement_kernel import Sensors
 from flexmanip_ros.payload.motion_kernel import PARAMETERS, Motion
 from flexmanip_ros.payload.signals import Quantity, Role, signals
-from flexmanip_ros.payload.structured_kernel import Sensors
 from flexmanip_ros.plant.manipulator import manipulator, workspace
 from flexmanip_ros.types import Array
 
