@@ -186,8 +186,8 @@ def _read(config: IdentifierParameters, state: State, core: estimator.Core, stam
           ) -> tuple[State, Estimate]:
     """Return the estimate at a stamp, its model read anew when that is due.
 
-    That is by ``model_rate``, and with every estimate for as long after an event as the event may arrive late:
-    so any order of arrival reads models at the same stamps.
+    That is by ``model_rate``, and with every estimate for as long after an event as it may arrive late: so
+    any order of arrival reads models at the same stamps.
     """
     assert state.timeline is not None
     settling = 2.0 * config.rewind_time + 1.0 / config.publish_rate
