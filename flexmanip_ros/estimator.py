@@ -57,6 +57,16 @@ def event(config: IdentifierParameters, core: Core, event: CaptureEvent) -> Core
     return core._replace(rpbsid=rpbsid.restart(config, core.rpbsid), structured=held)
 
 
+def anew(config: IdentifierParameters, core: Core, events: Sequence[CaptureEvent]) -> Core:
+    """Begin the payload anew, after events from before every sample; the model is of what was held anyway."""
+    if core.structured is None:
+        return core
+    held = structured.init(config)
+    for event in events:
+        held = structured.event(config, held, event)
+    return core._replace(structured=held)
+
+
 def estimate(config: IdentifierParameters, core: Core, stamp_ns: int, dt: float) -> Estimate:
     """Read model, modes and payload out of the estimators; the model is the costly part."""
     found, without = _identified(config, core.rpbsid, dt)

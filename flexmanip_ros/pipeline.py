@@ -144,7 +144,8 @@ def reconfigure(config: IdentifierParameters, state: State) -> State:
 def _event(state: State, event: CaptureEvent) -> State:
     if state.timeline is None or state.config is None:
         return state._replace(early=(*state.early, event))
-    return state._replace(timeline=timeline.event(state.config, state.timeline, event))
+    return state._replace(timeline=timeline.event(
+        state.config, state.timeline, event, state.first_ns))
 
 
 def _sample(config: IdentifierParameters, state: State, record: JointRecord

@@ -3,6 +3,7 @@
 An event that arrives early waits for its stamp. One that arrives late is applied at its own stamp: the last
 ``rewind_time`` of samples is kept, the estimator goes back to a checkpoint before the event and runs them
 again. From its arrival on, the result depends on stamps alone. An older event is applied at once and counted.
+One from before the first sample (latched, heard only now) held all along: the payload begins anew with it.
 """
 
 from __future__ import annotations
@@ -71,8 +72,12 @@ def advance(config: IdentifierParameters, line: Timeline, samples: Sequence[Samp
     return _run(config, line, block) if block else line
 
 
-def event(config: IdentifierParameters, line: Timeline, event: CaptureEvent) -> Timeline:
-    """Take an event: let it wait, go back for it, or (too old to go back) apply it now."""
+def event(config: IdentifierParameters, line: Timeline, event: CaptureEvent, first_ns: int = BEFORE_ALL
+          ) -> Timeline:
+    """Take an event: let it wait, go back for it, or (too old to go back) apply it now.
+
+    first_ns: stamp of the first sample [ns]; BEFORE_ALL when it is unknown.
+    """
     previous = line.stamp_of(event.kind)
     if previous is not None and abs(event.stamp_ns - previous) <= config.event_merge_time * 1e9:
         return line._replace(repeated_events=line.repeated_events + 1)
@@ -80,9 +85,18 @@ def event(config: IdentifierParameters, line: Timeline, event: CaptureEvent) -> 
     if event.stamp_ns > line.last_ns:
         return _wait(line, event)
     if event.stamp_ns <= line.checkpoints[0].after_ns:
+        if all(taken.stamp_ns <= first_ns for taken in line.latest):
+            return _all_along(config, line)
         now = event._replace(stamp_ns=line.last_ns + 1)
         return _wait(line._replace(late_events=line.late_events + 1), now)
     return _rewind(config, line, event)
+
+
+def _all_along(config: IdentifierParameters, line: Timeline) -> Timeline:
+    """Every sample came after the events: forget a payload that was read as if they had not happened."""
+    core = estimator.anew(config, line.core, sorted(line.latest, key=lambda e: e.stamp_ns))
+    return line._replace(core=core, checkpoints=(Checkpoint(line.last_ns, line.last_ns + 1, core),),
+                         samples=(), applied=(), late_events=line.late_events + 1)
 
 
 def _wait(line: Timeline, event: CaptureEvent) -> Timeline:

@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexmanip_ros import pipeline
-from flexmanip_ros.parameters import IdentifierParameters, configure
-from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord
+from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
+from flexmanip_ros.plant.excitation import sequence
+from flexmanip_ros.plant.simulator import simulate
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Status
 
 NAMES = ('joint1', 'joint2', 'link1_bend', 'link2_bend')
 MS = 1_000_000
@@ -113,3 +115,22 @@ def test_a_looped_recording_gives_the_same_estimates_again() -> None:
     _, twice = step_through([*items, *items], config)
     _, once = step_through(items, config)
     assert same(once, twice[len(once):])
+
+
+def test_a_capture_from_before_the_first_sample_counts_all_along_however_late_it_is_heard() -> None:
+    """An identifier that starts on a loaded arm may find the latched event after many samples."""
+    plant = PlantParameters(seed=2)
+    capture = CaptureEvent(100 * MS, EventKind.CAPTURE)
+    run = simulate(plant, sequence(ExcitationParameters(), 2000), [capture])
+    items = [JointRecord(int(run.stamp_ns[k]), run.names, run.position[k], run.velocity[k],
+                         np.append(run.effort[k], [0.0, 0.0])) for k in range(200, 2000)]
+    config = IdentifierParameters()
+    late: list[JointRecord | CaptureEvent] = [*items[:600], capture, *items[600:]]
+    state, live = step_through(late, config)
+    payload = live[-1].payload
+    assert state.timeline is not None
+    assert payload is not None
+    assert state.timeline.late_events == 1
+    assert live[-1].status is Status.TRACKING
+    assert payload.lower < plant.payload_mass < payload.upper
+    assert same(live, list(pipeline.run(config, late)))
