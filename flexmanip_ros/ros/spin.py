@@ -53,6 +53,12 @@ class Interrupt:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._handle)
 
+    @staticmethod
+    def over() -> None:
+        """All is put in order: a second signal (launch and a terminal both send one) changes nothing."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.raised = True
         self.exit_code = 128 + number if self._exit_with_signal else 0
@@ -105,6 +111,8 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
         executor.shutdown()
         node.destroy_node()
         rclpy.try_shutdown()
+        del executor  # it gives the signals back to their default
+        interrupt.over()
     return 0
 
 

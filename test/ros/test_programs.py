@@ -97,6 +97,10 @@ def test_a_signal_ends_a_node_cleanly(number: int) -> None:
             break
     time.sleep(1.0)  # in the executor by now; earlier is fine too, and tried by the demonstration's test
     process.send_signal(number)
+    deadline = time.monotonic() + 20.0
+    while process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+        process.send_signal(number)  # launch sends one, the terminal another: none may cut the end short
     _, err = process.communicate(timeout=20)
     assert process.returncode == 0
     assert 'Traceback' not in err
