@@ -10,10 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.parameters import ArmParameters
-from flexmanip_ros.payload.block_extraction import extract
+from flexmanip_ros.identification.uncertainty import Identified
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
+from flexmanip_ros.payload.block_extraction import estimate, extract
 from flexmanip_ros.payload.modal_basis import to_modal
-from flexmanip_ros.plant.linearization import vibration_model
+from flexmanip_ros.plant.linearization import discretize, vibration_model
+from flexmanip_ros.types import StateSpace, Status
 
 CONFIGURATIONS = [(60.0, 45.0), (0.0, 0.0), (45.0, 0.0), (-45.0, 45.0)]
 
@@ -67,3 +69,23 @@ def test_a_model_of_another_order_is_refused():
 def test_a_model_without_stiffness_is_refused():
     with pytest.raises(ModelError, match='excite'):
         extract(ArmParameters(), np.zeros((4, 4)), np.zeros((4, 2)), np.zeros(2), 1)
+
+
+@pytest.mark.parametrize(('tip_mass', 'noise'), [(5.0, 1e-7), (5.0, 1e-5), (9.9, 1e-5)])
+def test_a_mass_below_zero_is_never_a_narrow_interval_at_zero(tip_mass, noise):
+    config = configure(IdentifierParameters, {
+        'payload_method': 'block', 'arm.angle_convention': 'chord', 'arm.modes': 1})
+    theta, dt = np.radians([60.0, 45.0]), 1e-3
+    lighter = replace(config.arm, tip_mass=tip_mass)
+    A, B = discretize(*vibration_model(lighter, theta, 0.0, 1), dt)
+    model = StateSpace(A, B, np.eye(4), np.zeros((4, 2)), np.zeros((4, 4)), dt)
+    spread = np.zeros((16 + 8 + 16 + 8 + 16, 16))
+    spread[:16] = noise * np.eye(16)
+    found = estimate(config, Identified(
+        model, spread, np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, np.eye(4), known_basis=True), theta)
+    missing = config.arm.tip_mass - tip_mass
+    assert found.mass == found.lower == 0.0
+    assert found.upper >= 1.95 * found.std
+    if noise < 1e-6:
+        assert found.status is Status.INCONSISTENT
+        assert found.upper == pytest.approx(missing, rel=1e-3)
