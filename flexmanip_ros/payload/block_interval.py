@@ -62,7 +62,7 @@ def payload(
     if status is Status.TRACKING and widening * std > abs(mass):
         status = Status.POORLY_EXCITED
     if mass < 0.0:
-        # No payload is negative; an interval just cut off at 0 would look the surer the further the model is off.
+        # No payload is negative; an interval cut off at 0 would look the surer the further the model is off.
         if upper < 0.0 and status is Status.TRACKING:
             status = Status.INCONSISTENT
         upper = max(upper, widening * QUANTILE * std, -mass if upper < 0.0 else 0.0)
