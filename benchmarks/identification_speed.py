@@ -96,6 +96,25 @@ def identifier(p: int, r: int, m: int, count: int, publish: int = 0, **values: o
     return best(work, count, 5)
 
 
+def draw(growth: list[dict[str, float]]) -> None:
+    """Draw docs/images/identification_speed.png."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7.0, 4.0), layout='constrained')
+    for m in sorted({row['outputs'] for row in growth}):
+        rows = [row for row in growth if row['outputs'] == m]
+        axes.loglog([row['past_window'] for row in rows], [row['us'] for row in rows], 'o-',
+                    label=f'{m:g} outputs')
+    axes.set_xticks([10, 20, 50, 100], ['10', '20', '50', '100'])
+    axes.set(xlabel='past window p [samples]', ylabel='update [us a sample]',
+             title='Two inputs, order 4: an update costs the square of p (r + m)')
+    axes.grid(True, which='both', alpha=0.3)
+    axes.legend()
+    target = Path(__file__).resolve().parents[1] / 'docs' / 'images' / 'identification_speed.png'
+    target.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(target, dpi=110)
+
+
 def main() -> None:
     count = 20000
     rng = np.random.default_rng(0)
@@ -124,6 +143,8 @@ def main() -> None:
                 value = identifier(p, 2, m, max(200, 40000 // p), refinement='none')
                 growth.append({'past_window': p, 'outputs': m, 'us': value})
                 print(f'p = {p:<4} m = {m:<3}{value:10.2f} us', flush=True)
+    if growth:
+        draw(growth)
     target = Path(__file__).parent / 'results' / 'identification_speed.json'
     target.parent.mkdir(exist_ok=True)
     target.write_text(json.dumps({'microseconds': table, 'growth': growth}, indent=1) + '\n')
