@@ -11,6 +11,32 @@ from flexmanip_ros.types import Array
 
 
 @njit(cache=True)
+def innovation(u: Array, y: Array, C: Array, D: Array, x: Array, e: Array) -> None:
+    """Fill e (m,) = y - C x - D u."""
+    for o in range(e.size):
+        total = y[o]
+        for i in range(x.size):
+            total -= C[o, i] * x[i]
+        for i in range(u.size):
+            total -= D[o, i] * u[i]
+        e[o] = total
+
+
+@njit(cache=True)
+def following(u: Array, A: Array, B: Array, K: Array, x: Array, e: Array, after: Array) -> None:
+    """Fill after (n,) = A x + B u + K e."""
+    for i in range(x.size):
+        total = 0.0
+        for j in range(x.size):
+            total += A[i, j] * x[j]
+        for j in range(u.size):
+            total += B[i, j] * u[j]
+        for j in range(e.size):
+            total += K[i, j] * e[j]
+        after[i] = total
+
+
+@njit(cache=True)
 def linearize(
     U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, K: Array, x: Array, whiten: Array,
     free_gain: int, free_output: int, free_direct: int, N: Array, g: Array, moments: Array, X: Array,
@@ -37,13 +63,7 @@ def linearize(
     after = np.empty(n)
     moved = np.empty((n, d))
     for k in range(U.shape[0]):
-        for o in range(m):
-            total = Y[k, o]
-            for i in range(n):
-                total -= C[o, i] * x[i]
-            for i in range(r):
-                total -= D[o, i] * U[k, i]
-            e[o] = total
+        innovation(U[k], Y[k], C, D, x, e)
         for o in range(m):
             for j in range(d):
                 J[o, j] = 0.0
@@ -99,15 +119,7 @@ def linearize(
                 if free_direct:
                     for j in range(r):
                         moved[i, at_d + o * r + j] -= gain * U[k, j]
-        for i in range(n):
-            total = 0.0
-            for j in range(n):
-                total += A[i, j] * x[j]
-            for j in range(r):
-                total += B[i, j] * U[k, j]
-            for j in range(m):
-                total += K[i, j] * e[j]
-            after[i] = total
+        following(U[k], A, B, K, x, e, after)
         for i in range(n):
             x[i] = after[i]
             for j in range(d):
@@ -119,26 +131,12 @@ def residual_moments(
     U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, K: Array, x: Array, moments: Array,
 ) -> None:
     """Run the predictor only: moments (m, m) += e e', x (n,) becomes the state after the last sample."""
-    n, r, m = A.shape[0], B.shape[1], C.shape[0]
+    n, m = A.shape[0], C.shape[0]
     e = np.empty(m)
     after = np.empty(n)
     for k in range(U.shape[0]):
-        for o in range(m):
-            total = Y[k, o]
-            for i in range(n):
-                total -= C[o, i] * x[i]
-            for i in range(r):
-                total -= D[o, i] * U[k, i]
-            e[o] = total
-        for i in range(n):
-            total = 0.0
-            for j in range(n):
-                total += A[i, j] * x[j]
-            for j in range(r):
-                total += B[i, j] * U[k, j]
-            for j in range(m):
-                total += K[i, j] * e[j]
-            after[i] = total
+        innovation(U[k], Y[k], C, D, x, e)
+        following(U[k], A, B, K, x, e, after)
         for i in range(n):
             x[i] = after[i]
         for o in range(m):

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm, logm, solve_triangular
+from scipy.linalg import expm, logm
 
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.moments import triangle
@@ -134,9 +134,3 @@ def markov(model: StateSpace, count: int) -> Array:
         if k > 0:
             state = model.A @ state
     return out
-
-
-def solve_upper(R: Array, b: Array) -> Array:
-    """Solve R x = b for upper triangular R."""
-    x: Array = solve_triangular(R, b, check_finite=False)
-    return x

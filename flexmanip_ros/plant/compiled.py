@@ -20,8 +20,3 @@ def kernel(function: Function) -> Function:
     options: dict[str, Any] = {'cache': True, '_nrt': False}
     compiled: Function = njit(**options)(function)
     return compiled
-
-
-def loop(function: Function) -> Function:
-    """Compile a function that may create arrays, as the outer loops do."""
-    return njit(cache=True)(function)

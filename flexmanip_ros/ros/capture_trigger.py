@@ -23,7 +23,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from flexmanip_ros.io import cdr
 from flexmanip_ros.parameters import TriggerParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.auto_mode import Watcher, rehearse
@@ -78,10 +77,8 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         if not self.active:
             return
         with self._meter:
-            try:
-                stamp = cdr.stamp_ns(raw)
-            except cdr.CdrError:
-                self.complain('encoding', 'a JointState of another encoding than CDR was dropped')
+            stamp = self.stamp_of(raw)
+            if stamp is None:
                 return
             self._arrived = time.monotonic()
             if self._first_ns is None or self._last_ns is None or stamp < self._last_ns - LOOPED_NS:

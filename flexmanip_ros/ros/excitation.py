@@ -19,7 +19,6 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from flexmanip_ros.io import cdr
 from flexmanip_ros.parameters import ExcitationParameters
 from flexmanip_ros.plant import excitation, excitation_design
 from flexmanip_ros.ros import qos
@@ -92,10 +91,8 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
         if not self.active:
             return
         with self._meter:
-            try:
-                stamp = cdr.stamp_ns(raw)
-            except cdr.CdrError:
-                self.complain('encoding', 'a JointState of another encoding than CDR was dropped')
+            stamp = self.stamp_of(raw)
+            if stamp is None:
                 return
             if self._first_ns is None or stamp < self._first_ns:
                 self._first_ns, self._last = stamp, -1

@@ -25,6 +25,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.subscription import Subscription
 
 from flexmanip_ros.errors import FlexmanipError, ParameterError
+from flexmanip_ros.io import cdr
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.diagnostics import ERROR, WARN, Report
 from flexmanip_ros.ros.parameters import NodeParameters
@@ -188,6 +189,14 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
         if now - self._complained.get(reason, -math.inf) >= THROTTLE_S:
             self._complained[reason] = now
             self.get_logger().error(words)
+
+    def stamp_of(self, raw: bytes) -> int | None:
+        """Return the header stamp [ns] of a serialized JointState; None, with a complaint, without one."""
+        try:
+            return cdr.stamp_ns(raw)
+        except cdr.CdrError:
+            self.complain('encoding', 'a JointState of another encoding than CDR was dropped')
+            return None
 
     def diagnose(self) -> None:
         """Publish the node's diagnostic entry."""
