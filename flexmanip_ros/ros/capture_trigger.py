@@ -23,6 +23,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
+from flexmanip_ros.errors import SignalError
 from flexmanip_ros.parameters import TriggerParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.auto_mode import Watcher, rehearse
@@ -93,7 +94,12 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
     def _watch(self, watcher: Watcher, raw: bytes) -> None:
         """Mode auto: tell what the sample reveals."""
         dropped = watcher.counters.dropped
-        for event in watcher.take(self._reader(raw)):
+        try:
+            record = self._reader(raw)
+        except SignalError as error:
+            self.complain('encoding', f'message dropped: {error}')
+            return
+        for event in watcher.take(record):
             self.detected_publisher.publish(header(event))
             self.detected.append(event)
             self.get_logger().info(f'{event.kind.value} detected at {event.stamp_ns * 1e-9:.6f}')

@@ -18,6 +18,8 @@ from flexmanip_ros.messages import Dimension, Inertia, LabelledArray, Value
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointRecord
 
 SECOND = 1_000_000_000
+FIRST_NS, LAST_NS = -(1 << 31) * SECOND, (1 << 31) * SECOND - 1
+"""Nanoseconds that a stamp can hold (its seconds have 32 bits)."""
 
 
 def stamp_ns(stamp: Time) -> int:
@@ -26,8 +28,8 @@ def stamp_ns(stamp: Time) -> int:
 
 
 def time_message(nanoseconds: int) -> Time:
-    """Return nanoseconds as a stamp; both fields stay in their range for times before 1970 too."""
-    sec, nanosec = divmod(nanoseconds, SECOND)
+    """Return nanoseconds as a stamp, the nearest there is; fields in their range before 1970 too."""
+    sec, nanosec = divmod(min(max(nanoseconds, FIRST_NS), LAST_NS), SECOND)
     return Time(sec=sec, nanosec=nanosec)
 
 
@@ -38,11 +40,18 @@ class JointStateReader:
         self._layout: cdr.Layout | None = None
 
     def __call__(self, raw: bytes) -> JointRecord:
-        """Return the message; through rclpy's own decoder where the bytes are of another encoding."""
+        """Return the message; through rclpy's own decoder where the bytes are of another encoding.
+
+        Raises SignalError for bytes that are no JointState.
+        """
         try:
             record, self._layout = cdr.joint_record(raw, self._layout)
         except (cdr.CdrError, UnicodeDecodeError, struct.error):
-            return joint_record(deserialize_message(raw, JointState))
+            try:
+                return joint_record(deserialize_message(raw, JointState))
+            except (RuntimeError, MemoryError) as error:  # the errors of the middleware
+                raise SignalError('the bytes of a message are no JointState',
+                                  'look at its publisher') from error
         return record
 
 

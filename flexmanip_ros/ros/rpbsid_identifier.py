@@ -26,7 +26,7 @@ from std_msgs.msg import Float64, Float64MultiArray, Header
 from std_srvs.srv import Trigger
 
 from flexmanip_ros import messages, pipeline
-from flexmanip_ros.errors import CheckpointError, FlexmanipError
+from flexmanip_ros.errors import CheckpointError, FlexmanipError, SignalError
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, capture_event, to_message
@@ -110,7 +110,11 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             return
         with self.meter:
             self.losses.note(sequence_number(info))
-            record = self._reader(raw)
+            try:
+                record = self._reader(raw)
+            except SignalError as error:
+                self._refuse('encoding', str(error))
+                return
             if self._resumed:
                 self._first_after_resume(record.stamp_ns)
             self._take(record)
