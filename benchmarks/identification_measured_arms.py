@@ -15,13 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
-from flexmanip_ros.identification import rpbsid, validation
+from flexmanip_ros import holdout
+from flexmanip_ros.history import Signals
+from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.io.bag import read
 from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.types import JointRecord
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get('FLEXMANIP_DATA', ROOT.parent / 'shared' / 'data'))
+DT = 0.01
 CASES = (
     ('daisy_robot_arm', 1, 0.5, ({'order': 4}, {'order': 6, 'future_window': 10})),
     ('quanser_2dsfl_first_half', 2, 0.6, (
@@ -43,13 +46,13 @@ def ours(u: np.ndarray, y: np.ndarray, half: int, values: dict[str, object]) -> 
     state = rpbsid.init(config)
     for k in range(half):
         state = rpbsid.step(config, state, u[k], y[k])
-    found = rpbsid.identified(config, state, 0.01)
+    found = rpbsid.identified(config, rpbsid.finish(config, state), DT)
     assert found is not None
-    x0 = validation.state_at_end(found.model, u[:half], y[:half])
-    free = validation.simulate(found.model, u[half:], x0)
-    ahead = validation.predict(found.model, u[half:], y[half:], x0)
-    return {'simulation': validation.vaf(y[half:], free).tolist(),
-            'prediction': validation.vaf(y[half:], ahead).tolist()}
+    stamps = (np.arange(len(u)) * round(DT * 1e9)).astype(np.int64)
+    signals = Signals(stamps, u, y, np.empty((len(u), 0)), np.zeros(len(u), dtype=bool), config.inputs,
+                      config.outputs)
+    scores = holdout.score(found.model, signals, half * DT)
+    return {'simulation': scores.simulation.tolist(), 'prediction': scores.prediction.tolist()}
 
 
 def peers(u: np.ndarray, y: np.ndarray, half: int, orders: list[int]) -> dict[str, object]:

@@ -8,6 +8,7 @@ itself. Use: ros_latency.py [seconds a case]
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
@@ -103,6 +104,8 @@ def composed(rate: float) -> None:
     for node in nodes:
         executor.add_node(node)
         node.autostart()
+    gc.collect()
+    gc.freeze()
     spin(executor, None, interrupt)
     executor.shutdown()
 

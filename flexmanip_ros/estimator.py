@@ -11,6 +11,7 @@ import numpy as np
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.memory_kernel import FILLED, USED
 from flexmanip_ros.identification.modal import modes
+from flexmanip_ros.identification.refinement import Answer, Job
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, structured
@@ -67,13 +68,31 @@ def anew(config: IdentifierParameters, core: Core, events: Sequence[CaptureEvent
     return core._replace(structured=held)
 
 
-def estimate(config: IdentifierParameters, core: Core, stamp_ns: int, dt: float) -> Estimate:
-    """Read model, modes and payload out of the estimators; the model is the costly part."""
+def finish(config: IdentifierParameters, core: Core) -> Core:
+    """No sample follows: await what is under way."""
+    return core._replace(rpbsid=rpbsid.finish(config, core.rpbsid))
+
+
+def job(core: Core) -> tuple[Job, int] | None:
+    """Return the long work under way, and the samples until its result is taken."""
+    return rpbsid.job(core.rpbsid)
+
+
+def answered(core: Core, job: Job, answer: Answer) -> Core:
+    """Return the core knowing the result of that work."""
+    return core._replace(rpbsid=rpbsid.answered(core.rpbsid, job, answer))
+
+
+def payload(config: IdentifierParameters, core: Core) -> Payload | None:
+    """Return the payload where it does not rest on the model; else None."""
+    return structured.estimate(config, core.structured) if core.structured is not None else None
+
+
+def estimate(config: IdentifierParameters, core: Core, stamp_ns: int, dt: float, payload: Payload | None
+             ) -> Estimate:
+    """Read model and modes out of the identifier, the costly part, and a payload that rests on the model."""
     found, without = _identified(config, core.rpbsid, dt)
-    payload = None
-    if config.payload_method == 'structured' and core.structured is not None:
-        payload = structured.estimate(config, core.structured)
-    elif config.payload_method == 'block' and found is not None:
+    if config.payload_method == 'block' and found is not None:
         payload = block_extraction.estimate(config, found, core.angles)
     if found is None:
         return Estimate(stamp_ns, without, None, (), payload, model_status=without)
@@ -83,9 +102,9 @@ def estimate(config: IdentifierParameters, core: Core, stamp_ns: int, dt: float)
         innovation_power=found.innovation_power, model_status=found.status)
 
 
-def follow(config: IdentifierParameters, core: Core, stamp_ns: int, last: Estimate) -> Estimate:
-    """Return an estimate with the model of the last one; only a structured payload is read anew."""
-    payload = last.payload if core.structured is None else structured.estimate(config, core.structured)
+def follow(config: IdentifierParameters, stamp_ns: int, last: Estimate, payload: Payload | None) -> Estimate:
+    """Return an estimate with the model of the last one, and the payload if that stands by itself."""
+    payload = last.payload if payload is None else payload
     return replace(last, stamp_ns=stamp_ns, payload=payload, model_is_new=False,
                    status=_overall(config, last.model_status, payload))
 

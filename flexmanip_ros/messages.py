@@ -125,25 +125,35 @@ Value = LabelledArray | Inertia | float
 
 
 def outgoing(estimate: Estimate, frame_id: str) -> Iterator[tuple[str, Value]]:
-    """Yield (topic below the node's name, value) of everything an estimate publishes.
+    """Yield (topic below the node's name, value) of everything an estimate publishes."""
+    yield from outgoing_payload(estimate.payload, estimate.stamp_ns, frame_id)
+    yield from outgoing_model(estimate)
+
+
+def outgoing_payload(payload: Payload | None, stamp_ns: int, frame_id: str) -> Iterator[tuple[str, Value]]:
+    """Yield what an estimate says of the payload.
 
     Never a NaN; an interval without bound is said as infinite, and then no driver is told a payload.
     """
-    model = estimate.model
-    parts = model_parts(model) if model is not None and estimate.model_is_new else ()
-    if model is not None and parts and all(np.isfinite(part).all() for part in parts):
-        yield MODEL, model_matrix(model)
-        yield MODES, modes_matrix(estimate.modes)
-    payload = estimate.payload
     if payload is None or not math.isfinite(payload.mass):
         return
     row = payload_row(payload)
     if np.isnan(row.data).any():
         return
-    yield PAYLOAD_MASS, payload.mass
-    yield PAYLOAD_ESTIMATE, row
     if np.isfinite((payload.std, *payload.com, *payload.inertia)).all():
-        yield PAYLOAD, inertia(payload, estimate.stamp_ns, frame_id)
+        yield PAYLOAD, inertia(payload, stamp_ns, frame_id)
+    yield PAYLOAD_ESTIMATE, row
+    yield PAYLOAD_MASS, payload.mass
+
+
+def outgoing_model(estimate: Estimate) -> Iterator[tuple[str, Value]]:
+    """Yield model and modes if they were read with this estimate. Never a NaN."""
+    model = estimate.model
+    if model is None or not estimate.model_is_new:
+        return
+    if all(np.isfinite(part).all() for part in model_parts(model)):
+        yield MODEL, model_matrix(model)
+        yield MODES, modes_matrix(estimate.modes)
 
 
 def model_parts(model: StateSpace) -> tuple[Array, ...]:

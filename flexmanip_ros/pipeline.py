@@ -1,7 +1,7 @@
 """The one way through the house: messages in, estimates out.
 
-The live node calls ``step`` for each message, a replay and a study call ``run``. Both take the same path, so
-the same messages give the same estimates bit for bit.
+The live node calls ``take`` and ``read`` for each message, a replay and a study call ``run``. Both take the
+same path, so the same messages give the same estimates bit for bit.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ from typing import NamedTuple
 
 from flexmanip_ros import estimator, sampling, timeline
 from flexmanip_ros.errors import SignalError
+from flexmanip_ros.identification.refinement import Answer, Job
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.sampling import Counters
-from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Sample
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Payload, Sample
 
-BLOCK = 256
-"""Samples run through the compiled kernels at once when replaying."""
+GROUP, BLOCK = 5, 256
+"""Samples run through the compiled kernels at once, live and when replaying; the numbers are the same."""
 PATIENCE = 2000
 """Messages without a single usable one after which a replay gives up."""
 
@@ -28,6 +29,14 @@ class Reading(NamedTuple):
     estimate: Estimate
     samples: int
     instant: int
+
+
+class Due(NamedTuple):
+    """An estimate that is due: its payload where that stands by itself, and what its model is read from."""
+
+    stamp_ns: int
+    core: estimator.Core
+    payload: Payload | None
 
 
 class State(NamedTuple):
@@ -44,6 +53,8 @@ class State(NamedTuple):
     """Index of the last publishing instant, counted from the first stamp."""
     reading: Reading | None = None
     """The last estimate whose model was read anew."""
+    held: tuple[Sample, ...] = ()
+    """Samples still to be run, none of which an estimate waits for."""
 
     @property
     def counters(self) -> Counters:
@@ -66,10 +77,58 @@ def step(config: IdentifierParameters, state: State, item: JointRecord | Capture
 
     Raises ParameterError when the configuration does not fit the signals that the messages carry.
     """
+    return _all_read(*take(config, state, item))
+
+
+def take(config: IdentifierParameters, state: State, item: JointRecord | CaptureEvent, group: int = GROUP
+         ) -> tuple[State, tuple[Due, ...]]:
+    """Take one message; return what is due with it, each to be given to ``read`` before the next message.
+
+    Samples are run ``group`` at a time. Those before one that an estimate waits for are not kept until then.
+    Raises ParameterError when the configuration does not fit the signals that the messages carry.
+    """
     if isinstance(item, CaptureEvent):
-        return _event(state, item), ()
+        return _event(_run_held(state), item), ()
     state, samples = _sample(config, state, item)
-    return _consume(state, samples)
+    return _hold(state, samples, group)
+
+
+def read(state: State, due: Due) -> tuple[State, Estimate]:
+    """Return the estimate that is due, its model read anew when it is time for that.
+
+    That is by ``model_rate``, and with every estimate for as long after an event as it may arrive late: so
+    any order of arrival reads models at the same stamps.
+    """
+    assert state.timeline is not None
+    assert state.config is not None
+    config, last = state.config, state.reading
+    settling = 2.0 * config.rewind_time + 1.0 / config.publish_rate
+    changes = (state.first_ns, *(event.stamp_ns for event in state.timeline.latest))
+    young = any(0 <= due.stamp_ns - change <= settling * 1e9 for change in changes)
+    instant = _instant(state, due.stamp_ns, config.model_rate)
+    used = estimator.samples_used(due.core)
+    if last is not None and not young and instant <= last.instant and last.samples <= used:
+        return state, estimator.follow(config, due.stamp_ns, last.estimate, due.payload)
+    estimate = estimator.estimate(config, due.core, due.stamp_ns, state.sampling.dt, due.payload)
+    reading = Reading(estimate, used, instant) if estimate.model is not None else None
+    return state._replace(reading=reading), estimate
+
+
+def job(state: State) -> tuple[Job, int] | None:
+    """Return long work under way, and the samples until its result is taken.
+
+    Whoever has the time may ``solve`` it on another thread and give ``answered`` the result; otherwise it is
+    done when its turn comes. The numbers are the same.
+    """
+    return estimator.job(state.timeline.core) if state.timeline is not None else None
+
+
+def answered(state: State, job: Job, answer: Answer) -> State:
+    """Return the state knowing the result of long work; no change where that work is over."""
+    line = state.timeline
+    if line is None:
+        return state
+    return state._replace(timeline=line._replace(core=estimator.answered(line.core, job, answer)))
 
 
 def run(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]) -> Iterator[Estimate]:
@@ -86,41 +145,31 @@ def replay(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEv
     The same numbers as ``step`` on each item, faster. Raises SignalError when no message can be used.
     """
     state = init()
-    block: list[Sample] = []
     for item in items:
-        if isinstance(item, CaptureEvent):
-            state, ready = _consume(state, block)
-            block = []
-            yield from ((state, estimate) for estimate in ready)
-            state = _event(state, item)
-            continue
-        line = state.timeline
-        state, samples = _sample(config, state, item)
-        if state.timeline is not line:
-            block = []  # the clock was set back: what came before it is over
-        block.extend(samples)
-        if len(block) >= BLOCK or (samples and _due(state, samples[-1].stamp_ns)):
-            state, ready = _consume(state, block)
-            block = []
-            yield from ((state, estimate) for estimate in ready)
+        state, ready = _all_read(*take(config, state, item, BLOCK))
+        yield from ((state, estimate) for estimate in ready)
         if state.counters.accepted == 0 and state.counters.received >= PATIENCE:
             break
     if state.config is not None:
-        clock, held = sampling.flush(state.config, state.sampling)
-        state = state._replace(sampling=clock)
-        block.extend(held.samples)
-    state, ready = _consume(state, block)
-    yield from ((state, estimate) for estimate in ready)
+        clock, late = sampling.flush(state.config, state.sampling)
+        state, ready = _all_read(*_hold(state._replace(sampling=clock), late.samples, BLOCK))
+        yield from ((state, estimate) for estimate in ready)
+    state = _run_held(state)
     check_used(state)
     yield state, None
 
 
 def current(state: State) -> Estimate | None:
-    """Return the estimate at the latest sample, whatever the publishing grid; None before the first."""
-    line = state.timeline
-    if line is None or state.config is None or line.last_ns == timeline.BEFORE_ALL:
+    """Return the estimate at the latest sample, whatever the publishing grid; None before the first.
+
+    As none followed: a fit under way is awaited.
+    """
+    state = _run_held(state)
+    line, config = state.timeline, state.config
+    if line is None or config is None or line.last_ns == timeline.BEFORE_ALL:
         return None
-    return estimator.estimate(state.config, line.core, line.last_ns, state.sampling.dt)
+    core = estimator.finish(config, line.core)
+    return estimator.estimate(config, core, line.last_ns, state.sampling.dt, estimator.payload(config, core))
 
 
 def check_used(state: State) -> None:
@@ -132,6 +181,7 @@ def check_used(state: State) -> None:
 
 def reconfigure(config: IdentifierParameters, state: State) -> State:
     """Go on with parameters that were changed while running (those declared ``live``)."""
+    state = _run_held(state)
     if state.config is None:
         return state
     state = state._replace(config=replace(config, outputs=state.config.outputs))
@@ -178,49 +228,47 @@ def _instant(state: State, stamp_ns: int, rate: float) -> int:
     return int((stamp_ns - state.first_ns) * rate * 1e-9 + 1e-6)
 
 
-def _due(state: State, stamp_ns: int) -> bool:
+def _is_due(state: State, stamp_ns: int) -> bool:
     assert state.config is not None
     return _instant(state, stamp_ns, state.config.publish_rate) > state.published
 
 
-def _read(config: IdentifierParameters, state: State, core: estimator.Core, stamp_ns: int
-          ) -> tuple[State, Estimate]:
-    """Return the estimate at a stamp, its model read anew when that is due.
-
-    That is by ``model_rate``, and with every estimate for as long after an event as it may arrive late: so
-    any order of arrival reads models at the same stamps.
-    """
-    assert state.timeline is not None
-    settling = 2.0 * config.rewind_time + 1.0 / config.publish_rate
-    changes = (state.first_ns, *(event.stamp_ns for event in state.timeline.latest))
-    young = any(0 <= stamp_ns - change <= settling * 1e9 for change in changes)
-    instant = _instant(state, stamp_ns, config.model_rate)
-    used = estimator.samples_used(core)
-    last = state.reading
-    if last is not None and not young and instant <= last.instant and last.samples <= used:
-        return state, estimator.follow(config, core, stamp_ns, last.estimate)
-    estimate = estimator.estimate(config, core, stamp_ns, state.sampling.dt)
-    reading = Reading(estimate, used, instant) if estimate.model is not None else None
-    return state._replace(reading=reading), estimate
-
-
-def _consume(state: State, samples: Iterable[Sample]) -> tuple[State, tuple[Estimate, ...]]:
-    """Run samples through the estimators, stopping at each publishing instant."""
-    config, line = state.config, state.timeline
-    if config is None or line is None:
+def _hold(state: State, samples: Iterable[Sample], group: int) -> tuple[State, tuple[Due, ...]]:
+    """Keep samples, and run what is kept: when it is many, at each publishing instant and just before one."""
+    config = state.config
+    if config is None or state.timeline is None:
         return state, ()
-    ready: list[Estimate] = []
-    block: list[Sample] = []
+    due: list[Due] = []
+    dt_ns = int(state.sampling.dt * 1e9) if group == GROUP else 0
     for sample in samples:
-        block.append(sample)
-        if not _due(state, sample.stamp_ns):
-            continue
-        line = timeline.advance(config, line, block)
-        block = []
-        state = state._replace(
-            timeline=line, published=_instant(state, sample.stamp_ns, config.publish_rate))
-        state, estimate = _read(config, state, line.core, sample.stamp_ns)
-        ready.append(estimate)
-    if block:
-        state = state._replace(timeline=timeline.advance(config, line, block))
-    return state, tuple(ready)
+        state = state._replace(held=(*state.held, sample))
+        if _is_due(state, sample.stamp_ns):
+            state = _run_held(state)
+            state = state._replace(published=_instant(state, sample.stamp_ns, config.publish_rate))
+            due.append(_due_now(config, state, sample.stamp_ns))
+        elif len(state.held) >= group or _is_due(state, sample.stamp_ns + dt_ns):
+            state = _run_held(state)
+    return state, tuple(due)
+
+
+def _due_now(config: IdentifierParameters, state: State, stamp_ns: int) -> Due:
+    assert state.timeline is not None
+    core = state.timeline.core
+    return Due(stamp_ns, core, estimator.payload(config, core))
+
+
+def _run_held(state: State) -> State:
+    """Run the samples that are kept."""
+    if not state.held:
+        return state
+    assert state.timeline is not None
+    assert state.config is not None
+    return state._replace(timeline=timeline.advance(state.config, state.timeline, state.held), held=())
+
+
+def _all_read(state: State, due: tuple[Due, ...]) -> tuple[State, tuple[Estimate, ...]]:
+    estimates = []
+    for one in due:
+        state, estimate = read(state, one)
+        estimates.append(estimate)
+    return state, tuple(estimates)

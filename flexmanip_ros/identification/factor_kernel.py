@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from flexmanip_ros.identification.memory_kernel import (
     COUNTS,
@@ -30,7 +31,12 @@ from flexmanip_ros.identification.memory_kernel import (
 )
 from flexmanip_ros.types import Array
 
+Kinds = NDArray[np.int8]
+
 __all__ = ['COUNTS', 'SCALARS', 'advance_factor', 'rotate']
+
+LEARNT, REFUSED, QUIET = 0, 1, 2
+"""What became of a sample. One that only fills the past window counts as learnt."""
 
 GROWTH = 1.25
 """A regressor that exceeds its peak by this factor re-states the prior of its coefficient."""
@@ -101,9 +107,12 @@ def state_prior(
 def advance_factor(
     U: Array, Y: Array, R: Array, z: Array, row: Array, scratch: Array, peaks: Array, prior: Array,
     scale: Array, mean: Array, variance: Array, scalars: Array, counts: Array,
-    p: int, feedthrough: int, alpha: float, beta: float, mode: int,
+    p: int, feedthrough: int, alpha: float, beta: float, mode: int, fate: Kinds,
 ) -> None:
-    """Run N samples. U: (N, r), Y: (N, m) in outside units; every other array is state, overwritten."""
+    """Run N samples. U: (N, r), Y: (N, m) in outside units; every other array is state, overwritten.
+
+    fate: (N,) is written: LEARNT, REFUSED or QUIET.
+    """
     r = U.shape[1]
     m = Y.shape[1]
     width = r + m
@@ -112,12 +121,15 @@ def advance_factor(
     regressors = past + r if feedthrough else past
     new = np.empty(width)
     for k in range(U.shape[0]):
+        fate[k] = LEARNT
         if not accept(U[k], Y[k], new, scale, counts):
+            fate[k] = REFUSED
             continue
         remember(new, mean, scalars, counts, p)
         if counts[FILLED] >= p:
             b = memory(scalars, counts, beta, mode)
             if scalars[OPEN] == 0.0:
+                fate[k] = QUIET
                 push(z, new)
                 counts[FILLED] += 1
                 continue

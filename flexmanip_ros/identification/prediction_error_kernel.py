@@ -10,7 +10,7 @@ from numba import njit
 from flexmanip_ros.types import Array
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def innovation(u: Array, y: Array, C: Array, D: Array, x: Array, e: Array) -> None:
     """Fill e (m,) = y - C x - D u."""
     for o in range(e.size):
@@ -22,7 +22,7 @@ def innovation(u: Array, y: Array, C: Array, D: Array, x: Array, e: Array) -> No
         e[o] = total
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def following(u: Array, A: Array, B: Array, K: Array, x: Array, e: Array, after: Array) -> None:
     """Fill after (n,) = A x + B u + K e."""
     for i in range(x.size):
@@ -36,7 +36,7 @@ def following(u: Array, A: Array, B: Array, K: Array, x: Array, e: Array, after:
         after[i] = total
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def linearize(
     U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, K: Array, x: Array, whiten: Array,
     free_gain: int, free_output: int, free_direct: int, N: Array, g: Array, moments: Array, X: Array,
@@ -126,7 +126,7 @@ def linearize(
                 X[i, j] = moved[i, j]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def residual_moments(
     U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, K: Array, x: Array, moments: Array,
 ) -> None:
@@ -144,7 +144,7 @@ def residual_moments(
                 moments[o, i] += e[o] * e[i]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def condition(H: Array, root: Array, gradient: Array, step: Array) -> None:
     """Update in square-root form: root (k, k) <- root L^-T with L L' = I + H, step = (I + H)^-1 gradient.
 

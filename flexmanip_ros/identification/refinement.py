@@ -1,9 +1,12 @@
-"""The prediction-error fit kept up to date: whole stretches at first, then block by block.
+"""When the prediction-error fit is made, and what it works on: whole stretches at first, then blocks.
 
 After a start or an event the samples are kept and the fit is repeated on all of them each time their number
-has doubled, from the subspace model and from the fit before, whichever ends better. From ``LONGEST`` samples
-on the linearization is good enough to go on recursively: each block of samples updates parameters and state
-together, in square-root covariance form, and is then forgotten. Memory is constant; the work is bounded.
+has doubled. From ``LONGEST`` samples on the linearization is good enough to go on recursively: each block of
+samples updates parameters and state together and is then forgotten. Memory is constant; the work is bounded.
+
+A fit takes far longer than the time between two samples. So it is asked for as a ``Job`` that holds all it
+depends on, and its result is taken a fixed number of samples later: whoever runs the samples may work on it
+meanwhile, and the numbers do not depend on when it was ready.
 """
 
 from __future__ import annotations
@@ -12,10 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.identification.moments import Realized, triangle
-from flexmanip_ros.identification.prediction_error import derivatives, moved, run
-from flexmanip_ros.identification.prediction_error_kernel import condition
-from flexmanip_ros.identification.stretch import Recursion, arrive, fit_stretch
+from flexmanip_ros.identification.moments import triangle
+from flexmanip_ros.identification.stretch import Recursion
 from flexmanip_ros.types import Array
 
 CHUNK = 64
@@ -24,21 +25,41 @@ FIRST, LONGEST = 256, 2048
 """Samples of the first fit, and of the last one that sees them all; multiples of CHUNK."""
 BLOCK = 256
 """Samples of a recursive update; a multiple of CHUNK."""
-MEMORY = 1_000_000.0
-"""Samples after which parameters may have drifted by their own standard deviation."""
+DELAY = 8
+"""A fit of N samples is taken N / DELAY samples later, and at least CHUNK."""
 PARAMETERS = 80
 """With more parameters than this the subspace model is published as it is."""
 PAUSE = 8192
 """Samples from a fit that failed to the next attempt; a multiple of CHUNK."""
-MISFIT = 3.0
-"""Residual power of a block that ends a recursion; twice in a row."""
+
+
+class Job(NamedTuple):
+    """A fit to be made.
+
+    chunks: its samples, in arrays (CHUNK, r + m); R: (q, q) factor of the moments and scale: (r + m,), both
+    None for the update by a block; old: the fit before.
+    """
+
+    chunks: tuple[Array, ...]
+    R: Array | None
+    scale: Array | None
+    old: Recursion | None
+
+
+class Answer(NamedTuple):
+    """What a job gave: None where nothing fits. failed: a decomposition did."""
+
+    recursion: Recursion | None
+    failed: bool = False
 
 
 class Refined(NamedTuple):
     """What the refinement remembers.
 
     Closed chunks (CHUNK, r + m) never written to again, the open one, samples since the start (negative:
-    still to wait), and the fit. batch: the fit still sees every sample since the start.
+    still to wait), and the fit. batch: the fit still sees every sample since the start; seen: samples from
+    the first chunk on that the fit has taken in; job: under way, its result is taken at ``due`` samples;
+    answer: to it, if it is known by now.
     """
 
     chunks: tuple[Array, ...]
@@ -46,6 +67,10 @@ class Refined(NamedTuple):
     total: int
     batch: bool
     recursion: Recursion | None
+    seen: int = 0
+    job: Job | None = None
+    due: int = 0
+    answer: Answer | None = None
 
 
 def start(width: int) -> Refined:
@@ -53,16 +78,16 @@ def start(width: int) -> Refined:
     return Refined((), np.zeros((CHUNK, width)), 0, True, None)
 
 
-def due(refined: Refined) -> int:
+def until_chunk(refined: Refined) -> int:
     """Samples until the next piece of work (at least 1)."""
     return CHUNK - refined.total % CHUNK
 
 
 def take(refined: Refined, samples: Array) -> Refined:
-    """Store samples (k, r + m), k <= due(refined)."""
-    current = refined.current.copy()
+    """Store samples (k, r + m), k <= until_chunk(refined)."""
     if refined.total < 0:
         return refined._replace(total=refined.total + len(samples))
+    current = refined.current.copy()
     at = refined.total % CHUNK
     current[at:at + len(samples)] = samples
     refined = refined._replace(current=current, total=refined.total + len(samples))
@@ -74,7 +99,7 @@ def take(refined: Refined, samples: Array) -> Refined:
 def is_fit_due(refined: Refined) -> bool:
     """Whether the whole stretch is to be fitted now: at FIRST samples and each time they double."""
     total = refined.total
-    if not refined.batch or total <= 0 or total % FIRST:
+    if not refined.batch or refined.job is not None or total <= 0 or total % FIRST:
         return False
     doublings = total // FIRST
     return doublings & (doublings - 1) == 0
@@ -82,66 +107,51 @@ def is_fit_due(refined: Refined) -> bool:
 
 def is_block_due(refined: Refined) -> bool:
     """Whether a recursive update is due."""
-    if refined.recursion is None or refined.total % BLOCK or len(refined.chunks) * CHUNK < BLOCK:
-        return False
-    return refined.total % CHUNK == 0
+    waiting = len(refined.chunks) * CHUNK - refined.seen
+    return refined.recursion is not None and refined.job is None and waiting >= BLOCK
 
 
-def fit_all(
-    refined: Refined, starts: list[Realized], scale: Array, feedthrough: bool, noise: str,
-) -> Refined:
-    """Fit the whole stretch anew, see ``stretch.fit_stretch``."""
-    best = fit_stretch(np.vstack(refined.chunks), starts, refined.recursion, scale, feedthrough, noise)
-    return _next_phase(refined._replace(recursion=best))
+def ask_fit(refined: Refined, R: Array, scale: Array) -> Refined:
+    """Ask for a fit of the whole stretch, see ``stretch.fit_stretch``."""
+    job = Job(refined.chunks, R.copy(), scale.copy(), refined.recursion)
+    return refined._replace(job=job, due=refined.total + max(CHUNK, refined.total // DELAY))
 
 
-def _next_phase(refined: Refined) -> Refined:
-    """From LONGEST samples on the stretch is let go: recursion with a fit, a new stretch without."""
-    if refined.total < LONGEST:
-        return refined
-    if refined.recursion is None:
-        return give_up(refined)
-    return refined._replace(chunks=(), batch=False)
+def ask_block(refined: Refined) -> Refined:
+    """Ask for an update by the oldest block that the fit has not seen."""
+    first = refined.seen // CHUNK
+    job = Job(refined.chunks[first:first + BLOCK // CHUNK], None, None, refined.recursion)
+    return refined._replace(job=job, due=refined.total + CHUNK)
 
 
-def give_up(refined: Refined) -> Refined:
+def deliver(refined: Refined, answer: Answer) -> Refined:
+    """Go on with the result of the job."""
+    job = refined.job
+    assert job is not None
+    width = refined.current.shape[1]
+    refined = refined._replace(job=None, answer=None)
+    if answer.failed:  # the subspace model remains; a new stretch begins
+        return start(width)
+    if job.R is None:
+        return give_up(width) if answer.recursion is None else _seen(
+            refined._replace(recursion=answer.recursion), refined.seen + BLOCK)
+    count = len(job.chunks) * CHUNK
+    if answer.recursion is None and count >= LONGEST:
+        return give_up(width)
+    refined = refined._replace(recursion=answer.recursion, batch=count < LONGEST)
+    return _seen(refined, count)
+
+
+def _seen(refined: Refined, seen: int) -> Refined:
+    """From LONGEST samples on, forget what the fit has taken in."""
+    if refined.batch:
+        return refined._replace(seen=seen)
+    return refined._replace(chunks=refined.chunks[seen // CHUNK:], seen=0)
+
+
+def give_up(width: int) -> Refined:
     """Drop a fit that does not hold, and wait before the next: the plant may not be of this kind at all."""
-    return start(refined.current.shape[1])._replace(total=-PAUSE)
-
-
-def update(refined: Refined) -> Refined:
-    """One recursive block: parameters and state together, from the samples of the closed chunks."""
-    old = refined.recursion
-    assert old is not None
-    samples = np.vstack(refined.chunks[-(BLOCK // CHUNK):])
-    r = old.theta.B.shape[1]
-    U = np.ascontiguousarray(samples[:, :r] * old.scale[:r])
-    Y = np.ascontiguousarray(samples[:, r:] * old.scale[r:])
-    k = old.root.shape[0]
-    kept = old.root * np.sqrt(1.0 + len(U) / MEMORY)
-    zeta, theta = np.zeros(k), old.theta
-    arrival, root = np.zeros((0, k)), kept
-    for _ in range(2 if old.lost else 1):  # a state that was lost makes the first derivatives poor
-        information, gradient, _, arrival, _ = derivatives(U, Y, theta, old.structure, old.covariance, old.P)
-        H = kept.T @ information @ kept
-        if not np.all(np.isfinite(H)):
-            return give_up(refined)
-        root, step = kept.copy(), np.empty(k)
-        condition(H, root, kept.T @ gradient - zeta, step)
-        zeta = zeta + step
-        theta = moved(old.theta, old.P @ (kept @ zeta), old.structure)
-    covariance, end = run(U, Y, theta)
-    power = float(np.trace(np.linalg.solve(old.covariance, covariance))) / Y.shape[1]
-    strikes = old.strikes + 1 if not power < MISFIT else 0
-    if strikes >= 2 or not np.isfinite(power):
-        return give_up(refined)
-    share = len(U) / (old.weight + len(U))
-    recursion = old._replace(
-        theta=theta._replace(x=end), root=arrive(root, arrival), strikes=strikes,
-        gain=theta.K if old.structure.free_gain else old.gain, lost=False,
-        covariance=(1.0 - share) * old.covariance + share * covariance,
-        weight=min(old.weight + len(U), MEMORY))
-    return refined._replace(chunks=refined.chunks if refined.batch else (), recursion=recursion)
+    return start(width)._replace(total=-PAUSE)
 
 
 def break_window(refined: Refined) -> Refined:

@@ -17,11 +17,13 @@ from flexmanip_ros.errors import SignalError
 from flexmanip_ros.identification import (
     decimation,
     factor_kernel,
+    fitting,
     memory_kernel,
     paper_kernel,
     publication,
     refinement,
 )
+from flexmanip_ros.identification.factor_kernel import Kinds
 from flexmanip_ros.identification.memory_kernel import FILLED, POWER, PRIOR, USED, WEIGHT, WEIGHT2
 from flexmanip_ros.identification.moments import solve_regressor
 from flexmanip_ros.identification.uncertainty import Identified
@@ -32,6 +34,8 @@ MODES = {
     'constant': memory_kernel.CONSTANT, 'excitation': memory_kernel.EXCITATION,
     'innovation': memory_kernel.INNOVATION,
 }
+FRESH = 3.0
+"""A fit is published while the subspace model rests on at most this many times its samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,64 +134,62 @@ def advance(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array
         U, Y = np.ascontiguousarray(kept[:, :r]), np.ascontiguousarray(kept[:, r:])
     done = 0
     while done < len(U):
-        count = len(U) - done if new.refined is None else min(len(U) - done, refinement.due(new.refined))
-        _run(config, new, U[done:done + count], Y[done:done + count])
+        count = len(U) - done
         if new.refined is not None:
-            new = replace(new, refined=_refine(config, new, U[done:done + count], Y[done:done + count]))
+            count = min(count, refinement.until_chunk(new.refined))
+        u, y = U[done:done + count], Y[done:done + count]
+        fate = _run(config, new, u, y)
+        if new.refined is not None:
+            new = replace(new, refined=fitting.refine(
+                config, new.refined, np.hstack([u, y]), fate, new.memory[0], new.scale))
         done += count
     return new
 
 
-def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array) -> None:
-    """Run the compiled kernel, overwriting the arrays of the state."""
+def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array) -> Kinds:
+    """Run the compiled kernel, overwriting the arrays of the state; return what became of each sample."""
     recursive = config.estimator == 'paper'  # stale states: it must forget
     mode = MODES['excitation' if recursive and config.forgetting == 'innovation' else config.forgetting]
-    common: tuple[Any, ...] = (
-        state.z, state.scale, state.mean, state.variance, state.scalars, state.counts)
+    fate = np.zeros(len(U), dtype=np.int8)
     if config.estimator == 'paper':
+        common: tuple[Any, ...] = (
+            state.z, state.scale, state.mean, state.variance, state.scalars, state.counts)
         options: tuple[Any, ...] = (
             config.past_window, config.future_window, int(config.direct_feedthrough),
             int(config.weighted_observability), int(config.state_basis == 'tracked'),
             np.array(config.regularization), np.array(config.forgetting_factor), mode)
         memory: tuple[Any, ...] = state.memory
         paper_kernel.advance_paper(U, Y, *memory, *common, *options)
-        return
+        return fate
     R, row, scratch, peaks, prior = state.memory
     factor_kernel.advance_factor(
         U, Y, R, state.z, row, scratch, peaks, prior, state.scale, state.mean, state.variance, state.scalars,
         state.counts, config.past_window, int(config.direct_feedthrough), config.regularization[0],
-        config.forgetting_factor[0], mode)
+        config.forgetting_factor[0], mode, fate)
+    return fate
 
 
-def _refine(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array) -> refinement.Refined:
-    """Hand samples to the prediction-error fit and do the work that is due."""
+def job(state: RpbsidState) -> tuple[refinement.Job, int] | None:
+    """Return the fit under way, its result not known, and the samples until that is taken."""
     refined = state.refined
-    assert refined is not None
-    samples = np.hstack([U, Y])
-    good = np.all(np.abs(samples) * state.scale <= memory_kernel.LARGEST, axis=1)  # false for nan
-    for k in np.flatnonzero(~good):
-        refined = refinement.break_window(refined)
-        samples, good = samples[k + 1:], good[k + 1:]
-        break
-    if not np.all(good):
-        samples = samples[np.flatnonzero(~good)[-1] + 1:]
-    if state.counts[USED] and state.scalars[memory_kernel.OPEN] == 0.0:  # nothing to learn while all is quiet
-        return refinement.break_window(refined) if refined.total % refinement.CHUNK else refined
-    refined = refinement.take(refined, samples)
-    try:
-        if refinement.is_fit_due(refined):
-            starts = [publication.from_factor(config, state.memory[0], state.scale)]
-            if config.order > len(config.outputs) and config.past_window > config.future_window:
-                longer = replace(config, future_window=config.past_window)
-                starts.append(publication.from_factor(longer, state.memory[0], state.scale))
-            refined = refinement.fit_all(
-                refined, [realized for realized, _, _ in starts if realized is not None], starts[0][2],
-                config.direct_feedthrough, 'sensor' if config.refinement == 'output_error' else 'any')
-        elif refinement.is_block_due(refined):
-            refined = refinement.update(refined)
-    except np.linalg.LinAlgError:  # the subspace model remains; a new stretch begins
-        refined = refinement.start(samples.shape[1])
-    return refined
+    if refined is None or refined.job is None or refined.answer is not None:
+        return None
+    return refined.job, refined.due - refined.total
+
+
+def answered(state: RpbsidState, job: refinement.Job, answer: refinement.Answer) -> RpbsidState:
+    """Return the state knowing the result of ``job``, for when its turn comes; no change if it is over."""
+    refined = state.refined
+    if refined is None or refined.job is not job:
+        return state
+    return replace(state, refined=refined._replace(answer=answer))
+
+
+def finish(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
+    """No sample follows: take the result of the fit under way now."""
+    if state.refined is None:
+        return state
+    return replace(state, refined=fitting.delivered(config, state.refined))
 
 
 def window_restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
@@ -199,7 +201,7 @@ def window_restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidSt
     if new.decimator is not None:
         new = replace(new, decimator=decimation.restart(new.decimator))
     if new.refined is not None:
-        new = replace(new, refined=refinement.break_window(new.refined))
+        new = replace(new, refined=fitting.broken(config, new.refined))
     return new
 
 
@@ -241,8 +243,7 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> I
     dt *= config.decimation
     d = _regressors(config, len(config.inputs), len(config.outputs))
     refined = state.refined
-    # a fit of few samples does not replace a model of many
-    if refined is not None and refined.recursion and 2 * refined.recursion.weight >= state.counts[USED]:
+    if refined is not None and refined.recursion and FRESH * refined.recursion.weight >= state.counts[USED]:
         return publication.from_fit(
             config, refined.recursion, state.scalars, publication.excitation(state.memory[0][:d, :d]), dt)
     few = state.counts[USED] <= max(config.past_window, config.order)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Iterable
 from functools import partial
 
 from geometry_msgs.msg import InertiaStamped
@@ -35,6 +36,7 @@ from flexmanip_ros.ros.keeper import Keeper, too_old
 from flexmanip_ros.ros.node import FlexmanipNode, sequence_number, with_info
 from flexmanip_ros.ros.spin import run
 from flexmanip_ros.ros.warm_up import warm_up
+from flexmanip_ros.ros.worker import Worker
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Status
 
 NAME = 'rpbsid_identifier'
@@ -61,6 +63,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self._reader = JointStateReader()
         self._keeper: Keeper | None = None
         self._resumed = False
+        self._worker: Worker | None = None
 
     def make_entities(self) -> None:
         """Publishers, subscriptions and the reset service."""
@@ -91,8 +94,15 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self.state, self._resumed = state, True
             self.get_logger().info(f'resumed after {state.counters.accepted} samples')
 
+    def activated(self) -> None:
+        """Have a thread for the fits."""
+        self._worker = Worker()
+
     def deactivated(self) -> None:
         """Save what is known."""
+        if self._worker is not None:
+            self._worker.close()
+            self._worker = None
         if self._keeper is not None:
             self._keeper.finish()
             self._keeper.save(self.config, self.state)
@@ -143,18 +153,28 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         """One step; whatever is wrong with the message is said and counted, and the node goes on."""
         dropped = self.state.counters.dropped
         try:
-            self.state, estimates = pipeline.step(self.config, self.state, item)
+            self.state, due = pipeline.take(self.config, self.state, item)
         except FlexmanipError as error:
             self._refuse('configuration', str(error))
             return
         refusal = self.state.sampling.refusal
         if refusal is not None and self.state.counters.dropped > dropped:
             self.complain(refusal.reason, f'message dropped: {refusal.problem}; {refusal.remedy}')
-        for estimate in estimates:
+        for one in due:  # the payload first: nobody should wait for it while a model is read
+            self._publish(messages.outgoing_payload(one.payload, one.stamp_ns, self.config.payload_frame))
+            self.state, estimate = pipeline.read(self.state, one)
+            if one.payload is None:
+                self._publish(messages.outgoing_payload(
+                    estimate.payload, one.stamp_ns, self.config.payload_frame))
+            self._publish(messages.outgoing_model(estimate))
             self.estimate = estimate
-            for name, value in messages.outgoing(estimate, self.config.payload_frame):
-                self.outputs[name].publish(to_message(value))
-                self.published += 1
+        if self._worker is not None:
+            self.state = self._worker.attend(self.state)
+
+    def _publish(self, values: Iterable[tuple[str, messages.Value]]) -> None:
+        for name, value in values:
+            self.outputs[name].publish(to_message(value))
+            self.published += 1
 
     def _refuse(self, reason: str, words: str) -> None:
         self.refused += 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import signal
 import sys
@@ -105,6 +106,8 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
         executor.add_node(node)
         if not node.autostart():
             return BAD_INPUT  # the node has said why
+        gc.collect()
+        gc.freeze()  # what lives from here on is not looked through again while samples come
         spin(executor, None, interrupt)
     finally:
         node.close()
