@@ -175,19 +175,21 @@ def _next(config: IdentifierParameters, state: SamplingState, raw: Sample
           ) -> tuple[SamplingState, tuple[Sample, ...], bool]:
     """Advance the clock by one sample; return the complete samples and whether a gap precedes ``raw``."""
     gap = False
-    if state.last_ns is not None:
+    if state.last_ns is None:
+        state = state._replace(last_ns=raw.stamp_ns)
+    else:
         interval = raw.stamp_ns - state.last_ns
         total, count = state.interval_sum_ns, state.interval_count
         # Compared in whole nanoseconds times count: the same stamps give the same verdict on any machine.
         gap = not (interval * count < config.gap_factor * total
                    and interval * count > (2.0 - config.gap_factor) * total)
         if gap:
-            state = state._replace(irregular=state.irregular + 1, pending=(),
-                            counters=state.counters.plus('gaps'))
+            state = state._replace(irregular=state.irregular + 1, pending=(), last_ns=raw.stamp_ns,
+                                   counters=state.counters.plus('gaps'))
+            raw = replace(raw, gap=True)
         else:
-            state = state._replace(irregular=0, interval_sum_ns=total + interval, interval_count=count + 1)
-    state = state._replace(last_ns=raw.stamp_ns)
-    raw = replace(raw, gap=gap)
+            state = state._replace(irregular=0, interval_sum_ns=total + interval, interval_count=count + 1,
+                                   last_ns=raw.stamp_ns)
     delay = config.arm.effort_delay
     if delay == 0:
         return state, (raw,), gap
