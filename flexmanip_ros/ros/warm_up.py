@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
 from flexmanip_ros import pipeline
+from flexmanip_ros.errors import SignalError
+from flexmanip_ros.identification import refinement
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
-SAMPLES = 120
+EVENT = 40
+"""Samples before the event; enough to learn the sample time."""
+SAMPLES = EVENT + 3 * refinement.BLOCK + 2 * refinement.CHUNK
+"""Until the fits after it have begun and a block has followed."""
 STEP_NS = 1_000_000
 
 
@@ -19,12 +25,26 @@ def warm_up(config: IdentifierParameters) -> None:
 
     Raises ParameterError when the configuration cannot work at all, before any message comes.
     """
+    try:
+        for _ in pipeline.run(config, _signals(config)):
+            pass
+    except SignalError:  # every field is there: a signal that even these messages cannot carry
+        return
+
+
+def _signals(config: IdentifierParameters) -> Iterator[JointRecord | CaptureEvent]:
+    """Yield joints that swing at two frequencies when torque, at random, acts on them."""
     names = tuple(dict.fromkeys(
         signal.rpartition('/')[0] for signal in (*config.inputs, *config.outputs, *config.angles)))
-    state = pipeline.init()
+    rng = np.random.default_rng(0)
+    swing = np.exp(1j * np.array([0.1, 0.2]) - 0.01)
+    shape = rng.standard_normal((2, len(names)))
+    state = np.zeros(2, dtype=complex)
     for k in range(SAMPLES):
-        wave = np.array([math.sin(0.1 * (k + 1) * (i + 1)) for i in range(len(names))]) * 1e-2
-        record = JointRecord(k * STEP_NS, names, wave, wave * 3.0, wave * 100.0)
-        state, _ = pipeline.step(config, state, record)
-        if k == SAMPLES // 2:
-            state, _ = pipeline.step(config, state, CaptureEvent((k - 1) * STEP_NS, EventKind.CAPTURE))
+        if k == EVENT:
+            yield CaptureEvent((k - 1) * STEP_NS, EventKind.CAPTURE)
+        effort = rng.standard_normal(len(names))
+        noise = 1e-3 * rng.standard_normal((2, len(names)))
+        yield JointRecord(
+            k * STEP_NS, names, 0.01 * (state.imag @ shape + noise[0]), state.real @ shape + noise[1], effort)
+        state = swing * state + shape @ effort / math.sqrt(len(names))
