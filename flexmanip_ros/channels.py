@@ -83,8 +83,8 @@ def extract(places: tuple[tuple[str, int], ...], record: JointRecord) -> Array:
 
 
 def finite(values: Array) -> bool:
-    """Tell whether every value is finite; the sum is enough and cheap."""
-    return math.isfinite(float(values.sum()))
+    """Tell whether every value is finite; of so few this is the cheapest way, and a sum may overflow."""
+    return all(map(math.isfinite, values.tolist()))
 
 
 def _find(signal: str, record: JointRecord) -> tuple[str, int] | None:

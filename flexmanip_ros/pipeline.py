@@ -193,7 +193,7 @@ def reconfigure(config: IdentifierParameters, state: State) -> State:
 
 def _event(state: State, event: CaptureEvent) -> State:
     if state.timeline is None or state.config is None:
-        return state._replace(early=(*state.early, event))
+        return state._replace(early=(*state.early, event)[-timeline.MOST_EVENTS:])
     return state._replace(timeline=timeline.event(
         state.config, state.timeline, event, state.first_ns))
 

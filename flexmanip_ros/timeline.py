@@ -20,6 +20,11 @@ BEFORE_ALL = -(1 << 63)
 CHECKPOINTS = 2
 """Checkpoints within ``rewind_time``; one more is kept so that the whole of it can be run again."""
 
+MOST_EVENTS = 100
+"""Events that wait for their stamps at most, the earliest ones."""
+MOST_SAMPLES = 20_000
+"""Samples kept at most; at rates (or with stamps) that need more the time to go back is shorter."""
+
 
 class Checkpoint(NamedTuple):
     """The estimator after the sample at ``after_ns``, before the one at ``stamp_ns`` and its events."""
@@ -58,7 +63,9 @@ def advance(config: IdentifierParameters, line: Timeline, samples: Sequence[Samp
     block: list[Sample] = []
     for sample in samples:
         due = tuple(event for event in line.waiting if event.stamp_ns <= sample.stamp_ns)
-        checkpoint_due = not line.checkpoints or sample.stamp_ns - line.checkpoints[-1].stamp_ns >= spacing_ns
+        checkpoint_due = (
+            not line.checkpoints or sample.stamp_ns - line.checkpoints[-1].stamp_ns >= spacing_ns
+            or len(line.samples) + len(block) >= MOST_SAMPLES)
         if block and (due or checkpoint_due):
             line = _run(config, line, block)
             block = []
@@ -100,7 +107,8 @@ def _all_along(config: IdentifierParameters, line: Timeline) -> Timeline:
 
 
 def _wait(line: Timeline, event: CaptureEvent) -> Timeline:
-    return line._replace(waiting=tuple(sorted((*line.waiting, event), key=lambda e: e.stamp_ns)))
+    waiting = sorted((*line.waiting, event), key=lambda e: e.stamp_ns)
+    return line._replace(waiting=tuple(waiting[:MOST_EVENTS]))
 
 
 def _run(config: IdentifierParameters, line: Timeline, block: list[Sample]) -> Timeline:
@@ -112,7 +120,8 @@ def _checkpoint(config: IdentifierParameters, line: Timeline, stamp_ns: int) -> 
     """Remember the estimator as it is before the sample at ``stamp_ns``; forget what is too old."""
     kept = (*line.checkpoints, Checkpoint(line.last_ns, stamp_ns, line.core))
     oldest_needed = stamp_ns - int(config.rewind_time * 1e9)
-    while len(kept) > 1 and kept[1].stamp_ns <= oldest_needed:
+    too_many = len(line.samples) >= MOST_SAMPLES
+    while len(kept) > 1 and (kept[1].stamp_ns <= oldest_needed or too_many):
         kept = kept[1:]
     start = kept[0].after_ns
     return line._replace(checkpoints=kept,

@@ -11,6 +11,7 @@ import numpy as np
 
 from flexmanip_ros.control.feedback import Design, design, observation, reference
 from flexmanip_ros.control.gate import PayloadEstimate, Verdict, judge
+from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters.controller import ControllerParameters
 from flexmanip_ros.types import Array
 
@@ -45,6 +46,8 @@ class ControllerState(NamedTuple):
     verdict: Verdict | None = None
     """What became of the latest estimate."""
     designs: int = 0
+    failed_designs: int = 0
+    """How often there was no regulator for a configuration and payload."""
 
     @property
     def gain(self) -> Array:
@@ -121,6 +124,9 @@ def _scheduled(config: ControllerParameters, state: ControllerState, between: fl
     same_mass = abs(payload - state.designed_payload) <= config.reschedule_mass * held_mass
     if same_mass and abs(between - state.designed_between) <= config.reschedule_angle:
         return state
-    return state._replace(
-        old=state.now.G, now=design(config, between, payload), blend=0.0, designed_payload=payload,
-        designed_between=between, designs=state.designs + 1)
+    state = state._replace(designed_payload=payload, designed_between=between)
+    try:
+        wanted = design(config, between, payload)
+    except ModelError:  # the gains in use go on
+        return state._replace(failed_designs=state.failed_designs + 1)
+    return state._replace(old=state.now.G, now=wanted, blend=0.0, designs=state.designs + 1)

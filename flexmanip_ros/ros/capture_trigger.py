@@ -38,6 +38,18 @@ LOOPED_NS = 1_000_000_000
 """Stamps that go back further than this are a new recording, and the count begins again."""
 
 
+class Told:
+    """How many events were told, and the latest of them."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.latest: CaptureEvent | None = None
+
+    def note(self, event: CaptureEvent) -> None:
+        """One more."""
+        self.count, self.latest = self.count + 1, event
+
+
 class CaptureTrigger(FlexmanipNode[TriggerParameters]):
     """Announces events on the clock of the joint states."""
 
@@ -48,12 +60,14 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         self._meter = Meter()
         self._first_ns: int | None = None
         self._last_ns: int | None = None
+        self._before_ns: int | None = None
+        """Stamp before the last."""
         self._arrived = -1.0
         self._pending: tuple[CaptureEvent, ...] = ()
         self._watcher: Watcher | None = None
         self._reader = JointStateReader()
-        self.detected: list[CaptureEvent] = []
-        self.announced: list[CaptureEvent] = []
+        self.detected = Told()
+        self.announced = Told()
 
     def make_entities(self) -> None:
         """Publishers, subscription and services."""
@@ -71,7 +85,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
     def activated(self) -> None:
         """Count from the next sample, and watch from there on."""
         self._watcher = Watcher(self.config) if self.config.mode == 'auto' else None
-        self._first_ns = self._last_ns = None
+        self._first_ns = self._last_ns = self._before_ns = None
         self._pending = ()
 
     def _on_joint_states(self, raw: bytes) -> None:
@@ -82,14 +96,20 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
             if stamp is None:
                 return
             self._arrived = time.monotonic()
-            if self._first_ns is None or self._last_ns is None or stamp < self._last_ns - LOOPED_NS:
+            if self._first_ns is None or self._is_anew(stamp):
                 self._begin(stamp)
-            self._last_ns = stamp
+            self._before_ns, self._last_ns = self._last_ns, stamp
             while self._pending and stamp >= self._pending[0].stamp_ns - int(self.config.lead_time * 1e9):
                 self._announce(self._pending[0])
                 self._pending = self._pending[1:]
             if self._watcher is not None:
                 self._watch(self._watcher, raw)
+
+    def _is_anew(self, stamp: int) -> bool:
+        """Say whether stamps went back to a new recording, and not from one wrong stamp to the right ones."""
+        if self._last_ns is None or stamp >= self._last_ns - LOOPED_NS:
+            return False
+        return self._before_ns is None or not 0 <= stamp - self._before_ns <= LOOPED_NS
 
     def _watch(self, watcher: Watcher, raw: bytes) -> None:
         """Mode auto: tell what the sample reveals."""
@@ -101,7 +121,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
             return
         for event in watcher.take(record):
             self.detected_publisher.publish(header(event))
-            self.detected.append(event)
+            self.detected.note(event)
             self.get_logger().info(f'{event.kind.value} detected at {event.stamp_ns * 1e-9:.6f}')
         if watcher.counters.dropped > dropped and watcher.refusal is not None:
             self.complain(watcher.refusal.reason,
@@ -120,7 +140,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
 
     def _announce(self, event: CaptureEvent) -> None:
         self.events_publisher.publish(header(event))
-        self.announced.append(event)
+        self.announced.note(event)
         self.get_logger().info(f'{event.kind.value} at {event.stamp_ns * 1e-9:.6f}')
 
     def _on_capture(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -149,10 +169,10 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         """Rate of the joint states and what was announced."""
         report.values.update(self._meter.window())
         report.values['mode'] = self.config.mode
-        report.values['announced'] = len(self.announced)
+        report.values['announced'] = self.announced.count
         report.values['pending'] = len(self._pending)
         if self._watcher is not None:
-            report.values['detected'] = len(self.detected)
+            report.values['detected'] = self.detected.count
             report.values['dropped'] = self._watcher.counters.dropped
             report.values['statistic'], report.values['threshold'] = self._watcher.statistic
         if self.active and report.values['rate_hz'] == 0.0:

@@ -52,8 +52,9 @@ class Progress:
             return 'warming up'
         words = [' '.join(f'{mode.frequency_hz:.2f}' for mode in estimate.modes[:2]) + ' Hz'] \
             if estimate.modes else []
-        if self._composition.trigger.announced:
-            words.append(self._composition.trigger.announced[-1].kind.value)
+        told = self._composition.trigger.announced.latest
+        if told is not None:
+            words.append(told.kind.value)
         if estimate.payload is not None:
             words.append(f'payload {estimate.payload.mass:.2f} +- {estimate.payload.std:.2g} kg')
         return ', '.join(words)

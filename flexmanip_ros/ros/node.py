@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import textwrap
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -33,6 +34,8 @@ from flexmanip_ros.ros.parameters import NodeParameters
 Config = TypeVar('Config')
 THROTTLE_S = 2.0
 """A repeated complaint is written at most this often."""
+LONGEST_WORDS = 600
+"""Characters of a complaint: it may quote a message, and that may be of any length, over any lines."""
 
 
 class FlexmanipNode(LifecycleNode, Generic[Config]):
@@ -188,7 +191,7 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
         now = time.monotonic()
         if now - self._complained.get(reason, -math.inf) >= THROTTLE_S:
             self._complained[reason] = now
-            self.get_logger().error(words)
+            self.get_logger().error(textwrap.shorten(words, LONGEST_WORDS, placeholder=' ...'))
 
     def stamp_of(self, raw: bytes) -> int | None:
         """Return the header stamp [ns] of a serialized JointState; None, with a complaint, without one."""

@@ -12,6 +12,7 @@ A payload is told once it has been trusted for `settle_time`, and again when it 
 from __future__ import annotations
 
 import importlib
+import math
 import sys
 import time
 from typing import Any
@@ -48,7 +49,9 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         self.told = 0
         self.problem = ''
         self._inertia: Inertia | None = None
-        self._asked_at: float | None = None
+        self.doubtful = 0
+        self._asked: tuple[Any, float] | None = None
+        """The request that waits for its answer, and since when."""
 
     def make_entities(self) -> None:
         """Subscriptions and the client."""
@@ -57,6 +60,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
                 SetParameters, f'{self.config.target_node}/set_parameters')
         else:
             kind = service_class(self.config.service_type)
+            fill(kind.Request(), Inertia())  # refuses a request that has no place for a payload
             self._client = self.create_client(kind, self.config.service)
         self.subscription(InertiaStamped, 'rpbsid_identifier/payload', self._on_payload, qos.latched_input())
         self.subscription(Float64MultiArray, 'rpbsid_identifier/payload_estimate', self._on_estimate,
@@ -64,7 +68,8 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
 
     def activated(self) -> None:
         """Begin with nothing told."""
-        self.state, self._asked_at, self.problem = handover.HandoverState(), None, ''
+        self._forget_request()
+        self.state, self.problem = handover.HandoverState(), ''
 
     def _on_payload(self, message: InertiaStamped) -> None:
         self._inertia = message.inertia
@@ -73,10 +78,20 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         if not self.active or len(message.data) != 5 or self._inertia is None:
             return
         now = time.monotonic()
-        self.state, due = handover.step(self.config, self.state, PayloadEstimate(*message.data), now)
-        waiting = self._asked_at is not None and now - self._asked_at < ANSWER_S
-        if due and not waiting:
-            self._tell(self._inertia, now)
+        found = PayloadEstimate(*message.data)
+        self.state, due = handover.step(self.config, self.state, found, now)
+        if self._asked is not None and now - self._asked[1] >= ANSWER_S:
+            self.problem = f"service '{self._client.srv_name}' has not answered within {ANSWER_S:g} s"
+            self.complain('silence', f'{self.problem}; it is asked again')
+            self._forget_request()
+        if not due or self._asked is not None:
+            return
+        if not fits(self._inertia, found):
+            self.doubtful += 1
+            self.complain('payload', 'a payload was not told: its mass is not that of the estimate, or it '
+                          'has a value that is not finite')
+            return
+        self._tell(self._inertia, now)
 
     def _tell(self, inertia: Inertia, now: float) -> None:
         if not self._client.service_is_ready():
@@ -84,9 +99,15 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
             self.complain('service', f'{self.problem}; start the driver, or correct the parameters')
             self.state = handover.refused(self.state, now)
             return
-        self._asked_at = now
-        request = self._request(inertia)
-        self._client.call_async(request).add_done_callback(lambda future: self._answered(future, inertia.m))
+        future = self._client.call_async(self._request(inertia))
+        self._asked = future, now
+        future.add_done_callback(lambda future: self._answered(future, inertia.m))
+
+    def _forget_request(self) -> None:
+        """Wait no more for the answer; the client would keep the request for ever."""
+        if self._asked is not None:
+            future, self._asked = self._asked[0], None
+            self._client.remove_pending_request(future)
 
     def _request(self, inertia: Inertia) -> Any:
         if not self.config.target_node:
@@ -95,7 +116,9 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         return SetParameters.Request(parameters=[parameter.to_parameter_msg()])
 
     def _answered(self, future: Any, mass: float) -> None:
-        self._asked_at = None
+        if self._asked is None or self._asked[0] is not future:
+            return  # the answer to a request that was given up
+        self._asked = None
         reason = refusal(future.result())
         if reason:
             self.problem = f'{mass:.3f} kg was refused: {reason}'
@@ -112,10 +135,19 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         report.values['told'] = self.told
         report.values['told_mass_kg'] = 'none' if self.state.told_mass is None else self.state.told_mass
         report.values['trusted'] = self.state.trusted_since is not None
+        report.values['doubtful'] = self.doubtful
         if self.problem:
             report.worse(ERROR, self.problem)
         elif self.active and self.state.trusted_since is None:
             report.worse(WARN, 'no payload that can be trusted')
+
+
+def fits(inertia: Inertia, found: PayloadEstimate) -> bool:
+    """Say whether a body may be told: all finite, not below zero, its mass that of the trusted estimate."""
+    com, body = inertia.com, inertia
+    numbers = (com.x, com.y, com.z, body.ixx, body.ixy, body.ixz, body.iyy, body.iyz, body.izz)
+    near = abs(inertia.m - found.mass) <= max(3.0 * found.std, 1e-3 * abs(found.mass))  # one sample apart
+    return near and inertia.m >= 0.0 and all(map(math.isfinite, numbers))
 
 
 def service_class(name: str) -> Any:

@@ -25,6 +25,7 @@ from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros.control import controller
 from flexmanip_ros.control.gate import PayloadEstimate, Verdict
+from flexmanip_ros.errors import SignalError
 from flexmanip_ros.parameters.controller import ControllerParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, doubles
@@ -36,6 +37,10 @@ from flexmanip_ros.types import Array, JointRecord
 NAME = 'payload_controller'
 LONG_GAP = 10
 """Missing samples after which the filter starts anew instead of believing its prediction."""
+CLOCK_SET_BACK_NS = 1_000_000_000
+"""Stamps that go back further than this are a new clock (a simulation that began again)."""
+LARGEST = 1e6
+"""No angle, bend or rate of an arm is beyond this, in SI units."""
 
 
 class PayloadController(FlexmanipNode[ControllerParameters]):
@@ -91,15 +96,18 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         if not self.active or self.state is None:
             return
         with self._meter:
-            record = self._reader(raw)
+            try:
+                record = self._reader(raw)
+            except SignalError as error:
+                self._drop('encoding', f'a joint state was dropped: {error}')
+                return
             measured = self._measured(record)
             if measured is None:
-                self.dropped += 1
-                self.complain('joint_states', 'a joint state without finite position and velocity of '
-                              f'{", ".join((*self.config.joints, *self.config.bends))} was dropped')
+                wanted = ', '.join((*self.config.joints, *self.config.bends))
+                self._drop('joint_states', 'a joint state was dropped: it lacks position and velocity '
+                           f'(finite, below {LARGEST:g}) of {wanted}')
                 return
-            if self._last_ns is not None and record.stamp_ns <= self._last_ns:
-                self.dropped += 1
+            if self._is_late(record.stamp_ns):
                 return
             self._arrived = time.monotonic()
             longest_ns = LONG_GAP * 1e9 / self.config.rate
@@ -108,6 +116,20 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
             self._last_ns = record.stamp_ns
             self.state, torque = controller.step(self.config, self.state, measured)
             self._send(torque)
+
+    def _is_late(self, stamp_ns: int) -> bool:
+        """Drop a sample that is not newer than the last; stamps that went far back are a new clock."""
+        if self._last_ns is None or stamp_ns > self._last_ns:
+            return False
+        if stamp_ns < self._last_ns - CLOCK_SET_BACK_NS and self.state is not None:
+            self.state = self.state._replace(x=None)
+            return False
+        self._drop('stamps', 'a joint state whose stamp does not advance was dropped')
+        return True
+
+    def _drop(self, reason: str, words: str) -> None:
+        self.dropped += 1
+        self.complain(reason, words)
 
     def _measured(self, record: JointRecord) -> controller.Measured | None:
         """Pick the four signals by name; None when one is missing or not finite."""
@@ -120,15 +142,14 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         if record.position.size != count or record.velocity.size != count:
             return None
         position, velocity = record.position[self._places], record.velocity[self._places]
-        if not np.isfinite(position.sum() + velocity.sum()):
+        if not max(np.abs(position).max(), np.abs(velocity).max()) < LARGEST:  # false for NaN too
             return None
         fresh = time.monotonic() - self._added_at <= self.config.stale_after
         return controller.Measured(position, velocity, self._added if fresh else np.zeros(2))
 
     def _on_estimate(self, message: Float64MultiArray) -> None:
         if len(message.data) != 5:
-            self.complain('payload_estimate', 'a payload estimate has not 5 values; it was dropped')
-            self.dropped += 1
+            self._drop('payload_estimate', 'a payload estimate has not 5 values; it was dropped')
             return
         self._estimate = PayloadEstimate(*message.data)  # kept: a latched one may come before activation
         self._judge(self._estimate)
@@ -143,8 +164,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
 
     def _on_added(self, message: Float64MultiArray) -> None:
         if len(message.data) != 2 or not np.isfinite(message.data).all():
-            self.complain('added_efforts', 'an added effort is not two finite torques; it was dropped')
-            self.dropped += 1
+            self._drop('added_efforts', 'an added effort is not two finite torques; it was dropped')
             return
         self._added, self._added_at = np.array(message.data), time.monotonic()
 
@@ -176,6 +196,8 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
                          f'{self.config.rate:.0f}; set rate')
         if self.state is None:
             return
+        if self.state.failed_designs:
+            report.worse(WARN, f'{self.state.failed_designs} times no regulator was found; the gains stayed')
         verdict = self.state.verdict
         report.values.update(
             scheduled_payload_kg=self.state.payload, trusted_payload_kg=self.state.trusted,

@@ -36,6 +36,8 @@ from flexmanip_ros.types import CaptureEvent, EventKind
 NAME = 'plant_simulator'
 CATCH_UP = 5
 """Samples made in one run of the timer at most, so that commands get their turn between them."""
+MOST_EVENTS = 100
+"""Events that wait for their stamps at most."""
 
 
 class PlantSimulator(FlexmanipNode[PlantParameters]):
@@ -49,6 +51,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         self.efforts = np.zeros(2)
         self.dropped_commands = 0
         self.late_events = 0
+        self.refused_events = 0
         self.samples = 0
         self.backlog = 0
         self._alive_ns = 0
@@ -153,10 +156,13 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         try:
             event = capture_event(message)
         except FlexmanipError as error:
-            self.complain('event', str(error))
+            self._refuse_event(str(error))
             return
         if not self.active or event.stamp_ns < self._alive_ns:
             self.get_logger().info(f'{event.kind.value} from before the start is ignored')
+            return
+        if len(self._pending) >= MOST_EVENTS:
+            self._refuse_event(f'{MOST_EVENTS} events wait for their stamps already; one more was refused')
             return
         if self.samples and event.stamp_ns <= self._stamp(self.samples - 1):
             self.late_events += 1
@@ -165,6 +171,10 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
                 f'{event.kind.value} came {late_ms:.1f} ms late and is applied now; raise lead_time or '
                 'service_delay of capture_trigger')
         self._pending = tuple(sorted((*self._pending, event), key=lambda item: item.stamp_ns))
+
+    def _refuse_event(self, words: str) -> None:
+        self.refused_events += 1
+        self.complain('event', words)
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if not self.active:
@@ -183,12 +193,15 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         values['backlog'] = self.backlog
         values['dropped_commands'] = self.dropped_commands
         values['late_events'] = self.late_events
+        values['refused_events'] = self.refused_events
         if self._fault:
             report.worse(ERROR, self._fault)
         elif self.active and values['rate_hz'] < 0.9 * self.config.rate:
             report.worse(WARN, f'{values["rate_hz"]:.0f} of {self.config.rate:.0f} samples a second')
         if self.dropped_commands:
             report.worse(WARN, f'{self.dropped_commands} commands dropped')
+        if self.refused_events:
+            report.worse(WARN, f'{self.refused_events} events refused')
 
 
 def main(argv: list[str] | None = None) -> int:

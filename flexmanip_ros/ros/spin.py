@@ -7,6 +7,7 @@ import gc
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import Any
@@ -95,6 +96,7 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rcl raises types of its C extension for --ros-args and parameter files
         return refuse(name, first_line(error))
+    warnings.simplefilter('ignore', RuntimeWarning)  # numbers out of range have a status
     try:
         node = make()
     except (FlexmanipError, ParameterException) as error:

@@ -3,12 +3,17 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+import rclpy
 from geometry_msgs.msg import Inertia, InertiaStamped, Vector3
+from rcl_interfaces.srv import SetParameters
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from ros_harness import Ros, overrides
 from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.ros import qos
+from flexmanip_ros.ros import payload_adapter, qos
 from flexmanip_ros.ros.payload_adapter import PayloadAdapter, fill, refusal, service_class
 from flexmanip_ros.ros.plant_simulator import PlantSimulator
 
@@ -65,6 +70,45 @@ def test_a_driver_that_is_not_there_is_named(ros: Ros) -> None:
 def test_a_service_type_that_is_not_installed_is_named() -> None:
     with pytest.raises(ParameterError, match="'ur_msgs/srv/SetPayload' is not installed; install and source"):
         service_class('ur_msgs/srv/SetPayload')
+
+
+def test_a_request_without_a_place_for_a_payload_is_refused_before_it_is_needed(ros: Ros) -> None:
+    node = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
+        service='driver/set', service_type='std_srvs/srv/SetBool')))
+    assert not node.active
+
+
+def test_a_payload_that_is_not_that_of_its_estimate_is_not_told(ros: Ros) -> None:
+    plant = ros.managed(PlantSimulator(context=ros.context, overrides=overrides(rate=50.0, arm__modes=1)))
+    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
+        target_node='plant_simulator', settle_time=0.0)))
+    payload, _ = say(ros, 31.5, 0.1)
+    ros.wait(lambda: adapter.told == 1)
+    payload.publish(InertiaStamped(inertia=Inertia(m=90.0)))
+    ros.wait(lambda: adapter._inertia.m == 90.0)
+    adapter.state = adapter.state._replace(told_mass=None, told_at=-1e9)
+    ros.wait(lambda: adapter.doubtful > 0)
+    assert (plant.config.payload_mass, adapter.told) == (31.5, 1)
+
+
+def test_a_driver_that_does_not_answer_is_said_and_its_requests_are_not_kept(
+        ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(payload_adapter, 'ANSWER_S', 0.05)
+    deaf = Context()
+    rclpy.init(context=deaf, domain_id=ros.domain, signal_handler_options=SignalHandlerOptions.NO)
+    node = Node('deaf', context=deaf)  # never spun
+    node.create_service(SetParameters, 'driver/set_parameters', lambda request, response: response)
+    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
+        target_node='driver', settle_time=0.0, min_period=0.01)))
+    ros.wait(adapter._client.service_is_ready)
+    say(ros, 31.5, 0.1)
+    ros.wait(lambda: 'has not answered' in adapter.problem)
+    for _ in range(5):
+        first = adapter._asked
+        ros.wait(lambda first=first: adapter._asked is not first, what='another request')
+    assert len(adapter._client._pending_requests) <= 1
+    node.destroy_node()
+    rclpy.shutdown(context=deaf)
 
 
 class WithInertia:

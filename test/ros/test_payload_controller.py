@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from joint_states import joint_state
 from rclpy.parameter import Parameter
 from ros_harness import Ros, overrides
@@ -10,6 +11,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros.control import controller
+from flexmanip_ros.errors import ModelError
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import joint_record
 from flexmanip_ros.ros.payload_controller import PayloadController
@@ -49,7 +51,8 @@ def test_bad_samples_get_no_torque_and_are_counted(ros: Ros) -> None:
     for message in (good, nan, short, unnamed, late):
         states.publish(message)
     ros.wait(lambda: node.dropped == 4)
-    assert len(heard) == 1
+    ros.wait(lambda: heard)
+    assert node.sent == 1
     assert np.isfinite(heard[0].data).all()
 
 
@@ -62,6 +65,48 @@ def test_a_trusted_latched_estimate_changes_the_schedule_and_a_wild_one_does_not
     estimates.publish(Float64MultiArray(data=[80.0, 40.0, 0.0, 160.0, 1.0]))
     ros.wait(lambda: node.state.verdict.name == 'UNSURE')
     assert node.state.trusted == 20.0
+
+
+def test_a_clock_that_was_set_back_is_followed(ros: Ros) -> None:
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
+    node = start(ros)
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    for start_ns in (2 * 10**18, 10**18):
+        for k in range(5):
+            states.publish(joint_state(k, start_ns=start_ns))
+    ros.wait(lambda: len(heard) == 10)
+    assert node.dropped == 0
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf, 1e308, -1e300])
+def test_no_value_of_a_sample_makes_the_torque_anything_but_a_limited_number(ros: Ros, value: float) -> None:
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
+    node = start(ros)
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    for k in range(20):
+        message = joint_state(k)
+        if k % 5 == 1:
+            message.position[k % 4] = value
+        states.publish(message)
+    ros.wait(lambda: len(heard) == 16)
+    torques = np.array([message.data for message in heard])
+    assert (np.abs(torques) <= node.config.effort_limit).all()
+    assert node.dropped == 4
+
+
+def test_where_there_is_no_regulator_the_gains_stay(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    def none(*given: object) -> None:
+        raise ModelError('there is no regulator', 'none')
+
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
+    node = start(ros, payload_rate=1e6)
+    monkeypatch.setattr(controller, 'design', none)
+    node._on_estimate(Float64MultiArray(data=[20.0, 0.1, 19.8, 20.2, 1.0]))
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    for k in range(20):
+        states.publish(joint_state(k))
+    ros.wait(lambda: len(heard) == 20)
+    assert (node.state.failed_designs, node.state.designs) == (1, 0)
 
 
 def test_silence_means_zero_torque_once(ros: Ros) -> None:

@@ -1,0 +1,158 @@
+"""Every node that listens, on a bench: what it is sent, what it says, and whether it is still well."""
+
+from __future__ import annotations
+
+import gc
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from diagnostic_msgs.msg import DiagnosticArray
+from fuzz_messages import NEXT, messages
+from geometry_msgs.msg import InertiaStamped
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from joint_states import START_NS, STEP_NS
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from ros_harness import Ros, overrides
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Empty, Float64, Float64MultiArray, Header
+
+from flexmanip_ros.ros.capture_trigger import CaptureTrigger
+from flexmanip_ros.ros.conversions import time_message
+from flexmanip_ros.ros.excitation import Excitation
+from flexmanip_ros.ros.payload_adapter import PayloadAdapter
+from flexmanip_ros.ros.payload_controller import PayloadController
+from flexmanip_ros.ros.plant_simulator import PlantSimulator
+from flexmanip_ros.ros.rpbsid_identifier import RpbsidIdentifier
+
+EVENTS = {'capture_event': Header, 'capture_detected': Header}
+ESTIMATE = 'rpbsid_identifier/payload_estimate'
+IDENTIFIED = {f'rpbsid_identifier/{name}': kind for name, kind in (
+    ('model', Float64MultiArray), ('modes', Float64MultiArray), ('payload_mass', Float64),
+    ('payload_estimate', Float64MultiArray), ('payload', InertiaStamped))}
+DEEP = QoSProfile(
+    depth=1000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LATER_NS = START_NS + 10**12
+"""Samples of the made-up messages are later than those of a recording: that one is a new clock."""
+
+
+class Subject(NamedTuple):
+    """A node under test: its class and parameters, the topics it hears and says."""
+
+    cls: Any
+    values: dict[str, Any]
+    hears: dict[str, type]
+    says: dict[str, type]
+
+
+SUBJECTS = {
+    'rpbsid_identifier': Subject(
+        RpbsidIdentifier, {}, {'joint_states': JointState, **EVENTS}, IDENTIFIED),
+    'plant_simulator': Subject(
+        PlantSimulator, {'rate': 200.0, 'noise': 'none', 'arm__modes': 1},
+        {'effort_controller/commands': Float64MultiArray, 'capture_event': Header},
+        {'joint_states': JointState}),
+    'capture_trigger': Subject(
+        CaptureTrigger, {'mode': 'auto'}, {'joint_states': JointState}, EVENTS),
+    'capture_trigger_timed': Subject(
+        CaptureTrigger, {'mode': 'time', 'capture_time': 0.0}, {'joint_states': JointState}, EVENTS),
+    'payload_controller': Subject(
+        PayloadController, {'arm__modes': 1}, {
+            'joint_states': JointState, ESTIMATE: Float64MultiArray,
+            'payload_controller/added_efforts': Float64MultiArray},
+        {'effort_controller/commands': Float64MultiArray}),
+    'payload_adapter': Subject(
+        PayloadAdapter, {'target_node': 'nobody', 'settle_time': 0.0, 'min_period': 0.01},
+        {ESTIMATE: Float64MultiArray, 'rpbsid_identifier/payload': InertiaStamped}, {}),
+    'excitation': Subject(
+        Excitation, {'clock': 'joint_states', 'shape': 'multisine'}, {'joint_states': JointState},
+        {'effort_controller/commands': Float64MultiArray}),
+}
+
+
+class Bench:
+    """One node, spun, with a writer for every topic it hears and a reader for every one it says."""
+
+    def __init__(self, ros: Ros, name: str) -> None:
+        self.ros = ros
+        self.subject = SUBJECTS[name]
+        self.node = ros.managed(self.subject.cls(
+            context=ros.context, overrides=overrides(**self.subject.values)))
+        self.said = {topic: ros.listen(kind, topic) for topic, kind in self.subject.says.items()}
+        self.diagnostics = ros.listen(DiagnosticArray, '/diagnostics')
+        self.writers = {topic: ros.publisher(kind, topic, DEEP) for topic, kind in self.subject.hears.items()}
+        self._samples = 0
+        self._echoes = ros.listen(Empty, 'echo')
+        self._echo = ros.publisher(Empty, 'echo')
+
+    def send(self, sent: list[tuple[str, Any]]) -> None:
+        """Publish, and wait until whatever is in the queues before an echo was taken.
+
+        A joint state stamped ``NEXT`` gets the stamp of the next sample.
+        """
+        for topic, message in sent:
+            if isinstance(message, JointState) and message.header.stamp.nanosec == NEXT:
+                self._samples += 1
+                message.header.stamp = time_message(LATER_NS + self._samples * STEP_NS)
+            self.writers[topic].publish(message)
+        before = len(self._echoes)
+        self._echo.publish(Empty())
+        self.ros.wait(lambda: len(self._echoes) > before, what='the node to take what was sent')
+
+    def traffic(self) -> st.SearchStrategy[list[tuple[str, Any]]]:
+        """Return a strategy for what comes in."""
+        return st.lists(st.one_of([
+            st.tuples(st.just(topic), messages(kind)) for topic, kind in self.subject.hears.items()
+        ]), min_size=1, max_size=6)
+
+    def check(self) -> None:
+        """Everything said is a number, torques and the arm's states finite; nothing remembered has grown."""
+        for topic, heard in self.said.items():
+            fine = math.isfinite if 'identifier' not in topic else is_number  # an interval may be infinite
+            for message in heard:
+                assert all(map(fine, numbers(message))), message
+            heard.clear()
+        assert len(self.node._complained) < 20
+        assert len(self.node.events) < 20
+
+    def remembered(self) -> int:
+        """Return how many events and samples the node keeps."""
+        if isinstance(self.node, PlantSimulator):
+            return len(self.node._pending)
+        state = self.node.state
+        line = state.timeline
+        kept = () if line is None else (*line.samples, *line.applied, *line.waiting, *line.checkpoints)
+        return len(state.early) + len(kept)
+
+    def alive(self) -> None:
+        """The node answers: its diagnostics come."""
+        before = len(self.diagnostics)
+        self.ros.wait(lambda: len(self.diagnostics) > before, what='diagnostics')
+        gc.collect()
+
+
+def fuzz(bench: Bench, examples: int) -> None:
+    """Send what hypothesis makes up, and look at what the node says to each of it."""
+    @settings(max_examples=examples, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+    @given(bench.traffic())
+    def run(sent: list[tuple[str, Any]]) -> None:
+        bench.send(sent)
+        bench.check()
+
+    run()
+
+
+def is_number(value: float) -> bool:
+    """Say whether a value is no NaN."""
+    return not math.isnan(value)
+
+
+def numbers(message: Any) -> Iterator[float]:
+    """Yield every floating-point number in a message."""
+    for name, kind in message.get_fields_and_field_types().items():
+        value = getattr(message, name)
+        if hasattr(value, 'get_fields_and_field_types'):
+            yield from numbers(value)
+        elif 'double' in kind:
+            yield from value if hasattr(value, '__len__') else (value,)

@@ -1,0 +1,79 @@
+"""Whatever comes over the wire, the real nodes live, say no NaN, and remember little.
+
+Few examples here; ``benchmarks/ros_fuzz.py`` runs thousands.
+"""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from fuzz_nodes import SUBJECTS, Bench, fuzz
+from identifier_harness import CAPTURE, recording
+from joint_states import joint_state
+from ros_harness import Ros
+from std_msgs.msg import Float64MultiArray, Header
+
+from flexmanip_ros import timeline
+from flexmanip_ros.ros.conversions import header, time_message
+from flexmanip_ros.ros.conversions import joint_state as message_of
+
+pytestmark = pytest.mark.filterwarnings('ignore::RuntimeWarning')  # numbers out of range have a status
+
+
+@pytest.mark.parametrize('name', SUBJECTS)
+def test_no_message_ends_a_node_or_makes_it_say_nan(ros: Ros, name: str) -> None:
+    bench = Bench(ros, name)
+    fuzz(bench, examples=60)
+    bench.alive()
+
+
+def test_after_all_of_it_the_identifier_finds_the_payload_of_good_samples(ros: Ros) -> None:
+    bench = Bench(ros, 'rpbsid_identifier')
+    fuzz(bench, examples=100)
+    samples = recording(1500)
+    for first in range(0, 1500, 100):
+        if first == 300:
+            bench.send([('capture_event', header(CAPTURE))])
+        bench.send([('joint_states', message_of(sample)) for sample in samples[first:first + 100]])
+    estimate = bench.node.estimate
+    assert estimate.status.name == 'TRACKING'
+    assert abs(estimate.payload.mass - 20.0) < 4.0 * estimate.payload.std + 0.05
+    assert all(math.isfinite(mode.frequency_hz) for mode in estimate.modes)
+
+
+def test_after_all_of_it_the_controller_gives_a_torque_for_each_good_sample(ros: Ros) -> None:
+    bench = Bench(ros, 'payload_controller')
+    fuzz(bench, examples=60)
+    dropped, sent = bench.node.dropped, bench.node.sent
+    bench.send([('joint_states', joint_state(k, start_ns=1_800_000_000_000_000_000)) for k in range(50)])
+    assert (bench.node.dropped, bench.node.sent) == (dropped, sent + 50)
+
+
+@pytest.mark.parametrize('name', ['rpbsid_identifier', 'plant_simulator'])
+def test_events_without_end_do_not_fill_the_memory(ros: Ros, name: str) -> None:
+    bench = Bench(ros, name)
+    far = 2_000_000_000 * 10**9
+    for first in range(0, 3000, 100):
+        bench.send([('capture_event', Header(stamp=time_message(far + k * 10**9), frame_id='capture'))
+                    for k in range(first, first + 100)])
+    assert bench.remembered() <= 200
+
+
+def test_samples_whose_stamps_hardly_advance_do_not_fill_the_memory(
+        ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(timeline, 'MOST_SAMPLES', 1000)
+    bench = Bench(ros, 'rpbsid_identifier')
+    for first in range(0, 4000, 100):
+        message = [joint_state(k) for k in range(first, first + 100)]
+        for k, item in enumerate(message):
+            item.header.stamp = time_message(10**18 + first + k)
+        bench.send([('joint_states', item) for item in message])
+    assert 500 < bench.remembered() <= 1200
+
+
+def test_an_estimate_of_the_wrong_size_changes_nothing(ros: Ros) -> None:
+    bench = Bench(ros, 'payload_controller')
+    bench.send([('rpbsid_identifier/payload_estimate', Float64MultiArray(data=[20.0] * size))
+                for size in (0, 4, 6)])
+    assert (bench.node.state.trusted, bench.node.dropped) == (0.0, 3)
