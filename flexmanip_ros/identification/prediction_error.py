@@ -42,6 +42,13 @@ class Structure(NamedTuple):
     free_gain: bool
     only_gain: bool = False
 
+    def names(self) -> str:
+        """Return the parts that vary, in the order of the kernel."""
+        if self.only_gain:
+            return 'Kx'
+        free = {'K': self.free_gain, 'C': self.free_output, 'D': self.free_direct}
+        return ''.join(name for name in 'ABKCDx' if free.get(name, True))
+
 
 class Fit(NamedTuple):
     """Result of a descent.
@@ -61,22 +68,13 @@ class Fit(NamedTuple):
 
 def pack(theta: Theta, structure: Structure) -> Array:
     """(d,) parameters in the order of the kernel."""
-    parts = [theta.A, theta.B]
-    if structure.free_gain:
-        parts.append(theta.K)
-    if structure.free_output:
-        parts.append(theta.C)
-    if structure.free_direct:
-        parts.append(theta.D)
-    return np.concatenate([part.ravel() for part in [*parts, theta.x]])
+    return np.concatenate([getattr(theta, name).ravel() for name in structure.names()])
 
 
 def moved(theta: Theta, step: Array, structure: Structure) -> Theta:
     """Theta plus a step (d,)."""
     new, at = {}, 0
-    free = {'K': structure.free_gain, 'C': structure.free_output, 'D': structure.free_direct}
-    names = [name for name in 'ABKCDx' if free.get(name, True)]
-    for name in names:
+    for name in structure.names():
         part = getattr(theta, name)
         new[name] = part + step[at:at + part.size].reshape(part.shape)
         at += part.size
@@ -88,10 +86,7 @@ def directions(theta: Theta, structure: Structure) -> Array:
     n = theta.A.shape[0]
     d = pack(theta, structure).size
     chosen = np.eye(d - n)
-    if structure.only_gain:
-        at_k = theta.A.size + theta.B.size
-        chosen = chosen[:, at_k:at_k + theta.K.size]
-    elif structure.free_output:
+    if structure.free_output and not structure.only_gain:
         orbit = []
         for i in range(n):
             for j in range(n):
@@ -144,8 +139,9 @@ def derivatives(
         X = before @ P.T  # P has orthonormal columns
     end = theta.x.copy()
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-    linearize(U, Y, *theta[:5], end, whiten, int(structure.free_gain), int(structure.free_output),
-              int(structure.free_direct), N, g, moments, X)
+    free = structure.names()
+    linearize(U, Y, *theta[:5], end, whiten, int('A' in free), int('K' in free), int('C' in free),
+              int('D' in free), N, g, moments, X)
     N = N + np.triu(N, 1).T
     return P.T @ N @ P, P.T @ g, moments, X @ P, end
 

@@ -39,11 +39,11 @@ def following(u: Array, A: Array, B: Array, K: Array, x: Array, e: Array, after:
 @njit(cache=True, nogil=True)
 def linearize(
     U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, K: Array, x: Array, whiten: Array,
-    free_gain: int, free_output: int, free_direct: int, N: Array, g: Array, moments: Array, X: Array,
+    free_system: int, free_gain: int, free_output: int, free_direct: int, N: Array, g: Array, moments: Array, X: Array,
 ) -> None:
     """Run the predictor x+ = A x + B u + K e, e = y - C x - D u over (L, r), (L, m), and its derivatives.
 
-    Parameters in order: A, B row-major, K if free_gain, C if free_output, D if free_direct, then x at the
+    Parameters in order: A, B row-major if free_system, K if free_gain, C if free_output, D if free_direct, then x at the
     start. whiten: (m, m), whiten' whiten = inverse innovation covariance. On return x is the state after the
     last sample, N (d, d) += J' J (upper triangle) and g (d,) += J' e with J the derivatives of the
     whitened predictions; moments (m, m) += e e' and X (n, d) = dx/dparameters, started at
@@ -52,7 +52,7 @@ def linearize(
     n, r, m = A.shape[0], B.shape[1], C.shape[0]
     d = N.shape[0]
     at_b = n * n
-    at_k = at_b + n * r
+    at_k = at_b + n * r if free_system else 0
     at_c = at_k + (n * m if free_gain else 0)
     at_d = at_c + (m * n if free_output else 0)
     closed = A - K @ C
@@ -104,10 +104,11 @@ def linearize(
                 a = closed[i, q]
                 for j in range(d):
                     moved[i, j] += a * X[q, j]
-            for j in range(n):
-                moved[i, i * n + j] += x[j]
-            for j in range(r):
-                moved[i, at_b + i * r + j] += U[k, j]
+            if free_system:
+                for j in range(n):
+                    moved[i, i * n + j] += x[j]
+                for j in range(r):
+                    moved[i, at_b + i * r + j] += U[k, j]
             if free_gain:
                 for j in range(m):
                     moved[i, at_k + i * m + j] += e[j]

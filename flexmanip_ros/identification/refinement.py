@@ -25,8 +25,9 @@ FIRST, LONGEST = 256, 2048
 """Samples of the first fit, and of the last one that sees them all; multiples of CHUNK."""
 BLOCK = 256
 """Samples of a recursive update; a multiple of CHUNK."""
-DELAY = 8
-"""A fit of N samples is taken N / DELAY samples later, and at least CHUNK."""
+DELAY = 4
+"""A fit of N samples is taken N / DELAY samples later, and at least SOONEST."""
+SOONEST = 128
 PARAMETERS = 80
 """With more parameters than this the subspace model is published as it is."""
 PAUSE = 8192
@@ -114,7 +115,7 @@ def is_block_due(refined: Refined) -> bool:
 def ask_fit(refined: Refined, R: Array, scale: Array) -> Refined:
     """Ask for a fit of the whole stretch, see ``stretch.fit_stretch``."""
     job = Job(refined.chunks, R.copy(), scale.copy(), refined.recursion)
-    return refined._replace(job=job, due=refined.total + max(CHUNK, refined.total // DELAY))
+    return refined._replace(job=job, due=refined.total + max(SOONEST, refined.total // DELAY))
 
 
 def ask_block(refined: Refined) -> Refined:

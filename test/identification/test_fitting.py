@@ -70,7 +70,7 @@ def test_no_step_does_the_work_it_asks_for():
     state = rpbsid.advance(CONFIG, rpbsid.init(CONFIG), u[:256], y[:256])
     pending = rpbsid.job(state)
     assert pending is not None
-    assert pending[1] == 64, 'a quarter of the samples of the first fit'
+    assert pending[1] == 128, 'half of the samples of the first fit'
     assert state.refined is not None
     assert state.refined.recursion is None
 

@@ -30,7 +30,7 @@ def test_fits_on_a_thread_beside_the_samples_give_the_bits_of_the_replay():
             state, ready = pipeline.step(config, state, item)
             live += ready
             before = pipeline.job(state)
-            if before is not None and before[1] == 60:  # a while after it was asked for: let it be ready
+            if before is not None and before[1] <= 120:  # a while after it was asked for: let it be ready
                 limit = time.monotonic() + 20.0
                 while pipeline.job(state) is not None and time.monotonic() < limit:
                     state = worker.attend(state)
