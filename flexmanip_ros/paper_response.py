@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
-from flexmanip_ros import paper
+from flexmanip_ros import paper, paper_run
 from flexmanip_ros.identification import validation
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, configure
 from flexmanip_ros.plant import excitation, linearization
@@ -42,7 +42,7 @@ def true_response(case: paper.Case) -> Response:
     return _response(case, exact, case.payload)
 
 
-def identified_response(case: paper.Case, track: paper.Track) -> Response | None:
+def identified_response(case: paper.Case, track: paper_run.Track) -> Response | None:
     """Return what the last identified model does, its angles with the estimated payload; None without one."""
     mass = track.mass[-1] if track.mass.size else np.nan
     if track.model is None or not np.isfinite(mass):

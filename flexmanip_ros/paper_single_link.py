@@ -8,6 +8,7 @@ the measured torque; nobody tells it the payload, so the link sags at the captur
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 
@@ -25,6 +26,22 @@ JOINT_NAMES = ('joint1', 'joint2')
 def messages(arm: ArmParameters, angle: float, payload: float, seed: int, *, duration: float,
              capture_time: float, snr_db: float) -> list[JointRecord | CaptureEvent]:
     """Return joint states of link 2 (joint 1 at rest at 0) with chord angle ``angle`` [rad] at the start."""
+    torques, clean = motion(arm, angle, payload, duration, capture_time)
+    noise = float(np.std(clean)) * 10.0 ** (-snr_db / 20.0)
+    angles = clean + noise * np.random.default_rng(seed).normal(size=clean.size)
+    empty = np.empty(0)
+    items: list[JointRecord | CaptureEvent] = [
+        JointRecord(round(k * 1e9 / RATE), JOINT_NAMES, np.array([0.0, angles[k]]), empty,
+                    np.array([0.0, torques[k]])) for k in range(clean.size)]
+    capture = round(capture_time * RATE)
+    items.insert(capture, CaptureEvent(round(capture * 1e9 / RATE), EventKind.CAPTURE))
+    return items
+
+
+@cache
+def motion(arm: ArmParameters, angle: float, payload: float, duration: float, capture_time: float
+           ) -> tuple[Array, Array]:
+    """Return what the joint gives [N m] and the angle [rad], (N,) each; all seeds share them."""
     count, capture = round(duration * RATE), round(capture_time * RATE)
     L, rho = arm.link_length[1], arm.linear_density[1]
     wave = excitation.sequence(ExcitationParameters(rate=RATE), count)[:, 1]
@@ -39,14 +56,7 @@ def messages(arm: ArmParameters, angle: float, payload: float, seed: int, *, dur
         hold = -STIFFNESS * (x[0] - angle) - DAMPING * x[1]
         torques[k], angles[k] = wave[k] + known * math.cos(angle) + hold, x[0]
         x = _integrated(x, torques[k], weight, inertia(arm, held))
-    noise = float(np.std(angles)) * 10.0 ** (-snr_db / 20.0)
-    angles = angles + noise * np.random.default_rng(seed).normal(size=count)
-    empty = np.empty(0)
-    items: list[JointRecord | CaptureEvent] = [
-        JointRecord(round(k * 1e9 / RATE), JOINT_NAMES, np.array([0.0, angles[k]]), empty,
-                    np.array([0.0, torques[k]])) for k in range(count)]
-    items.insert(capture, CaptureEvent(round(capture * 1e9 / RATE), EventKind.CAPTURE))
-    return items
+    return torques, angles
 
 
 def inertia(arm: ArmParameters, payload: float) -> float:

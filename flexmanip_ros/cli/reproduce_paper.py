@@ -9,14 +9,18 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from flexmanip_ros import paper, study
+from flexmanip_ros import paper, paper_run, paper_summary, study
 from flexmanip_ros.cli import console, workers
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.io.table import OutputError, write_file
+from flexmanip_ros.io.table import OutputError, check_place, write_file
+
+if TYPE_CHECKING:
+    from flexmanip_ros.io.paper_sections import Planned
 
 PROG = 'reproduce_paper'
 EXAMPLES = """examples:
@@ -27,7 +31,11 @@ Writes report.html (figures and tables, nothing else needed), runs.csv (one row 
 summary.csv. The same seeds give the same numbers.
 exit status: 0 on success, 2 on bad arguments, 130 when interrupted.
 """
-Task = tuple[paper.Case, int]
+PAGE, ROWS, SUMMARY = 'report.html', 'runs.csv', 'summary.csv'
+GROUPS: Mapping[str, tuple[paper.Case, ...]] = {
+    'payloads': paper.PAYLOADS, 'configurations': paper.CONFIGURATIONS,
+    'finite_element': (paper.FINITE_ELEMENT,)}
+"""Cases whose figures belong together; they are drawn as soon as the last run of the group is done."""
 SHOWN = ('mean error [%]', 'rms error at 6 s [%]', 'bound at 6 s [%]', '95 % interval holds [%]',
          'time per sample [us]')
 
@@ -51,14 +59,94 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return console.run(PROG, lambda: _main(given))
 
 
-def work(task: Task) -> tuple[list[study.Row], dict[str, paper.Track]]:
-    """Do one run of one case."""
-    return paper.run(*task)
+class Job(NamedTuple):
+    """Something a worker does: a run, a bound, or a figure."""
+
+    kind: str
+    key: tuple[Any, ...]
+    call: Callable[[], Any]
+
+
+def work(job: Job) -> Any:
+    """Do it."""
+    return job.call()
+
+
+class Collected:
+    """What came back, and what can be drawn of it."""
+
+    def __init__(self, cases: Sequence[paper.Case], seeds: Sequence[int]) -> None:
+        self.groups = {name: [case for case in group if case in cases] for name, group in GROUPS.items()}
+        self.seeds = seeds
+        self.runs: dict[tuple[str, int], tuple[list[study.Row], dict[str, paper_run.Track]]] = {}
+        self.bounds: dict[tuple[str, str], float | None] = {}
+        self.planned: dict[str, Sequence[Planned]] = {}
+        self.drawn: dict[tuple[str, int], bytes] = {}
+
+    def first(self) -> list[Job]:
+        """Return what can be done at once; the runs of one group after the other."""
+        cases = [case for group in self.groups.values() for case in group]
+        bounds = [Job('bound', (case.name, method.name), partial(paper.bound, case, method.name))
+                  for case in cases for method in paper.METHODS if paper.has_bound(case, method)]
+        runs = [Job('run', (case, seed), partial(paper_run.run, case, seed))
+                for group in self.groups.values() for seed in self.seeds for case in group]
+        from flexmanip_ros.io import paper_sections
+
+        return [*bounds, *self._drawings('signals', paper_sections.without_results()), *runs]
+
+    def take(self, outcome: workers.Outcome) -> list[Job]:
+        """Keep an outcome; return what can be drawn now."""
+        job, found = outcome.task, outcome.result
+        if job.kind == 'bound':
+            self.bounds[job.key] = found
+        elif job.kind == 'figure':
+            self.drawn[job.key] = found or b''
+        else:
+            case, seed = job.key
+            self.runs[case.name, seed] = (
+                found if outcome.error is None else (_failed(case, seed, outcome.error), {}))
+            group = next(name for name, cases in self.groups.items() if case in cases)
+            if all((known.name, seed) in self.runs for known in self.groups[group] for seed in self.seeds):
+                return self._figures(group)
+        return []
+
+    def rows(self) -> list[study.Row]:
+        """Return every row there is, in the order of cases and seeds."""
+        return [row for group in self.groups.values() for case in group for seed in self.seeds
+                for row in self.runs.get((case.name, seed), ([], {}))[0]]
+
+    def pictures(self) -> dict[str, list[tuple[Planned, bytes]]]:
+        """Return planned figures with their pictures."""
+        return {group: [(one, self.drawn.get((group, k), b'')) for k, one in enumerate(planned)]
+                for group, planned in self.planned.items()}
+
+    def _figures(self, group: str) -> list[Job]:
+        from flexmanip_ros.io import paper_sections
+
+        plan = {'payloads': paper_sections.payload_example,
+                'configurations': paper_sections.configuration_example,
+                'finite_element': paper_sections.finite_element_example}[group]
+        return self._drawings(group, plan(self._tracks(), self.rows()))
+
+    def _tracks(self) -> dict[str, dict[str, list[paper_run.Track]]]:
+        return {case.name: {
+            method.name: [self.runs[case.name, seed][1][method.name] for seed in self.seeds
+                          if method.name in self.runs.get((case.name, seed), ([], {}))[1]]
+            for method in paper.METHODS} for case in paper.CASES}
+
+    def _drawings(self, group: str, planned: Sequence[Planned]) -> list[Job]:
+        from flexmanip_ros.io import paper_sections
+
+        self.planned[group] = planned
+        return [Job('figure', (group, k), partial(paper_sections.drawing, one))
+                for k, one in enumerate(planned)]
 
 
 def _main(given: argparse.Namespace) -> int:
     if given.runs < 1:
         raise ParameterError(f'--runs is {given.runs}', 'give at least 1')
+    if given.workers is not None and given.workers < 0:
+        raise ParameterError(f'--workers is {given.workers}', 'give 0 or more')
     console.require_pictures()
     from flexmanip_ros.io import paper_report
 
@@ -68,37 +156,35 @@ def _main(given: argparse.Namespace) -> int:
     except OSError as err:
         raise OutputError(f"folder '{folder}' cannot be made: {err.strerror}",
                           'give another --output') from err
+    for name in (PAGE, ROWS, SUMMARY):
+        check_place(folder / name)
     started = time.perf_counter()
     cases = [case for case in paper.CASES if given.case is None or case.name in given.case]
-    tasks: list[Task] = [(case, given.first_seed + k) for k in range(given.runs) for case in cases]
-    found: dict[Task, tuple[list[study.Row], dict[str, paper.Track]]] = {}
-    with console.progress('reproducing', 'runs') as progress:
-        for outcome in _compute(given.workers, tasks):
-            found[outcome.task] = outcome.result if outcome.error is None else (_failed(outcome), {})
-            progress(len(found), len(tasks))
-    rows = [row for task in tasks for row in found[task][0]]
-    tracks = {case.name: {method.name: [found[task][1][method.name] for task in tasks
-                                        if task[0] is case and method.name in found[task][1]]
-                          for method in paper.METHODS} for case in paper.CASES}
+    collected = Collected(cases, range(given.first_seed, given.first_seed + given.runs))
+    feed = workers.Feed(collected.first())
+    with console.progress('reproducing', 'steps') as progress:
+        for count, outcome in enumerate(_compute(given.workers, feed), start=1):
+            feed.add(collected.take(outcome))
+            progress(count, feed.total)
     wall = time.perf_counter() - started
-    lines = paper_report.summary(rows)
-    write_csv(folder / 'runs.csv', rows)
-    write_csv(folder / 'summary.csv', lines)
-    paper_report.report(folder / 'report.html', paper_report.Study(rows, tracks, given.runs, wall))
+    rows = collected.rows()
+    lines = paper_summary.summary(rows, collected.bounds)
+    write_csv(folder / ROWS, rows)
+    write_csv(folder / SUMMARY, lines)
+    paper_report.report(folder / PAGE, paper_report.Study(
+        rows, collected.bounds, collected.pictures(), given.runs, wall))
     print('\n'.join(describe(lines)))
-    print(f"{len(tasks)} runs in {wall:.1f} s; wrote '{folder / 'report.html'}', runs.csv and summary.csv")
+    print(f"{len(collected.runs)} runs in {wall:.1f} s; wrote '{folder / PAGE}', {ROWS} and {SUMMARY}")
     return console.SUCCESS
 
 
-def _compute(count: int | None, tasks: Sequence[Task]) -> Iterator[workers.Outcome]:
+def _compute(count: int | None, jobs: Iterable[Job]) -> Iterator[workers.Outcome]:
     cores = len(os.sched_getaffinity(0)) if count is None else count
-    return workers.processes(work, tasks, cores) if cores > 0 else workers.serial(work, tasks)
+    return workers.processes(work, jobs, cores) if cores > 0 else workers.serial(work, jobs)
 
 
-def _failed(outcome: workers.Outcome) -> list[study.Row]:
-    case, seed = outcome.task
-    words = study.describe(outcome.error or RuntimeError('unknown'))
-    return [{'case': case.name, 'method': method.name, 'seed': seed, 'error': words}
+def _failed(case: paper.Case, seed: int, error: BaseException) -> list[study.Row]:
+    return [{'case': case.name, 'method': method.name, 'seed': seed, 'error': study.describe(error)}
             for method in paper.METHODS]
 
 

@@ -6,6 +6,7 @@ import importlib
 import multiprocessing
 import os
 import signal
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -33,6 +34,28 @@ class Outcome(NamedTuple):
     error: BaseException | None
 
 
+class Feed:
+    """Tasks that grow while a study runs: what an outcome makes possible is added before the next comes."""
+
+    def __init__(self, tasks: Iterable[Task]) -> None:
+        self.waiting = deque(tasks)
+        self.total = len(self.waiting)
+
+    def add(self, tasks: Iterable[Task]) -> None:
+        """Append tasks."""
+        more = list(tasks)
+        self.waiting.extend(more)
+        self.total += len(more)
+
+    def __iter__(self) -> Iterator[Task]:
+        return self
+
+    def __next__(self) -> Task:
+        if not self.waiting:
+            raise StopIteration
+        return self.waiting.popleft()
+
+
 def serial(work: Work, tasks: Iterable[Task]) -> Iterator[Outcome]:
     """Compute here, one after the other."""
     for task in tasks:
@@ -47,7 +70,8 @@ def serial(work: Work, tasks: Iterable[Task]) -> Iterator[Outcome]:
 def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome]:
     """Compute in ``count`` processes of this machine. Outcomes come as they are ready.
 
-    A worker that dies (killed, out of memory) costs at most the run that killed it.
+    tasks may be a ``Feed``. A worker that dies (killed, out of memory) costs at most the run that
+    killed it.
     """
     for name in THREADS:
         os.environ.setdefault(name, '1')  # one run a core; more threads would only get in each other's way

@@ -46,10 +46,20 @@ def page(title: str, lead: str, sections: Sequence[Section]) -> str:
 
 def picture(drawn: Figure, words: str) -> str:
     """Return a figure as an inline image."""
+    return image(png(drawn), words)
+
+
+def png(drawn: Figure) -> bytes:
+    """Return a figure as PNG."""
     buffer = io.BytesIO()
     drawn.savefig(buffer, format='png')
-    data = base64.b64encode(buffer.getvalue()).decode('ascii')
-    return f'<img alt="{escape(words)}" src="data:image/png;base64,{data}">'
+    return buffer.getvalue()
+
+
+def image(data: bytes, words: str) -> str:
+    """Return a PNG as an inline image; words: for who cannot see it."""
+    text = base64.b64encode(data).decode('ascii')
+    return f'<img alt="{escape(words)}" src="data:image/png;base64,{text}">'
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = '') -> str:
@@ -65,6 +75,13 @@ def number(value: Any, digits: int = 5) -> str:
     if value is None or (isinstance(value, float) and np.isnan(value)):
         return '\N{EN DASH}'
     return str(value) if isinstance(value, (int, str)) else f'{float(value):.{digits}g}'
+
+
+def plain(value: float | None, digits: int = 2) -> str:
+    """Write a number with few digits and no exponent; a missing one is a dash."""
+    if value is None or np.isnan(value):
+        return '\N{EN DASH}'
+    return np.format_float_positional(value, precision=digits, fractional=False, trim='-')
 
 
 def _cell(value: Any) -> str:

@@ -19,6 +19,8 @@ from matplotlib.patches import Patch
 from flexmanip_ros.types import Array, Estimate, EventKind, Status
 
 COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#7F7F7F', '#000000')
+LINES: tuple[Any, ...] = ('-', (0, (4, 1.2)), (0, (1.2, 1)), (0, (6, 1.2, 1.2, 1.2)))
+"""Signals in one plot differ by more than their colour."""
 PAYLOAD_COLOUR = '#009E73'
 TRUTH_COLOUR = '#000000'
 EVENT_COLOUR = '#AA0000'
@@ -46,14 +48,27 @@ def figure(rows: int, heights: Sequence[float], *, share_time: bool = True) -> t
     made = Figure(figsize=(WIDTH, float(sum(heights)) + 0.6), dpi=DPI, layout='constrained')
     FigureCanvasAgg(made)
     axes = made.subplots(rows, 1, sharex=share_time, squeeze=False, height_ratios=list(heights))[:, 0]
+    _plain(axes)
+    if share_time:
+        axes[-1].set_xlabel('time since the first sample [s]')
+    return made, list(axes)
+
+
+def row(columns: int, height: float) -> tuple[Figure, list[Any]]:
+    """Return a figure of the page's width and its axes side by side."""
+    made = Figure(figsize=(WIDTH, height + 0.6), dpi=DPI, layout='constrained')
+    FigureCanvasAgg(made)
+    axes = made.subplots(1, columns, squeeze=False)[0]
+    _plain(axes)
+    return made, list(axes)
+
+
+def _plain(axes: Iterable[Any]) -> None:
     for ax in axes:
         ax.grid(True, color='#E4E4E4', linewidth=0.7)
         ax.set_axisbelow(True)
         for side in ('top', 'right'):
             ax.spines[side].set_visible(False)
-    if share_time:
-        axes[-1].set_xlabel('time since the first sample [s]')
-    return made, list(axes)
 
 
 def save(made: Figure, path: str | Path) -> None:
@@ -77,7 +92,8 @@ def envelope(time: Array, values: Array) -> tuple[Array, Array]:
 def lines(ax: Any, time: Array, columns: Array, labels: Sequence[str], title: str, unit: str) -> None:
     """Draw signals (N, k) over time."""
     for k, label in enumerate(labels):
-        ax.plot(*envelope(time, columns[:, k]), color=COLOURS[k % len(COLOURS)], linewidth=1.1, label=label)
+        ax.plot(*envelope(time, columns[:, k]), color=COLOURS[k % len(COLOURS)],
+                linestyle=LINES[k % len(LINES)], linewidth=1.1, label=label)
     ax.set_ylabel(f'{title}\n[{unit}]')
     legend(ax)
 

@@ -55,12 +55,20 @@ def estimate(config: IdentifierParameters, identified: Identified, angles: Array
     seen = sensor_matrix(config, kappa) if identified.model.order == 4 * kappa else None
     if seen is None or angles.shape != (2,) or np.linalg.matrix_rank(seen[0]) < 2 * kappa:
         return block_interval.unknown(Status.UNOBSERVABLE)
-    empty = blocks(config.arm, chords(config.arm, angles), kappa=kappa)
+    empty = blocks(config.arm, working_point(config, angles), kappa=kappa)
 
     def mass_of(Ac: Array, Bc: Array) -> Array:
         return masses(config.arm, empty, Ac, Bc, config.payload.known_coupling)
 
     return block_interval.payload(identified, *seen, mass_of)
+
+
+def working_point(config: IdentifierParameters, angles: Array) -> Array:
+    """Return the chord angles (2,) that a model belongs to: measured ones, or where a linear plant stays."""
+    given = config.payload.working_point
+    if config.payload.dynamics == 'linear' and len(given) == 2:
+        return np.array(given, dtype=np.float64)
+    return chords(config.arm, angles)
 
 
 def masses(arm: ArmParameters, empty: Blocks, Ac: Array, Bc: Array, known_mb: bool) -> Array:

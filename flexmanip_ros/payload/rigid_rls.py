@@ -1,6 +1,7 @@
 """The paper's first rival: recursive least squares on two rigid links, angles differentiated by a filter.
 
-It knows nothing of bending, hence its bias. Same calls as ``structured``.
+It knows nothing of bending, hence its bias; of a linear plant it is told the working point. Same calls as
+``structured``.
 """
 
 from __future__ import annotations
@@ -78,4 +79,11 @@ def _arm(config: IdentifierParameters, dt: float) -> RigidArm:
         Ma11=rho1 * L1 ** 3 / 3 + (arm.joint_mass + rho2 * L2 + arm.tip_mass) * L1 ** 2,
         Ma22=rho2 * L2 ** 3 / 3 + arm.tip_mass * L2 ** 2, coupling=(rho2 * L2 / 2 + arm.tip_mass) * L1 * L2,
         L1=L1, L2=L2, reaction=1.0 if arm.torque_convention == 'joint' else 0.0, cutoff=_cutoff(config),
-        fade=float(np.exp(-dt / MEMORY)))
+        fade=float(np.exp(-dt / MEMORY)), frozen_turn=_frozen_turn(config))
+
+
+def _frozen_turn(config: IdentifierParameters) -> float:
+    """Where a linear plant stays, as far as it is given [rad]."""
+    point = config.payload.working_point
+    frozen = config.payload.dynamics == 'linear' and len(point) == 2
+    return point[1] - point[0] if frozen else float('nan')

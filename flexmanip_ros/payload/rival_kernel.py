@@ -25,6 +25,8 @@ class RigidArm(NamedTuple):
     """Of the differentiating filter [rad/s]."""
     fade: float
     """Forgetting factor a sample."""
+    frozen_turn: float
+    """Angle between the links at which a linear plant stays [rad]; nan: measured, with centripetal terms."""
 
 
 @kernel
@@ -66,6 +68,8 @@ def rigid(arm: RigidArm, x: Array, sums: Array, dt: float, efforts: Array, chord
             continue  # the filters still carry their start
         turn = x[1, 0] - x[0, 0]
         c, s = np.cos(turn), np.sin(turn)
+        if not np.isnan(arm.frozen_turn):
+            c, s = np.cos(arm.frozen_turn), 0.0
         known0 = arm.Ma11 * acc0 + arm.coupling * (c * acc1 - s * rate1 * rate1)
         known1 = arm.Ma22 * acc1 + arm.coupling * (c * acc0 + s * rate0 * rate0)
         cross = arm.L1 * arm.L2

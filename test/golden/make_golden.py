@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from flexmanip_ros import paper, study
+from flexmanip_ros import paper, paper_run, study
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, configure
 from flexmanip_ros.plant import excitation, simulator
 from flexmanip_ros.scenario import scenario
@@ -27,7 +27,7 @@ PLANTS = ('nonlinear', 'linear', 'finite_element')
 def results() -> dict[str, Any]:
     """Return run -> column -> number, computed now."""
     rows: dict[str, study.Row] = {f'plant {model}': _plant(model) for model in PLANTS}
-    for row in paper.run(paper.PAYLOADS[0], 0)[0]:
+    for row in paper_run.run(paper.PAYLOADS[0], 0)[0]:
         rows[f'paper 20 kg, {row["method"]}'] = row
     rows['nonlinear'] = study.trial(scenario(NONLINEAR), 0)[0]
     return {name: {key: value for key, value in row.items() if key not in NOT_NUMBERS_OF_OURS}

@@ -1,0 +1,223 @@
+"""One experiment of the paper: every method over the same samples, as rows and as tracks over time.
+
+Work that several methods share is done once: one pass of an identifier serves every method that reads it, the
+messages become samples once for the two rivals.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from flexmanip_ros import paper, pipeline, rivals, study
+from flexmanip_ros import paper_single_link as single_link
+from flexmanip_ros.identification import rpbsid
+from flexmanip_ros.paper import Case, Method
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, PlantParameters, configure
+from flexmanip_ros.payload import block_extraction
+from flexmanip_ros.scenario import Run, Scenario
+from flexmanip_ros.types import Array, CaptureEvent, Estimate, JointRecord, StateSpace, Status
+
+Item = JointRecord | CaptureEvent
+
+
+class Track(NamedTuple):
+    """One method over one run: time (T,) [s], mass, lower, upper (T,) [kg], frequencies (T, 2) [Hz]."""
+
+    time: Array
+    mass: Array
+    lower: Array
+    upper: Array
+    frequencies: Array
+    model: StateSpace | None
+
+
+class Reading(NamedTuple):
+    """What a method gave: its estimates, the last one at the last sample, and what they cost [s]."""
+
+    estimates: list[Estimate]
+    wall: float
+
+
+def run(case: Case, seed: int) -> tuple[list[study.Row], dict[str, Track]]:
+    """Simulate one experiment and put every method over the same samples; rows and tracks.
+
+    Whatever goes wrong in a method becomes the ``error`` of its row; the others go on.
+    """
+    found: dict[str, Reading] = {}
+    failed: dict[str, str] = {}
+    alone = [method for method in paper.METHODS if method.name == paper.ALONE]
+    others = [method for method in paper.METHODS if method.name != paper.ALONE]
+    readers = [[method for method in others if method.identifier == name] for name in paper.IDENTIFIERS]
+    rivalling = [method for method in others if method.rival]
+    items: list[Item] = []
+    with _attempt(failed, others):
+        items = _messages(case, seed)
+    for group in readers if items else ():
+        with _attempt(failed, group):
+            found.update(_identify(case, group, items))
+    if items:
+        with _attempt(failed, rivalling):
+            found.update(_compare(case, rivalling, items))
+    with _attempt(failed, alone):
+        found.update(_compare(case, alone, _own_run(case, seed)))
+    return _rows(case, seed, found, failed)
+
+
+@contextmanager
+def _attempt(failed: dict[str, str], methods: Sequence[Method]) -> Iterator[None]:
+    """Keep an error as that of some methods: a defect in one must not hide the others."""
+    try:
+        yield
+    except Exception as error:
+        failed.update({method.name: study.describe(error) for method in methods})
+
+
+def _rows(case: Case, seed: int, found: dict[str, Reading], failed: dict[str, str]
+          ) -> tuple[list[study.Row], dict[str, Track]]:
+    rows: list[study.Row] = []
+    tracks: dict[str, Track] = {}
+    for method in paper.METHODS:
+        row: study.Row = {'case': case.name, 'method': method.name, 'seed': seed,
+                          'error': failed.get(method.name, '')}
+        if method.name in found:
+            reading = found[method.name]
+            tracks[method.name] = follow(reading.estimates)
+            row.update(_columns(reading.estimates, tracks[method.name], case))
+            row['us_per_sample'] = 1e6 * reading.wall / (paper.WINDOW[1] * PlantParameters().rate)
+        rows.append(row)
+    return rows, tracks
+
+
+def _identify(case: Case, readers: Sequence[Method], items: Sequence[Item]) -> dict[str, Reading]:
+    """Run one identifier once; each of the methods that read it costs the pass and its own reading.
+
+    The identifier's own estimates are those of the method without settings of its own; the others read a
+    block payload from its model.
+    """
+    configs = {method.name: _configured(case, method)[1].identifier for method in readers}
+    own = next(method.name for method in readers if not method.settings)
+    found = {name: Reading([], 0.0) for name in configs}
+    walls = dict.fromkeys(configs, 0.0)
+    begun = time.perf_counter()
+    for state, estimate in pipeline.replay(configs[own], items):
+        now = estimate if estimate is not None else pipeline.current(state)  # the last: at the last sample
+        if now is None:
+            continue
+        found[own].estimates.append(now)
+        for name in configs.keys() - {own}:
+            started = time.perf_counter()
+            held = (now.stamp_ns - state.first_ns) * 1e-9 >= paper.CAPTURE_TIME
+            found[name].estimates.append(_with_block(configs[name], state, now) if held else
+                                         replace(now, payload=None))
+            walls[name] += time.perf_counter() - started
+    shared = time.perf_counter() - begun - sum(walls.values())
+    return {name: reading._replace(wall=shared + walls[name]) for name, reading in found.items()}
+
+
+def _with_block(config: IdentifierParameters, state: pipeline.State, now: Estimate) -> Estimate:
+    """Return an estimate with the payload that the blocks of its model give."""
+    assert state.timeline is not None
+    core = state.timeline.core
+    try:
+        found = rpbsid.identified(config, core.rpbsid, state.sampling.dt)
+    except np.linalg.LinAlgError:  # nothing moves yet
+        found = None
+    if found is None:
+        return replace(now, payload=None, status=now.model_status)
+    payload = block_extraction.estimate(config, found, core.angles)
+    status = payload.status if found.status is Status.TRACKING else found.status
+    return replace(now, payload=payload, status=status)
+
+
+def _compare(case: Case, methods: Sequence[Method], items: Sequence[Item]) -> dict[str, Reading]:
+    """Run methods that are no part of the identifier over the same samples."""
+    config = _configured(case, methods[0])[1].identifier
+    begun = time.perf_counter()
+    sampled = rivals.samples(config, items)
+    shared = time.perf_counter() - begun
+    found = {}
+    for method in methods:
+        begun = time.perf_counter()
+        estimates = list(rivals.run(method.rival, config, sampled))
+        found[method.name] = Reading(estimates, shared + time.perf_counter() - begun)
+    return found
+
+
+@cache
+def _prepared(case: Case, name: str) -> tuple[Scenario, Run]:
+    """Return the scenario and its configurations but for the seed."""
+    made = paper.scenario(case, next(method for method in paper.METHODS if method.name == name))
+    return made, made.configuration(0, name)
+
+
+def _configured(case: Case, method: Method) -> tuple[Scenario, Run]:
+    return _prepared(case, method.name)
+
+
+def _messages(case: Case, seed: int) -> list[Item]:
+    made, configured = _configured(case, paper.METHODS[0])
+    return study.messages(made, replace(configured, plant=replace(configured.plant, seed=seed)), seed)
+
+
+def _own_run(case: Case, seed: int) -> list[Item]:
+    return single_link.messages(
+        configure(ArmParameters, paper.ARM), math.radians(case.angles_deg[1]), case.payload, seed,
+        duration=paper.WINDOW[1], capture_time=paper.CAPTURE_TIME, snr_db=PlantParameters().snr_db)
+
+
+@cache
+def true_frequencies(case: Case, mass: float) -> tuple[float, ...]:
+    """Return the two lowest frequencies of a case's arm with a payload [Hz]."""
+    return tuple(study.true_frequencies(_configured(case, paper.METHODS[0])[1], mass))
+
+
+def _columns(estimates: Sequence[Estimate], track: Track, case: Case) -> study.Row:
+    inside = (track.time >= paper.WINDOW[0]) & (track.time <= paper.WINDOW[1])
+    true = np.array(true_frequencies(case, case.payload))
+    relative = 100.0 * np.abs(track.mass - case.payload) / case.payload
+    frequency = 100.0 * np.abs(track.frequencies - true) / true
+    held = (track.lower <= case.payload) & (case.payload <= track.upper)
+    row: study.Row = {
+        'payload_true_kg': case.payload, 'payload_mass_kg': _last(track.mass),
+        'payload_lower_kg': _last(track.lower), 'payload_upper_kg': _last(track.upper),
+        'covered': bool(held[-1]) if held.size else None,
+        'error_percent': _mean(relative[inside]), 'status': estimates[-1].status.name if estimates else '',
+    }
+    for k in range(true.size):
+        row[f'true_frequency_{k + 1}'] = float(true[k])
+        row[f'frequency_error_percent_{k + 1}'] = _mean(frequency[inside, k])
+    return row
+
+
+def follow(estimates: Sequence[Estimate]) -> Track:
+    """Return estimates as arrays; what there was not is nan, and so is a mass of which nothing is known."""
+    count = len(estimates)
+    table = np.full((count, 3), np.nan)
+    frequencies = np.full((count, 2), np.nan)
+    for k, estimate in enumerate(estimates):
+        held = estimate.payload
+        if held is not None:
+            table[k] = held.mass if math.isfinite(held.std) else np.nan, held.lower, held.upper
+        found = [mode.frequency_hz for mode in estimate.modes[:2]]
+        frequencies[k, :len(found)] = found
+    start = estimates[0].stamp_ns if estimates else 0
+    stamps = np.array([(estimate.stamp_ns - start) / 1e9 for estimate in estimates], dtype=np.float64)
+    return Track(stamps, table[:, 0], table[:, 1], table[:, 2], frequencies,
+                 estimates[-1].model if estimates else None)
+
+
+def _mean(values: Array) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else None
+
+
+def _last(values: Array) -> float | None:
+    return float(values[-1]) if values.size and math.isfinite(values[-1]) else None
