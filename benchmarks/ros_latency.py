@@ -2,7 +2,8 @@
 
 Plant, excitation, trigger and identifier over DDS: composed in one process, and one process each. Latency is
 from the middleware's source time stamp of a joint state to that of the estimate with the same stamp, so that
-the observer's own delays do not count; `sample` is the identifier's callback for every sample, as it reports
+the observer's own delays do not count; `bare` is publish and subscribe alone, the floor on the machine as it
+is at the time; `sample` is the identifier's callback for every sample, as it reports
 itself. Use: ros_latency.py [seconds a case]
 """
 
@@ -120,6 +121,9 @@ def case(name: str, rate: float, seconds: float, domain: int) -> dict[str, Any]:
     executor.add_node(observer)
     if name == 'composed':
         commands = {'all': [sys.executable, __file__, '--composed', str(rate)]}
+    elif name == 'bare':
+        commands = {node: [sys.executable, str(HERE / 'parts' / 'bare_nodes.py'), role, str(rate)]
+                    for node, role in (('source', 'source'), ('rpbsid_identifier', 'echo'))}
     else:
         commands = {node: [sys.executable, '-m', f'flexmanip_ros.ros.{node}', *parameters(rate)]
                     for node in NODES}
@@ -145,13 +149,13 @@ def case(name: str, rate: float, seconds: float, domain: int) -> dict[str, Any]:
         observer.destroy_node()
         rclpy.shutdown()
     p50, p99 = np.percentile(latencies, [50, 99]) if latencies.size else (np.nan, np.nan)
-    sample = [[float(r[f'callback_{what}_us']) for r in reports] for what in ('p50', 'p99', 'max')]
+    sample = [[float(r[f'callback_{what}_us']) for r in reports] or [0.0] for what in ('p50', 'p99', 'max')]
     return {
         'arrangement': name, 'rate_hz': rate, 'samples_hz': count / wall, 'seconds': wall,
         'lost_by_identifier': reports[-1]['lost'] if reports else 'unknown', 'lost_by_observer': lost,
         'estimates': int(latencies.size),
         'estimate_us': [float(p50), float(p99), float(latencies.max(initial=0.0))],
-        'sample_us': [float(np.median(sample[0])), float(np.median(sample[1])), max(sample[2], default=0.0)],
+        'sample_us': [float(np.median(sample[0])), float(np.median(sample[1])), max(sample[2])],
         'cpu_percent': used,
     }
 
@@ -169,7 +173,7 @@ def main() -> int:
         return 0
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else SECONDS
     rows = [case(name, rate, seconds, 1 + (os.getpid() + 7 * k) % 100) for k, (name, rate) in enumerate(
-        (('composed', 1000.0), ('separate', 1000.0), ('separate', 4000.0)))]
+        (('bare', 1000.0), ('composed', 1000.0), ('separate', 1000.0), ('separate', 4000.0)))]
     print('| arrangement | rate Hz | held Hz | lost | estimate p50 / p99 / max us | '
           'sample p50 / p99 / max us | CPU % |')
     print('|---|---|---|---|---|---|---|')

@@ -17,7 +17,7 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.sampling import Counters
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Payload, Sample
 
-GROUP, BLOCK = 5, 256
+GROUP, BLOCK = 10, 256
 """Samples run through the compiled kernels at once, live and when replaying; the numbers are the same."""
 PATIENCE = 2000
 """Messages without a single usable one after which a replay gives up."""

@@ -184,9 +184,9 @@ def _next(config: IdentifierParameters, state: SamplingState, raw: Sample
         gap = not (interval * count < config.gap_factor * total
                    and interval * count > (2.0 - config.gap_factor) * total)
         if gap:
+            raw = replace(raw, gap=True)
             state = state._replace(irregular=state.irregular + 1, pending=(), last_ns=raw.stamp_ns,
                                    counters=state.counters.plus('gaps'))
-            raw = replace(raw, gap=True)
         else:
             state = state._replace(irregular=0, interval_sum_ns=total + interval, interval_count=count + 1,
                                    last_ns=raw.stamp_ns)
