@@ -164,9 +164,14 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
             return self.create_publisher(kind, topic, profile, qos_overriding_options=qos.overridable())
 
     def subscription(self, kind: type[Any], topic: str, callback: Callable[..., None],
-                     profile: QoSProfile, *, raw: bool = False) -> Subscription:
-        """Create a subscription whose quality of service the user may override; its events are counted."""
+                     profile: QoSProfile, *, raw: bool = False,
+                     matched: Callable[[Any], None] | None = None) -> Subscription:
+        """Create a subscription whose quality of service the user may override; its events are counted.
+
+        matched: called when a publisher comes or goes.
+        """
         watch = SubscriptionEventCallbacks(
+            matched=matched,
             deadline=lambda event: self._count(topic, 'deadline_missed', event.total_count),
             liveliness=lambda event: self._count(topic, 'publishers_not_alive', event.not_alive_count),
             incompatible_qos=lambda event: self._incompatible(topic, event))

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import sys
+from typing import Any
 
 import numpy as np
 from rclpy.context import Context
@@ -28,8 +29,8 @@ from flexmanip_ros.plant import simulator
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.clock import SampleGrid
 from flexmanip_ros.ros.conversions import capture_event, joint_state
-from flexmanip_ros.ros.diagnostics import ERROR, WARN, Meter, Report
-from flexmanip_ros.ros.node import FlexmanipNode
+from flexmanip_ros.ros.diagnostics import ERROR, WARN, LossCounter, Meter, Report
+from flexmanip_ros.ros.node import FlexmanipNode, sequence_number, with_info
 from flexmanip_ros.ros.spin import run
 from flexmanip_ros.types import CaptureEvent, EventKind
 
@@ -50,6 +51,8 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         self.state: simulator.PlantState | None = None
         self.efforts = np.zeros(2)
         self.dropped_commands = 0
+        self.lost_commands = LossCounter()
+        self._several = False
         self.late_events = 0
         self.refused_events = 0
         self.samples = 0
@@ -63,7 +66,9 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         """Publisher, subscriptions, service and timer."""
         self.joint_states = self.publisher(JointState, 'joint_states', qos.sensor_output())
         self._message = JointState()
-        self.subscription(Float64MultiArray, 'effort_controller/commands', self._on_command, qos.command())
+        self.subscription(
+            Float64MultiArray, 'effort_controller/commands', with_info(self._on_command), qos.command(),
+            matched=self._on_publisher)
         self.subscription(Header, 'capture_event', self._on_event, qos.latched_input())
         self.create_service(Trigger, '~/reset', self._on_reset)
         self._grid = SampleGrid(self, self.config.rate)
@@ -140,13 +145,21 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             change = simulator.attach if event.kind is EventKind.CAPTURE else simulator.release
             self.state = change(self.config, self.state)
 
-    def _on_command(self, message: Float64MultiArray) -> None:
+    def _on_command(self, message: Float64MultiArray, info: object) -> None:
+        if not self._several:
+            self.lost_commands.note(sequence_number(info))
         if len(message.data) != 2:
             self._drop(f'a command has {len(message.data)} values; send one torque for each of the 2 joints')
         elif not all(map(math.isfinite, message.data)):
             self._drop('a command has a value that is not finite; look at the controller')
         else:
             self.efforts = np.array(message.data)
+
+    def _on_publisher(self, event: Any) -> None:
+        """Each publisher has numbers of its own: count those of one, anew once another is gone."""
+        self._several = event.current_count > 1
+        if self._several or event.current_count_change < 0:
+            self.lost_commands.restart()
 
     def _drop(self, words: str) -> None:
         self.dropped_commands += 1
@@ -192,6 +205,8 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         values['samples'] = self.samples
         values['backlog'] = self.backlog
         values['dropped_commands'] = self.dropped_commands
+        lost = self.lost_commands.lost
+        values['lost_commands'] = f'{lost} or more (several publishers)' if self._several else lost
         values['late_events'] = self.late_events
         values['refused_events'] = self.refused_events
         if self._fault:
@@ -200,6 +215,8 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             report.worse(WARN, f'{values["rate_hz"]:.0f} of {self.config.rate:.0f} samples a second')
         if self.dropped_commands:
             report.worse(WARN, f'{self.dropped_commands} commands dropped')
+        if lost:
+            report.worse(WARN, f'{lost} commands lost: they came faster than they were taken')
         if self.refused_events:
             report.worse(WARN, f'{self.refused_events} events refused')
 

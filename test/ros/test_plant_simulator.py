@@ -74,6 +74,40 @@ def test_a_wrong_command_is_dropped_whole_and_counted(ros: Ros, bad: list[float]
     assert heard[-1].effort[:2].tolist() == [2.0, 1.0]
 
 
+@pytest.mark.parametrize('depth', [1, 1000])
+@pytest.mark.parametrize('count', [3, 200])
+def test_every_bad_command_of_a_burst_is_counted_as_dropped_or_as_lost(
+        ros: Ros, count: int, depth: int) -> None:
+    node, _ = start(ros)
+    node.trigger_activate()
+    commands = ros.publisher(Float64MultiArray, 'effort_controller/commands', depth)
+    commands.publish(Float64MultiArray(data=[2.0, 1.0]))
+    ros.wait(lambda: node.efforts.tolist() == [2.0, 1.0])
+    for _ in range(count):
+        commands.publish(Float64MultiArray(data=[1.0]))
+    commands.publish(Float64MultiArray(data=[3.0, 1.0]))
+    ros.wait(lambda: node.efforts.tolist() == [3.0, 1.0])
+    assert node.dropped_commands + node.lost_commands.lost == count
+    assert node.dropped_commands >= min(count, 9)
+
+
+def test_two_publishers_with_numbers_of_their_own_are_no_loss(ros: Ros) -> None:
+    node, _ = start(ros)
+    node.trigger_activate()
+    first, second = (ros.publisher(Float64MultiArray, 'effort_controller/commands') for _ in range(2))
+    ros.wait(lambda: node._several)
+    torque = 0.0
+    for publisher in (*[first] * 50, second, first, second):
+        torque += 1.0
+        publisher.publish(Float64MultiArray(data=[torque, 1.0]))
+        ros.wait(lambda torque=torque: node.efforts[0] == torque)
+    ros.helper.destroy_publisher(second)
+    ros.wait(lambda: not node._several)
+    first.publish(Float64MultiArray(data=[-1.0, 1.0]))
+    ros.wait(lambda: node.efforts[0] == -1.0)
+    assert node.lost_commands.lost == 0
+
+
 def test_dropped_commands_show_in_the_diagnostics(ros: Ros) -> None:
     diagnostics = ros.listen(DiagnosticArray, '/diagnostics', 10)
     node, _ = start(ros)
