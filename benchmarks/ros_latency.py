@@ -1,10 +1,10 @@
 """Claim: live at 1 kHz nothing is lost, p99 from sample to estimate is 0.5 ms or less, at a fifth of a core.
 
-Plant, excitation, trigger and identifier over DDS: composed in one process, and one process each. Latency is
-from the middleware's source time stamp of a joint state to that of the estimate with the same stamp, so that
-the observer's own delays do not count; `bare` is publish and subscribe alone, the floor on the machine as it
-is at the time; `sample` is the identifier's callback for every sample, as it reports
-itself. Use: ros_latency.py [seconds a case]
+Plant, excitation, trigger and identifier over DDS: composed in one process, and one process each; `played`:
+the identifier alone, the samples simulated beforehand; `bare`: publish and subscribe alone, the floor on the
+machine as it is at the time. Latency is from the middleware's source time stamp of a joint state to that of
+the estimate with the same stamp, so that the observer's own delays do not count; `sample` is the identifier's
+callback for every sample, as it reports itself. Use: ros_latency.py [seconds a case]
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ from flexmanip_ros.ros.spin import Interrupt, make_executor, spin
 HERE = Path(__file__).resolve().parent
 SECONDS = 60.0
 SETTLE_S = 3.0
+CASES = (('bare', 1000.0), ('composed', 1000.0), ('separate', 1000.0), ('played', 4000.0),
+         ('separate', 4000.0))
 NODES = ('rpbsid_identifier', 'capture_trigger', 'excitation', 'plant_simulator')
 TICKS = os.sysconf('SC_CLK_TCK')
 
@@ -125,8 +127,12 @@ def case(name: str, rate: float, seconds: float, domain: int) -> dict[str, Any]:
         commands = {node: [sys.executable, str(HERE / 'parts' / 'bare_nodes.py'), role, str(rate)]
                     for node, role in (('source', 'source'), ('rpbsid_identifier', 'echo'))}
     else:
+        nodes = NODES if name == 'separate' else NODES[:1]
         commands = {node: [sys.executable, '-m', f'flexmanip_ros.ros.{node}', *parameters(rate)]
-                    for node in NODES}
+                    for node in nodes}
+    if name == 'played':
+        commands['player'] = [sys.executable, str(HERE / 'parts' / 'bare_nodes.py'), 'player', str(rate),
+                              str(seconds + 2 * SETTLE_S)]
     processes = {node: subprocess.Popen(command) for node, command in commands.items()}
     try:
         wait(executor, lambda: bool(observer.latencies), 120.0)
@@ -172,8 +178,8 @@ def main() -> int:
         composed(float(sys.argv[2]))
         return 0
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else SECONDS
-    rows = [case(name, rate, seconds, 1 + (os.getpid() + 7 * k) % 100) for k, (name, rate) in enumerate(
-        (('bare', 1000.0), ('composed', 1000.0), ('separate', 1000.0), ('separate', 4000.0)))]
+    rows = [case(name, rate, seconds, 1 + (os.getpid() + 7 * k) % 100)
+            for k, (name, rate) in enumerate(CASES)]
     print('| arrangement | rate Hz | held Hz | lost | estimate p50 / p99 / max us | '
           'sample p50 / p99 / max us | CPU % |')
     print('|---|---|---|---|---|---|---|')
