@@ -39,12 +39,13 @@ def following(u: Array, A: Array, B: Array, K: Array, x: Array, e: Array, after:
 @njit(cache=True, nogil=True)
 def linearize(
     U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, K: Array, x: Array, whiten: Array,
-    free_system: int, free_gain: int, free_output: int, free_direct: int, N: Array, g: Array, moments: Array, X: Array,
+    free_system: int, free_gain: int, free_output: int, free_direct: int,
+    N: Array, g: Array, moments: Array, X: Array,
 ) -> None:
     """Run the predictor x+ = A x + B u + K e, e = y - C x - D u over (L, r), (L, m), and its derivatives.
 
-    Parameters in order: A, B row-major if free_system, K if free_gain, C if free_output, D if free_direct, then x at the
-    start. whiten: (m, m), whiten' whiten = inverse innovation covariance. On return x is the state after the
+    Parameters in order: A, B row-major if free_system, K if free_gain, C if free_output, D if free_direct, then
+    x at the start. whiten: (m, m), whiten' whiten = inverse innovation covariance. On return x is the state after the
     last sample, N (d, d) += J' J (upper triangle) and g (d,) += J' e with J the derivatives of the
     whitened predictions; moments (m, m) += e e' and X (n, d) = dx/dparameters, started at
     [0 I] by the caller.

@@ -134,3 +134,11 @@ def markov(model: StateSpace, count: int) -> Array:
         if k > 0:
             state = model.A @ state
     return out
+
+
+def suggested_order(singular_values: Array) -> int:
+    """Return the order after which the singular values fall most steeply (0: unknown)."""
+    values = singular_values[singular_values > 1e-12 * max(singular_values, default=0.0)]
+    if values.size < 2:
+        return int(values.size)
+    return int(np.argmax(values[:-1] / values[1:])) + 1

@@ -37,14 +37,6 @@ class Identified(NamedTuple):
     samples: float = 0.0
     """Effective number of samples behind the model."""
 
-    @property
-    def suggested_order(self) -> int:
-        """Order after which the singular values fall most steeply (0: unknown)."""
-        values = self.singular_values[self.singular_values > 1e-12 * max(self.singular_values, default=0.0)]
-        if values.size < 2:
-            return int(values.size)
-        return int(np.argmax(values[:-1] / values[1:])) + 1
-
 
 class Tangent(NamedTuple):
     """Directions in which the model varies: (s, ...) stacks of dA, dB, dC, dD, dK."""

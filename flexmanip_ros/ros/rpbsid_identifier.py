@@ -28,6 +28,7 @@ from std_srvs.srv import Trigger
 
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.errors import CheckpointError, FlexmanipError, SignalError
+from flexmanip_ros.identification.realization import suggested_order
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, capture_event, to_message
@@ -229,6 +230,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             excitation=estimate.excitation, condition=estimate.condition,
             innovation_power=estimate.innovation_power)
         if estimate.singular_values is not None:
+            report.values['order'] = self.config.order
+            report.values['suggested_order'] = suggested_order(estimate.singular_values)
             report.values['singular_values'] = ' '.join(f'{value:.4g}' for value in estimate.singular_values)
         if payload is not None:
             report.values.update(

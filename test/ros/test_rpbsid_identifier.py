@@ -78,6 +78,15 @@ def test_nan_in_a_configured_field_is_dropped_and_counted_and_elsewhere_it_does_
     assert all(np.isfinite(model.data).all() for model in live.said[messages.MODEL])
 
 
+def test_the_diagnostics_suggest_an_order_beside_the_one_in_use(ros: Ros) -> None:
+    live = Live(ros, payload_method='none', order=4)
+    live.send(*recording(300))
+    values = ros.wait(lambda: 'suggested_order' in live.values() and live.values(), what='the suggestion')
+    assert values['order'] == '4'
+    assert 1 <= int(values['suggested_order']) <= 10
+    assert len(values['singular_values'].split()) >= int(values['suggested_order'])
+
+
 def test_a_message_of_unequal_sizes_is_dropped_and_counted(ros: Ros) -> None:
     live = Live(ros, payload_method='none')
     samples = list(recording(60))
