@@ -44,11 +44,11 @@ def linearize(
 ) -> None:
     """Run the predictor x+ = A x + B u + K e, e = y - C x - D u over (L, r), (L, m), and its derivatives.
 
-    Parameters in order: A, B row-major if free_system, K if free_gain, C if free_output, D if free_direct, then
-    x at the start. whiten: (m, m), whiten' whiten = inverse innovation covariance. On return x is the state after the
-    last sample, N (d, d) += J' J (upper triangle) and g (d,) += J' e with J the derivatives of the
-    whitened predictions; moments (m, m) += e e' and X (n, d) = dx/dparameters, started at
-    [0 I] by the caller.
+    Parameters in order: A, B row-major if free_system, K if free_gain, C if free_output, D if free_direct,
+    then x at the start. whiten: (m, m), whiten' whiten = inverse innovation covariance. On return x is the
+    state after the last sample, N (d, d) += J' J (upper triangle) and g (d,) += J' e with J the derivatives
+    of the whitened predictions; moments (m, m) += e e' and X (n, d) = dx/dparameters, started at [0 I] by
+    the caller.
     """
     n, r, m = A.shape[0], B.shape[1], C.shape[0]
     d = N.shape[0]
