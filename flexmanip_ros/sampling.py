@@ -39,9 +39,13 @@ class Counters(NamedTuple):
         return (self.repeated_stamp + self.late_stamp + self.missing_signal + self.unequal_sizes
                 + self.not_finite)
 
-    def plus(self, name: str, amount: int = 1) -> Counters:
+    def plus(self, name: str) -> Counters:
         """Return the counters with one of them raised."""
-        return self._replace(**{name: getattr(self, name) + amount})
+        return self._replace(**{name: getattr(self, name) + 1})
+
+    def received_and(self, name: str) -> Counters:
+        """Return the counters after one message with this fate."""
+        return self._replace(**{'received': self.received + 1, name: getattr(self, name) + 1})
 
 
 class SamplingState(NamedTuple):
@@ -82,7 +86,6 @@ def init() -> SamplingState:
 def step(config: IdentifierParameters, state: SamplingState, record: JointRecord
          ) -> tuple[SamplingState, Sampled]:
     """Take one message; return the samples it completes, in the order of their stamps."""
-    state = state._replace(counters=state.counters.plus('received'))
     channels = state.channels
     if channels is None or channels.names != record.names:
         found = resolve(config, record, state.outputs)
@@ -114,7 +117,7 @@ _LATE = Refusal('late_stamp', 'a header stamp is older than the one before',
 
 
 def _refuse(state: SamplingState, refusal: Refusal) -> SamplingState:
-    return state._replace(counters=state.counters.plus(refusal.reason), refusal=refusal)
+    return state._replace(counters=state.counters.received_and(refusal.reason), refusal=refusal)
 
 
 def _fault(channels: Channels, record: JointRecord) -> Refusal | None:
@@ -140,12 +143,12 @@ def _on_clock(config: IdentifierParameters, state: SamplingState, raw: Sample
         return _refuse(state, _LATE), NOTHING
     if state.interval_count == 0:
         state = state._replace(learning=(*state.learning, raw), last_ns=raw.stamp_ns,
-                        counters=state.counters.plus('accepted'))
+                               counters=state.counters.received_and('accepted'))
         return _learned(config, state, reset=False) if len(state.learning) > LEARNING else (state, NOTHING)
     state, ready, gap = _next(config, state, raw)
     if gap and state.irregular >= RELEARN:
         return _restart(config, state, raw)
-    return state._replace(counters=state.counters.plus('accepted')), Sampled(ready)
+    return state._replace(counters=state.counters.received_and('accepted')), Sampled(ready)
 
 
 def _restart(config: IdentifierParameters, state: SamplingState, raw: Sample
