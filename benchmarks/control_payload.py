@@ -1,10 +1,10 @@
-"""Claim: with the payload estimate the controller settles a move in the time it takes with the true payload.
+"""Claim: with the payload estimate a move settles sooner than without, and bends the links no more.
 
 The nonlinear arm (3 modes a link, 40 dB) holds its angles, catches an object of 20, 50 or 100 kg that drifts
 at 0.1 m/s, and 3 s later moves both joints by 0.1 rad. The same run three times: without the estimate, with
 the identifier's own (run in the loop, as its node does), and with the true payload from the capture on. The
-torque of the controller is all the excitation there is. Peak bend is what the move itself needs: knowing a
-heavier payload means more torque, hence a little more bend on the way. Use: control_payload.py
+torque of the controller is all the excitation there is. Bends are told from the capture to the move, where
+the estimate changes the gains, and from the move on. Use: control_payload.py
 """
 
 from __future__ import annotations
@@ -70,6 +70,7 @@ def run(mass: float, knows: str) -> dict[str, Any]:
         'mass_kg': mass, 'knows': knows,
         'settling_s': float((outside[-1] + 1) / 1000.0) if outside.size else 0.0,
         'settled': bool(outside.size == 0 or outside[-1] + 1 < len(error)),
+        'peak_bend_capture_mm': float(np.abs(positions[CAPTURE:MOVE, 2:]).max() * 1e3),
         'peak_bend_move_mm': float(np.abs(positions[MOVE:, 2:]).max() * 1e3),
         'scheduled_kg': state.payload,
     }
@@ -84,12 +85,12 @@ def smooth(values: np.ndarray) -> np.ndarray:
 def main() -> None:
     """Run every case; print a table and write JSON."""
     rows = [run(mass, knows) for mass in (20.0, 50.0, 100.0) for knows in ('nothing', 'estimate', 'truth')]
-    print('| payload kg | controller knows | scheduled kg | settling s | peak bend of the move mm |')
-    print('|---|---|---|---|---|')
+    print('| payload kg | controller knows | scheduled kg | settling s | peak bend mm: capture | move |')
+    print('|---|---|---|---|---|---|')
     for row in rows:
         settling = f'{row["settling_s"]:.2f}' if row['settled'] else f'> {row["settling_s"]:.1f}'
         print(f'| {row["mass_kg"]:.0f} | {row["knows"]} | {row["scheduled_kg"]:.2f} | {settling} | '
-              f'{row["peak_bend_move_mm"]:.2f} |')
+              f'{row["peak_bend_capture_mm"]:.2f} | {row["peak_bend_move_mm"]:.2f} |')
     target = HERE / 'results' / 'control_payload.json'
     target.parent.mkdir(exist_ok=True)
     target.write_text(json.dumps(rows, indent=1) + '\n', encoding='utf-8')

@@ -9,8 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flexmanip_ros.control import path
 from flexmanip_ros.control.feedback import Design, design, observation, reference
 from flexmanip_ros.control.gate import PayloadEstimate, Verdict, judge
+from flexmanip_ros.control.path import Path
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters.controller import ControllerParameters
 from flexmanip_ros.types import Array
@@ -29,8 +31,8 @@ class ControllerState(NamedTuple):
 
     C: Array
     now: Design
-    old: Array
-    """Gains (2, 2n) that ``now.G`` takes over from."""
+    old: Design
+    """The design that ``now`` takes over from."""
     payload: float
     """Payload scheduled on [kg]; it follows ``trusted``."""
     trusted: float
@@ -38,8 +40,10 @@ class ControllerState(NamedTuple):
     designed_between: float
     x: Array | None = None
     """Predicted state (2n,) at the next sample; None before the first."""
-    held: Array | None = None
-    """Encoder angles held now (2,) [rad], on the way to ``setpoint``."""
+    way: Path | None = None
+    """Encoder angles to hold [rad], on the way to ``goal``."""
+    goal: Array | None = None
+    """The setpoint that ``way`` was planned for."""
     setpoint: Array | None = None
     blend: float = 1.0
     """0: the old gains, 1: the new ones."""
@@ -52,7 +56,11 @@ class ControllerState(NamedTuple):
     @property
     def gain(self) -> Array:
         """Gains (2, 2n) in use."""
-        return self.old + self.blend * (self.now.G - self.old)
+        return self.between(self.old.G, self.now.G)
+
+    def between(self, old: Array, now: Array) -> Array:
+        """Return what is in use while one design takes over from another."""
+        return old + self.blend * (now - old)
 
 
 def init(config: ControllerParameters) -> ControllerState:
@@ -60,14 +68,16 @@ def init(config: ControllerParameters) -> ControllerState:
     first = design(config, 0.0, config.initial_payload)
     C: Array = np.kron(np.eye(2), observation(config)).astype(np.float64)
     return ControllerState(
-        C=C, now=first, old=first.G,
+        C=C, now=first, old=first,
         payload=config.initial_payload, trusted=config.initial_payload,
         designed_payload=config.initial_payload, designed_between=0.0,
         setpoint=None if config.hold_present else np.asarray(config.setpoint, dtype=np.float64))
 
 
 def goto(state: ControllerState, angles: Array) -> ControllerState:
-    """Move to other encoder angles (2,) [rad], at the configured rate."""
+    """Move to other encoder angles (2,) [rad], as fast as rate, torque and bend may be."""
+    if state.setpoint is not None and np.array_equal(state.setpoint, angles):
+        return state
     return state._replace(setpoint=np.asarray(angles, dtype=np.float64))
 
 
@@ -83,13 +93,13 @@ def step(config: ControllerParameters, state: ControllerState, measured: Measure
          ) -> tuple[ControllerState, Array]:
     """Return the torques (2,) [N m] for a sample, within the limits."""
     x = _filtered(config, state, measured)
-    state = _held(config, state, measured.position[:2])
     state = _scheduled(config, state, float(x[1] - x[0]))
-    assert state.held is not None
-    error = x.copy()
-    error[:2] -= reference(config, state.held)
+    way = _onward(config, state, measured.position[:2])
+    state = state._replace(way=way, goal=state.setpoint)
+    wanted, acceleration = _wanted(config, state, way)
+    feedforward = state.between(state.old.F, state.now.F) @ acceleration
     limit = np.asarray(config.effort_limit)
-    torque: Array = np.clip(measured.added - state.gain @ error, -limit, limit)
+    torque: Array = np.clip(measured.added + feedforward - state.gain @ (x - wanted), -limit, limit)
     return state._replace(x=state.now.A @ x + state.now.B @ torque), torque
 
 
@@ -104,12 +114,31 @@ def _filtered(config: ControllerParameters, state: ControllerState, measured: Me
     return x
 
 
-def _held(config: ControllerParameters, state: ControllerState, present: Array) -> ControllerState:
-    """Take the present angles at first, then move towards the setpoint no faster than allowed."""
-    held = present.copy() if state.held is None else state.held
-    target = held if state.setpoint is None else state.setpoint
-    reach = config.setpoint_rate / config.rate
-    return state._replace(held=held + np.clip(target - held, -reach, reach))
+def _onward(config: ControllerParameters, state: ControllerState, present: Array) -> Path:
+    """Stay at the first angles, go towards the setpoint when there is another one."""
+    way = path.rest(present) if state.way is None else state.way.after(1.0 / config.rate)
+    if state.setpoint is None or state.setpoint is state.goal:
+        return way
+    position, rate, *_ = way.now()
+    design = state.now
+    bends = state.C[2:4, 2:len(design.A) // 2] @ design.E
+    limits = np.concatenate([config.move_effort * np.asarray(config.effort_limit), [config.move_bend] * 2])
+    seconds = path.duration(
+        reference(config, state.setpoint - position), reference(config, rate), config.setpoint_rate,
+        np.vstack([design.F, bends]), limits)
+    return path.plan(way, state.setpoint, seconds)
+
+
+def _wanted(config: ControllerParameters, state: ControllerState, way: Path) -> tuple[Array, Array]:
+    """Return the state (2n,) that belongs to the way, bends included, and the chords' acceleration (2,)."""
+    n = len(state.now.A) // 2
+    if way.ended:
+        wanted = np.zeros(2 * n)
+        wanted[:2] = reference(config, way.goal)
+        return wanted, np.zeros(2)
+    position, rate, acceleration, jerk = (reference(config, row) for row in way.now())
+    bends = state.between(state.old.E, state.now.E)
+    return np.concatenate([position, bends @ acceleration, rate, bends @ jerk]), acceleration
 
 
 def _scheduled(config: ControllerParameters, state: ControllerState, between: float) -> ControllerState:
@@ -129,4 +158,4 @@ def _scheduled(config: ControllerParameters, state: ControllerState, between: fl
         wanted = design(config, between, payload)
     except ModelError:  # the gains in use go on
         return state._replace(failed_designs=state.failed_designs + 1)
-    return state._replace(old=state.now.G, now=wanted, blend=0.0, designs=state.designs + 1)
+    return state._replace(old=state.now, now=wanted, blend=0.0, designs=state.designs + 1)

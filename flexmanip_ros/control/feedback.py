@@ -67,17 +67,31 @@ def model(config: ControllerParameters, between: float, payload: float) -> tuple
     return discretize(A, B, 1.0 / config.rate)
 
 
+def feedforward(config: ControllerParameters, between: float, payload: float) -> tuple[Array, Array]:
+    """Return (F (2, 2), E (2 kappa, 2)): torques and modal coordinates per acceleration of the chords.
+
+    The quasi-static solution of M q'' + K q = B u with eta'' = 0.
+    """
+    b = blocks(config.arm, np.array([0.0, between]), payload, config.arm.modes)
+    F = solve(b.B_theta, b.Ma)
+    E = solve(b.Kc, b.B_eta @ F - b.Mb.T, assume_a='pos')
+    return F, E
+
+
 class Design(NamedTuple):
     """Everything made for one configuration and payload.
 
     A (2n, 2n), B (2n, 2): one sample; G (2, 2n): torque = -G (x - x_ref); L (2n, 8): weight of the innovation
-    of [positions, rates]; the stationary linear quadratic regulator and Kalman filter.
+    of [positions, rates]; the stationary linear quadratic regulator and Kalman filter. F (2, 2): torque that
+    accelerates the chords (2,) without vibration, E (2 kappa, 2): modal coordinates that go with it.
     """
 
     A: Array
     B: Array
     G: Array
     L: Array
+    F: Array
+    E: Array
 
 
 def design(config: ControllerParameters, between: float, payload: float) -> Design:
@@ -99,4 +113,4 @@ def design(config: ControllerParameters, between: float, payload: float) -> Desi
         raise ModelError(
             f'there is no regulator at {between:.3f} rad with {payload:.3f} kg',
             'change angle_scale, bend_scale or effort_scale') from error
-    return Design(A, B, G, L)
+    return Design(A, B, G, L, *feedforward(config, between, payload))

@@ -24,8 +24,13 @@ class ControllerParameters:
     setpoint_rate: float = parameter(
         0.2, 'the held angles move to a new setpoint no faster than this', unit='rad/s', low=1e-3, high=100.0,
         live=True)
+    move_bend: float = parameter(
+        0.01, 'bend that a move to a new setpoint may take at the sensors; a heavier arm is moved more slowly',
+        unit='m', low=1e-6, high=10.0, live=True)
+    move_effort: float = parameter(
+        0.5, 'fraction of effort_limit that a move to a new setpoint may take', low=0.01, high=1.0, live=True)
     angle_scale: float = parameter(
-        0.02, 'an angle error that costs as much as effort_scale (larger: softer)', unit='rad', low=1e-6)
+        0.01, 'an angle error that costs as much as effort_scale (larger: softer)', unit='rad', low=1e-6)
     bend_scale: float = parameter(
         0.02, 'a bending that costs as much as effort_scale (larger: less damping of vibration)', unit='m',
         low=1e-7)

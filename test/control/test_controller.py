@@ -100,3 +100,20 @@ def test_estimates_can_be_left_out_of_the_schedule() -> None:
 def test_a_sensor_at_the_end_of_a_link_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"'arm.sensor_position' is 0"):
         configure(ControllerParameters, {'arm.sensor_position': [0.0, 0.5]})
+
+
+@pytest.mark.parametrize('payload', [0.0, 20.0, 60.0])
+def test_a_move_bends_the_links_as_much_as_it_may_whatever_they_carry(payload: float) -> None:
+    config = replace(CONFIG, move_bend=0.006, initial_payload=payload)
+    plant = PlantParameters(payload_mass=payload, noise='none', arm=config.arm)
+    arm = simulator.attach(plant, simulator.init(plant))
+    state, torque, bends = controller.init(config), np.zeros(2), []
+    for k in range(6000):
+        arm, record = simulator.step(plant, arm, torque)
+        if k == 100:
+            state = controller.goto(state, record.position[:2] + np.array([0.2, -0.2]))
+        state, torque = controller.step(
+            config, state, controller.Measured(record.position, record.velocity, np.zeros(2)))
+        bends.append(np.abs(record.position[2:]).max())
+    assert 0.0045 < max(bends) < 0.0075
+    assert record.position[:2] == pytest.approx(state.setpoint, abs=0.02)
