@@ -96,7 +96,6 @@ setup(
     description='Online identification of a flexible two-link arm and of the payload it catches.',
     license='Apache-2.0',
     entry_points={
-        'console_scripts': [f'{name} = {NAME}.ros.{name}:main' for name in NODES]
-        + [f'{name} = {NAME}.cli.{name}:main' for name in PROGRAMS],
+        'console_scripts': [f'{name} = {NAME}.cli.start:{name}' for name in (*NODES, *PROGRAMS)],
     },
 )

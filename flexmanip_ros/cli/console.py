@@ -89,7 +89,7 @@ def require_pictures() -> None:
 
 def run(prog: str, body: Callable[[], int]) -> int:
     """Run a program: our errors become one line and exit 2, an interrupt exit 130."""
-    with _terminate_as_interrupt(), warnings.catch_warnings():
+    with _signals_as_interrupt(), warnings.catch_warnings():
         warnings.simplefilter('ignore')  # numbers out of range have a status; stderr is for one line
         try:
             return body()
@@ -111,17 +111,18 @@ def run(prog: str, body: Callable[[], int]) -> int:
 
 
 @contextmanager
-def _terminate_as_interrupt() -> Iterator[None]:
-    """Make SIGTERM do what Ctrl-C does, so that what was computed is written in both cases."""
+def _signals_as_interrupt() -> Iterator[None]:
+    """Let SIGINT and SIGTERM raise, so that what was computed is written in both cases."""
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
     try:
-        before = signal.signal(signal.SIGTERM, interrupt)
+        before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     except ValueError:  # not the main thread
         yield
         return
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -25,7 +25,7 @@ class ControllerParameters:
         0.2, 'the held angles move to a new setpoint no faster than this', unit='rad/s', low=1e-3, high=100.0,
         live=True)
     move_bend: float = parameter(
-        0.01, 'bend that a move to a new setpoint may take at the sensors; a heavier arm is moved more slowly',
+        0.01, 'bend that a move to a new setpoint may take at the sensors; a heavier arm moves more slowly',
         unit='m', low=1e-6, high=10.0, live=True)
     move_effort: float = parameter(
         0.5, 'fraction of effort_limit that a move to a new setpoint may take', low=0.01, high=1.0, live=True)
