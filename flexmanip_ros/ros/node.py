@@ -116,6 +116,19 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
         """Cease to work for good."""
         return self._transition(self._deactivate)
 
+    def _LifecycleNodeMixin__on_change_state(self, request: Any, response: Any) -> Any:
+        """Answer no to a transition that the present state does not have.
+
+        The method of rclpy 7.1 (Jazzy) raises, which ends the node: ros2/rclpy#1209.
+        """
+        try:
+            return super()._LifecycleNodeMixin__on_change_state(request, response)
+        except RuntimeError as error:
+            state, reason = self._state_machine.current_state[1], str(error).split(', at ')[0]
+            self.get_logger().error(f"a transition was refused in state '{state}': {reason}")
+            response.success = False
+            return response
+
     def autostart(self) -> bool:
         """Configure and activate at once, as a plain ``ros2 run`` expects, unless ``autostart`` is false.
 
@@ -215,6 +228,9 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
             report.values[name] = count
             if count:
                 report.worse(WARN if name.endswith('deadline_missed') else ERROR, f'{name}: {count}')
+        own = self.get_name(), self.get_namespace()
+        if self.get_node_names_and_namespaces().count(own) > 1:
+            report.worse(ERROR, 'another node has the same name; stop one, or rename it with __node')
         if not self.active:
             report.words.insert(0, 'not active')
         self._diagnostics.publish(report.message(self.get_name(), self.get_clock().now().to_msg()))

@@ -1,0 +1,77 @@
+"""Managed life in any order and many times over, with the real nodes: nothing is left behind or breaks."""
+
+from __future__ import annotations
+
+import random
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from joint_states import joint_state
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from ros_harness import Ros, overrides
+from sensor_msgs.msg import JointState
+
+from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.capture_trigger import CaptureTrigger
+from flexmanip_ros.ros.excitation import Excitation
+from flexmanip_ros.ros.payload_adapter import PayloadAdapter
+from flexmanip_ros.ros.payload_controller import PayloadController
+from flexmanip_ros.ros.plant_simulator import PlantSimulator
+from flexmanip_ros.ros.rpbsid_identifier import RpbsidIdentifier
+
+TRANSITIONS = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP, Transition.TRANSITION_ACTIVATE,
+               Transition.TRANSITION_DEACTIVATE)
+ALLOWED = {('unconfigured', 0): 'inactive', ('inactive', 1): 'unconfigured', ('inactive', 2): 'active',
+           ('active', 3): 'inactive'}
+NODES = {
+    PlantSimulator: {'rate': 100.0, 'noise': 'none', 'arm__modes': 1}, Excitation: {}, CaptureTrigger: {},
+    PayloadController: {'arm__modes': 1}, PayloadAdapter: {'target_node': 'nobody'},
+    RpbsidIdentifier: {'payload_method': 'none', 'checkpoint_period': 0.1},
+}
+
+
+def entities(node: Any) -> tuple[int, ...]:
+    """Return how many of each kind a node holds."""
+    return (len(list(node.publishers)), len(list(node.subscriptions)), len(list(node.services)),
+            len(list(node.clients)), len(list(node.timers)))
+
+
+@pytest.mark.parametrize('cls', NODES)
+def test_transitions_in_any_order_do_what_they_may_and_leave_nothing_behind(
+        ros: Ros, cls: Any, tmp_path: Path) -> None:
+    given = NODES[cls] | ({'checkpoint_file': str(tmp_path / 'state')} if cls is RpbsidIdentifier else {})
+    node = ros.managed(cls(context=ros.context, overrides=overrides(**given)))
+    states = ros.helper.create_publisher(JointState, 'joint_states', qos.sensor_output())
+    change = ros.helper.create_client(ChangeState, f'{node.get_name()}/change_state')
+    ask = ros.helper.create_client(GetState, f'{node.get_name()}/get_state')
+    ros.wait(lambda: change.service_is_ready() and ask.service_is_ready())
+    rng, state, held, sample = random.Random(4), 'active', set(), 0
+    for _ in range(120):
+        number = rng.choice((0, 1, 2, 3, *(n for s, n in ALLOWED if s == state) ))
+        request = ChangeState.Request()
+        request.transition.id = TRANSITIONS[number]
+        answer = change.call_async(request)
+        ros.wait(answer.done, what='the answer to a transition')
+        assert answer.result().success == ((state, number) in ALLOWED)
+        state = ALLOWED.get((state, number), state)
+        for _ in range(5):
+            sample += 1
+            states.publish(joint_state(sample))
+        said = ask.call_async(GetState.Request())
+        ros.wait(said.done, what='the state')
+        assert said.result().current_state.label == state
+        if state != 'active':
+            held.add(entities(node))
+    assert len(held) == 1
+    assert threading.active_count() <= 5  # this one, the executor, and what computes or saves meanwhile
+
+
+def test_two_nodes_of_one_name_say_so(ros: Ros) -> None:
+    heard = ros.listen(DiagnosticArray, '/diagnostics')
+    first, second = (ros.managed(CaptureTrigger(context=ros.context)) for _ in range(2))
+    ros.wait(lambda: sum('another node' in message.status[0].message for message in heard) > 1)
+    assert (first.active, second.active) == (True, True)
