@@ -57,7 +57,7 @@ def recording(path: Path, killed: bool) -> str:
         for _ in bag.read(path):
             pass
     except BagError as error:
-        empty = any(words in str(error) for words in ('is empty', 'no message', 'is not in', 'metadata.yaml'))
+        empty = any(words in str(error) for words in ('is empty', 'no message', 'has no topic', 'metadata.yaml'))
         return '' if killed or empty else str(error)
     return ''
 
@@ -177,7 +177,7 @@ def attempt(program: Program, number: signal.Signals, delay: float, places: dict
         killed = number == signal.SIGKILL
         allowed = {-number} if killed else {0, 128 + number, 130}
         loud = 'Traceback' in err or 'terminate called' in err
-        early = process.returncode in (-number, 1) and 'flexmanip_ros' not in err
+        early = process.returncode in (-number, 1) and 'flexmanip_ros/' not in err
         if process.returncode not in allowed and not early and not finished:
             problem.append(f'exit code {process.returncode}')
         if loud and not early:
@@ -212,6 +212,15 @@ def feeding(wanted: bool) -> Iterator[None]:
             feeder.wait()
 
 
+def inputs(folder: Path, seconds: int) -> dict[str, str]:
+    """Make a recording and a scenario for the programs that read them; return where they are."""
+    places = {'bag': str(folder / 'bag'), 'scenario': str(folder / 'scenario.yaml')}
+    Path(places['scenario']).write_text(SCENARIO, encoding='utf-8')
+    make = [sys.executable, '-c', START.format('simulate_bag'), places['bag'], '--duration', str(seconds)]
+    subprocess.run(make, check=True, stdout=subprocess.DEVNULL)
+    return places
+
+
 def delays(program: Program, runs: int, rng: random.Random) -> list[float]:
     """Return delays, one in each of as many equal parts of the program's life."""
     return [program.longest_s * (k + rng.random()) / runs for k in range(runs)]
@@ -228,10 +237,7 @@ def main() -> None:
     rng = random.Random(1)
     trials = []
     with tempfile.TemporaryDirectory() as folder:
-        places = {'bag': f'{folder}/bag', 'scenario': f'{folder}/scenario.yaml'}
-        Path(places['scenario']).write_text(SCENARIO, encoding='utf-8')
-        make = [sys.executable, '-c', START.format('simulate_bag'), places['bag'], '--duration', '20']
-        subprocess.run(make, check=True, stdout=subprocess.DEVNULL)
+        places = inputs(Path(folder), seconds=20)
         for program in (item for item in PROGRAMS if part in item.name):
             with feeding(program.fed):
                 for number in SIGNALS:

@@ -82,7 +82,7 @@ class Bench:
         self.said = {topic: ros.listen(kind, topic) for topic, kind in self.subject.says.items()}
         self.diagnostics = ros.listen(DiagnosticArray, '/diagnostics')
         self.writers = {topic: ros.publisher(kind, topic, DEEP) for topic, kind in self.subject.hears.items()}
-        self._samples = 0
+        self._samples = self.sent = 0
         self._echoes = ros.listen(Empty, 'echo')
         self._echo = ros.publisher(Empty, 'echo')
 
@@ -96,6 +96,7 @@ class Bench:
                 self._samples += 1
                 message.header.stamp = time_message(LATER_NS + self._samples * STEP_NS)
             self.writers[topic].publish(message)
+            self.sent += 1
         before = len(self._echoes)
         self._echo.publish(Empty())
         self.ros.wait(lambda: len(self._echoes) > before, what='the node to take what was sent')

@@ -1,0 +1,57 @@
+"""A signal at any moment: a few moments here, every program at many in ``benchmarks/ros_signals.py``."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks'))
+
+import ros_signals
+
+INT, TERM, KILL = ros_signals.SIGNALS
+
+
+@pytest.fixture(scope='module')
+def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Return a recording and a scenario for the programs that read them."""
+    return ros_signals.inputs(tmp_path_factory.mktemp('inputs'), seconds=5)
+
+
+@pytest.fixture(autouse=True)
+def interrupts(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Let Ctrl-C through to what is started, though the tests may run in the background."""
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + (os.getpid() + 70) % 100))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize(('name', 'number', 'delay'), [
+    ('plant_simulator', INT, 0.4),  # modules are imported
+    ('plant_simulator', TERM, 2.5),
+    ('excitation', INT, 1.0),
+    ('capture_trigger', INT, 1.6),
+    ('rpbsid_identifier', INT, 1.2),  # kernels are loaded
+    ('rpbsid_identifier', TERM, 3.5),
+    ('rpbsid_identifier', KILL, 3.5),
+    ('payload_controller', INT, 1.2),
+    ('payload_adapter', TERM, 1.2),
+    ('simulate_bag', INT, 1.4),
+    ('simulate_bag', KILL, 1.4),
+    ('identify_bag', TERM, 1.2),
+    ('identify_bag to a bag', INT, 1.4),
+    ('monte_carlo', TERM, 2.5),
+    ('monte_carlo', KILL, 2.5),
+])
+def test_a_signal_ends_a_program_cleanly_and_leaves_whole_files(
+        name: str, number: signal.Signals, delay: float, places: dict[str, str]) -> None:
+    (program,) = (item for item in ros_signals.PROGRAMS if item.name == name)
+    trial = ros_signals.attempt(program, number, delay, places)
+    assert trial.problem == ''
+    assert trial.took_s < 20.0
