@@ -59,6 +59,8 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
             return None
         root, step = kept.copy(), np.empty(k)
         condition(H, root, kept.T @ gradient - zeta, step)
+        if not np.all(np.isfinite(step)):
+            return None
         zeta = zeta + step
         theta = moved(old.theta, old.P @ (kept @ zeta), old.structure)
     covariance, end = run(U, Y, theta)
