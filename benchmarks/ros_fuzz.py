@@ -2,7 +2,7 @@
 
 Hypothesis makes up messages (JointState, Header, Float64MultiArray, InertiaStamped; names, sizes, values and
 stamps at their extremes; bytes that are no message) and sends them over DDS to every real node that listens;
-the strategies are those of test/ros/test_fuzz.py, which runs a few. Memory is the resident set of this process
+the strategies are those of test/ros/test_fuzz.py, which runs a few. Memory is what this process holds
 after the first and after the last tenth of the examples. Use: ros_fuzz.py [EXAMPLES] [PART_OF_A_NAME]
 """
 

@@ -61,6 +61,8 @@ class SamplingState(NamedTuple):
     pending: tuple[Sample, ...] = ()
     counters: Counters = Counters()
     refusal: Refusal | None = None
+    doubtful: Sample | None = None
+    """A sample from far ahead, until the next one tells whether the clock was set or one stamp was wrong."""
 
     @property
     def dt(self) -> float:
@@ -114,6 +116,8 @@ _REPEATED = Refusal('repeated_stamp', 'header stamps do not advance',
                     'use a publisher that fills header.stamp with the time of each sample')
 _LATE = Refusal('late_stamp', 'a header stamp is older than the one before',
                 'publish in the order of the stamps')
+_AHEAD = Refusal('late_stamp', 'one header stamp was far ahead of those before and after it',
+                 'look at the clock of the publisher')
 
 
 def _refuse(state: SamplingState, refusal: Refusal) -> SamplingState:
@@ -133,6 +137,27 @@ def _fault(channels: Channels, record: JointRecord) -> Refusal | None:
 
 def _on_clock(config: IdentifierParameters, state: SamplingState, raw: Sample
               ) -> tuple[SamplingState, Sampled]:
+    """Place a sample; one from far ahead waits for the next, as a single wrong stamp must not cost all."""
+    held, last = state.doubtful, state.last_ns
+    if last is None or state.interval_count == 0:
+        return _placed(config, state, raw)
+    ahead = (raw.stamp_ns - last) * 1e-9
+    if held is None:
+        if ahead > config.max_time_jump:
+            return state._replace(doubtful=raw), NOTHING
+        return _placed(config, state, raw)
+    state = state._replace(doubtful=None)
+    if abs(ahead) <= config.max_time_jump:
+        return _placed(config, _refuse(state, _AHEAD), raw)
+    state, first = _placed(config, state, held)
+    state, second = _placed(config, state, raw)
+    if second.reset:
+        return state, second
+    return state, Sampled(first.samples + second.samples, first.reset)
+
+
+def _placed(config: IdentifierParameters, state: SamplingState, raw: Sample
+            ) -> tuple[SamplingState, Sampled]:
     """Place a sample by its stamp: repeated, late, a jump back, still learning, or the next one."""
     interval = None if state.last_ns is None else raw.stamp_ns - state.last_ns
     if interval == 0:

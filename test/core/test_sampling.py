@@ -57,6 +57,21 @@ def test_joints_are_matched_by_name_in_any_order_and_extra_joints_are_ignored() 
         assert (a.angles == b.angles).all()
 
 
+def test_one_stamp_from_far_ahead_costs_one_message() -> None:
+    wrong = replace(record(50), stamp_ns=record(50).stamp_ns + 10**11)
+    for after in ([], [record(49)]):  # the next may be one that was there before
+        state, samples, resets = drive([*map(record, range(50)), wrong, *after, *map(record, range(51, 100))])
+        assert (resets, state.counters.resets, len(samples)) == (0, 0, 99)
+        assert (state.counters.late_stamp, state.counters.repeated_stamp) == (1, len(after))
+        assert state.dt == 1e-3
+
+
+def test_a_clock_that_was_set_ahead_is_followed_after_one_sample() -> None:
+    state, samples, resets = drive([*map(record, range(50)), *(record(k + 10**6) for k in range(50))])
+    assert (resets, state.counters.accepted, state.counters.gaps, len(samples)) == (0, 100, 1, 100)
+    assert [sample.stamp_ns for sample in samples] == sorted(sample.stamp_ns for sample in samples)
+
+
 def test_a_bag_without_velocities_uses_displacements_only() -> None:
     state, samples, _ = drive([record(k, velocity=[]) for k in range(30)])
     assert state.outputs == ('link1_bend/position', 'link2_bend/position')

@@ -77,6 +77,19 @@ def test_samples_out_of_order_never_move_the_clock_back(ros: Ros) -> None:
     assert honest(believed(live), TRUTH)
 
 
+def test_one_stamp_from_far_ahead_does_not_cost_what_was_identified(ros: Ros) -> None:
+    live = Live(ros)
+    announce(ros, live)
+    samples = list(recording(1500))
+    samples[900] = replace(samples[900], stamp_ns=samples[900].stamp_ns + 10**12)
+    live.send(*samples[:899])
+    live.send(*samples[899:])
+    counters = live.node.state.counters
+    assert (counters.resets, counters.late_stamp, counters.gaps, counters.accepted) == (0, 1, 1, 1499)
+    assert believed(live).status is Status.TRACKING
+    assert honest(believed(live), TRUTH)
+
+
 def test_a_storm_of_nan_leaves_no_trace_but_its_count_and_a_gap(ros: Ros) -> None:
     live = Live(ros)
     samples = list(recording(1500))
@@ -121,8 +134,8 @@ def test_a_flood_is_taken_or_counted_as_lost_to_the_last_message(ros: Ros) -> No
     for sample in samples:  # as fast as the publisher can: several times the usual rate
         live.joint_states.publish(conversions.joint_state(sample))
     ros.wait(lambda: live.node.state.timeline and live.node.meter.idle_s() > 0.5, timeout=60.0)
-    first = samples[0]
-    live.send(replace(first, stamp_ns=START_NS + 5_000_000_000))
+    last = samples[-1]
+    live.send(replace(last, stamp_ns=last.stamp_ns + 1_000_000))
     node = live.node
     ros.wait(lambda: node.state.counters.received + node.losses.lost == 4001, what='every message')
     assert node.state.counters.accepted == node.state.counters.received
