@@ -25,12 +25,15 @@ class Core(NamedTuple):
     structured: structured.StructuredState | None
     angles: Array
     """The latest measured configuration: (2,) [rad], or (0,) when there is none."""
+    swept: Array
+    """What the configuration went through since the last event, see ``block_extraction.sweep``."""
 
 
 def init(config: IdentifierParameters) -> Core:
     """Start with nothing known. ``config.outputs`` are those the messages really carry."""
     wanted = config.payload_method == 'structured'
-    return Core(rpbsid.init(config), structured.init(config) if wanted else None, np.empty(0))
+    return Core(rpbsid.init(config), structured.init(config) if wanted else None, np.empty(0),
+                np.empty(0))
 
 
 def advance(config: IdentifierParameters, core: Core, samples: Sequence[Sample]) -> Core:
@@ -47,7 +50,8 @@ def advance(config: IdentifierParameters, core: Core, samples: Sequence[Sample])
     held = core.structured
     if held is not None:
         held = structured.advance(config, held, samples)
-    return Core(identifier, held, samples[-1].angles)
+    swept = block_extraction.sweep(config, core.swept, samples)
+    return Core(identifier, held, samples[-1].angles, swept)
 
 
 def event(config: IdentifierParameters, core: Core, event: CaptureEvent) -> Core:
@@ -55,7 +59,7 @@ def event(config: IdentifierParameters, core: Core, event: CaptureEvent) -> Core
     held = core.structured
     if held is not None:
         held = structured.event(config, held, event)
-    return core._replace(rpbsid=rpbsid.restart(config, core.rpbsid), structured=held)
+    return core._replace(rpbsid=rpbsid.restart(config, core.rpbsid), structured=held, swept=np.empty(0))
 
 
 def anew(config: IdentifierParameters, core: Core, events: Sequence[CaptureEvent]) -> Core:
@@ -93,7 +97,7 @@ def estimate(config: IdentifierParameters, core: Core, stamp_ns: int, dt: float,
     """Read model and modes out of the identifier, the costly part, and a payload that rests on the model."""
     found, without = _identified(config, core.rpbsid, dt)
     if config.payload_method == 'block' and found is not None:
-        payload = block_extraction.estimate(config, found, core.angles)
+        payload = block_extraction.estimate(config, found, core.angles, core.swept)
     if found is None:
         return Estimate(stamp_ns, without, None, (), payload, model_status=without)
     return Estimate(

@@ -125,7 +125,7 @@ def bound(case: Case, method: str) -> float | None:
 
 def scenario(case: Case, method: Method) -> Scenario:
     """Return the scenario of a case for one method."""
-    modes = 3 if case.model != 'linear' and method.name == 'structured' else 1
+    modes = 1 if case.model == 'linear' else 3
     identifier: dict[str, Any] = {f'arm.{name}': value for name, value in ARM.items()}
     identifier |= {'arm.modes': modes}
     identifier |= {'publish_rate': TRACK_RATE, 'model_rate': TRACK_RATE, 'payload.dynamics': 'linear',

@@ -132,7 +132,7 @@ def _with_block(config: IdentifierParameters, state: pipeline.State, now: Estima
         found = None
     if found is None:
         return replace(now, payload=None, status=now.model_status)
-    payload = block_extraction.estimate(config, found, core.angles)
+    payload = block_extraction.estimate(config, found, core.angles, core.swept)
     status = payload.status if found.status is Status.TRACKING else found.status
     return replace(now, payload=payload, status=status)
 

@@ -6,6 +6,7 @@ stiffness; h = 2 kappa modal coordinates; the state is [eta; eta'] with eta = [e
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,11 @@ from numpy.typing import NDArray
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
-from flexmanip_ros.payload import block_interval
+from flexmanip_ros.payload import block_interval, block_truncation
 from flexmanip_ros.payload.angles import chords
 from flexmanip_ros.payload.modal_basis import sensor_matrix
 from flexmanip_ros.plant.linearization import Blocks, blocks
-from flexmanip_ros.types import Array, Payload, Status
+from flexmanip_ros.types import Array, Payload, Sample, Status
 
 
 def extract(
@@ -45,22 +46,67 @@ def extract(
     return mass
 
 
-def estimate(config: IdentifierParameters, identified: Identified, angles: Array) -> Payload:
+NOWHERE: Array = np.empty(0)
+"""A sweep of which nothing is known."""
+
+
+def estimate(config: IdentifierParameters, identified: Identified, angles: Array, swept: Array = NOWHERE
+             ) -> Payload:
     """Return the payload of an identified model with its 95 % interval; never a NaN.
 
-    angles: (2,) measured, by the arm's convention. The interval comes from models drawn from the covariance
-    of the identified one (``block_interval``).
+    angles: (2,) measured, by the arm's convention; swept: from ``sweep``. The interval comes from models
+    drawn from the covariance of the identified one (``block_interval``), and reaches over what a model of
+    kappa modes at one configuration cannot know: further modes, and with a known M_b how the arm moved.
     """
     kappa = identified.model.order // 4
     seen = sensor_matrix(config, kappa) if identified.model.order == 4 * kappa else None
     if seen is None or angles.shape != (2,) or np.linalg.matrix_rank(seen[0]) < 2 * kappa:
         return block_interval.unknown(Status.UNOBSERVABLE)
-    empty = blocks(config.arm, working_point(config, angles), kappa=kappa)
+    theta = working_point(config, angles)
+    known = config.payload.known_coupling
+    empty = blocks(config.arm, theta, kappa=kappa)
 
     def mass_of(Ac: Array, Bc: Array) -> Array:
-        return masses(config.arm, empty, Ac, Bc, config.payload.known_coupling)
+        return masses(config.arm, empty, Ac, Bc, known)
 
-    return block_interval.payload(identified, *seen, mass_of)
+    def doubts_of(Ac: Array, Bc: Array, mass: float) -> list[tuple[float, float]]:
+        excess = _excess(config, theta, kappa, mass_of, mass)
+        moved = [0.0]
+        for turn in np.arccos(swept):  # the blocks depend on the angle between the links alone
+            there = blocks(config.arm, np.array([0.0, turn]), kappa=kappa)
+            moved.append(float(masses(config.arm, there, Ac, Bc, known)) - mass)
+        return [(min(0.0, -2.0 * excess), max(0.0, -2.0 * excess)), (min(moved), max(moved))]
+
+    return block_interval.payload(identified, *seen, mass_of, doubts_of)
+
+
+def sweep(config: IdentifierParameters, before: Array, samples: Sequence[Sample]) -> Array:
+    """Return the smallest and largest cosine between the links (2,), after more samples.
+
+    Kept only where it matters: M_b is taken from the arm (it varies with that cosine) and the arm moves.
+    """
+    payload = config.payload
+    if (config.payload_method != 'block' or not payload.known_coupling or payload.dynamics == 'linear'
+            or samples[0].angles.shape != (2,)):
+        return before
+    theta = np.array([chords(config.arm, sample.angles) for sample in samples])
+    cosines = np.concatenate([before, np.cos(theta[:, 1] - theta[:, 0])])
+    return np.array([cosines.min(), cosines.max()])
+
+
+def _excess(config: IdentifierParameters, theta: Array, kappa: int, mass_of: Callable[[Array, Array], Array],
+            read: float) -> float:
+    """Return how much of the mass that was read is none, by the modes that the model has not [kg]."""
+    excess = 0.0
+    if config.arm.modes <= kappa:
+        return excess
+    for _ in range(block_truncation.STEPS):
+        payload = max(read - excess, 0.0)
+        model = block_truncation.truncated(config, theta, payload, kappa)
+        if model is None:
+            return 0.0
+        excess = float(mass_of(*model)) - payload
+    return excess
 
 
 def working_point(config: IdentifierParameters, angles: Array) -> Array:

@@ -35,24 +35,33 @@ def unknown(status: Status, consistency: float = 1.0) -> Payload:
 
 def payload(
     identified: Identified, S: Array, rates: tuple[bool, ...], mass_of: Callable[[Array, Array], Array],
+    doubts_of: Callable[[Array, Array, float], list[tuple[float, float]]],
 ) -> Payload:
-    """Return the payload; S, rates: what the outputs see; mass_of: payload of modal (Ac, Bc)."""
+    """Return the payload; S, rates: what the outputs see; mass_of: payload of modal (Ac, Bc).
+
+    doubts_of: how far below (negative) and above the mass [kg] of modal (Ac, Bc) the payload may be for
+    reasons that are not noise. The interval reaches over them; where one is larger than the noise, the status
+    says INCONSISTENT.
+    """
     model = identified.model
     power = identified.innovation_power if math.isfinite(identified.innovation_power) else 1.0
     if not (np.isfinite(model.A).all() and np.isfinite(model.B).all() and np.isfinite(model.C).all()):
         return unknown(Status.DIVERGED)
     try:
         Ac, Bc = continuous(model)
-        mass = float(mass_of(*to_modal(Ac, Bc, model.C, S, rates)))
+        modal = to_modal(Ac, Bc, model.C, S, rates)
+        mass = float(mass_of(*modal))
         directions = continuous_spread(identified)
         around = mass_of(*_modal(Ac, Bc, model.C, [STEP * part for part in directions], S, rates))
         std = float(np.linalg.norm((around - mass) / STEP))
         normal = draws(directions[0].shape[0])
         drawn = mass_of(*_modal(
             Ac, Bc, model.C, [np.tensordot(normal, part, axes=1) for part in directions], S, rates))
+        doubts = doubts_of(*modal, mass) if math.isfinite(mass) else []
     except (np.linalg.LinAlgError, ModelError):
         return unknown(Status.ILL_CONDITIONED, power)
-    if not (math.isfinite(mass) and math.isfinite(std)) or directions[0].shape[0] == 0:
+    reach = max((above - below for below, above in doubts), default=0.0)
+    if not all(map(math.isfinite, (mass, std, reach))) or directions[0].shape[0] == 0:
         return unknown(Status.ILL_CONDITIONED, power)
     # a fit that is worse than its noise has a wider interval by as much
     widening = math.sqrt(max(1.0, power))
@@ -63,12 +72,17 @@ def payload(
     status = identified.status
     if status is Status.TRACKING and widening * std > abs(mass):
         status = Status.POORLY_EXCITED
+    if status is Status.TRACKING and reach > upper - lower:
+        status = Status.INCONSISTENT
+    lower += sum(below for below, _ in doubts)
+    upper += sum(above for _, above in doubts)
     if mass < 0.0:
         # No payload is negative; an interval cut off at 0 would look the surer the further the model is off.
-        if upper < 0.0 and status is Status.TRACKING:
-            status = Status.INCONSISTENT
+        if status is Status.TRACKING:
+            status = Status.INCONSISTENT if upper < 0.0 else Status.POORLY_EXCITED
         upper = max(upper, widening * QUANTILE * std, -mass if upper < 0.0 else 0.0)
-    return Payload(max(mass, 0.0), widening * std, max(lower, 0.0), max(upper, 0.0), power, status)
+    std = math.hypot(widening * std, 0.5 * reach)
+    return Payload(max(mass, 0.0), std, max(lower, 0.0), max(upper, 0.0), power, status)
 
 
 def continuous(model: StateSpace) -> tuple[Array, Array]:

@@ -10,12 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexmanip_ros.errors import ModelError
+from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
-from flexmanip_ros.payload.block_extraction import estimate, extract
+from flexmanip_ros.payload import block_interval, block_truncation
+from flexmanip_ros.payload.block_extraction import estimate, extract, sweep
 from flexmanip_ros.payload.modal_basis import to_modal
 from flexmanip_ros.plant.linearization import discretize, vibration_model
-from flexmanip_ros.types import StateSpace, Status
+from flexmanip_ros.types import Sample, StateSpace, Status
 
 CONFIGURATIONS = [(60.0, 45.0), (0.0, 0.0), (45.0, 0.0), (-45.0, 45.0)]
 
@@ -89,3 +91,65 @@ def test_a_mass_below_zero_is_never_a_narrow_interval_at_zero(tip_mass, noise):
     if noise < 1e-6:
         assert found.status is Status.INCONSISTENT
         assert found.upper == pytest.approx(missing, rel=1e-3)
+
+
+def _sharp(model, order=4):
+    """A model identified almost without noise: (Ac, Bc) of two modes, all states measured."""
+    A, B = discretize(*model, 1e-3)
+    exact = StateSpace(A, B, np.eye(order), np.zeros((order, 2)), np.zeros((order, order)), 1e-3)
+    spread = np.zeros((order * (2 * order + 2) + 2 * order + order * order, 16))
+    spread[:16] = 1e-9 * np.eye(16)
+    return Identified(exact, spread, np.ones(order), 1.0, 1.0, 1.0, Status.TRACKING, np.eye(order),
+                      known_basis=True)
+
+
+def _config(**changes):
+    return configure(IdentifierParameters, {
+        'payload_method': 'block', 'arm.angle_convention': 'chord', 'arm.modes': 1,
+        **{name.replace('__', '.'): value for name, value in changes.items()}})
+
+
+@pytest.mark.parametrize('known', [False, True])
+@pytest.mark.parametrize('convention', ['joint', 'paper'])
+def test_modes_that_the_model_has_not_widen_the_interval_to_hold_the_payload(convention, known):
+    theta = np.radians([60.0, 45.0])
+    config = _config(arm__modes=5, arm__torque_convention=convention, payload__known_coupling=known)
+    seen = block_truncation.truncated(config, theta, 20.0, 1)
+    found = estimate(config, _sharp(seen), theta)
+    assert found.mass > 20.01  # what two modes of ten make of 20 kg
+    assert found.lower <= 20.0 <= found.upper
+    assert found.status is Status.INCONSISTENT
+    blind = estimate(replace(config, arm=replace(config.arm, modes=1)), _sharp(seen), theta)
+    assert blind.lower > 20.0
+
+
+def test_a_linear_plant_keeps_its_working_point_whatever_the_angles_read():
+    theta, drifted = np.radians([60.0, 45.0]), np.radians([63.0, 42.0])
+    model = _sharp(vibration_model(_config().arm, theta, 20.0, 1))
+    still = _config(payload__known_coupling=True, payload__dynamics='linear',
+                    payload__working_point=theta.tolist())
+    assert estimate(still, model, drifted).mass == pytest.approx(20.0, abs=1e-4)
+    moving = _config(payload__known_coupling=True)
+    assert abs(estimate(moving, model, drifted).mass - 20.0) > 0.5
+
+
+def test_known_coupling_doubts_as_far_as_the_arm_moved():
+    path = np.radians([[60.0, 45.0], [61.5, 43.5], [63.0, 42.0]])
+    config = _config(payload__known_coupling=True)
+    model = _sharp(vibration_model(config.arm, path[0], 20.0, 1))
+    samples = [Sample(k, np.zeros(2), np.zeros(4), angles) for k, angles in enumerate(path)]
+    swept = sweep(config, np.empty(0), samples)
+    np.testing.assert_allclose(swept, [np.cos(np.radians(21.0)), np.cos(np.radians(15.0))])
+    np.testing.assert_array_equal(swept, sweep(config, sweep(config, np.empty(0), samples[:1]), samples[1:]))
+    found = estimate(config, model, path[-1], swept)
+    assert found.lower <= 20.0 + 1e-6
+    assert found.upper >= 20.0 - 1e-6
+    assert found.status is Status.INCONSISTENT
+
+
+def test_the_logarithm_by_eigenvectors_is_the_matrix_logarithm():
+    model = _sharp(vibration_model(_config(arm__damping_ratio=0.01).arm, np.zeros(2), 50.0, 1)).model
+    Ac, Bc = block_interval.continuous(model)
+    exact = to_continuous(model.A, model.B, model.dt)
+    np.testing.assert_allclose(Ac, exact[0], atol=1e-9 * np.abs(exact[0]).max())
+    np.testing.assert_allclose(Bc, exact[1], atol=1e-9 * np.abs(exact[1]).max())
