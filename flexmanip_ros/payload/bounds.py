@@ -95,14 +95,16 @@ def nonlinear(
     if model is None:
         raise ModelError('the configured signals cannot give a payload', 'name both torques and both angles')
     n = model.motion.q.size
-    m = mem.memory(2 * n + PARAMETERS, len(model.roles))
+    m = mem.memory(2 * n + model.motion.G.shape[1], len(model.roles))
     start.first(config, model, m, np.zeros(len(model.roles)))
     m.x[:2] = theta
     m.x[n:n + 2] = 0.0 if rates is None else rates
-    m.x[2 * n] = np.log(max(payload, 1e-9) / model.motion.scale)
-    m.S[2 * n, 2 * n] = 10.0 * start.PAYLOAD_STD
+    p = m.x.size - PARAMETERS
+    m.S[2 * n:p] = 0.0  # the structure is known, of every mode
+    m.x[p] = np.log(max(payload, 1e-9) / model.motion.scale)
+    m.S[p, p] = 10.0 * start.PAYLOAD_STD
     if config.payload.rotary_inertia:
-        m.S[2 * n + 5, 2 * n + 5] = start.PAYLOAD_STD
+        m.S[-1, -1] = start.PAYLOAD_STD
     start.freeze(config, model, theta)
     seen = sensors(config, model, dt, np.zeros(m.x.size))
     information = np.zeros((m.x.size, m.x.size))
@@ -114,8 +116,8 @@ def nonlinear(
         if not predict(model.motion, m.x, m.S, efforts[k], dt, True):
             raise ModelError('the arm diverges under these torques', 'use smaller torques')
         if k + 1 in counts:
-            spread = np.linalg.solve(np.eye(m.x.size) + information, m.S[2 * n])
-            found.append(payload * float(np.sqrt(m.S[2 * n] @ spread)))
+            spread = np.linalg.solve(np.eye(m.x.size) + information, m.S[p])
+            found.append(payload * float(np.sqrt(m.S[p] @ spread)))
     return np.array(found)
 
 

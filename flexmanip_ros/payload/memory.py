@@ -18,7 +18,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT = range(8)
 # elements of ``count``
 HELD, STORED, PASSED, PASSING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN = range(11)
 # elements of ``score``
-MOVE, VARIANCE, DRIFT, NOW, SEEMED = range(5)
+MOVE, VARIANCE, DRIFT, NOW, SEEMED, BEYOND = range(6)
 
 
 class Memory(NamedTuple):
@@ -35,8 +35,9 @@ class Memory(NamedTuple):
     counts: NDArray[np.int64]
     """(11,) counters."""
     score: Array
-    """(5,) move of the payload in this batch, its variance; mean squared normalised move; time to diffuse;
-    what the arm seemed to hold before the event, when it was empty, in standard deviations."""
+    """(6,) move of the payload in this batch, its variance; mean squared normalised move; time to diffuse;
+    what the arm seemed to hold before the event, when it was empty, in standard deviations, then in those
+    that the error to reckon with in its inertia adds to."""
     x0: Array
     """(nx,) mean just after the last event."""
     S0: Array
@@ -64,7 +65,7 @@ def memory(nx: int, m: int) -> Memory:
     return Memory(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 8)), recent=np.zeros((m, 4)),
         counts=np.zeros(11, dtype=np.int64),
-        score=np.zeros(5), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx),
+        score=np.zeros(6), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx),
         samples=np.zeros((HORIZON, 3 + m)), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
         g=np.zeros(nx), innovation=np.zeros((m, 2)), power=np.ones(m))
 

@@ -1,8 +1,9 @@
 """Compiled motion of the structured filter: the arm's equations carry the mean, their Jacobian the spread.
 
-The state is [q (n), qd (n), parameters (6)], parameters = [payload, ln stiffness factor 1, 2, damping
-ratio 1, 2, ln rotary inertia]. The spread is a square root S (nx, nx), covariance = S S'; it moves as
-S <- F S.
+The state is [q (n), qd (n), unevenness (n - 4), parameters (6)], parameters = [payload, ln stiffness factor
+1, 2, damping ratio 1, 2, ln rotary inertia]; unevenness = how much stiffer each mode beyond a link's first is
+than that factor says (logarithm), link 1, then link 2. The spread is a square root S (nx, nx), covariance =
+S S'; it moves as S <- F S.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from flexmanip_ros.plant.manipulator import Manipulator, Workspace
 
 PARAMETERS = 6
-"""Payload, two stiffness factors (logarithm), two damping ratios, rotary inertia (logarithm)."""
+"""Last states: payload, two stiffness factors (logarithm), two damping ratios, rotary inertia (logarithm)."""
 SERIES = 12
 """Terms of the motion's exponential: 1e-9 of the fastest mode at one radian a step."""
 SPREAD_SERIES = 6
@@ -77,15 +78,19 @@ def set_parameters(motion: Motion, x: Array, held: bool) -> None:
     """Write payload, stiffness and damping of the state into the arm."""
     n = motion.q.size
     k = (n - 2) // 2
-    motion.payload[0] = payload_mass(motion, x[2 * n], held)
+    p = x.size - PARAMETERS
+    motion.payload[0] = payload_mass(motion, x[p], held)
     motion.payload[1] = 0.0
     if held and motion.inertia > 0.0:
-        motion.payload[1] = motion.inertia * np.exp(min(x[2 * n + 5], 12.0))
+        motion.payload[1] = motion.inertia * np.exp(min(x[p + 5], 12.0))
     for link in range(2):
-        factor_EI = np.exp(x[2 * n + 1 + link])
-        ratio = x[2 * n + 3 + link]
-        for j in range(2 + link * k, 2 + (link + 1) * k):
-            motion.arm.stiffness[j] = motion.stiffness[j] * factor_EI
+        ratio = x[p + 3 + link]
+        for mode in range(k):
+            j = 2 + link * k + mode
+            factor_EI = x[p + 1 + link]
+            if mode > 0:
+                factor_EI += x[2 * n + link * (k - 1) + mode - 1]
+            motion.arm.stiffness[j] = motion.stiffness[j] * np.exp(factor_EI)
             motion.arm.damping[j] = motion.damping[j] * ratio
 
 
@@ -111,9 +116,10 @@ def accelerate(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array) -
 
 @kernel
 def linearize(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array, held: bool) -> bool:
-    """Fill qdd and its derivatives: motion.dq, motion.dqd (n, n) and motion.G (n, 6) by the parameters."""
+    """Fill qdd and its derivatives: motion.dq, motion.dqd (n, n), motion.G by unevenness and parameters."""
     n = q.size
     k = (n - 2) // 2
+    uneven = motion.G.shape[1] - PARAMETERS
     arm, M, a, G = motion.arm, motion.work.M, motion.a, motion.G
     if motion.frozen:
         if not accelerate(motion, q, qd, effort, qdd):
@@ -141,17 +147,23 @@ def linearize(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array, he
         return False
     rate = motion.payload[0] if held else 1.0
     for r in range(n):
-        G[r, 0] = motion.dp[r, 0] * rate
-        G[r, 5] = motion.dp[r, 1] * motion.payload[1]
+        for c in range(1, 5):
+            G[r, uneven + c] = 0.0
+        G[r, uneven] = motion.dp[r, 0] * rate
+        G[r, uneven + 5] = motion.dp[r, 1] * motion.payload[1]
     for link in range(2):
-        for part in range(2):
+        for mode in range(k):
+            j = 2 + link * k + mode
             for r in range(n):
                 a[r] = 0.0
-            for j in range(2 + link * k, 2 + (link + 1) * k):
-                a[j] = -arm.stiffness[j] * q[j] if part == 0 else -motion.damping[j] * qd[j]
+            a[j] = 1.0
             solve(M, a)
             for r in range(n):
-                G[r, 1 + 2 * part + link] = a[r]
+                by_stiffness = -arm.stiffness[j] * q[j] * a[r]
+                G[r, uneven + 1 + link] += by_stiffness
+                G[r, uneven + 3 + link] -= motion.damping[j] * qd[j] * a[r]
+                if mode > 0:
+                    G[r, link * (k - 1) + mode - 1] = by_stiffness
     return True
 
 
@@ -255,7 +267,7 @@ def spread(motion: Motion, S: Array, h: float) -> None:
                     Y[n + i, c] += a * X[j, c] + b * X[n + j, c]
         if order == 1:
             for i in range(n):
-                for p in range(PARAMETERS):
+                for p in range(motion.G.shape[1]):
                     g = motion.G[i, p]
                     for c in range(nx):
                         Y[n + i, c] += g * S[2 * n + p, c]

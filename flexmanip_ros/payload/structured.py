@@ -15,7 +15,7 @@ from flexmanip_ros.payload import memory as mem
 from flexmanip_ros.payload import structured_start as start
 from flexmanip_ros.payload.measurement_kernel import Sensors
 from flexmanip_ros.payload.motion_kernel import PARAMETERS, predict
-from flexmanip_ros.payload.structured_judgement import judge
+from flexmanip_ros.payload.structured_judgement import inexact, judge
 from flexmanip_ros.payload.structured_kernel import advance as run
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload, Sample
@@ -106,12 +106,12 @@ def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: Eve
     opened = np.zeros((m.x.size, 2))
     if kind is EventKind.CAPTURE:
         if not held:
-            _forget_payload(m)  # the arm was empty: what it seemed to hold were its errors
+            _forget_payload(config, model, m)  # the arm was empty: what it seemed to hold were its errors
         opened[payload, 0] = start.PAYLOAD_STD
         opened[-1, 1] = start.PAYLOAD_STD if config.payload.rotary_inertia else 0.0
         m.counts[mem.HELD] = 1
     else:
-        _forget_payload(m)
+        _forget_payload(config, model, m)
         opened[payload, 0] = start.EMPTY_STD * model.motion.scale + 0.3 * before
         m.counts[mem.HELD] = 0
     m.S[:] = start.widen(m.S, np.hstack([columns, opened]))
@@ -119,7 +119,7 @@ def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: Eve
     return before
 
 
-def _forget_payload(m: mem.Memory) -> None:
+def _forget_payload(config: IdentifierParameters, model: Model, m: mem.Memory) -> None:
     """Condition an empty arm on holding exactly nothing; drop what is known of a payload that is let go."""
     payload = m.x.size - PARAMETERS
     if not m.counts[mem.HELD]:
@@ -128,6 +128,7 @@ def _forget_payload(m: mem.Memory) -> None:
         if square > 0.0:
             if m.counts[mem.SINCE_EVENT] > mem.HORIZON:
                 m.score[mem.SEEMED] = m.x[payload] / np.sqrt(square)
+                m.score[mem.BEYOND] = m.x[payload] / np.hypot(np.sqrt(square), inexact(config, model, m, 0.0))
             gain = m.S @ f / square
             m.x[:] -= gain * m.x[payload]
             m.S[:] -= np.outer(gain, f)
@@ -159,7 +160,7 @@ def _begin(config: IdentifierParameters, state: StructuredState) -> StructuredSt
     Y = measurements(model, samples)
     steps = np.diff([sample.stamp_ns for sample in samples]) * 1e-9
     dt = float(np.median(steps))
-    m = mem.memory(2 * model.motion.q.size + PARAMETERS, len(model.roles))
+    m = mem.memory(2 * model.motion.q.size + model.motion.G.shape[1], len(model.roles))
     m.noise[:] = start.noise(model, Y)
     start.first(config, model, m, Y[0])
     start.freeze(config, model, np.mean([sample.angles for sample in samples], axis=0))

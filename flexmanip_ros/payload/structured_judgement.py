@@ -24,7 +24,7 @@ FEW = 50
 POWER_LIMIT = 2.0
 """Innovation power over white noise beyond which the model does not fit."""
 WIDENING_LIMIT = 4.0
-"""Factor on the standard deviation beyond which the model does not fit."""
+"""Factor on the standard deviation, the model error apart, beyond which the model does not fit."""
 SEEMED_FREE = 2.0
 """Standard deviations that an empty arm may seem to hold without a doubt of the model."""
 SETTLED = 1000
@@ -41,21 +41,22 @@ def judge(config: IdentifierParameters, model: Model | None, m: mem.Memory | Non
     scale = model.motion.scale
     held = bool(m.counts[mem.HELD])
     consistency = misfit(model, m)
-    widening = math.sqrt(drift(m)) * max(1.0, abs(float(m.score[mem.SEEMED])) / SEEMED_FREE)
-    widening *= math.sqrt(max(1.0, consistency / POWER_LIMIT))
+    restless = math.sqrt(drift(m) * max(1.0, consistency / POWER_LIMIT))
+    widening, doubt = (restless * max(1.0, abs(float(m.score[seemed])) / SEEMED_FREE)
+                       for seemed in (mem.SEEMED, mem.BEYOND))
     std = widening * float(np.sqrt(m.S[state] @ m.S[state]))
     status = Status.TRACKING
-    if consistency > POWER_LIMIT or widening > WIDENING_LIMIT:
+    if consistency > POWER_LIMIT or doubt > WIDENING_LIMIT:
         status = Status.INCONSISTENT
     if m.counts[mem.SINCE_EVENT] < FEW:
         status = Status.WARMING_UP
     if restarts and m.counts[mem.SEEN] < SETTLED:
         status = Status.DIVERGED
     mass = float(scale * np.exp(min(m.x[state], 12.0))) if held else 0.0
-    inexact = config.payload.model_error * (mass + scale) if not exact(m) else 0.0
+    misjudged = inexact(config, model, m, mass)
     if not held:
-        return empty(float(m.x[state]), math.hypot(std, inexact), consistency, status)
-    std = math.hypot(std, inexact / mass)
+        return empty(float(m.x[state]), math.hypot(std, misjudged), consistency, status)
+    std = math.hypot(std, misjudged / mass)
     if std > UNKNOWN_STD and status is Status.TRACKING:
         status = Status.POORLY_EXCITED
     lower = max(0.0, mass * (1.0 - QUANTILE * std))
@@ -95,6 +96,11 @@ def drift(m: mem.Memory) -> float:
     if batches == 0:
         return 1.0
     return max(1.0, float(m.score[mem.DRIFT]) - 2.0 * math.sqrt(2.0 / batches))
+
+
+def inexact(config: IdentifierParameters, model: Model, m: mem.Memory, mass: float) -> float:
+    """Deviation [kg] of a payload by the error to reckon with in the arm's inertia; 0 for an exact arm."""
+    return 0.0 if exact(m) else config.payload.model_error * (mass + model.motion.scale)
 
 
 def exact(m: mem.Memory) -> bool:

@@ -52,7 +52,8 @@ def motion(config: IdentifierParameters) -> Motion:
     """Allocate the arm for the compiled functions; its mass matrices are set at the working point later."""
     nominal = manipulator(config.arm)
     n = 2 + 2 * nominal.kappa
-    nx = 2 * n + PARAMETERS
+    constants = n - 4 + PARAMETERS
+    nx = 2 * n + constants
     unit = manipulator(replace(config.arm, damping_ratio=0.5)).damping / 0.5
     arm = nominal._replace(stiffness=nominal.stiffness.copy(), damping=nominal.damping.copy())
     lightest = config.arm.tip_mass + config.arm.linear_density[1] * config.arm.link_length[1] / 3
@@ -66,7 +67,7 @@ def motion(config: IdentifierParameters) -> Motion:
         scale=lightest, least=-0.5 * lightest, substeps=STEP_ANGLE / fastest, payload=np.zeros(4),
         a=np.zeros(n), q=np.zeros(n), k=np.zeros((8, n)), dq=np.zeros((n, n)), dqd=np.zeros((n, n)),
         dp=np.zeros((n, 4)),
-        G=np.zeros((n, PARAMETERS)), X=np.zeros((2 * n, nx)), Y=np.zeros((2 * n, nx)))
+        G=np.zeros((n, constants)), X=np.zeros((2 * n, nx)), Y=np.zeros((2 * n, nx)))
 
 
 def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Array) -> Sensors:

@@ -7,7 +7,7 @@ import numpy as np
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import memory as mem
 from flexmanip_ros.payload.angles import chords
-from flexmanip_ros.payload.motion_kernel import set_parameters
+from flexmanip_ros.payload.motion_kernel import PARAMETERS, set_parameters
 from flexmanip_ros.payload.signals import Quantity
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.plant.capture import body_jacobian
@@ -26,7 +26,7 @@ BEND_STD = 0.01
 """Bending over the length of the link before the first sample."""
 OTHER_JUMP = 0.3
 """Part of the rate jump at a capture that the rigid impulse at the tip does not explain."""
-RATE_NOISE = 100.0
+RATE_NOISE = 10.0
 """Variance of rates over their white noise before they are known: rates show what the modes left out do."""
 FLOORS = {Quantity.ANGLE: 1e-6, Quantity.ANGLE_RATE: 1e-5, Quantity.BEND: 1e-7, Quantity.BEND_RATE: 1e-6}
 """Least standard deviations of a sensor [rad, rad/s, m, m/s]: no signal is exact."""
@@ -59,7 +59,8 @@ def first(config: IdentifierParameters, model: Model, m: mem.Memory, y: Array) -
             shape = model.motion.arm.output[2 + role.link, 2 + role.link * k]
             m.x[2 + role.link * k] = y[i] * shape / (shape ** 2 + 0.1)
     m.x[:2] = chords(config.arm, angles)
-    m.x[2 * n + 3:2 * n + 5] = config.arm.damping_ratio
+    p = m.x.size - PARAMETERS
+    m.x[p + 3:p + 5] = config.arm.damping_ratio
     std = np.zeros(m.x.size)
     std[:2], std[n:n + 2] = ANGLE_STD, RATE_STD
     for link, (L, EI, rho) in enumerate(zip(config.arm.link_length, config.arm.bending_stiffness,
@@ -69,9 +70,12 @@ def first(config: IdentifierParameters, model: Model, m: mem.Memory, y: Array) -
         std[part] = BEND_STD * L / j ** 2
         # a mode's rate is its bending times its frequency, which grows as j^2
         std[n + part.start:n + part.stop] = BEND_STD * L * (np.pi / L) ** 2 * np.sqrt(EI / rho)
-    std[2 * n] = EMPTY_STD * model.motion.scale
-    std[2 * n + 1:2 * n + 3] = max(config.payload.stiffness_std, CERTAIN)
-    std[2 * n + 3:2 * n + 5] = max(config.payload.damping_std, CERTAIN)
+    std[p] = EMPTY_STD * model.motion.scale
+    # shear, rotary inertia and coarse elements all move a mode the farther the higher it is, as j^2 or faster
+    uneven = config.payload.model_error * (np.arange(2, k + 1) ** 2 - 1) / 3
+    std[2 * n:p] = np.maximum(np.tile(uneven, 2), CERTAIN)
+    std[p + 1:p + 3] = max(config.payload.stiffness_std, CERTAIN)
+    std[p + 3:p + 5] = max(config.payload.damping_std, CERTAIN)
     m.S[:] = np.diag(std)
 
 
@@ -123,7 +127,9 @@ def diffusion(config: IdentifierParameters, model: Model, m: mem.Memory) -> Arra
     # a rate is then forgotten over T: what it gains in T equals what T seconds of samples tell of it
     gained[n:n + 2] = 1e-4 / T
     gained[n + 2:2 * n] = 1e-5 / T * np.array(config.arm.link_length).max()
-    gained[2 * n] = (1e-4 if m.counts[mem.HELD] else 1e-3) / T
-    gained[2 * n + 1:2 * n + 5] = 1e-4 / T
-    gained[2 * n + 5] = 1e-3 / T if config.payload.rotary_inertia else 0.0
+    p = m.x.size - PARAMETERS
+    gained[2 * n:p] = 1e-4 / T
+    gained[p] = (1e-4 if m.counts[mem.HELD] else 1e-3) / T
+    gained[p + 1:p + 5] = 1e-4 / T
+    gained[p + 5] = 1e-3 / T if config.payload.rotary_inertia else 0.0
     return gained

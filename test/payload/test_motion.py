@@ -23,7 +23,7 @@ def arm():
 def bent(arm, n: int) -> np.ndarray:
     """A bent arm in motion, holding something."""
     rng = np.random.default_rng(0)
-    x = np.zeros(2 * n + motion_kernel.PARAMETERS)
+    x = np.zeros(2 * n + arm.G.shape[1])
     x[:2], x[n:n + 2] = (1.0, 0.6), (0.3, -0.4)
     x[2:n] = rng.normal(size=n - 2) * np.tile([5e-3, 5e-4, 1e-4], 2)
     x[n + 2:2 * n] = rng.normal(size=n - 2) * np.tile([0.5, 0.2, 0.1], 2)
@@ -77,3 +77,19 @@ def test_the_linearisation_is_the_derivative_of_the_motion(arm):
         motion_kernel.accelerate(arm, down[:n].copy(), down[n:].copy(), TORQUE, low)
         given = dq[:, i] if i < n else dqd[:, i - n]
         np.testing.assert_allclose((high - low) / 2e-6, given, rtol=1e-5, atol=1e-6 * np.abs(given).max())
+
+
+def test_the_derivatives_by_stiffness_and_unevenness_are_those_of_the_motion(arm):
+    n = arm.q.size
+    x = bent(arm, n)
+    qdd, low, high = np.zeros(n), np.zeros(n), np.zeros(n)
+    assert motion_kernel.linearize(arm, x[:n].copy(), x[n:2 * n].copy(), TORQUE, qdd, True)
+    G = arm.G.copy()
+    for c in range(G.shape[1]):
+        up, down = x.copy(), x.copy()
+        up[2 * n + c] += 1e-5
+        down[2 * n + c] -= 1e-5
+        for state, acceleration in ((up, high), (down, low)):
+            motion_kernel.set_parameters(arm, state, True)
+            motion_kernel.accelerate(arm, x[:n].copy(), x[n:2 * n].copy(), TORQUE, acceleration)
+        np.testing.assert_allclose((high - low) / 2e-5, G[:, c], rtol=1e-4, atol=1e-6 * np.abs(G).max())

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from recording import ARM, BENDS, RATES, config, event, record
 
-from flexmanip_ros.parameters import PayloadParameters
+from flexmanip_ros.parameters import ArmParameters, PayloadParameters
 from flexmanip_ros.payload import structured
 from flexmanip_ros.types import EventKind, Status
 
@@ -110,6 +110,25 @@ def test_stiffness_wrong_by_three_per_cent_costs_less_than_one_per_cent():
     found = structured.estimate(config(wrong), run(config(wrong), samples, (event(2.0),)))
     assert found.mass == pytest.approx(20.0, rel=0.01)
     assert found.lower < 20.0 < found.upper
+
+
+FINITE_ELEMENT = {'torque_convention': 'paper', 'angle_convention': 'chord', 'shortening': False,
+                  'slope_correction': False, 'modes': 3}
+
+
+@pytest.mark.parametrize(('damping', 'elements', 'payload', 'degrees', 'seed'), [
+    (0.0, 10, 20.0, (45.0, 0.0), 0), (0.0, 10, 20.0, (45.0, 0.0), 1), (0.0, 10, 5.0, (60.0, 45.0), 2),
+    (0.0, 4, 100.0, (45.0, 0.0), 3), (0.003, 10, 20.0, (45.0, 0.0), 4)])
+def test_modes_that_the_model_has_a_little_wrong_do_not_move_the_payload(
+        damping, elements, payload, degrees, seed):
+    arm = ArmParameters(damping_ratio=damping, **FINITE_ELEMENT)
+    samples = record(5.0, (event(3.0),), degrees, payload, arm=arm, seed=seed, model='finite_element',
+                     elements=elements, capture_impact='continuous')
+    settings = config(arm, payload=PayloadParameters(dynamics='linear'))
+    found = structured.estimate(settings, run(settings, samples, (event(3.0),)))
+    assert found.mass == pytest.approx(payload, rel=0.003)
+    assert found.lower < payload < found.upper
+    assert found.status is Status.TRACKING
 
 
 def test_a_wrong_arm_is_found_out_and_the_truth_stays_inside():
