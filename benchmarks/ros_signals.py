@@ -112,7 +112,8 @@ PROGRAMS = (
             lambda folder, killed: recording(folder / 'bag', True)),  # it holds no joint states
     Program('monte_carlo', 'monte_carlo',
             ('{scenario}', '--runs', '6', '--workers', '1', '--output', '{out}/study.csv'), 10.0, rows),
-    Program('reproduce_paper', 'reproduce_paper', ('{out}/paper',), 5.0),
+    Program('reproduce_paper', 'reproduce_paper', (
+        '--runs', '1', '--case', 'payload_20', '--workers', '1', '--output', '{out}/paper'), 8.0),
     Program('write_urdf', 'write_urdf', (), 0.6),
 )
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib
 import multiprocessing
+import multiprocessing.connection
 import os
 import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -78,7 +80,7 @@ def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome
     waiting = iter(tasks)
     again: list[tuple[Task, int]] = []
     while True:
-        pool = ProcessPoolExecutor(count, multiprocessing.get_context('spawn'), _leave_interrupts)
+        pool = ProcessPoolExecutor(count, multiprocessing.get_context('spawn'), _serve)
         running: dict[Future[Any], tuple[Task, int]] = {}
         try:
             if again:  # alone, so that it is known which one kills
@@ -106,9 +108,18 @@ def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _leave_interrupts() -> None:
-    """Ctrl-C reaches every process of a terminal; only the one that collects answers it."""
+def _serve() -> None:
+    """Leave Ctrl-C, which reaches every process of a terminal, to the one that collects; end with that one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+
+
+def _end_with(sentinel: int) -> None:
+    """End this process, whatever it does, when the process behind the sentinel has ended."""
+    multiprocessing.connection.wait([sentinel])
+    os._exit(1)
 
 
 def _fill(pool: ProcessPoolExecutor, work: Work, waiting: Iterator[Task],
