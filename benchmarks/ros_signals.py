@@ -57,7 +57,8 @@ def recording(path: Path, killed: bool) -> str:
         for _ in bag.read(path):
             pass
     except BagError as error:
-        empty = any(words in str(error) for words in ('is empty', 'no message', 'has no topic', 'metadata.yaml'))
+        said = ('is empty', 'no message', 'has no topic', 'metadata.yaml')
+        empty = any(words in str(error) for words in said)
         return '' if killed or empty else str(error)
     return ''
 

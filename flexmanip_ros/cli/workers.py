@@ -109,7 +109,7 @@ def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome
 
 
 def _serve() -> None:
-    """Leave Ctrl-C, which reaches every process of a terminal, to the one that collects; end with that one."""
+    """Leave Ctrl-C, which reaches every process of a terminal, to the one that collects; end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:
