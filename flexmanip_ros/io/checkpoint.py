@@ -7,6 +7,7 @@ Reading makes only classes of this package that are of those kinds, so no file c
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import importlib
@@ -39,6 +40,8 @@ def save(path: str | Path, value: Any) -> None:
         partial.write_bytes(encode(value))
         os.replace(partial, target)
     except OSError as err:
+        with contextlib.suppress(OSError):
+            partial.unlink()  # half a state helps nobody, least on a full disk
         raise CheckpointError(f"checkpoint '{path}' cannot be written: {err.strerror}",
                               'give another checkpoint_file, or free some space') from err
 

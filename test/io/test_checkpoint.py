@@ -86,6 +86,23 @@ def test_a_checkpoint_of_another_version_says_so(tmp_path: Path) -> None:
         checkpoint.load(tmp_path / 'old')
 
 
+def test_a_save_that_fails_keeps_the_old_state_and_leaves_no_scraps(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / 'state'
+    checkpoint.save(path, (1.0, 2.0))
+
+    def full(self: Path, data: bytes) -> None:
+        with self.open('wb') as file:
+            file.write(data[:20])
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr(Path, 'write_bytes', full)
+    with pytest.raises(CheckpointError, match='No space left'):
+        checkpoint.save(path, (3.0, 4.0))
+    assert checkpoint.load(path) == (1.0, 2.0)
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match='cannot be written'):
         checkpoint.save(tmp_path / 'no' / 'such' / 'folder', 1)
