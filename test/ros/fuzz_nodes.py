@@ -86,7 +86,7 @@ class Bench:
         self._echoes = ros.listen(Empty, 'echo')
         self._echo = ros.publisher(Empty, 'echo')
 
-    def send(self, sent: list[tuple[str, Any]]) -> None:
+    def send(self, sent: list[tuple[str, Any]], *, wait: bool = True) -> None:
         """Publish, and wait until whatever is in the queues before an echo was taken.
 
         A joint state stamped ``NEXT`` gets the stamp of the next sample.
@@ -97,6 +97,8 @@ class Bench:
                 message.header.stamp = time_message(LATER_NS + self._samples * STEP_NS)
             self.writers[topic].publish(message)
             self.sent += 1
+        if not wait:
+            return
         before = len(self._echoes)
         self._echo.publish(Empty())
         self.ros.wait(lambda: len(self._echoes) > before, what='the node to take what was sent')
