@@ -11,14 +11,18 @@ from flexmanip_ros.identification.factor_kernel import Kinds
 from flexmanip_ros.identification.prediction_error import derivatives, moved, run
 from flexmanip_ros.identification.prediction_error_kernel import condition
 from flexmanip_ros.identification.refinement import Answer, Job, Refined
-from flexmanip_ros.identification.stretch import Recursion, arrive, fit_stretch
+from flexmanip_ros.identification.stretch import UNEXPLAINED, Recursion, arrive, fit_stretch, unexplained
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.types import Array
 
 MEMORY = 1_000_000.0
 """Samples after which parameters may have drifted by their own standard deviation."""
-MISFIT = 3.0
-"""Residual power of a block that ends a recursion; twice in a row."""
+NOISE_BLOCKS, DRIFT_BLOCKS = 16, 4
+"""Blocks over which the noise is remembered, and how fast the parameters move."""
+SURPRISE = 2.0
+"""Standard deviations beyond which a block says that the parameters have gone elsewhere."""
+LARGEST_DRIFT = 20.0
+"""Logarithm of the largest factor on a variance from one block."""
 
 
 def solve(config: IdentifierParameters, job: Job) -> Answer:
@@ -49,31 +53,69 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
     U = np.ascontiguousarray(samples[:, :r] * old.scale[:r])
     Y = np.ascontiguousarray(samples[:, r:] * old.scale[r:])
     k = old.root.shape[0]
-    kept = old.root * np.sqrt(1.0 + len(U) / MEMORY)
-    zeta, theta = np.zeros(k), old.theta
+    kept = old.root * np.sqrt(1.0 + len(U) / MEMORY) * np.exp(0.5 * old.drift)
+    noise = old.covariance
+    if not old.lost:  # what the model leaves (a moving arm is not linear) is noise to it
+        before, _ = run(U, Y, old.theta)
+        if not np.all(np.isfinite(before)):
+            return None
+        noise = noise * max(1.0, float(np.trace(np.linalg.solve(noise, before))) / Y.shape[1])
+    zeta, theta, further = np.zeros(k), old.theta, 0.0
     arrival, root = np.zeros((0, k)), kept
     for _ in range(2 if old.lost else 1):  # a state that was lost makes the first derivatives poor
-        information, gradient, _, arrival, _ = derivatives(U, Y, theta, old.structure, old.covariance, old.P)
+        information, gradient, _, arrival, _ = derivatives(U, Y, theta, old.structure, noise, old.P)
         H = kept.T @ information @ kept
         if not np.all(np.isfinite(H)):
             return None
+        g = kept.T @ gradient
         root, step = kept.copy(), np.empty(k)
-        condition(H, root, kept.T @ gradient - zeta, step)
+        condition(H.copy(), root, g - zeta, step)
+        if not old.lost and is_surprising(float(g @ step), H, old.widening):
+            further = drift(H, g, old.widening)
+            kept, H, g = np.exp(0.5 * further) * kept, np.exp(further) * H, np.exp(0.5 * further) * g
+            root = kept.copy()
+            condition(H, root, g, step)
         if not np.all(np.isfinite(step)):
             return None
         zeta = zeta + step
         theta = moved(old.theta, old.P @ (kept @ zeta), old.structure)
     covariance, end = run(U, Y, theta)
-    power = float(np.trace(np.linalg.solve(old.covariance, covariance))) / Y.shape[1]
-    strikes = old.strikes + 1 if not power < MISFIT else 0
-    if strikes >= 2 or not np.isfinite(power):
+    left = unexplained(covariance, Y)
+    strikes = old.strikes + 1 if not left < UNEXPLAINED else 0
+    if strikes >= 2 or not np.isfinite(left):
         return None
-    share = len(U) / (old.weight + len(U))
+    share = max(len(U) / (old.weight + len(U)), 1.0 / NOISE_BLOCKS)
+    moving = old.drift + further if further > 0.0 else 0.0
     return old._replace(
         theta=theta._replace(x=end), root=arrive(root, arrival), strikes=strikes,
         gain=theta.K if old.structure.free_gain else old.gain, lost=False,
         covariance=(1.0 - share) * old.covariance + share * covariance,
-        weight=min(old.weight + len(U), MEMORY))
+        weight=min(old.weight + len(U), MEMORY),
+        drift=old.drift + (moving - old.drift) / DRIFT_BLOCKS)
+
+
+def is_surprising(size: float, H: Array, widening: float) -> bool:
+    """Whether a block says that the parameters have gone elsewhere, or its residuals have a memory.
+
+    H: (k, k) information of the block in coordinates of unit prior deviation, size: g' (I + H)^-1 g with its
+    gradient g (k,). Parameters that stayed where they were give it the mean tr H and the variance 2 tr H^2.
+    """
+    deviation = np.sqrt(2.0) * float(np.linalg.norm(H))
+    return bool(size > widening ** 2 * (float(np.trace(H)) + SURPRISE * deviation))
+
+
+def drift(H: Array, g: Array, widening: float) -> float:
+    """Logarithm >= 0 of the factor on the prior variances at which the block is what it should be."""
+    values, vectors = np.linalg.eigh(H)
+    values = np.maximum(values, 0.0)
+    square = (vectors.T @ g) ** 2
+    mean = widening ** 2 * float(values.sum())
+    low, high = 0.0, LARGEST_DRIFT
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        more = np.sum(square / (1.0 + np.exp(middle) * values)) > mean
+        low, high = (middle, high) if more else (low, middle)
+    return low
 
 
 def refine(config: IdentifierParameters, refined: Refined, samples: Array, fate: Kinds, R: Array, scale: Array

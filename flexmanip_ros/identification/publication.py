@@ -87,7 +87,7 @@ def from_fit(
     su, sy = recursion.scale[:r], recursion.scale[r:]
     su, sy = np.where(su > 0.0, su, 1.0), np.where(sy > 0.0, sy, 1.0)
     k = P.shape[1] - n
-    spread = recursion.widening * (P[:-n, :k] @ recursion.root[:k]).T
+    spread = recursion.widening * np.exp(0.5 * recursion.drift) * (P[:-n, :k] @ recursion.root[:k]).T
     free = (True, True, structure.free_gain, structure.free_output, structure.free_direct)
     shapes = ((n, n), (n, r), (n, m), (m, n), (m, r))
     sizes = [a * b if is_free else 0 for (a, b), is_free in zip(shapes, free, strict=True)]

@@ -28,7 +28,7 @@ from flexmanip_ros.identification.memory_kernel import FILLED, POWER, PRIOR, USE
 from flexmanip_ros.identification.moments import solve_regressor
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.types import Array
+from flexmanip_ros.types import Array, Status
 
 MODES = {
     'constant': memory_kernel.CONSTANT, 'excitation': memory_kernel.EXCITATION,
@@ -257,8 +257,12 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> I
         realized, R, scale = publication.from_factor(config, state.memory[0], state.scale)
     if realized is None:
         return None
-    return publication.publish(
+    found = publication.publish(
         config, realized, R, scale, state.scalars, state.variance, int(state.counts[USED]), d, dt)
+    early = refined is not None and state.counts[USED] < refinement.FIRST + refinement.SOONEST
+    if found is not None and early and found.status is Status.TRACKING:
+        return found._replace(status=Status.WARMING_UP)  # a short past is biased, and no fit has been made
+    return found
 
 
 def reset(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:

@@ -24,7 +24,7 @@ ITERATIONS = 12
 CLEAN = 1e-20
 """Relative innovation power below which the subspace model has no bias worth removing; the least assumed."""
 UNEXPLAINED = 0.5
-"""Share of an output's power that a fit with K = 0 may leave before it is taken not to simulate at all."""
+"""Share of the outputs' power that a fit with K = 0 may leave before it is taken not to simulate at all."""
 
 
 class Recursion(NamedTuple):
@@ -33,7 +33,8 @@ class Recursion(NamedTuple):
     scale: (r + m,) of its signals; root: (k, k) S with S S' the covariance of the coordinates P (d, k) and
     the state; covariance: (m, m) of the innovations, worth ``weight`` samples; widening: factor on standard
     deviations from the scatter of the gradients; gain: (n, m) published K, theta's own unless that is held;
-    singular_values, condition: of the subspace model the fit began with; lost: the state is unknown.
+    singular_values, condition: of the subspace model the fit began with; lost: the state is unknown;
+    drift: logarithm of the factor by which variances grow from block to block, as the plant itself moves.
     """
 
     theta: Theta
@@ -49,6 +50,7 @@ class Recursion(NamedTuple):
     singular_values: Array
     condition: float
     lost: bool = False
+    drift: float = 0.0
 
 
 class Attempt(NamedTuple):
@@ -116,6 +118,12 @@ def fit_stretch(
         condition=float(np.linalg.cond(starts[0].state / np.where(length > 0.0, length, 1.0))))
 
 
+def unexplained(covariance: Array, Y: Array) -> float:
+    """Share of power of Y (N, m) in residuals of a covariance (m, m), the mean over the outputs."""
+    power = np.mean(Y ** 2, axis=0)
+    return float(np.mean(np.diag(covariance) / np.where(power > 0.0, power, np.inf)))
+
+
 def _signals(samples: Array, scale: Array, r: int) -> tuple[Array, Array]:
     return np.ascontiguousarray(samples[:, :r] * scale[:r]), np.ascontiguousarray(samples[:, r:] * scale[r:])
 
@@ -136,8 +144,7 @@ def _attempt(
     penalty = n * m * np.log(count) / count
     chosen = structure._replace(free_gain=False, only_gain=False)
     best = descend(U, Y, begin._replace(K=np.zeros_like(begin.K)), chosen, ITERATIONS)
-    simulates = best is not None and bool(
-        np.all(np.diag(best.covariance) < UNEXPLAINED * np.mean(Y ** 2, axis=0)))
+    simulates = best is not None and unexplained(best.covariance, Y) < UNEXPLAINED
     cost = np.inf if best is None else best.cost
     wanted = False
     if noise == 'any' or simulates:
