@@ -36,7 +36,8 @@ def judge(config: IdentifierParameters, model: Model | None, m: mem.Memory | Non
     if model is None:
         return Payload(0.0, math.inf, 0.0, math.inf, 1.0, Status.UNOBSERVABLE)
     if m is None:
-        return Payload(0.0, math.inf, 0.0, math.inf, 1.0, Status.WARMING_UP)
+        begun = Status.DIVERGED if restarts else Status.WARMING_UP  # it may fall over at every sample
+        return Payload(0.0, math.inf, 0.0, math.inf, 1.0, begun)
     state = m.x.size - PARAMETERS
     scale = model.motion.scale
     held = bool(m.counts[mem.HELD])
@@ -83,7 +84,12 @@ def rotary(
 
 
 def empty(seeming: float, std: float, consistency: float, status: Status) -> Payload:
-    """Return the payload of an arm that should be empty and seems to hold ``seeming`` kg."""
+    """Return the payload of an arm that should be empty and seems to hold ``seeming`` kg.
+
+    An arm that does not move as an empty one may hold anything: nobody said so, or it is another arm.
+    """
+    if status is Status.INCONSISTENT:
+        return Payload(0.0, math.inf, 0.0, math.inf, consistency, status)
     upper = max(seeming, 0.0) + QUANTILE * std
     if abs(seeming) > 3.0 * std and status is Status.TRACKING:
         return Payload(max(seeming, 0.0), std, 0.0, upper, consistency, Status.INCONSISTENT)

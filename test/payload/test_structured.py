@@ -83,6 +83,13 @@ def test_a_load_that_was_never_announced_is_not_taken_for_an_empty_arm():
     assert found.upper > 5.0
 
 
+@pytest.mark.parametrize('payload', [2.0, 20.0])
+def test_a_capture_that_was_never_announced_leaves_no_claim(payload):
+    found = structured.estimate(config(), run(config(), record(2.5, (event(1.5),), payload=payload)))
+    assert found.status is Status.INCONSISTENT
+    assert found.lower <= payload <= found.upper
+
+
 def test_after_a_release_nothing_is_held_with_an_interval():
     events = (event(1.0), event(2.0, EventKind.RELEASE))
     found = structured.estimate(config(), run(config(), record(3.0, events), events))
@@ -207,6 +214,14 @@ def test_absurd_numbers_restart_the_filter_and_say_so(caught):
     found = structured.estimate(settings, state)
     assert finite(found)
     assert found.status in (Status.DIVERGED, Status.INCONSISTENT, Status.WARMING_UP)
+
+
+@pytest.mark.parametrize('scale', [1e3, 1e6, 1e12])
+def test_signals_in_other_units_are_told_from_a_start(caught, scale):
+    wrong = [replace(sample, y=scale * sample.y, angles=scale * sample.angles) for sample in caught]
+    found = structured.estimate(config(), run(config(), wrong, (event(1.5),)))
+    assert finite(found)
+    assert found.status in (Status.DIVERGED, Status.INCONSISTENT)
 
 
 def test_rates_alone_are_enough_with_the_angles(caught):
