@@ -16,6 +16,8 @@ from flexmanip_ros.types import JointRecord, Sample
 
 LEARNING = 20
 """Intervals looked at before the sample time is known."""
+FAR = 100.0
+"""Sample times ahead that are taken for far where ``max_time_jump`` is shorter (a slow clock)."""
 RELEARN = 20
 """Irregular intervals in a row after which the sample time is taken to have changed."""
 
@@ -106,7 +108,9 @@ def step(config: IdentifierParameters, state: SamplingState, record: JointRecord
 
 
 def flush(config: IdentifierParameters, state: SamplingState) -> tuple[SamplingState, Sampled]:
-    """Give out what still waits for the sample time (a recording shorter than the learning)."""
+    """Give out what still waits: for the sample time (a recording shorter than the learning), or for doubt."""
+    if state.doubtful is not None:
+        return _placed(config, state._replace(doubtful=None), state.doubtful)
     return _learned(config, state, reset=False) if state.learning else (state, NOTHING)
 
 
@@ -142,12 +146,13 @@ def _on_clock(config: IdentifierParameters, state: SamplingState, raw: Sample
     if last is None or state.interval_count == 0:
         return _placed(config, state, raw)
     ahead = (raw.stamp_ns - last) * 1e-9
+    far = max(config.max_time_jump, FAR * state.dt)
     if held is None:
-        if ahead > config.max_time_jump:
+        if ahead > far:
             return state._replace(doubtful=raw), NOTHING
         return _placed(config, state, raw)
     state = state._replace(doubtful=None)
-    if abs(ahead) <= config.max_time_jump:
+    if abs(ahead) <= far:
         return _placed(config, _refuse(state, _AHEAD), raw)
     state, first = _placed(config, state, held)
     state, second = _placed(config, state, raw)
