@@ -19,8 +19,8 @@ class Score:
 
     runs, failed: counts; mean_error_percent, median_error_percent: of the mean relative error in the window;
     rms_error_percent: of the last estimate; bias_kg: mean of its error; coverage_percent: how often its 95 %
-    interval held the truth, with the 95 % interval of that figure; us_per_sample: median cost; bound_ratio:
-    root mean square of the last error over its Cramer-Rao bound.
+    interval, where it gave one, held the truth, with the 95 % interval of that figure; us_per_sample: median
+    cost; bound_ratio: root mean square of the last error over its Cramer-Rao bound.
     """
 
     runs: int
@@ -58,6 +58,7 @@ def score(rows: Sequence[Mapping[str, Any]]) -> Score:
     """Sum up the rows of one estimator."""
     good = [row for row in rows if not row.get('error')]
     failed, runs = len(rows) - len(good), len(rows)
+    costs = [row['us_per_sample'] for row in good if _number(row, 'us_per_sample') is not None]
     needed = ('payload_mass_kg', 'payload_true_kg')
     good = [row for row in good if all(_number(row, name) is not None for name in needed)]
     errors = np.array([row['payload_mass_kg'] - row['payload_true_kg'] for row in good], dtype=np.float64)
@@ -67,9 +68,8 @@ def score(rows: Sequence[Mapping[str, Any]]) -> Score:
     with np.errstate(divide='ignore', invalid='ignore'):
         relative = 100.0 * errors / truths
     relative = relative[np.isfinite(relative)]
-    hits = sum(bool(row['covered']) for row in good)
-    share, low, high = coverage(hits, len(good))
-    costs = [row['us_per_sample'] for row in good if _number(row, 'us_per_sample') is not None]
+    claims = [bool(row['covered']) for row in good if row.get('covered') is not None]
+    share, low, high = coverage(sum(claims), len(claims))
     ratios = [(row['payload_mass_kg'] - row['payload_true_kg']) / row['bound_std_kg'] for row in good
               if _number(row, 'bound_std_kg')]
     return Score(

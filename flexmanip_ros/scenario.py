@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 from zlib import crc32
@@ -72,6 +73,8 @@ class Scenario:
     def __post_init__(self) -> None:
         if not 0.0 < self.duration <= 1e5:
             raise ParameterError(f'duration is {self.duration!r}', 'give seconds above 0')
+        if not self.window[0] < self.window[1]:
+            raise ParameterError(f'window is {list(self.window)}', 'give [from, to], seconds')
         if not self.estimators:
             raise ParameterError('estimators is empty', 'name at least one')
         for name in self.vary:
@@ -130,6 +133,10 @@ def scenario(tree: Any) -> Scenario:
         if name not in known:
             raise ParameterError(f"a scenario has no '{name}'", f'known are {", ".join(sorted(known))}')
     given = dict(tree)
+    if not isinstance(given.get('name', ''), (str, int)):
+        raise ParameterError(f"'name' of a scenario is {given['name']!r:.60}", 'give a word')
+    if 'name' in given:
+        given['name'] = str(given['name'])
     for name in ('plant', 'excitation', 'identifier'):
         given[name] = _flat(name, given.get(name) or {})
     if 'estimators' in given:
@@ -173,8 +180,8 @@ def _flat(name: str, tree: Any, prefix: str = '') -> dict[str, Any]:
 
 
 def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ParameterError(f"'{name}' of a scenario is {value!r:.60}", 'give a number')
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise ParameterError(f"'{name}' of a scenario is {value!r:.60}", 'give a finite number')
     return float(value)
 
 
@@ -197,6 +204,24 @@ def _check_varied(name: str, how: Mapping[str, Any]) -> None:
     kind, values = next(iter(how.items()))
     if not isinstance(values, (list, tuple)) or not values or (kind != 'choice' and len(values) != 2):
         raise ParameterError(f"'{kind}' of '{name}' is {values!r:.60}", 'give a list of values')
+    if kind != 'choice':
+        _check_range(name, kind, values)
+    elif name == CAPTURE_TIME:
+        for value in values:
+            _number(name, value)
+
+
+def _check_range(name: str, kind: str, values: Sequence[Any]) -> None:
+    """Refuse ends (or mean and deviation) that are no numbers, of different sizes, or the wrong way round."""
+    try:
+        first, second = (np.asarray(value, dtype=np.float64) for value in values)
+        is_good = first.shape == second.shape and first.ndim <= 1 and bool(np.isfinite([first, second]).all())
+    except (TypeError, ValueError):
+        is_good = False
+    if not is_good or (second < (first if kind == 'uniform' else 0.0)).any():
+        raise ParameterError(f"'{kind}' of '{name}' is {values!r:.60}",
+                             'give two numbers, or two lists as long as each other: '
+                             + ('low, then high' if kind == 'uniform' else 'mean, then deviation from 0 up'))
 
 
 def _draw(how: Mapping[str, Any], rng: np.random.Generator) -> Any:

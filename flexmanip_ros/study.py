@@ -66,11 +66,12 @@ def messages(scenario: Scenario, run: Run, seed: int) -> list[JointRecord | Capt
 
 
 def measure(config: IdentifierParameters, items: Sequence[JointRecord | CaptureEvent], true_kg: float | None,
-            window: tuple[float, float], *, bound: bool = False) -> Row:
+            window: tuple[float, float], *, bound: bool = False, settled: float = 0.0) -> Row:
     """Identify and return the columns of a row.
 
-    true_kg: mass held after a capture; None when unknown. window: from and to [s] of the mean error;
-    bound: add the least standard deviation that the samples after the capture allow.
+    true_kg: mass held after a capture; None when unknown. window: from and to [s] of the mean error, at the
+    earliest ``settled`` seconds after the event that made it true; bound: add the least standard deviation
+    that the samples after the capture allow.
     """
     started = time.perf_counter()
     state, estimates = pipeline.init(), []
@@ -95,7 +96,9 @@ def measure(config: IdentifierParameters, items: Sequence[JointRecord | CaptureE
     true = None if true_kg is None else (true_kg if held else 0.0)
     row['payload_true_kg'] = true
     row['covered'] = None if true is None or low is None or high is None else bool(low <= true <= high)
-    row['error_percent'] = None if true is None else _window_error(state, estimates, true, window)
+    changed = row['capture_time_s'] if held else row['release_time_s']
+    begin = window[0] if changed is None else max(window[0], changed + settled)
+    row['error_percent'] = None if true is None else _window_error(state, estimates, true, (begin, window[1]))
     if bound and held and config.payload_method != 'none':
         mass = row['payload_mass_kg'] if true is None else true
         row['bound_std_kg'] = _bound(config, items, row['capture_time_s'], mass, state.sampling.dt)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -66,7 +67,7 @@ def _main(given: argparse.Namespace) -> int:
         require_pictures()
     interrupted = False
     with Journal(given.output, identity) as journal:
-        done = {row[tasks.KEY] for row in journal.rows}
+        done = {row.get(tasks.KEY) for row in journal.rows}
         left = [task for task in todo if task.key not in done]
         if done:
             print(f'continuing: {len(todo) - len(left)} of {len(todo)} runs are there', file=sys.stderr)
@@ -151,11 +152,17 @@ def describe(rows: Sequence[Row]) -> list[str]:
              f'{"rms/bound":>9s} {"us/sample":>9s}']
     for name in sorted({str(row.get('estimator', '')) for row in rows}):
         made = score([row for row in rows if str(row.get('estimator', '')) == name])
-        held = f'{made.coverage_percent:.1f} % ({made.coverage_low:.1f}..{made.coverage_high:.1f})'
-        lines.append(f'{name:24s} {made.runs:6d} {made.failed:6d} {made.mean_error_percent:10.4g} '
-                     f'{made.median_error_percent:9.4g} {made.rms_error_percent:8.4g} {made.bias_kg:9.3g} '
-                     f'{held:>22s} {made.bound_ratio:9.3g} {made.us_per_sample:9.1f}')
+        held = '-' if math.isnan(made.coverage_percent) else (
+            f'{made.coverage_percent:.1f} % ({made.coverage_low:.1f}..{made.coverage_high:.1f})')
+        lines.append(f'{name or "(failed)":24s} {made.runs:6d} {made.failed:6d} '
+                     f'{_short(made.mean_error_percent, 4):>10s} {_short(made.median_error_percent, 4):>9s} '
+                     f'{_short(made.rms_error_percent, 4):>8s} {_short(made.bias_kg):>9s} {held:>22s} '
+                     f'{_short(made.bound_ratio):>9s} {_short(made.us_per_sample):>9s}')
     return lines
+
+
+def _short(value: float, digits: int = 3) -> str:
+    return '-' if math.isnan(value) else f'{value:.{digits}g}'
 
 
 if __name__ == '__main__':

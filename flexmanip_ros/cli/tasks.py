@@ -15,6 +15,8 @@ from flexmanip_ros.scenario import Scenario
 
 KEY = 'run'
 """Column that names a run; a study continues with the runs whose name it has not."""
+SETTLED = 1.0
+"""Seconds after a capture in a recording from which on the error counts, as in the paper."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def _recorded(task: Recorded) -> study.Row:
         if not items:
             raise
         fault = str(error)
-    row = study.measure(task.config, items, truth, task.window)
+    row = study.measure(task.config, items, truth, task.window, settled=SETTLED)
     return {'bag': task.path, 'estimator': task.config.payload_method, **row, 'error': fault}
 
 

@@ -1,4 +1,4 @@
-"""The rows of a study as they come: one JSON line each, on disk before the next; and the table made of them.
+"""The rows of a study as they come: one JSON line a run, on disk before the next; and the table made of them.
 
 A study that was interrupted, or killed, continues from its journal. The table (.csv or .parquet) is written
 from it at the end and on an interrupt.
@@ -7,6 +7,7 @@ from it at the end and on an interrupt.
 from __future__ import annotations
 
 import csv
+import fcntl
 import importlib
 import io
 import json
@@ -26,7 +27,8 @@ SUFFIXES = ('.csv', '.parquet')
 class Journal:
     """Rows of one study at ``path`` + '.journal'. Use it in a ``with``.
 
-    identity: what makes the study this one; a journal of another study is refused with OutputError.
+    identity: what makes the study this one. Refused with OutputError: a journal of another study, one that is
+    damaged, and one that another process writes.
     """
 
     def __init__(self, path: str | Path, identity: Mapping[str, Any]) -> None:
@@ -39,36 +41,59 @@ class Journal:
             _parquet()
         check_place(self.path)
         head = json.dumps({'study': identity}, sort_keys=True)
-        if self.journal.exists():
-            self._resume(head)
-        elif self.path.exists():
+        is_new = not self.journal.exists()
+        if is_new and self.path.exists():
             raise OutputError(f"'{path}' exists already and has no journal to continue from",
                               'remove it or give another name')
-        self._file = self.journal.open('a', encoding='utf-8')
-        if not self.rows and self.journal.stat().st_size == 0:
-            self._append(head)
+        try:
+            self._file = self.journal.open('a', encoding='utf-8')
+        except OSError as err:
+            raise OutputError(f"'{self.journal}' cannot be written: {err.strerror}",
+                              'give another place') from err
+        try:
+            self._lock()
+            if is_new or not self._resume(head):
+                self._append(head)
+        except BaseException:
+            self._file.close()
+            raise
 
-    def _resume(self, head: str) -> None:
-        """Read what is there; a line that a kill tore is taken back."""
+    def _lock(self) -> None:
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as err:
+            raise OutputError(f"'{self.journal}' is being written by another process",
+                              'wait for it, or give another --output') from err
+        except OSError:
+            return  # a file system without locks
+
+    def _resume(self, head: str) -> bool:
+        """Read what is there; a line that a kill tore is taken back. Tell whether the head was whole."""
         content = self.journal.read_bytes()
         whole = content[:content.rfind(b'\n') + 1]
-        if len(whole) < len(content):
-            with self.journal.open('r+b') as file:
-                file.truncate(len(whole))
-        lines = whole.decode('utf-8').splitlines()
+        if not whole and not f'{head}\n'.encode().startswith(content):
+            raise OutputError(f"'{self.journal}' is no journal of a study",
+                              'remove it, or give another --output')
+        lines = whole.decode('utf-8', errors='replace').splitlines()
         if lines and lines[0] != head:
             raise OutputError(f"'{self.journal}' belongs to another study",
                               'give another --output, or remove the journal to start again')
-        try:
-            self.rows = [json.loads(line) for line in lines[1:]]
-        except ValueError as err:
-            raise OutputError(f"'{self.journal}' is damaged: {err}", 'remove it to start again') from err
+        for place, line in enumerate(lines[1:], start=2):
+            try:
+                self.rows.extend(_run(line))
+            except ValueError as err:
+                raise OutputError(f"'{self.journal}' is damaged in line {place}: {err}",
+                                  'remove that line, its run is done again') from err
+        if len(whole) < len(content):
+            self._file.truncate(len(whole))
+        return bool(lines)
 
     def add(self, rows: Iterable[Row]) -> None:
         """Keep the rows of one run, all or none."""
         kept = list(rows)
-        self._append('\n'.join(json.dumps(row) for row in kept))
-        self.rows.extend(kept)
+        line = json.dumps(kept)
+        self.rows.extend(kept)  # first: an interrupt while writing must not leave it out of the table
+        self._append(line)
 
     def _append(self, text: str) -> None:
         try:
@@ -101,6 +126,14 @@ class Journal:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         self._file.close()
+
+
+def _run(line: str) -> list[Row]:
+    """Return the rows of a run. Raises ValueError for anything else."""
+    found = json.loads(line)
+    if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):
+        raise ValueError('it holds no rows')
+    return found
 
 
 def _sortable(value: Any) -> tuple[int, Any]:

@@ -57,33 +57,6 @@ def test_one_row_a_run_and_the_same_bits_for_the_same_seed(scenario_file, tmp_pa
     assert _without_cost(first) == _without_cost(second)
 
 
-def test_a_study_continues_where_a_kill_left_it(scenario_file, tmp_path, capsys):
-    out = tmp_path / 'out.csv'
-    assert _run(scenario_file, '--runs', 2, '--workers', 0, '--output', out) == 0
-    journal = tmp_path / 'out.csv.journal'
-    content = journal.read_bytes()
-    journal.write_bytes(content[:-30])  # a kill in the middle of the second row
-    out.unlink()
-    assert _run(scenario_file, '--runs', 3, '--workers', 0, '--output', out) == 0
-    assert 'continuing: 1 of 3' in capsys.readouterr().err
-    assert [row['seed'] for row in _rows(out)] == ['0', '1', '2']
-
-
-def test_a_finished_study_is_not_done_again(scenario_file, tmp_path):
-    out = tmp_path / 'out.csv'
-    for _ in range(2):
-        assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
-    assert len(_rows(out)) == 1
-
-
-def test_another_study_does_not_overwrite_this_one(scenario_file, tmp_path, capsys):
-    out = tmp_path / 'out.csv'
-    assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
-    scenario_file.write_text(SCENARIO.replace('0.2\n', '0.25\n', 1), encoding='utf-8')
-    assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 2
-    assert 'another study' in capsys.readouterr().err
-
-
 def test_a_failed_run_is_a_row_with_its_error(scenario_file, tmp_path, capsys):
     scenario_file.write_text(SCENARIO + 'excitation: {amplitude: [1.0e+150, 1.0e+150]}\n', encoding='utf-8')
     out = tmp_path / 'out.csv'
@@ -170,6 +143,15 @@ def test_a_worker_that_dies_costs_only_its_run(tmp_path, monkeypatch):
     ('plant: {ordre: 3}', "unknown parameter 'ordre'"),
     ('estimators: {}', 'estimators'),
     ('faults: {drop: 2}', 'probability'),
+    ('vary: {plant.payload_mass: {uniform: [a, b]}}', 'two numbers'),
+    ('vary: {plant.payload_mass: {uniform: [100, 12]}}', 'low, then high'),
+    ('vary: {plant.payload_mass: {normal: [20, -1]}}', 'deviation from 0'),
+    ('vary: {plant.payload_mass: {uniform: [.nan, 12]}}', 'two numbers'),
+    ('vary: {plant.initial_angles: {uniform: [[0, 0], [1]]}}', 'two lists'),
+    ('vary: {capture_time: {choice: [soon]}}', 'finite number'),
+    ('capture_time: .nan', 'finite number'),
+    ('window: [6, 4]', 'window'),
+    ('name: [1]', 'a word'),
     ('- a', 'names and values'),
 ])
 def test_a_bad_scenario_is_one_line_and_exit_2(scenario_file, tmp_path, capsys, text, words):
