@@ -38,7 +38,7 @@ class Job(NamedTuple):
     """A fit to be made.
 
     chunks: its samples, in arrays (CHUNK, r + m); R: (q, q) factor of the moments and scale: (r + m,), both
-    None for the update by a block; old: the fit before.
+    None for the update by a block; old: the fit before, if any.
     """
 
     chunks: tuple[Array, ...]
@@ -60,7 +60,7 @@ class Refined(NamedTuple):
     Closed chunks (CHUNK, r + m) never written to again, the open one, samples since the start (negative:
     still to wait), and the fit. batch: the fit still sees every sample since the start; seen: samples from
     the first chunk on that the fit has taken in; job: under way, its result is taken at ``due`` samples;
-    answer: to it, if it is known by now.
+    answer: to it, if it is known by now; before: the fit of before the last event, to start from.
     """
 
     chunks: tuple[Array, ...]
@@ -72,11 +72,17 @@ class Refined(NamedTuple):
     job: Job | None = None
     due: int = 0
     answer: Answer | None = None
+    before: Recursion | None = None
 
 
-def start(width: int) -> Refined:
+def start(width: int, before: Recursion | None = None) -> Refined:
     """Begin without a fit."""
-    return Refined((), np.zeros((CHUNK, width)), 0, True, None)
+    return Refined((), np.zeros((CHUNK, width)), 0, True, None, before=before)
+
+
+def restart(refined: Refined) -> Refined:
+    """Begin anew: the plant has changed, and yet is another of its kind."""
+    return start(refined.current.shape[1], refined.recursion or refined.before)
 
 
 def until_chunk(refined: Refined) -> int:
@@ -114,7 +120,7 @@ def is_block_due(refined: Refined) -> bool:
 
 def ask_fit(refined: Refined, R: Array, scale: Array) -> Refined:
     """Ask for a fit of the whole stretch, see ``stretch.fit_stretch``."""
-    job = Job(refined.chunks, R.copy(), scale.copy(), refined.recursion)
+    job = Job(refined.chunks, R.copy(), scale.copy(), refined.recursion or refined.before)
     return refined._replace(job=job, due=refined.total + max(SOONEST, refined.total // DELAY))
 
 
@@ -158,7 +164,7 @@ def give_up(width: int) -> Refined:
 def break_window(refined: Refined) -> Refined:
     """Samples are missing: what was learnt is kept, the state is unknown, the open stretch is over."""
     old = refined.recursion
-    fresh = start(refined.current.shape[1])
+    fresh = start(refined.current.shape[1], refined.before)
     if old is None:
         return fresh
     n = old.theta.A.shape[0]

@@ -213,7 +213,7 @@ def restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
     """
     new = window_restart(config, state)
     if new.refined is not None:
-        new = replace(new, refined=refinement.start(len(config.inputs) + len(config.outputs)))
+        new = replace(new, refined=refinement.restart(new.refined))
     if not config.restart_on_event or not new.counts[USED]:
         return new
     new.counts[USED] = 0
