@@ -95,12 +95,12 @@ def _main(given: argparse.Namespace) -> int:
 
 def _plan(given: argparse.Namespace) -> tuple[Sequence[tasks.Task], dict[str, Any]]:
     """Return the runs asked for, and what identifies the study in its journal."""
-    source = Path(given.source)
+    source = Path(given.source).absolute()  # workers elsewhere stand in another folder
     if source.is_dir():
         config = load(IdentifierParameters, 'rpbsid_identifier', given.params, given.set)
         found = tasks.recordings(source)
         if not found:
-            raise ParameterError(f"folder '{source}' holds no recording",
+            raise ParameterError(f"folder '{given.source}' holds no recording",
                                  'give a folder of rosbag2 recordings')
         return ([tasks.Recorded(str(path), config, (0.0, float('inf'))) for path in found],
                 {'recordings': str(source), 'parameters': _digest(flatten(config))})
@@ -108,7 +108,7 @@ def _plan(given: argparse.Namespace) -> tuple[Sequence[tasks.Task], dict[str, An
         raise ParameterError(f'--runs is {given.runs}', 'give at least 1')
     if given.params is not None:
         raise ParameterError('--params is for recordings', 'put the parameters into the scenario file')
-    study = read_scenario(source, given.set)
+    study = read_scenario(Path(given.source), given.set)
     return ([tasks.Simulated(study, given.first_seed + k) for k in range(given.runs)],
             {'scenario': study.name, 'parameters': _digest(asdict(study))})
 

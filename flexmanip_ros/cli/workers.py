@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import math
 import multiprocessing
 import multiprocessing.connection
 import os
 import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -21,6 +23,8 @@ AHEAD = 4
 """Runs handed out for each worker, so that none waits."""
 ANSWER_TIME = 10.0
 """Seconds after which a scheduler that says nothing is taken not to be there."""
+RECOUNT = 5.0
+"""Seconds after which the workers of a cluster are counted again."""
 ATTEMPTS = 2
 """A run during which the worker died is tried once more, alone; then its death is its error."""
 
@@ -149,18 +153,28 @@ def cluster(work: Work, tasks: Iterable[Task], address: str) -> Iterator[Outcome
         raise FlexmanipError(f"no Dask scheduler answers at '{address}'",
                              'start one with: dask scheduler, and workers with: dask worker ADDRESS') from err
     with client:
+        try:
+            client.wait_for_workers(1, timeout=ANSWER_TIME)
+        except TimeoutError as err:
+            raise FlexmanipError(f"the cluster at '{address}' has no workers",
+                                 'start some with: dask worker ADDRESS') from err
         waiting = iter(tasks)
-        cores = max(sum(client.nthreads().values()), 1)
         running: dict[Any, Task] = {}
         ready = dask.as_completed()
+        most, counted = 0, -math.inf
 
         def hand_out() -> None:
-            for task in waiting:
-                future = client.submit(work, task, pure=False, retries=1)
+            nonlocal most, counted
+            if time.monotonic() - counted > RECOUNT:  # workers may come and go
+                most, counted = AHEAD * max(sum(client.nthreads().values()), 1), time.monotonic()
+            while len(running) < most:
+                try:
+                    task = next(waiting)
+                except StopIteration:
+                    return
+                future = client.submit(work, task, pure=False)
                 running[future] = task
                 ready.add(future)
-                if len(running) >= cores * AHEAD:
-                    return
 
         hand_out()
         for future in ready:

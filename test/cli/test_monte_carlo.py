@@ -170,7 +170,7 @@ def test_the_scenarios_in_config_are_valid(path):
     assert read_scenario(path).name == path.stem
 
 
-def test_the_same_work_goes_to_a_dask_cluster(scenario_file, tmp_path):
+def test_the_same_work_goes_to_a_dask_cluster(scenario_file, tmp_path, capsys, monkeypatch):
     pytest.importorskip('distributed')
     here = tmp_path / 'scheduler.json'
     common = [sys.executable, '-m', 'dask']
@@ -183,6 +183,10 @@ def test_the_same_work_goes_to_a_dask_cluster(scenario_file, tmp_path):
             assert time.monotonic() < deadline
             time.sleep(0.05)
         address = json.loads(here.read_text())['address']
+        with monkeypatch.context() as hurry:
+            hurry.setattr(workers, 'ANSWER_TIME', 2.0)
+            assert _run(scenario_file, '--scheduler', address, '--output', tmp_path / 'none.csv') == 2
+        assert 'has no workers' in capsys.readouterr().err
         started += [subprocess.Popen([*common, 'worker', address, '--nthreads', '1', '--no-nanny',
                                       '--no-dashboard', '--host', '127.0.0.1',
                                       '--death-timeout', '20'], **quiet) for _ in range(2)]
