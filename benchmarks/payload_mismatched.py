@@ -2,7 +2,7 @@
 
 Independent rigid-rod chains (22 hinges a link) on other arms, payloads and motions; the two recorded physics
 bags (skipped where absent); joints that turn 30 degrees at 30 dB; finite elements, damped and not, by our
-conventions and the paper's; stiffness 3 % wrong in the parameters after 2 s of empty motion. kappa = 3; errors
+conventions and the paper's; stiffness 3 % wrong in the parameters after 2 s of empty motion. kappa = 3; error
 and coverage 1 and 3 s after capture.
 
 Use: python benchmarks/payload_mismatched.py [--runs 4]
