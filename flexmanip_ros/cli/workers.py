@@ -10,6 +10,7 @@ import os
 import signal
 import threading
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -115,6 +116,7 @@ def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome
 def _serve() -> None:
     """Leave Ctrl-C, which reaches every process of a terminal, to the one that collects; end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    warnings.simplefilter('ignore')  # as in the collecting process: what matters is a status or an error
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()

@@ -151,19 +151,22 @@ def payload_figure(made: Run) -> Figure:
     return drawn
 
 
-def validation_figure(scores: Scores, outputs: Sequence[str]) -> Figure:
+def validation_figure(scores: Scores, outputs: Sequence[str], *, has_arm: bool) -> Figure:
     """Draw what was measured after the identification, and what the model said."""
     drawn, axes = plots.figure(len(outputs), [1.7] * len(outputs))
     for k, (ax, name) in enumerate(zip(axes, outputs, strict=True)):
-        for values, label, colour, width in (
-                (scores.measured, 'measured', '#9A9A9A', 2.2),
-                (scores.simulated, 'simulated', plots.COLOURS[1], 1.1),
-                (scores.predicted, 'one step ahead', plots.COLOURS[0], 0.8)):
-            ax.plot(*plots.envelope(scores.time, values[:, k]), color=colour, linewidth=width, label=label)
-        spread = scores.measured[:, k]
+        joint, _, field = name.rpartition('/')
+        _, unit, scale = _quantity(joint, field, has_arm)
+        for values, label, colour, width, line in (
+                (scores.measured, 'measured', '#9A9A9A', 2.6, plots.LINES[0]),
+                (scores.simulated, 'simulated', plots.COLOURS[1], 1.1, plots.LINES[0]),
+                (scores.predicted, 'one step ahead', plots.COLOURS[0], 0.9, plots.LINES[1])):
+            ax.plot(*plots.envelope(scores.time, scale * values[:, k]), color=colour, linewidth=width,
+                    linestyle=line, label=label)
+        spread = scale * scores.measured[:, k]
         room = 0.3 * (float(spread.max() - spread.min()) or 1.0)
         ax.set_ylim(float(spread.min()) - room, float(spread.max()) + room)
-        ax.set_ylabel(name.replace('/', '\n'))
+        ax.set_ylabel(f'{joint}\n{field}\n[{unit}]')
         ax.set_title(f'VAF {scores.simulation[k]:.2f} % simulated, {scores.prediction[k]:.2f} % predicted',
                      loc='left', fontsize=9)
         if k == 0:

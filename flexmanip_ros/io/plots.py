@@ -28,7 +28,14 @@ STATUS_COLOURS = {
     Status.WARMING_UP: '#C8C8C8', Status.TRACKING: '#009E73', Status.POORLY_EXCITED: '#E69F00',
     Status.ILL_CONDITIONED: '#CC79A7', Status.SAMPLE_GAP: '#56B4E9', Status.INCONSISTENT: '#D55E00',
     Status.NO_PAYLOAD_METHOD: '#56B4E9', Status.UNOBSERVABLE: '#7F7F7F', Status.DIVERGED: '#000000',
+    Status.ORDER_TOO_LOW: '#F0E442',
 }
+STATUS_HATCHES = {
+    Status.TRACKING: '', Status.WARMING_UP: '..', Status.POORLY_EXCITED: '//', Status.ILL_CONDITIONED: 'xx',
+    Status.SAMPLE_GAP: '||', Status.INCONSISTENT: '\\\\', Status.NO_PAYLOAD_METHOD: '--',
+    Status.UNOBSERVABLE: '++', Status.DIVERGED: 'OO', Status.ORDER_TOO_LOW: '**',
+}
+"""A status differs by more than its colour."""
 WIDTH = 10.0
 """Inches; about the width of a page."""
 DPI = 120
@@ -131,7 +138,8 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int,
     for k in range(count):
         colour, middle, spread = COLOURS[k % len(COLOURS)], values[:, k, 0], 1.96 * values[:, k, 1]
         ax.fill_between(time, middle - spread, middle + spread, color=colour, alpha=0.2, linewidth=0)
-        ax.plot(time, middle, color=colour, linewidth=1.4, label=f'mode {k + 1}, 95 % band')
+        ax.plot(time, middle, color=colour, linestyle=LINES[k % len(LINES)], linewidth=1.4,
+                label=f'mode {k + 1}, 95 % band')
     for index, (begin, end, known) in enumerate(truth):
         for k, frequency in enumerate(known):
             ax.plot([begin, end], [frequency] * 2, color=TRUTH_COLOUR, linestyle=(0, (4, 3)), linewidth=1.1,
@@ -143,6 +151,7 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int,
             ax.set_ylim(min(known_all) - room, max(known_all) + room)
         else:
             limit(ax, _lowest(values[:, :, 0]), [])
+            ax.set_ylim(bottom=max(ax.get_ylim()[0], 0.0))
         _note_beyond(ax, values[-1, :, 0])
     ax.set_ylabel('frequency\n[Hz]')
     legend(ax)
@@ -221,13 +230,18 @@ def statuses(ax: Any, estimates: Sequence[Estimate], start_ns: int) -> None:
         if k < len(estimates) and estimates[k].status is estimates[begin].status:
             continue
         status = estimates[begin].status
-        ax.axvspan(time[begin], time[min(k, len(estimates) - 1)], color=STATUS_COLOURS[status], linewidth=0)
+        ax.axvspan(time[begin], time[min(k, len(estimates) - 1)], **_status_look(status))
         if status not in seen:
             seen.append(status)
         begin = k
     ax.set_yticks([])
     ax.set_ylabel('status', rotation=0, ha='right', va='center')
     ax.grid(False)
-    names = [Patch(color=STATUS_COLOURS[s], label=s.name.lower().replace('_', ' ')) for s in seen]
+    names = [Patch(label=s.name.lower().replace('_', ' '), **_status_look(s)) for s in seen]
     ax.legend(handles=names, loc='upper left', bbox_to_anchor=(1.005, 1.2), frameon=False, fontsize=9,
               borderaxespad=0.0)
+
+
+def _status_look(status: Status) -> dict[str, Any]:
+    return {'facecolor': STATUS_COLOURS[status], 'hatch': STATUS_HATCHES[status], 'edgecolor': '#FFFFFF',
+            'linewidth': 0}

@@ -33,7 +33,7 @@ def identification_report(
             pictures.payload_figure(made), 'payload with its 95 % interval, and residual power over time')))
     if scores is not None:
         note = '' if not scores.until_gap else '<p class="note">Scored up to the first gap.</p>'
-        drawn = pictures.validation_figure(scores, made.signals.outputs)
+        drawn = pictures.validation_figure(scores, made.signals.outputs, has_arm=made.has_arm)
         sections.append(Section(
             'Validation', note + picture(drawn, 'measured, simulated and predicted outputs')))
     if model is not None:

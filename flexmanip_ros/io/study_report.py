@@ -55,14 +55,15 @@ def errors(rows: Sequence[Row]) -> Figure | None:
     relative = [100.0 * (part - true) / true for part in (mass, low, high)]
     held = np.array([bool(row['covered']) for row in good])
     drawn, axes = plots.figure(1, [3.4], share_time=False)
-    for chosen, colour, label in ((held, plots.PAYLOAD_COLOUR, 'truth inside'),
-                                  (~held, plots.EVENT_COLOUR, 'truth outside')):
+    for chosen, colour, mark, label in ((held, plots.PAYLOAD_COLOUR, 'o', 'truth inside\nthe 95 % interval'),
+                                        (~held, plots.EVENT_COLOUR, 'x', 'truth outside')):
         if chosen.any():
             axes[0].vlines(true[chosen], relative[1][chosen], relative[2][chosen], color=colour, alpha=0.5)
-            axes[0].plot(true[chosen], relative[0][chosen], 'o', markersize=4, color=colour, label=label)
+            axes[0].plot(true[chosen], relative[0][chosen], mark, markersize=4, color=colour, label=label)
     axes[0].axhline(0.0, color=plots.TRUTH_COLOUR, linewidth=1.0)
-    spread = np.percentile(np.abs(relative[0]), 95) + np.median(relative[2] - relative[1])
-    room = 1.5 * float(spread)
+    spread = float(np.percentile(np.abs(relative[0]), 95))
+    # intervals that are much wider than the errors must not hide them
+    room = 1.5 * (spread + min(float(np.median(relative[2] - relative[1])), 3.0 * spread))
     axes[0].set_ylim(-room or -1.0, room or 1.0)
     axes[0].set_xlabel('true payload [kg]')
     axes[0].set_ylabel('error [%]')

@@ -56,3 +56,8 @@ def test_an_interval_keeps_the_digits_that_tell_its_ends_apart(lower, upper, wor
     _, (ax,) = plots.figure(1, [2.0])
     plots.payload(ax, [Estimate(k, Status.TRACKING, None, (), held) for k in range(3)], 0)
     assert [text.get_text() for text in ax.texts] == [words]
+
+
+def test_every_status_has_a_colour_and_a_pattern_of_its_own():
+    looks = [(plots.STATUS_COLOURS[status], plots.STATUS_HATCHES[status]) for status in Status]
+    assert len({hatch for _, hatch in looks}) == len(looks)
