@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -70,7 +69,7 @@ FINITE_ELEMENT = Case('finite_element', 20.0, (45.0, 0.0), 'finite_element')
 CASES = (*PAYLOADS, *CONFIGURATIONS, FINITE_ELEMENT)
 
 IDENTIFIERS: Mapping[str, Mapping[str, Any]] = {
-    'paper': {'payload_method': 'block', 'estimator': 'paper', 'forgetting': 'constant',
+    'paper': {'payload_method': 'none', 'estimator': 'paper', 'forgetting': 'constant',
               'restart_on_event': False},
     'ours': {'payload_method': 'structured', 'forgetting_factor': [0.9995, 0.9995, 0.9995]},
 }
@@ -78,7 +77,7 @@ IDENTIFIERS: Mapping[str, Mapping[str, Any]] = {
 _BLOCK = {'payload_method': 'block'}
 _WEIGHED = {'payload.gravity': single_link.GRAVITY, 'outputs': ['joint2/position'], 'order': 1}
 METHODS = (
-    Method('paper', "the paper's settings: beta 0.99, no restart, block extraction", 'paper'),
+    Method('paper', "the paper's settings: beta 0.99, no restart, block extraction", 'paper', _BLOCK),
     Method('restart', 'ours: restart at the capture, beta 0.9995, maximum-likelihood refinement; block '
            'extraction', 'ours', _BLOCK),
     Method('known M_b', 'ours: the same model, the coupling block taken from the arm', 'ours',
@@ -95,20 +94,14 @@ BEST_MODEL = 'restart'
 """The method whose state-space model is shown in the test responses and frequency tracks."""
 
 
-def has_bound(case: Case, method: Method) -> bool:
-    """Whether a method's bound in a case is known."""
-    return case.model == 'linear' and not method.rival
-
-
-@cache
-def bound(case: Case, method: str) -> float | None:
-    """Return the Cramer-Rao bound of the payload [kg] at the end of a run; None where a method has none.
+def bounds_of(case: Case) -> dict[str, float]:
+    """Return method -> Cramer-Rao bound of the payload [kg] at the end of a run, where a method has one.
 
     ``structured`` knows the structure; the block extractions know nothing of (A, B), and theirs is the bound
     of their own formula (docs of ``payload.bounds``).
     """
-    if not has_bound(case, next(known for known in METHODS if known.name == method)):
-        return None
+    if case.model != 'linear':
+        return {}
     run = scenario(case, METHODS[0]).configuration(0, METHODS[0].name)
     quiet = replace(run.plant, noise='none')
     torque = excitation.sequence(run.excitation, round(WINDOW[1] * quiet.rate))
@@ -118,9 +111,9 @@ def bound(case: Case, method: str) -> float | None:
     states = np.hstack([clean.position[first:, 2:], clean.velocity[first:, 2:]])
     given = (quiet.arm, np.radians(case.angles_deg), case.payload, states, torque[first:],
              np.concatenate([noise[2:4], noise[6:8]]), 1.0 / quiet.rate, (len(states),))
-    if method == 'structured':
-        return float(bounds.structure_known(*given)[0])
-    return float(bounds.structure_unknown(*given, known_mb=method == 'known M_b')[0])
+    structure = float(bounds.structure_known(*given)[0])
+    trace, known = (float(bounds.structure_unknown(*given, known_mb=known)[0]) for known in (False, True))
+    return {'paper': trace, 'restart': trace, 'known M_b': known, 'structured': structure}
 
 
 def scenario(case: Case, method: Method) -> Scenario:

@@ -55,14 +55,14 @@ def run(case: Case, seed: int) -> tuple[list[study.Row], dict[str, Track]]:
     failed: dict[str, str] = {}
     alone = [method for method in paper.METHODS if method.name == paper.ALONE]
     others = [method for method in paper.METHODS if method.name != paper.ALONE]
-    readers = [[method for method in others if method.identifier == name] for name in paper.IDENTIFIERS]
     rivalling = [method for method in others if method.rival]
     items: list[Item] = []
     with _attempt(failed, others):
         items = _messages(case, seed)
-    for group in readers if items else ():
-        with _attempt(failed, group):
-            found.update(_identify(case, group, items))
+    for name in paper.IDENTIFIERS if items else ():
+        readers = [method for method in others if method.identifier == name]
+        with _attempt(failed, readers):
+            found.update(_identify(case, name, readers, items))
     if items:
         with _attempt(failed, rivalling):
             found.update(_compare(case, rivalling, items))
@@ -96,34 +96,35 @@ def _rows(case: Case, seed: int, found: dict[str, Reading], failed: dict[str, st
     return rows, tracks
 
 
-def _identify(case: Case, readers: Sequence[Method], items: Sequence[Item]) -> dict[str, Reading]:
+def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[Item]) -> dict[str, Reading]:
     """Run one identifier once; each of the methods that read it costs the pass and its own reading.
 
-    The identifier's own estimates are those of the method without settings of its own; the others read a
-    block payload from its model.
+    A method without settings of its own takes the identifier's estimates; the others read a block payload
+    from its model, from the capture on.
     """
-    configs = {method.name: _configured(case, method)[1].identifier for method in readers}
-    own = next(method.name for method in readers if not method.settings)
-    found = {name: Reading([], 0.0) for name in configs}
-    walls = dict.fromkeys(configs, 0.0)
+    configs = {method.name: _configured(case, method)[1].identifier for method in readers if method.settings}
+    found = {method.name: Reading([], 0.0) for method in readers}
+    walls = dict.fromkeys(found, 0.0)
     begun = time.perf_counter()
-    for state, estimate in pipeline.replay(configs[own], items):
+    for state, estimate in pipeline.replay(_identifier(case, name), items):
         now = estimate if estimate is not None else pipeline.current(state)  # the last: at the last sample
         if now is None:
             continue
-        found[own].estimates.append(now)
-        for name in configs.keys() - {own}:
+        held = (now.stamp_ns - state.first_ns) * 1e-9 >= paper.CAPTURE_TIME
+        for method in found:
             started = time.perf_counter()
-            held = (now.stamp_ns - state.first_ns) * 1e-9 >= paper.CAPTURE_TIME
-            found[name].estimates.append(_with_block(configs[name], state, now) if held else
-                                         replace(now, payload=None))
-            walls[name] += time.perf_counter() - started
+            read = now
+            if method in configs:
+                read = (_with_block(configs[method], case, state, now) if held
+                        else replace(now, payload=None))
+            found[method].estimates.append(read)
+            walls[method] += time.perf_counter() - started
     shared = time.perf_counter() - begun - sum(walls.values())
-    return {name: reading._replace(wall=shared + walls[name]) for name, reading in found.items()}
+    return {method: reading._replace(wall=shared + walls[method]) for method, reading in found.items()}
 
 
-def _with_block(config: IdentifierParameters, state: pipeline.State, now: Estimate) -> Estimate:
-    """Return an estimate with the payload that the blocks of its model give."""
+def _with_block(config: IdentifierParameters, case: Case, state: pipeline.State, now: Estimate) -> Estimate:
+    """Return an estimate with the payload that the blocks of its model give at the case's working point."""
     assert state.timeline is not None
     core = state.timeline.core
     try:
@@ -132,7 +133,7 @@ def _with_block(config: IdentifierParameters, state: pipeline.State, now: Estima
         found = None
     if found is None:
         return replace(now, payload=None, status=now.model_status)
-    payload = block_extraction.estimate(config, found, core.angles, core.swept)
+    payload = block_extraction.estimate(config, found, np.radians(case.angles_deg), core.swept)
     status = payload.status if found.status is Status.TRACKING else found.status
     return replace(now, payload=payload, status=status)
 
@@ -149,6 +150,12 @@ def _compare(case: Case, methods: Sequence[Method], items: Sequence[Item]) -> di
         estimates = list(rivals.run(method.rival, config, sampled))
         found[method.name] = Reading(estimates, shared + time.perf_counter() - begun)
     return found
+
+
+@cache
+def _identifier(case: Case, name: str) -> IdentifierParameters:
+    """Return the configuration of one of the identifiers, whoever reads it."""
+    return paper.scenario(case, Method(name, '', name)).configuration(0, name).identifier
 
 
 @cache

@@ -11,7 +11,7 @@ from flexmanip_ros import paper, study
 from flexmanip_ros.metrics import coverage
 from flexmanip_ros.types import Array
 
-Bounds = Mapping[tuple[str, str], float | None]
+Bounds = Mapping[tuple[str, str], float]
 """(case, method) -> Cramer-Rao bound of the payload at the end of a run [kg]."""
 Line = dict[str, Any]
 

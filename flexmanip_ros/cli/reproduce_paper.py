@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class Job(NamedTuple):
-    """Something a worker does: a run, a bound, or a figure."""
+    """Something a worker does: a run, the bounds of a case, or a figure."""
 
     kind: str
     key: tuple[Any, ...]
@@ -79,15 +79,14 @@ class Collected:
         self.groups = {name: [case for case in group if case in cases] for name, group in GROUPS.items()}
         self.seeds = seeds
         self.runs: dict[tuple[str, int], tuple[list[study.Row], dict[str, paper_run.Track]]] = {}
-        self.bounds: dict[tuple[str, str], float | None] = {}
+        self.bounds: dict[tuple[str, str], float] = {}
         self.planned: dict[str, Sequence[Planned]] = {}
         self.drawn: dict[tuple[str, int], bytes] = {}
 
     def first(self) -> list[Job]:
         """Return what can be done at once; the runs of one group after the other."""
         cases = [case for group in self.groups.values() for case in group]
-        bounds = [Job('bound', (case.name, method.name), partial(paper.bound, case, method.name))
-                  for case in cases for method in paper.METHODS if paper.has_bound(case, method)]
+        bounds = [Job('bounds', (case.name,), partial(paper.bounds_of, case)) for case in cases]
         runs = [Job('run', (case, seed), partial(paper_run.run, case, seed))
                 for group in self.groups.values() for seed in self.seeds for case in group]
         from flexmanip_ros.io import paper_sections
@@ -97,8 +96,8 @@ class Collected:
     def take(self, outcome: workers.Outcome) -> list[Job]:
         """Keep an outcome; return what can be drawn now."""
         job, found = outcome.task, outcome.result
-        if job.kind == 'bound':
-            self.bounds[job.key] = found
+        if job.kind == 'bounds':
+            self.bounds |= {(*job.key, method): value for method, value in (found or {}).items()}
         elif job.kind == 'figure':
             self.drawn[job.key] = found or b''
         else:

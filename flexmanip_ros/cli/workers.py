@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import math
 import multiprocessing
@@ -24,6 +25,8 @@ AHEAD = 4
 """Runs handed out for each worker, so that none waits."""
 ANSWER_TIME = 10.0
 """Seconds after which a scheduler that says nothing is taken not to be there."""
+GARBAGE = 20_000
+"""Objects made before old ones are looked through: a run holds many small ones as long as it lasts."""
 RECOUNT = 5.0
 """Seconds after which the workers of a cluster are counted again."""
 ATTEMPTS = 2
@@ -116,6 +119,7 @@ def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome
 def _serve() -> None:
     """Leave Ctrl-C, which reaches every process of a terminal, to the one that collects; end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    gc.set_threshold(GARBAGE)
     warnings.simplefilter('ignore')  # as in the collecting process: what matters is a status or an error
     parent = multiprocessing.parent_process()
     if parent is not None:
