@@ -256,9 +256,12 @@ def main() -> None:
               f'{sum(trial.finished for trial in mine)} | '
               f'{", ".join(f"{code}: {count}" for code, count in sorted(codes.items()))} | '
               f'{max(trial.took_s for trial in mine):.2f} | {sum(bool(trial.problem) for trial in mine)} |')
-    if not part:
-        target = HERE / 'results' / 'ros_signals.json'
-        rows = [trial._asdict() for trial in trials]
+    target = HERE / 'results' / 'ros_signals.json'
+    tried = {trial.program for trial in trials}
+    rows = [row for row in json.loads(target.read_text(encoding='utf-8')) if row['program'] not in tried] \
+        if part and target.exists() else []
+    rows += [trial._asdict() for trial in trials]
+    if rows:
         target.write_text(json.dumps(rows, indent=1) + '\n', encoding='utf-8')
     if any(trial.problem for trial in trials):
         sys.exit(1)
