@@ -108,7 +108,7 @@ def step(config: IdentifierParameters, state: SamplingState, record: JointRecord
 
 
 def flush(config: IdentifierParameters, state: SamplingState) -> tuple[SamplingState, Sampled]:
-    """Give out what still waits: for the sample time (a recording shorter than the learning), or for doubt."""
+    """Give out what still waits: for the sample time (a recording too short to learn it), or in doubt."""
     if state.doubtful is not None:
         return _placed(config, state._replace(doubtful=None), state.doubtful)
     return _learned(config, state, reset=False) if state.learning else (state, NOTHING)

@@ -11,8 +11,6 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from flexmanip_ros.parameters.demo import IDENTIFIER
-
 PACKAGE = 'flexmanip_ros'
 ARGUMENTS = (
     # name, default, words
@@ -30,10 +28,6 @@ def _number(name):
     return ParameterValue(LaunchConfiguration(name), value_type=float)
 
 
-def _plain(value):
-    return list(value) if isinstance(value, tuple) else value
-
-
 def _node(executable, parameters):
     return Node(
         package=PACKAGE, executable=executable, namespace=LaunchConfiguration('namespace'), output='screen',
@@ -46,7 +40,6 @@ def generate_launch_description():
         *(DeclareLaunchArgument(name, default_value=default, description=words)
           for name, default, words in ARGUMENTS),
         _node('rpbsid_identifier', {
-            **{name: _plain(value) for name, value in IDENTIFIER.items()},
             'payload_method': ParameterValue(LaunchConfiguration('payload_method'), value_type=str)}),
         _node('capture_trigger', {
             'mode': 'time', 'capture_time': _number('capture_time'),

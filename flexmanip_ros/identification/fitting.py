@@ -21,7 +21,7 @@ NOISE_BLOCKS, DRIFT_BLOCKS = 16, 4
 """Blocks over which the noise is remembered, and how fast the parameters move."""
 SURPRISE = 2.0
 """Standard deviations beyond which a block says that the parameters have gone elsewhere."""
-LARGEST_DRIFT = 20.0
+LARGEST_DRIFT = 1.4
 """Logarithm of the largest factor on a variance from one block."""
 
 

@@ -26,16 +26,19 @@ def transform(model: StateSpace, W: Array) -> StateSpace:
 def to_continuous(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
     """Ac (n, n) [1/s] and Bc (n, r) whose response to inputs held over dt is (A, B).
 
-    Matrix logarithm of [[A, B], [0, I]] / dt. Raises ModelError where no real logarithm exists
-    (a pole at zero or on the negative real axis).
+    By eigenvectors, B = Ac^-1 (A - I) Bc; where they do not serve by the matrix logarithm of
+    [[A, B], [0, I]], which does not always give the same bits twice. Raises ModelError where no real
+    logarithm exists (a pole at zero or on the negative real axis).
     """
     n, r = B.shape
-    joint = np.zeros((n + r, n + r))
-    joint[:n, :n], joint[:n, n:], joint[n:, n:] = A, B, np.eye(r)
-    poles = np.linalg.eigvals(A)
-    if not np.all(np.isfinite(A)) or _outside_log(poles):
+    if not np.all(np.isfinite(A)) or _outside_log(np.linalg.eigvals(A)):
         raise ModelError(
             'the model has a pole that no continuous system has', 'lower the order or the sample time')
+    Ac, held = continuous_state_matrix(A, dt), A - np.eye(n)
+    if Ac is not None and np.linalg.cond(held) < WORST_BASIS:
+        return Ac, np.asarray(np.linalg.solve(held, Ac @ B), dtype=np.float64)
+    joint = np.zeros((n + r, n + r))
+    joint[:n, :n], joint[:n, n:], joint[n:, n:] = A, B, np.eye(r)
     log = np.real(logm(joint)) / dt
     return log[:n, :n], log[:n, n:]
 
@@ -75,6 +78,19 @@ def stabilized(A: Array) -> Array:
         return np.asarray(A / radius.max(), dtype=np.float64)
     inside = values / np.maximum(radius, 1.0) * (1.0 - 1e-12)
     return np.asarray(np.real(np.linalg.solve(vectors.T, (vectors * inside).T).T), dtype=np.float64)
+
+
+def lightly_damped(A: Array, most: float) -> Array:
+    """A (n, n) with every oscillation damped by at most the ratio ``most``, at its own frequency."""
+    values, vectors = np.linalg.eig(A)
+    angle = np.abs(np.angle(values))
+    turning = (angle > 1e-9) & (angle < np.pi - 1e-9)
+    if not turning.any() or np.linalg.cond(vectors) > WORST_BASIS:
+        return A
+    slow = np.exp(-most / np.sqrt(1.0 - most ** 2) * angle)
+    radius = np.abs(values)
+    moved = values * np.where(turning & (radius < slow), slow / np.where(radius > 0.0, radius, 1.0), 1.0)
+    return np.asarray(np.real(np.linalg.solve(vectors.T, (vectors * moved).T).T), dtype=np.float64)
 
 
 def known_output_basis(model: StateSpace) -> Array | None:

@@ -7,7 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.moments import Realized
+from flexmanip_ros.identification.pbsid import pbsid
 from flexmanip_ros.identification.prediction_error import (
     Fit,
     Structure,
@@ -18,9 +20,14 @@ from flexmanip_ros.identification.prediction_error import (
     directions,
     forgets,
 )
-from flexmanip_ros.types import Array
+from flexmanip_ros.identification.realization import lightly_damped, to_continuous, to_discrete
+from flexmanip_ros.types import Array, StateSpace
 
 ITERATIONS = 12
+ROWS, PAST, RIDGE = 128, 8, 1e-3
+"""Means over the stretch, their past window, and the ridge on them, of a start for slow modes."""
+LIGHT = 0.005
+"""Largest damping ratio of a second start: a short past makes modes seem damped, and fits start lost."""
 CLEAN = 1e-20
 """Relative innovation power below which the subspace model has no bias worth removing; the least assumed."""
 UNEXPLAINED = 0.5
@@ -64,16 +71,34 @@ class Attempt(NamedTuple):
     begin: Array
 
 
-def candidate(realized: Realized, feedthrough: bool) -> tuple[Theta, Structure]:
-    """Starting point from the subspace model, C held when it can fix the basis."""
-    n, m = realized.A.shape[0], realized.C.shape[0]
-    theta = Theta(realized.A, realized.B, realized.C, realized.D, realized.K, np.zeros(n))
-    if n == m and np.linalg.cond(realized.C) < 1e6:
-        W = realized.C
-        A = np.asarray(np.linalg.solve(W.T, (W @ realized.A).T).T, dtype=np.float64)
-        theta = Theta(A, W @ realized.B, np.eye(n), realized.D, W @ realized.K, np.zeros(n))
+def candidate(model: StateSpace, feedthrough: bool) -> tuple[Theta, Structure]:
+    """Starting point from a model of scaled signals, C held when it can fix the basis."""
+    n, m = model.A.shape[0], model.C.shape[0]
+    theta = Theta(model.A, model.B, model.C, model.D, model.K, np.zeros(n))
+    if n == m and np.linalg.cond(model.C) < 1e6:
+        W = model.C
+        A = np.asarray(np.linalg.solve(W.T, (W @ model.A).T).T, dtype=np.float64)
+        theta = Theta(A, W @ model.B, np.eye(n), model.D, W @ model.K, np.zeros(n))
         return _dense(theta), Structure(False, feedthrough, False)
     return _dense(theta), Structure(True, feedthrough, False)
+
+
+def averaged(U: Array, Y: Array, n: int) -> StateSpace | None:
+    """Model of order n from the means over many samples (N, r), (N, m): a short past that reaches far back.
+
+    Its own past is as many samples as the window of the recursion, and yet sees whole periods of slow modes.
+    """
+    every = len(U) // ROWS
+    if every < 2:
+        return None
+    u, y = (X[:every * ROWS].reshape(ROWS, every, -1).mean(axis=1) for X in (U, Y))
+    try:
+        model, _ = pbsid(u, y, n=n, p=PAST, f=PAST, dt=float(every), regularization=RIDGE)
+        A, B = to_discrete(*to_continuous(model.A, model.B, float(every)), 1.0)
+    except (ModelError, np.linalg.LinAlgError):
+        return None
+    found = StateSpace(A, B, model.C, np.zeros_like(model.D), np.zeros((n, Y.shape[1])), 1.0)
+    return found if all(np.all(np.isfinite(part)) for part in (A, B, model.C)) else None
 
 
 def _dense(theta: Theta) -> Theta:
@@ -100,8 +125,14 @@ def fit_stretch(
             return None
         size = np.linalg.slogdet(moments / len(samples) + 1e-300 * np.eye(m))[1]
         floor = float(size) + realized.Xi.size * np.log(len(samples)) / len(samples)
-        begin, structure = candidate(realized, feedthrough)
+        begin, structure = candidate(
+            StateSpace(realized.A, realized.B, realized.C, realized.D, realized.K, 1.0), feedthrough)
         found.append(_attempt(samples, begin, structure, scale, noise, floor))
+        found.append(_attempt(
+            samples, begin._replace(A=lightly_damped(begin.A, LIGHT)), structure, scale, noise, floor))
+    slow = averaged(*_signals(samples, scale, starts[0].B.shape[1]), starts[0].A.shape[0]) if starts else None
+    if slow is not None:
+        found.append(_attempt(samples, *candidate(slow, feedthrough), scale, noise, floor))
     if old is not None:
         begin = old.theta._replace(x=np.zeros_like(old.theta.x), K=old.gain)
         own = floor + 2.0 * float(np.sum(np.log(old.scale[-m:] / scale[-m:]))) if starts else floor

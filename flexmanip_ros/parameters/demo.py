@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.field import check_all, parameter
-
-IDENTIFIER: Mapping[str, Any] = {
-    'order': 8, 'past_window': 20, 'future_window': 10, 'forgetting_factor': (0.9995, 0.9995, 0.9995),
-}
-"""What the demonstration changes of the identifier: two modes of each link, and a memory of 2 s that begins
-anew at the capture. With order 4 the third modes at 50 Hz push the lowest two up by 5 %."""
 
 
 @dataclass(frozen=True)
@@ -47,5 +40,4 @@ def settings(config: DemoParameters) -> dict[str, dict[str, Any]]:
         'excitation': {'rate': config.rate, 'clock': 'joint_states'},
         'capture_trigger': {'mode': 'time', 'capture_time': config.capture_time,
                             'release_time': config.release_time},
-        'rpbsid_identifier': dict(IDENTIFIER),
     }

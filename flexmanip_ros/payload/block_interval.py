@@ -13,17 +13,15 @@ from collections.abc import Callable
 import numpy as np
 
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.identification.realization import continuous_state_matrix, to_continuous
+from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.payload.modal_basis import to_modal
-from flexmanip_ros.types import Array, Payload, StateSpace, Status
+from flexmanip_ros.types import Array, Payload, Status
 
 DRAWS = 256
 """Models drawn for the interval."""
 STEP = 1e-4
 """Step of the derivatives, in standard deviations."""
-WORST = 1e8
-"""Condition number beyond which a shortcut is not taken."""
 QUANTILE = 1.959963984540054
 """Of the normal distribution, for 95 %."""
 
@@ -48,7 +46,7 @@ def payload(
     if not (np.isfinite(model.A).all() and np.isfinite(model.B).all() and np.isfinite(model.C).all()):
         return unknown(Status.DIVERGED)
     try:
-        Ac, Bc = continuous(model)
+        Ac, Bc = to_continuous(model.A, model.B, model.dt)
         modal = to_modal(Ac, Bc, model.C, S, rates)
         mass = float(mass_of(*modal))
         directions = continuous_spread(identified)
@@ -83,18 +81,6 @@ def payload(
         upper = max(upper, widening * QUANTILE * std, -mass if upper < 0.0 else 0.0)
     std = math.hypot(widening * std, 0.5 * reach)
     return Payload(max(mass, 0.0), std, max(lower, 0.0), max(upper, 0.0), power, status)
-
-
-def continuous(model: StateSpace) -> tuple[Array, Array]:
-    """Return (Ac, Bc) of a discrete model: by eigenvectors, or where they do not serve by ``to_continuous``.
-
-    B = Ac^-1 (A - I) Bc for an input held over the sample. Raises ModelError.
-    """
-    Ac = continuous_state_matrix(model.A, model.dt)
-    held = model.A - np.eye(model.order)
-    if Ac is None or np.linalg.cond(held) > WORST:
-        return to_continuous(model.A, model.B, model.dt)
-    return Ac, np.asarray(np.linalg.solve(held, Ac @ model.B), dtype=np.float64)
 
 
 def continuous_spread(identified: Identified) -> tuple[Array, Array, Array]:

@@ -23,6 +23,7 @@ from flexmanip_ros.plant.linearization import frequencies, vibration_model
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord
 
 DIFFERENT = 1
+SECOND = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def finish(config: DemoParameters, facts: Facts, folder: Path, console: Console)
     estimates = list(pipeline.run(facts.identifier, items))
     different = compare(facts.live, outgoing(estimates, facts.identifier.payload_frame))
     replay_s = time.monotonic() - began
-    truth = known_truth(config, facts.plant)
+    truth = known_truth(config, facts.plant, items)
     picture = folder / 'overview.png'
     # The two lowest modes are those whose change a payload shows; with the next at 50 Hz they were one line.
     shown = [replace(estimate, modes=estimate.modes[:len(truth.before)]) for estimate in estimates]
@@ -103,15 +104,25 @@ def bits(value: Value) -> bytes:
     return struct.pack('<d', value)
 
 
-def known_truth(config: DemoParameters, plant: PlantParameters) -> Truth:
-    """Return what the simulation knows: the payload, and the frequencies at the initial configuration."""
-    theta = np.array(plant.initial_angles)
+def known_truth(config: DemoParameters, plant: PlantParameters,
+                items: Sequence[JointRecord | CaptureEvent]) -> Truth:
+    """Return what the simulation knows: the payload, and the frequencies of the arm as it stood.
 
-    def lowest(mass: float) -> tuple[float, ...]:
-        return tuple(float(f) for f in frequencies(vibration_model(plant.arm, theta, mass)[0])[:2])
+    It moves: its mean configuration over the last second before the capture counts, and of the run.
+    """
+    records = [item for item in items if isinstance(item, JointRecord)]
+    end_ns = records[-1].stamp_ns
+    caught_ns = min((item.stamp_ns for item in items if isinstance(item, CaptureEvent)), default=end_ns)
+
+    def lowest(mass: float, until_ns: int) -> tuple[float, ...]:
+        last = [np.cumsum(record.position[:2]) for record in records
+                if until_ns - SECOND < record.stamp_ns <= until_ns]
+        found = frequencies(vibration_model(plant.arm, np.mean(last, axis=0), mass)[0])
+        return tuple(float(f) for f in found[:2])
 
     caught = config.capture_time >= 0.0
-    return Truth(config.payload_mass if caught else None, lowest(0.0), lowest(config.payload_mass))
+    return Truth(config.payload_mass if caught else None, lowest(0.0, caught_ns),
+                 lowest(config.payload_mass, end_ns))
 
 
 def _title(config: DemoParameters) -> str:

@@ -78,3 +78,20 @@ def test_message_by_message_is_the_replay_bit_for_bit(bad: list[tuple[int, str]]
     assert live[-1].payload is not None
     assert last.counters == state.counters
     assert _bits(pipeline.current(state)) == _bits(pipeline.current(last))
+
+
+def test_every_fit_after_a_capture_gives_the_same_bits_live_and_replayed() -> None:
+    plant = configure(PlantParameters, {'payload_mass': 20.0, 'snr_db': 40.0})
+    event = CaptureEvent(600 * MS, EventKind.CAPTURE)
+    made = simulator.simulate(plant, excitation.sequence(ExcitationParameters(), 4000), (event,), 0)
+    items = list(simulator.records(made, (event,)))
+    for method in ('structured', 'block'):
+        config = configure(IdentifierParameters, {'payload_method': method})
+        state, live = pipeline.init(), []
+        for item in items:
+            state, ready = pipeline.step(config, state, item)
+            live += ready
+        ballast = [np.empty(3 * k + 1) for k in range(50)]  # other places in memory, the same numbers
+        replayed = list(pipeline.run(config, items))
+        assert [_bits(one) for one in live] == [_bits(one) for one in replayed], len(ballast)
+        assert sum(one.model_is_new for one in live) > 30

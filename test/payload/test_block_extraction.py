@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import logm
 
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
-from flexmanip_ros.payload import block_interval, block_truncation
+from flexmanip_ros.payload import block_truncation
 from flexmanip_ros.payload.block_extraction import estimate, extract, sweep
 from flexmanip_ros.payload.modal_basis import to_modal
 from flexmanip_ros.plant.linearization import discretize, vibration_model
@@ -149,7 +150,7 @@ def test_known_coupling_doubts_as_far_as_the_arm_moved():
 
 def test_the_logarithm_by_eigenvectors_is_the_matrix_logarithm():
     model = _sharp(vibration_model(_config(arm__damping_ratio=0.01).arm, np.zeros(2), 50.0, 1)).model
-    Ac, Bc = block_interval.continuous(model)
-    exact = to_continuous(model.A, model.B, model.dt)
-    np.testing.assert_allclose(Ac, exact[0], atol=1e-9 * np.abs(exact[0]).max())
-    np.testing.assert_allclose(Bc, exact[1], atol=1e-9 * np.abs(exact[1]).max())
+    Ac, Bc = to_continuous(model.A, model.B, model.dt)
+    exact = np.real(logm(np.block([[model.A, model.B], [np.zeros((2, 4)), np.eye(2)]]))) / model.dt
+    np.testing.assert_allclose(Ac, exact[:4, :4], atol=1e-9 * np.abs(exact).max())
+    np.testing.assert_allclose(Bc, exact[:4, 4:], atol=1e-9 * np.abs(exact).max())
