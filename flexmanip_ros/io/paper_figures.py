@@ -141,7 +141,8 @@ def frequency_tracks(tracks: Tracks, before: Sequence[float], after: Sequence[fl
     for limit, words in ((5.0, 'the paper accepts 5 %'), (0.5, 'our target 0.5 %')):
         axes[2].axhline(limit, color='#555555', linewidth=1.0, linestyle=':')
         axes[2].annotate(words, (0.995, limit), xycoords=('axes fraction', 'data'), xytext=(0, 2), ha='right',
-                         textcoords='offset points', fontsize=8, color='#555555')
+                         textcoords='offset points', fontsize=8, color='#555555',
+                         bbox={'facecolor': 'white', 'edgecolor': 'none', 'alpha': 0.8, 'pad': 0.5})
     axes[2].set_ylim(1e-4, 50.0)
     axes[2].set_ylabel('median error\n[%]')
     plots.legend(axes[2])
