@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.identification import rpbsid
-from flexmanip_ros.identification.memory_kernel import FILLED, USED
+from flexmanip_ros.identification.memory_kernel import FILLED, REJECTED, USED
 from flexmanip_ros.identification.modal import modes
 from flexmanip_ros.identification.refinement import Answer, Job
 from flexmanip_ros.identification.uncertainty import Identified
@@ -116,6 +116,11 @@ def follow(config: IdentifierParameters, stamp_ns: int, last: Estimate, payload:
 def samples_used(core: Core) -> int:
     """Return how many samples the model rests on."""
     return int(core.rpbsid.counts[USED])
+
+
+def outliers(core: Core) -> int:
+    """Return how many samples the identifier refused: values that cannot be, or far outside all before."""
+    return int(core.rpbsid.counts[REJECTED])
 
 
 def _overall(config: IdentifierParameters, model: Status, payload: Payload | None) -> Status:

@@ -122,7 +122,7 @@ def advance_factor(
     new = np.empty(width)
     for k in range(U.shape[0]):
         fate[k] = LEARNT
-        if not accept(U[k], Y[k], new, scale, counts):
+        if not accept(U[k], Y[k], new, scale, mean, counts):
             fate[k] = REFUSED
             continue
         remember(new, mean, scalars, counts, p)

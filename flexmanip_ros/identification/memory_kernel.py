@@ -13,9 +13,10 @@ WEIGHT, WEIGHT2, PRIOR, ENERGY, LATELY, POWER, GAMMA, OPEN = 0, 1, 2, 3, 4, 5, 6
 remembered and lately (unit: squared peaks), innovation power, last conversion factor, how far the last
 sample counted (0: not)."""
 SCALARS = 8
-FILLED, USED, SEEN, REJECTED = 0, 1, 2, 3
-"""Samples in a row without a gap, regressions since the restart, samples since reset, samples refused."""
-COUNTS = 4
+FILLED, USED, SEEN, REJECTED, ODD = 0, 1, 2, 3, 4
+"""Samples in a row without a gap, regressions since the restart, samples since reset, samples refused, samples
+in a row that stand out."""
+COUNTS = 5
 
 CONSTANT, EXCITATION, INNOVATION = 0, 1, 2
 """Modes of forgetting, see ``memory``."""
@@ -25,19 +26,23 @@ QUIET, LIVELY = 0.005, 0.05
 full."""
 LARGEST = 1e100
 """Numbers are brought to about 1 by the first value of their channel; beyond this the sample is refused."""
+OUTLIER, PATIENCE, SETTLED = 20.0, 2, 50
+"""A value this many times the largest of its channel so far is a sensor's mistake and refused, unless more than
+so many come in a row; looked for from that many regressions on."""
 EXPECTED, SURPRISE = 1.5, 3.0
 """Innovation power below which the model fits, above which the plant is taken to have changed."""
 
 
 @njit(cache=True)
-def accept(u: Array, y: Array, new: Array, scale: Array, counts: Array) -> bool:
-    """Scale one sample into ``new`` (r + m,); a number that is not finite breaks the window instead.
+def accept(u: Array, y: Array, new: Array, scale: Array, mean: Array, counts: Array) -> bool:
+    """Scale one sample into ``new`` (r + m,); a number that cannot be breaks the window instead.
 
     The scale of a channel is the power of two next to its first value that is not zero: exact, so
     nothing of it is seen outside, and squares neither overflow nor vanish inside.
     """
     r = u.shape[0]
     counts[SEEN] += 1
+    odd = False
     for i in range(new.shape[0]):
         value = u[i] if i < r else y[i - r]
         if not math.isfinite(value):
@@ -52,6 +57,12 @@ def accept(u: Array, y: Array, new: Array, scale: Array, counts: Array) -> bool:
             counts[FILLED] = 0
             counts[REJECTED] += 1
             return False
+        odd = odd or (mean[1, i] > 0.0 and abs(new[i]) > OUTLIER * mean[1, i])
+    counts[ODD] = counts[ODD] + 1 if odd and counts[USED] >= SETTLED else 0
+    if 0 < counts[ODD] <= PATIENCE:
+        counts[FILLED] = 0
+        counts[REJECTED] += 1
+        return False
     return True
 
 

@@ -169,7 +169,7 @@ def advance_paper(
     for i in range(n):
         prior2[i, i] = 1.0
     for k in range(U.shape[0]):
-        if not accept(U[k], Y[k], new, scale, counts):
+        if not accept(U[k], Y[k], new, scale, mean, counts):
             last[n + width] = 0.0
             continue
         remember(new, mean, scalars, counts, p)

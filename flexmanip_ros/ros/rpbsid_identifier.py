@@ -26,7 +26,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
 from std_srvs.srv import Trigger
 
-from flexmanip_ros import messages, pipeline
+from flexmanip_ros import estimator, messages, pipeline
 from flexmanip_ros.errors import CheckpointError, FlexmanipError, SignalError
 from flexmanip_ros.identification.realization import suggested_order
 from flexmanip_ros.parameters import IdentifierParameters
@@ -202,7 +202,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         line = self.state.timeline
         if line is not None:
             values.update(late_events=line.late_events, repeated_events=line.repeated_events,
-                          rewinds=line.rewinds)
+                          rewinds=line.rewinds, outliers=estimator.outliers(line.core))
         if self.active and values['rate_hz'] == 0.0:
             report.worse(STALE, 'no joint_states')
         if self.refused:

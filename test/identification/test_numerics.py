@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from linear_arm import configuration, random_system, record, sorted_poles
 
 from flexmanip_ros.identification import rpbsid
-from flexmanip_ros.identification.memory_kernel import USED
+from flexmanip_ros.identification.memory_kernel import REJECTED, USED
 
 MODES = [{'forgetting': 'innovation'}, {'forgetting': 'excitation'}, {'forgetting': 'constant'},
          {'estimator': 'paper', 'forgetting': 'excitation'}, {'estimator': 'paper', 'forgetting': 'constant'}]
@@ -84,3 +84,27 @@ def test_factor_stays_triangular_with_a_positive_information_matrix():
     R = state.memory[0]
     assert np.array_equal(R, np.triu(R))
     assert np.all(np.diag(R)[:-2] > 0)
+
+
+@pytest.mark.parametrize('choice', [{'estimator': 'factor'}, {'estimator': 'paper'}])
+@pytest.mark.parametrize('count', [1, 2])
+def test_a_sensor_that_is_mad_for_a_moment_changes_nothing_that_was_learnt(choice, count):
+    rng = np.random.default_rng(3)
+    u, y = record(random_system(2, 1, 2, rng), 1200, 0.01, rng)
+    config = configuration(1, 2, order=2, past_window=4, future_window=2, **choice)
+    wild = y.copy()
+    wild[700:700 + count, 1] = 1e4 * np.abs(y[:, 1]).max()
+    good, bad = (identified(config, rpbsid.advance(config, rpbsid.init(config), u, data))
+                 for data in (y, wild))
+    near = np.abs(sorted_poles(good.model.A) - sorted_poles(bad.model.A)).max()
+    assert near < 0.02
+
+
+def test_signals_that_grow_for_good_are_followed_after_two_samples():
+    rng = np.random.default_rng(4)
+    u, y = record(random_system(2, 1, 2, rng), 1200, 0.01, rng)
+    config = configuration(1, 2, order=2, past_window=4, future_window=2)
+    state = rpbsid.advance(config, rpbsid.init(config), u[:600], y[:600])
+    grown = rpbsid.advance(config, state, 1e3 * u[600:], 1e3 * y[600:])
+    assert grown.counts[REJECTED] == 2
+    assert grown.counts[USED] > state.counts[USED] + 580
