@@ -14,8 +14,8 @@ remembered and lately (unit: squared peaks), innovation power, last conversion f
 sample counted (0: not)."""
 SCALARS = 8
 FILLED, USED, SEEN, REJECTED, ODD = 0, 1, 2, 3, 4
-"""Samples in a row without a gap, regressions since the restart, samples since reset, samples refused, samples
-in a row that stand out."""
+"""Samples in a row without a gap, regressions since the restart, samples since reset, samples refused, and
+samples in a row that stand out."""
 COUNTS = 5
 
 CONSTANT, EXCITATION, INNOVATION = 0, 1, 2
@@ -27,8 +27,8 @@ full."""
 LARGEST = 1e100
 """Numbers are brought to about 1 by the first value of their channel; beyond this the sample is refused."""
 OUTLIER, PATIENCE, SETTLED = 20.0, 2, 50
-"""A value this many times the largest of its channel so far is a sensor's mistake and refused, unless more than
-so many come in a row; looked for from that many regressions on."""
+"""A value this many times the largest of its channel so far is a sensor's mistake and refused, unless more
+than so many come in a row; looked for from that many regressions on."""
 EXPECTED, SURPRISE = 1.5, 3.0
 """Innovation power below which the model fits, above which the plant is taken to have changed."""
 
