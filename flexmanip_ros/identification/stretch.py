@@ -140,7 +140,7 @@ def fit_stretch(
     done = [attempt for attempt in found if attempt is not None]
     if not done:
         return None
-    recursion = _recursion(samples, min(done, key=lambda attempt: attempt.cost))
+    recursion = _recursion(samples, _with_direct(samples, min(done, key=lambda attempt: attempt.cost)))
     if not starts:
         return recursion
     length = np.linalg.norm(starts[0].state, axis=0)
@@ -172,11 +172,11 @@ def _attempt(
     n, r = begin.B.shape
     U, Y = _signals(samples, scale, r)
     m, count = Y.shape[1], len(U)
-    penalty = n * m * np.log(count) / count
+    penalty = _price(n * m, count)
     chosen = structure._replace(free_gain=False, only_gain=False)
     best = descend(U, Y, begin._replace(K=np.zeros_like(begin.K)), chosen, ITERATIONS)
     simulates = best is not None and unexplained(best.covariance, Y) < UNEXPLAINED
-    cost = np.inf if best is None else best.cost
+    cost = np.inf if best is None else best.cost + (_price(m * r, count) if structure.free_direct else 0.0)
     wanted = False
     if noise == 'any' or simulates:
         wanted = best is None or _gain_asked_for(U, Y, best, chosen, penalty)
@@ -190,6 +190,27 @@ def _attempt(
         return None
     shift = 2.0 * float(np.sum(np.log(scale[r:])))
     return Attempt(best, chosen, scale, cost - shift, wanted, begin.K)
+
+
+def _with_direct(samples: Array, attempt: Attempt) -> Attempt:
+    """Free D where the likelihood pays for it: modes above those of the order bend with the input at once.
+
+    Left out, that compliance is made up for by the modes that are there, and they are off.
+    """
+    fit, structure = attempt.fit, attempt.structure
+    if structure.free_direct:
+        return attempt
+    U, Y = _signals(samples, attempt.scale, fit.theta.B.shape[1])
+    free = structure._replace(free_direct=True)
+    other = descend(U, Y, fit.theta, free, ITERATIONS)
+    if other is None or not other.cost + _price(fit.theta.D.size, len(U)) < fit.cost:
+        return attempt
+    return attempt._replace(fit=other, structure=free)
+
+
+def _price(parameters: int, count: int) -> float:
+    """What further parameters must bring in log-likelihood a sample (Schwarz)."""
+    return parameters * float(np.log(count)) / count
 
 
 def _recursion(samples: Array, attempt: Attempt) -> Recursion:
