@@ -8,6 +8,7 @@ import numpy as np
 
 from flexmanip_ros.identification import publication, refinement
 from flexmanip_ros.identification.factor_kernel import Kinds
+from flexmanip_ros.identification.moments import triangle
 from flexmanip_ros.identification.prediction_error import derivatives, moved, run
 from flexmanip_ros.identification.prediction_error_kernel import condition
 from flexmanip_ros.identification.refinement import Answer, Job, Refined
@@ -17,9 +18,9 @@ from flexmanip_ros.types import Array
 
 MEMORY = 1_000_000.0
 """Samples after which parameters may have drifted by their own standard deviation."""
-NOISE_BLOCKS, DRIFT_BLOCKS = 16, 4
-"""Blocks over which the noise is remembered, and how fast the parameters move."""
-SURPRISE = 2.0
+NOISE_BLOCKS, DRIFT_BLOCKS, WENT_BLOCKS = 16, 4, 4
+"""Blocks over which the noise is remembered, how fast the parameters move, and where they go."""
+SURPRISE = 4.0
 """Standard deviations beyond which a block says that the parameters have gone elsewhere."""
 LARGEST_DRIFT = 1.4
 """Logarithm of the largest factor on a variance from one block."""
@@ -54,6 +55,8 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
     Y = np.ascontiguousarray(samples[:, r:] * old.scale[r:])
     k = old.root.shape[0]
     kept = old.root * np.sqrt(1.0 + len(U) / MEMORY) * np.exp(0.5 * old.drift)
+    if old.went.any():
+        kept = triangle(np.hstack([kept, old.went[:, None]]).T).T
     noise = old.covariance
     if not old.lost:  # what the model leaves (a moving arm is not linear) is noise to it
         before, _ = run(U, Y, old.theta)
@@ -85,13 +88,16 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
     if strikes >= 2 or not np.isfinite(left):
         return None
     share = max(len(U) / (old.weight + len(U)), 1.0 / NOISE_BLOCKS)
+    step = kept @ zeta
+    step[k - len(end):] = 0.0  # the state moves anyway
     moving = old.drift + further if further > 0.0 else 0.0
     return old._replace(
         theta=theta._replace(x=end), root=arrive(root, arrival), strikes=strikes,
         gain=theta.K if old.structure.free_gain else old.gain, lost=False,
         covariance=(1.0 - share) * old.covariance + share * covariance,
         weight=min(old.weight + len(U), MEMORY),
-        drift=old.drift + (moving - old.drift) / DRIFT_BLOCKS)
+        drift=old.drift + (moving - old.drift) / DRIFT_BLOCKS,
+        went=old.went if old.lost else old.went + (step - old.went) / WENT_BLOCKS)
 
 
 def is_surprising(size: float, H: Array, widening: float) -> bool:

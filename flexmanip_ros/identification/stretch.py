@@ -41,7 +41,8 @@ class Recursion(NamedTuple):
     the state; covariance: (m, m) of the innovations, worth ``weight`` samples; widening: factor on standard
     deviations from the scatter of the gradients; gain: (n, m) published K, theta's own unless that is held;
     singular_values, condition: of the subspace model the fit began with; lost: the state is unknown;
-    drift: logarithm of the factor by which variances grow from block to block, as the plant itself moves.
+    drift: logarithm of the factor by which variances grow from block to block, as the plant itself moves;
+    went: (k,) how far the coordinates went of late in a block, that far may they go again.
     """
 
     theta: Theta
@@ -56,6 +57,7 @@ class Recursion(NamedTuple):
     gain: Array
     singular_values: Array
     condition: float
+    went: Array
     lost: bool = False
     drift: float = 0.0
 
@@ -226,7 +228,7 @@ def _recursion(samples: Array, attempt: Attempt) -> Recursion:
         root=arrive(covariance_root(fit.information), fit.arrival),
         covariance=fit.covariance + CLEAN * np.diag(np.mean(Y ** 2, axis=0)), weight=float(len(U)),
         widening=_widening(U, Y, fit, structure), strikes=0, gain=fit.theta.K if gain is None else gain,
-        singular_values=np.zeros(0), condition=float('nan'))
+        singular_values=np.zeros(0), condition=float('nan'), went=np.zeros(fit.directions.shape[1]))
 
 
 def _gain_alone(U: Array, Y: Array, theta: Theta, begin: Array, structure: Structure) -> Array | None:

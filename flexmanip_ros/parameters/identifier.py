@@ -32,7 +32,8 @@ class IdentifierParameters:
     regularization: tuple[float, ...] = parameter(
         (0.1, 0.1, 0.1), 'regularization alpha 1..3 on internally scaled signals',
         low=1e-12, high=1e12, size=3)
-    direct_feedthrough: bool = parameter(False, 'identify D instead of holding it at zero')
+    direct_feedthrough: bool = parameter(
+        False, 'identify D from the first sample on; a refined fit frees it where the likelihood pays for it')
     estimator: str = parameter(
         'factor', 'factor: moments in one triangular factor, solved when a model is asked for; '
         'paper: three recursive least squares at every sample', choices=('factor', 'paper'))

@@ -23,7 +23,6 @@ from flexmanip_ros.plant.linearization import frequencies, vibration_model
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord
 
 DIFFERENT = 1
-SECOND = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -106,23 +105,23 @@ def bits(value: Value) -> bytes:
 
 def known_truth(config: DemoParameters, plant: PlantParameters,
                 items: Sequence[JointRecord | CaptureEvent]) -> Truth:
-    """Return what the simulation knows: the payload, and the frequencies of the arm as it stood.
+    """Return what the simulation knows: the payload, and the frequencies of the arm.
 
-    It moves: its mean configuration over the last second before the capture counts, and of the run.
+    It moves, and memory grows from the start and from the capture on: its mean configuration since counts.
     """
     records = [item for item in items if isinstance(item, JointRecord)]
-    end_ns = records[-1].stamp_ns
+    first_ns, end_ns = records[0].stamp_ns, records[-1].stamp_ns
     caught_ns = min((item.stamp_ns for item in items if isinstance(item, CaptureEvent)), default=end_ns)
 
-    def lowest(mass: float, until_ns: int) -> tuple[float, ...]:
-        last = [np.cumsum(record.position[:2]) for record in records
-                if until_ns - SECOND < record.stamp_ns <= until_ns]
-        found = frequencies(vibration_model(plant.arm, np.mean(last, axis=0), mass)[0])
+    def lowest(mass: float, from_ns: int, until_ns: int) -> tuple[float, ...]:
+        seen = [np.cumsum(record.position[:2]) for record in records
+                if from_ns <= record.stamp_ns <= until_ns]
+        found = frequencies(vibration_model(plant.arm, np.mean(seen, axis=0), mass)[0])
         return tuple(float(f) for f in found[:2])
 
     caught = config.capture_time >= 0.0
-    return Truth(config.payload_mass if caught else None, lowest(0.0, caught_ns),
-                 lowest(config.payload_mass, end_ns))
+    return Truth(config.payload_mass if caught else None, lowest(0.0, first_ns, caught_ns),
+                 lowest(config.payload_mass, min(caught_ns, end_ns), end_ns))
 
 
 def _title(config: DemoParameters) -> str:
