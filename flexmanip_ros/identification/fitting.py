@@ -18,7 +18,7 @@ from flexmanip_ros.types import Array
 
 MEMORY = 1_000_000.0
 """Samples after which parameters may have drifted by their own standard deviation."""
-NOISE_BLOCKS, DRIFT_BLOCKS, WENT_BLOCKS = 16, 4, 4
+NOISE_BLOCKS, DRIFT_BLOCKS, WENT_BLOCKS = 16, 4, 8
 """Blocks over which the noise is remembered, how fast the parameters move, and where they go."""
 SURPRISE = 4.0
 """Standard deviations beyond which a block says that the parameters have gone elsewhere."""
