@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import importlib
 import json
 import subprocess
@@ -11,57 +10,27 @@ import time
 from pathlib import Path
 
 import pytest
+from quick_study import SCENARIO, rows_of, run, without_cost
 
 from flexmanip_ros.cli import tasks, workers
-from flexmanip_ros.cli.monte_carlo import main
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.types import JointRecord
-
-SCENARIO = """
-name: quick
-duration: 0.2
-capture_time: 0.1
-window: [0.15, 0.2]
-identifier: {payload_method: none}
-vary:
-  plant.payload_mass: {uniform: [12.0, 100.0]}
-"""
-
-
-@pytest.fixture
-def scenario_file(tmp_path):
-    path = tmp_path / 'quick.yaml'
-    path.write_text(SCENARIO, encoding='utf-8')
-    return path
-
-
-def _rows(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding='utf-8') as file:
-        return list(csv.DictReader(file))
-
-
-def _run(*arguments: object) -> int:
-    return main([str(argument) for argument in arguments])
-
-
-def _without_cost(rows: list[dict[str, str]]) -> list[dict[str, str]]:
-    return [{name: value for name, value in row.items() if name != 'us_per_sample'} for row in rows]
 
 
 def test_one_row_a_run_and_the_same_bits_for_the_same_seed(scenario_file, tmp_path):
     for name in ('a.csv', 'b.csv'):
-        assert _run(scenario_file, '--runs', 3, '--workers', 0, '--output', tmp_path / name) == 0
-    first, second = _rows(tmp_path / 'a.csv'), _rows(tmp_path / 'b.csv')
+        assert run(scenario_file, '--runs', 3, '--workers', 0, '--output', tmp_path / name) == 0
+    first, second = rows_of(tmp_path / 'a.csv'), rows_of(tmp_path / 'b.csv')
     assert [row['seed'] for row in first] == ['0', '1', '2']
     assert len({row['plant.payload_mass'] for row in first}) == 3
-    assert _without_cost(first) == _without_cost(second)
+    assert without_cost(first) == without_cost(second)
 
 
 def test_a_failed_run_is_a_row_with_its_error(scenario_file, tmp_path, capsys):
     scenario_file.write_text(SCENARIO + 'excitation: {amplitude: [1.0e+150, 1.0e+150]}\n', encoding='utf-8')
     out = tmp_path / 'out.csv'
-    assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
-    assert 'diverged' in _rows(out)[0]['error']
+    assert run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
+    assert 'diverged' in rows_of(out)[0]['error']
 
 
 def test_the_report_shows_scores_runs_and_failures(tmp_path):
@@ -80,7 +49,7 @@ def test_the_report_shows_scores_runs_and_failures(tmp_path):
 def test_parquet_holds_the_same_rows(scenario_file, tmp_path):
     parquet = pytest.importorskip('pyarrow.parquet')
     out = tmp_path / 'out.parquet'
-    assert _run(scenario_file, '--runs', 2, '--workers', 0, '--output', out) == 0
+    assert run(scenario_file, '--runs', 2, '--workers', 0, '--output', out) == 0
     table = parquet.read_table(out).to_pydict()
     assert table['seed'] == [0, 1]
     assert all(isinstance(value, float) for value in table['plant.payload_mass'])
@@ -103,8 +72,8 @@ def test_a_folder_of_recordings_is_a_study_and_a_broken_one_a_row(tmp_path):
     out = tmp_path / 'out.csv'
     settings = ['--set=payload_method=none', '--set=inputs=[a/effort]', '--set=outputs=[a/position]',
                 '--set=order=1']
-    assert _run(folder, '--workers', 0, '--output', out, *settings) == 0
-    rows = {Path(row['run']).name: row for row in _rows(out)}
+    assert run(folder, '--workers', 0, '--output', out, *settings) == 0
+    rows = {Path(row['run']).name: row for row in rows_of(out)}
     assert set(rows) == {'one', 'two', 'three.mcap'}
     assert 'cannot be read' in rows['three.mcap']['error']
     assert rows['one']['samples'] == '300'
@@ -156,7 +125,7 @@ def test_a_worker_that_dies_costs_only_its_run(tmp_path, monkeypatch):
 ])
 def test_a_bad_scenario_is_one_line_and_exit_2(scenario_file, tmp_path, capsys, text, words):
     scenario_file.write_text(text, encoding='utf-8')
-    assert _run(scenario_file, '--output', tmp_path / 'out.csv') == 2
+    assert run(scenario_file, '--output', tmp_path / 'out.csv') == 2
     err = capsys.readouterr().err
     assert words in err
     assert str(scenario_file) in err
@@ -185,15 +154,15 @@ def test_the_same_work_goes_to_a_dask_cluster(scenario_file, tmp_path, capsys, m
         address = json.loads(here.read_text())['address']
         with monkeypatch.context() as hurry:
             hurry.setattr(workers, 'ANSWER_TIME', 2.0)
-            assert _run(scenario_file, '--scheduler', address, '--output', tmp_path / 'none.csv') == 2
+            assert run(scenario_file, '--scheduler', address, '--output', tmp_path / 'none.csv') == 2
         assert 'has no workers' in capsys.readouterr().err
         started += [subprocess.Popen([*common, 'worker', address, '--nthreads', '1', '--no-nanny',
                                       '--no-dashboard', '--host', '127.0.0.1',
                                       '--death-timeout', '20'], **quiet) for _ in range(2)]
         far, near = tmp_path / 'far.csv', tmp_path / 'near.csv'
-        assert _run(scenario_file, '--runs', 4, '--scheduler', address, '--output', far) == 0
-        assert _run(scenario_file, '--runs', 4, '--workers', 0, '--output', near) == 0
-        assert _without_cost(_rows(far)) == _without_cost(_rows(near))
+        assert run(scenario_file, '--runs', 4, '--scheduler', address, '--output', far) == 0
+        assert run(scenario_file, '--runs', 4, '--workers', 0, '--output', near) == 0
+        assert without_cost(rows_of(far)) == without_cost(rows_of(near))
     finally:
         for process in reversed(started):
             process.terminate()
@@ -208,5 +177,5 @@ def test_the_same_work_goes_to_a_dask_cluster(scenario_file, tmp_path, capsys, m
 def test_a_cluster_that_is_not_there_is_one_clear_line(scenario_file, tmp_path, capsys, monkeypatch):
     pytest.importorskip('distributed')
     monkeypatch.setattr(workers, 'ANSWER_TIME', 0.5)
-    assert _run(scenario_file, '--scheduler', 'tcp://127.0.0.1:9', '--output', tmp_path / 'out.csv') == 2
+    assert run(scenario_file, '--scheduler', 'tcp://127.0.0.1:9', '--output', tmp_path / 'out.csv') == 2
     assert 'no Dask scheduler answers' in capsys.readouterr().err

@@ -2,71 +2,41 @@
 
 from __future__ import annotations
 
-import csv
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
+from quick_study import SCENARIO, rows_of, run, without_cost
 
-from flexmanip_ros.cli.monte_carlo import main
 from flexmanip_ros.io.journal import Journal
-
-SCENARIO = """
-name: quick
-duration: 0.2
-capture_time: 0.1
-window: [0.15, 0.2]
-identifier: {payload_method: none}
-"""
-
-
-@pytest.fixture
-def scenario_file(tmp_path):
-    path = tmp_path / 'quick.yaml'
-    path.write_text(SCENARIO, encoding='utf-8')
-    return path
-
-
-def _rows(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding='utf-8') as file:
-        return list(csv.DictReader(file))
-
-
-def _run(*arguments: object) -> int:
-    return main([str(argument) for argument in arguments])
-
-
-def _without_cost(rows: list[dict[str, str]]) -> list[dict[str, str]]:
-    return [{name: value for name, value in row.items() if name != 'us_per_sample'} for row in rows]
 
 
 def test_a_study_continues_where_a_kill_left_it(scenario_file, tmp_path, capsys):
     out = tmp_path / 'out.csv'
-    assert _run(scenario_file, '--runs', 2, '--workers', 0, '--output', out) == 0
+    assert run(scenario_file, '--runs', 2, '--workers', 0, '--output', out) == 0
     journal = tmp_path / 'out.csv.journal'
     content = journal.read_bytes()
     journal.write_bytes(content[:-30])  # a kill in the middle of the second row
     out.unlink()
-    assert _run(scenario_file, '--runs', 3, '--workers', 0, '--output', out) == 0
+    assert run(scenario_file, '--runs', 3, '--workers', 0, '--output', out) == 0
     assert 'continuing: 1 of 3' in capsys.readouterr().err
-    assert [row['seed'] for row in _rows(out)] == ['0', '1', '2']
+    assert [row['seed'] for row in rows_of(out)] == ['0', '1', '2']
 
 
 def test_a_finished_study_is_not_done_again(scenario_file, tmp_path):
     out = tmp_path / 'out.csv'
     for _ in range(2):
-        assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
-    assert len(_rows(out)) == 1
+        assert run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
+    assert len(rows_of(out)) == 1
 
 
 def test_another_study_does_not_overwrite_this_one(scenario_file, tmp_path, capsys):
     out = tmp_path / 'out.csv'
-    assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
+    assert run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
     scenario_file.write_text(SCENARIO.replace('0.2\n', '0.25\n', 1), encoding='utf-8')
-    assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 2
+    assert run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 2
     assert 'another study' in capsys.readouterr().err
 
 
@@ -83,12 +53,12 @@ estimators: {a: {}, b: {}}
 def test_a_kill_between_the_rows_of_a_run_loses_none_of_them(scenario_file, tmp_path):
     scenario_file.write_text(TWO, encoding='utf-8')
     out, journal = tmp_path / 'out.csv', tmp_path / 'out.csv.journal'
-    assert _run(scenario_file, '--runs', 2, '--workers', 0, '--output', out) == 0
-    whole, content = _without_cost(_rows(out)), journal.read_bytes()
+    assert run(scenario_file, '--runs', 2, '--workers', 0, '--output', out) == 0
+    whole, content = without_cost(rows_of(out)), journal.read_bytes()
     for cut in (10, len(content.splitlines()[-1]) // 2 + 5):
         journal.write_bytes(content[:-cut])
-        assert _run(scenario_file, '--runs', 2, '--workers', 0, '--output', out) == 0
-        assert _without_cost(_rows(out)) == whole
+        assert run(scenario_file, '--runs', 2, '--workers', 0, '--output', out) == 0
+        assert without_cost(rows_of(out)) == whole
 
 
 @pytest.mark.parametrize(('damage', 'words'), [
@@ -100,11 +70,11 @@ def test_a_kill_between_the_rows_of_a_run_loses_none_of_them(scenario_file, tmp_
 ])
 def test_a_damaged_journal_is_refused_and_kept(scenario_file, tmp_path, capsys, damage, words):
     out, journal = tmp_path / 'out.csv', tmp_path / 'out.csv.journal'
-    assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
+    assert run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
     capsys.readouterr()
     damaged = damage(journal.read_bytes().splitlines(keepends=True))
     journal.write_bytes(damaged)
-    assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 2
+    assert run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 2
     err = capsys.readouterr().err
     assert words in err
     assert err.count('\n') == 1
@@ -114,20 +84,20 @@ def test_a_damaged_journal_is_refused_and_kept(scenario_file, tmp_path, capsys, 
 def test_a_journal_torn_in_its_head_begins_anew(scenario_file, tmp_path):
     out = tmp_path / 'out.csv'
     (tmp_path / 'out.csv.journal').write_text('{"study": {"para', encoding='utf-8')
-    assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
-    assert len(_rows(out)) == 1
+    assert run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
+    assert len(rows_of(out)) == 1
 
 
 def test_two_processes_do_not_write_one_study(scenario_file, tmp_path, capsys):
     out = tmp_path / 'out.csv'
     with Journal(out, {'a': 1}):
-        assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 2
+        assert run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 2
     assert 'by another process' in capsys.readouterr().err
 
 
 def test_a_journal_that_cannot_be_opened_is_one_line(scenario_file, tmp_path, capsys):
     (tmp_path / 'out.csv.journal').mkdir()
-    assert _run(scenario_file, '--runs', 1, '--workers', 0, '--output', tmp_path / 'out.csv') == 2
+    assert run(scenario_file, '--runs', 1, '--workers', 0, '--output', tmp_path / 'out.csv') == 2
     assert 'cannot be written' in capsys.readouterr().err
 
 
@@ -145,14 +115,14 @@ def test_an_interrupt_keeps_what_was_done_and_the_same_command_goes_on(scenario_
     process.send_signal(signal.SIGINT)
     assert 'the same command continues' in process.communicate(timeout=60)[1]
     assert process.returncode == 130
-    done = len(_rows(out))
+    done = len(rows_of(out))
     assert done >= 2
-    assert _run(scenario_file, '--runs', done + 2, '--workers', 0, '--output', out) == 0
-    assert [row['seed'] for row in _rows(out)] == [str(seed) for seed in range(done + 2)]
+    assert run(scenario_file, '--runs', done + 2, '--workers', 0, '--output', out) == 0
+    assert [row['seed'] for row in rows_of(out)] == [str(seed) for seed in range(done + 2)]
 
 
 def test_overlapping_seeds_are_done_once(scenario_file, tmp_path):
     out = tmp_path / 'out.csv'
-    assert _run(scenario_file, '--runs', 2, '--workers', 0, '--output', out) == 0
-    assert _run(scenario_file, '--runs', 2, '--first-seed', 1, '--workers', 0, '--output', out) == 0
-    assert [row['seed'] for row in _rows(out)] == ['0', '1', '2']
+    assert run(scenario_file, '--runs', 2, '--workers', 0, '--output', out) == 0
+    assert run(scenario_file, '--runs', 2, '--first-seed', 1, '--workers', 0, '--output', out) == 0
+    assert [row['seed'] for row in rows_of(out)] == ['0', '1', '2']
