@@ -38,7 +38,7 @@ def solve(config: IdentifierParameters, job: Job) -> Answer:
 
 
 def _stretch(config: IdentifierParameters, job: Job, R: Array, scale: Array) -> Recursion | None:
-    """Fit the whole stretch from the subspace model and from the fit before, whichever ends better."""
+    """Fit the whole stretch, see ``stretch.fit_stretch``, from the subspace model of one or two windows."""
     starts = [publication.from_factor(config, R, scale)]
     if config.order > len(config.outputs) and config.past_window > config.future_window:
         longer = replace(config, future_window=config.past_window)

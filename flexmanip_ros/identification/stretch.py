@@ -111,7 +111,7 @@ def fit_stretch(
     samples: Array, starts: list[Realized], old: Recursion | None, scale: Array, feedthrough: bool,
     noise: str,
 ) -> Recursion | None:
-    """Fit samples (N, r + m) from subspace models and from the fit before; the best one is kept.
+    """Fit samples (N, r + m) from subspace models, from means and from the fit before; the best one is kept.
 
     scale: (r + m,) of the subspace models' signals; noise: ``sensor`` holds K = 0 while the system is fitted,
     ``any`` frees it where that is the better model. None where nothing simulates the stretch.
