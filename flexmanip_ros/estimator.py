@@ -27,6 +27,8 @@ class Core(NamedTuple):
     """The latest measured configuration: (2,) [rad], or (0,) when there is none."""
     swept: Array
     """What the configuration went through since the last event, see ``block_extraction.sweep``."""
+    owed: tuple[Sample, ...] = ()
+    """Samples that the identifier has still to take; the payload has them already."""
 
 
 def init(config: IdentifierParameters) -> Core:
@@ -38,6 +40,24 @@ def init(config: IdentifierParameters) -> Core:
 
 def advance(config: IdentifierParameters, core: Core, samples: Sequence[Sample]) -> Core:
     """Run samples through both estimators; one call of N samples gives the bits of N calls of one."""
+    return settle(config, payload_ahead(config, core, samples))
+
+
+def payload_ahead(config: IdentifierParameters, core: Core, samples: Sequence[Sample]) -> Core:
+    """Run samples through the payload's estimator alone: the identifier owes them, see ``settle``."""
+    held = core.structured
+    if held is not None:
+        held = structured.advance(config, held, samples)
+    swept = block_extraction.sweep(config, core.swept, samples)
+    return core._replace(structured=held, angles=samples[-1].angles, swept=swept,
+                         owed=(*core.owed, *samples))
+
+
+def settle(config: IdentifierParameters, core: Core) -> Core:
+    """Run the samples that the identifier owes."""
+    samples = core.owed
+    if not samples:
+        return core
     identifier = core.rpbsid
     start = 0
     for stop in [i for i, sample in enumerate(samples) if sample.gap and i > 0] + [len(samples)]:
@@ -47,15 +67,12 @@ def advance(config: IdentifierParameters, core: Core, samples: Sequence[Sample])
         identifier = rpbsid.advance(
             config, identifier, np.array([s.u for s in part]), np.array([s.y for s in part]))
         start = stop
-    held = core.structured
-    if held is not None:
-        held = structured.advance(config, held, samples)
-    swept = block_extraction.sweep(config, core.swept, samples)
-    return Core(identifier, held, samples[-1].angles, swept)
+    return core._replace(rpbsid=identifier, owed=())
 
 
 def event(config: IdentifierParameters, core: Core, event: CaptureEvent) -> Core:
     """Tell both estimators that the arm caught or let go of something before the next sample."""
+    core = settle(config, core)
     held = core.structured
     if held is not None:
         held = structured.event(config, held, event)
@@ -74,6 +91,7 @@ def anew(config: IdentifierParameters, core: Core, events: Sequence[CaptureEvent
 
 def finish(config: IdentifierParameters, core: Core) -> Core:
     """No sample follows: await what is under way."""
+    core = settle(config, core)
     return core._replace(rpbsid=rpbsid.finish(config, core.rpbsid))
 
 

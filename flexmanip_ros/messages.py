@@ -137,12 +137,12 @@ def outgoing_payload(payload: Payload | None, stamp_ns: int, frame_id: str) -> I
     """
     if payload is None or not math.isfinite(payload.mass):
         return
-    row = payload_row(payload)
-    if np.isnan(row.data).any():
+    numbers = payload.std, payload.lower, payload.upper, payload.consistency
+    if any(map(math.isnan, numbers)):
         return
-    if np.isfinite((payload.std, *payload.com, *payload.inertia)).all():
+    if all(map(math.isfinite, (payload.std, *payload.com, *payload.inertia))):
         yield PAYLOAD, inertia(payload, stamp_ns, frame_id)
-    yield PAYLOAD_ESTIMATE, row
+    yield PAYLOAD_ESTIMATE, payload_row(payload)
     yield PAYLOAD_MASS, payload.mass
 
 

@@ -99,17 +99,20 @@ def read(state: State, due: Due) -> tuple[State, Estimate]:
     That is by ``model_rate``, and with every estimate for as long after an event as it may arrive late: so
     any order of arrival reads models at the same stamps.
     """
-    assert state.timeline is not None
-    assert state.config is not None
-    config, last = state.config, state.reading
+    line, config, last = state.timeline, state.config, state.reading
+    assert line is not None
+    assert config is not None
+    core = estimator.settle(config, due.core)
+    if due.core is line.core:
+        state = state._replace(timeline=line._replace(core=core))
     settling = 2.0 * config.rewind_time + 1.0 / config.publish_rate
-    changes = (state.first_ns, *(event.stamp_ns for event in state.timeline.latest))
+    changes = (state.first_ns, *(event.stamp_ns for event in line.latest))
     young = any(0 <= due.stamp_ns - change <= settling * 1e9 for change in changes)
     instant = _instant(state, due.stamp_ns, config.model_rate)
-    used = estimator.samples_used(due.core)
+    used = estimator.samples_used(core)
     if last is not None and not young and instant <= last.instant and last.samples <= used:
         return state, estimator.follow(config, due.stamp_ns, last.estimate, due.payload)
-    estimate = estimator.estimate(config, due.core, due.stamp_ns, state.sampling.dt, due.payload)
+    estimate = estimator.estimate(config, core, due.stamp_ns, state.sampling.dt, due.payload)
     reading = Reading(estimate, used, instant) if estimate.model is not None else None
     return state._replace(reading=reading), estimate
 
@@ -243,7 +246,7 @@ def _hold(state: State, samples: Iterable[Sample], group: int) -> tuple[State, t
     for sample in samples:
         state = state._replace(held=(*state.held, sample))
         if _is_due(state, sample.stamp_ns):
-            state = _run_held(state)
+            state = _run_held(state, ahead=True)
             state = state._replace(published=_instant(state, sample.stamp_ns, config.publish_rate))
             due.append(_due_now(config, state, sample.stamp_ns))
         elif len(state.held) >= group or _is_due(state, sample.stamp_ns + dt_ns):
@@ -257,13 +260,14 @@ def _due_now(config: IdentifierParameters, state: State, stamp_ns: int) -> Due:
     return Due(stamp_ns, core, estimator.payload(config, core))
 
 
-def _run_held(state: State) -> State:
-    """Run the samples that are kept."""
+def _run_held(state: State, *, ahead: bool = False) -> State:
+    """Run the samples that are kept; ``ahead`` as in ``timeline.advance``."""
     if not state.held:
         return state
     assert state.timeline is not None
     assert state.config is not None
-    return state._replace(timeline=timeline.advance(state.config, state.timeline, state.held), held=())
+    return state._replace(timeline=timeline.advance(
+        state.config, state.timeline, state.held, ahead=ahead), held=())
 
 
 def _all_read(state: State, due: tuple[Due, ...]) -> tuple[State, tuple[Estimate, ...]]:

@@ -57,14 +57,21 @@ class Timeline(NamedTuple):
         return next((event.stamp_ns for event in self.latest if event.kind is kind), None)
 
 
-def advance(config: IdentifierParameters, line: Timeline, samples: Sequence[Sample]) -> Timeline:
-    """Run samples, in rising stamps, through the estimator, with the events that fall among them."""
+def advance(config: IdentifierParameters, line: Timeline, samples: Sequence[Sample], *, ahead: bool = False
+            ) -> Timeline:
+    """Run samples, in rising stamps, through the estimator, with the events that fall among them.
+
+    ahead: somebody waits for the payload of the last one; what can be done after it is left for later (the
+    identifier's step to ``estimator.settle``, a checkpoint to the next sample).
+    """
     spacing_ns = int(config.rewind_time * 1e9) // CHECKPOINTS
     block: list[Sample] = []
     for sample in samples:
         due = tuple(event for event in line.waiting if event.stamp_ns <= sample.stamp_ns)
+        awaited = ahead and sample is samples[-1]  # a checkpoint may be late, but at the same sample always
         checkpoint_due = (
-            not line.checkpoints or sample.stamp_ns - line.checkpoints[-1].stamp_ns >= spacing_ns
+            not line.checkpoints
+            or sample.stamp_ns - line.checkpoints[-1].stamp_ns >= spacing_ns * (3 if awaited else 2) // 2
             or len(line.samples) + len(block) >= MOST_SAMPLES)
         if block and (due or checkpoint_due):
             line = _run(config, line, block)
@@ -76,7 +83,7 @@ def advance(config: IdentifierParameters, line: Timeline, samples: Sequence[Samp
                                  applied=(*line.applied, event),
                                  waiting=tuple(e for e in line.waiting if e is not event))
         block.append(sample)
-    return _run(config, line, block) if block else line
+    return _run(config, line, block, ahead=ahead) if block else line
 
 
 def event(config: IdentifierParameters, line: Timeline, event: CaptureEvent, first_ns: int = BEFORE_ALL
@@ -111,8 +118,10 @@ def _wait(line: Timeline, event: CaptureEvent) -> Timeline:
     return line._replace(waiting=tuple(waiting[:MOST_EVENTS]))
 
 
-def _run(config: IdentifierParameters, line: Timeline, block: list[Sample]) -> Timeline:
-    return line._replace(core=estimator.advance(config, line.core, block),
+def _run(config: IdentifierParameters, line: Timeline, block: list[Sample], *, ahead: bool = False
+         ) -> Timeline:
+    run = estimator.payload_ahead if ahead else estimator.advance
+    return line._replace(core=run(config, line.core, block),
                          samples=(*line.samples, *block), last_ns=block[-1].stamp_ns)
 
 

@@ -16,7 +16,9 @@ from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
 STAMP = struct.Struct('<iI')
 COUNT = struct.Struct('<I')
-HEAD = 4 + STAMP.size
+START = 4
+"""Where a message begins, after its encapsulation."""
+HEAD = START + STAMP.size
 """Bytes before frame_id: encapsulation and stamp (offsets below count from the encapsulation's start)."""
 LITTLE_ENDIAN = b'\x00\x01'
 
@@ -42,7 +44,7 @@ def stamp_ns(raw: bytes) -> int:
     """Return the stamp of a message that begins with a Header [ns]."""
     if len(raw) < HEAD or raw[:2] != LITTLE_ENDIAN:
         raise CdrError('a message is not little-endian CDR with a header')
-    seconds, nanoseconds = STAMP.unpack_from(raw, 4)
+    seconds, nanoseconds = STAMP.unpack_from(raw, START)
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 

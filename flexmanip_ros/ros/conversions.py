@@ -27,9 +27,14 @@ def stamp_ns(stamp: Time) -> int:
     return int(stamp.sec) * SECOND + int(stamp.nanosec)
 
 
+def clamped(nanoseconds: int) -> tuple[int, int]:
+    """Return seconds and nanoseconds of the nearest stamp there is; in their range before 1970 too."""
+    return divmod(min(max(nanoseconds, FIRST_NS), LAST_NS), SECOND)
+
+
 def time_message(nanoseconds: int) -> Time:
-    """Return nanoseconds as a stamp, the nearest there is; fields in their range before 1970 too."""
-    sec, nanosec = divmod(min(max(nanoseconds, FIRST_NS), LAST_NS), SECOND)
+    """Return nanoseconds as a stamp, the nearest there is."""
+    sec, nanosec = clamped(nanoseconds)
     return Time(sec=sec, nanosec=nanosec)
 
 
@@ -62,9 +67,9 @@ def joint_record(message: JointState) -> JointRecord:
         np.array(message.velocity, dtype=np.float64), np.array(message.effort, dtype=np.float64))
 
 
-def joint_state(record: JointRecord, message: JointState | None = None) -> JointState:
-    """Return a record as a JointState, into ``message`` when one is given (saves its construction)."""
-    message = JointState() if message is None else message
+def joint_state(record: JointRecord) -> JointState:
+    """Return a record as a JointState."""
+    message = JointState()
     message.header.stamp = time_message(record.stamp_ns)
     message.name = list(record.names)
     message.position = doubles(record.position)

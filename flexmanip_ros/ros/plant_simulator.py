@@ -28,8 +28,9 @@ from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.plant import simulator
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.clock import SampleGrid
-from flexmanip_ros.ros.conversions import capture_event, joint_state
+from flexmanip_ros.ros.conversions import capture_event
 from flexmanip_ros.ros.diagnostics import ERROR, WARN, LossCounter, Meter, Report
+from flexmanip_ros.ros.encoding import JointStateWriter
 from flexmanip_ros.ros.node import FlexmanipNode, sequence_number, with_info
 from flexmanip_ros.ros.spin import run
 from flexmanip_ros.types import CaptureEvent, EventKind
@@ -65,7 +66,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
     def make_entities(self) -> None:
         """Publisher, subscriptions, service and timer."""
         self.joint_states = self.publisher(JointState, 'joint_states', qos.sensor_output())
-        self._message = JointState()
+        self._encoded = JointStateWriter()
         self.subscription(
             Float64MultiArray, 'effort_controller/commands', with_info(self._on_command), qos.command(),
             matched=self._on_publisher)
@@ -135,7 +136,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             return
         self.samples += 1
         if record is not None:  # lost on its way (sensors.drop_probability)
-            self.joint_states.publish(joint_state(record, self._message))
+            self.joint_states.publish(self._encoded(record))
 
     def _apply_events(self, stamp: int) -> None:
         """Take or let go of the object before the first sample that is not older than the event."""

@@ -31,8 +31,9 @@ from flexmanip_ros.errors import CheckpointError, FlexmanipError, SignalError
 from flexmanip_ros.identification.realization import suggested_order
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.conversions import JointStateReader, capture_event, to_message
+from flexmanip_ros.ros.conversions import JointStateReader, capture_event
 from flexmanip_ros.ros.diagnostics import ERROR, STALE, WARN, LossCounter, Meter, Report
+from flexmanip_ros.ros.encoding import Encoder
 from flexmanip_ros.ros.keeper import Keeper, too_old
 from flexmanip_ros.ros.node import FlexmanipNode, sequence_number, with_info
 from flexmanip_ros.ros.spin import run
@@ -62,6 +63,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self.losses = LossCounter()
         self.meter = Meter()
         self._reader = JointStateReader()
+        self._encoded = Encoder()
         self._keeper: Keeper | None = None
         self._resumed = False
         self._worker: Worker | None = None
@@ -174,7 +176,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def _publish(self, values: Iterable[tuple[str, messages.Value]]) -> None:
         for name, value in values:
-            self.outputs[name].publish(to_message(value))
+            self.outputs[name].publish(self._encoded(value))
             self.published += 1
 
     def _refuse(self, reason: str, words: str) -> None:
