@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from flexmanip_ros.identification import publication, refinement
 from flexmanip_ros.identification.factor_kernel import Kinds
@@ -22,6 +23,8 @@ NOISE_BLOCKS, DRIFT_BLOCKS, WENT_BLOCKS = 16, 4, 8
 """Blocks over which the noise is remembered, how fast the parameters move, and where they go."""
 SURPRISE = 4.0
 """Standard deviations beyond which a block says that the parameters have gone elsewhere."""
+CHANCE = 2.0
+"""Standard deviations that are left to chance before anything is taken to swell or to move."""
 LARGEST_DRIFT = 1.4
 """Logarithm of the largest factor on a variance from one block."""
 
@@ -44,7 +47,8 @@ def _stretch(config: IdentifierParameters, job: Job, R: Array, scale: Array) -> 
         longer = replace(config, future_window=config.past_window)
         starts.append(publication.from_factor(longer, R, scale))
     return fit_stretch(
-        np.vstack(job.chunks), [realized for realized, _, _ in starts if realized is not None], job.old,
+        np.vstack(job.chunks), [realized for realized, _, _ in starts if realized is not None],
+        [fit for fit in (job.old, job.older) if fit is not None],
         starts[0][2], config.direct_feedthrough, 'sensor' if config.refinement == 'output_error' else 'any')
 
 
@@ -55,14 +59,16 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
     Y = np.ascontiguousarray(samples[:, r:] * old.scale[r:])
     k = old.root.shape[0]
     kept = old.root * np.sqrt(1.0 + len(U) / MEMORY) * np.exp(0.5 * old.drift)
-    if old.went.any():
-        kept = triangle(np.hstack([kept, old.went[:, None]]).T).T
+    if old.going > 0.0:
+        kept = triangle(np.hstack([kept, old.going * old.went[:, None]]).T).T
     noise = old.covariance
     if not old.lost:  # what the model leaves (a moving arm is not linear) is noise to it
         before, _ = run(U, Y, old.theta)
         if not np.all(np.isfinite(before)):
             return None
-        noise = noise * max(1.0, float(np.trace(np.linalg.solve(noise, before))) / Y.shape[1])
+        power = float(np.trace(np.linalg.solve(noise, before))) / Y.shape[1]
+        known = min(old.weight, 2.0 * NOISE_BLOCKS * len(U))
+        noise = noise * max(1.0, power - CHANCE * np.sqrt(2.0 / Y.shape[1] * (1.0 / len(U) + 1.0 / known)))
     zeta, theta, further = np.zeros(k), old.theta, 0.0
     arrival, root = np.zeros((0, k)), kept
     for _ in range(2 if old.lost else 1):  # a state that was lost makes the first derivatives poor
@@ -91,13 +97,14 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
     step = kept @ zeta
     step[k - len(end):] = 0.0  # the state moves anyway
     moving = old.drift + further if further > 0.0 else 0.0
+    went = old.went if old.lost else old.went + (step - old.went) / WENT_BLOCKS
     return old._replace(
         theta=theta._replace(x=end), root=arrive(root, arrival), strikes=strikes,
         gain=theta.K if old.structure.free_gain else old.gain, lost=False,
         covariance=(1.0 - share) * old.covariance + share * covariance,
         weight=min(old.weight + len(U), MEMORY),
         drift=old.drift + (moving - old.drift) / DRIFT_BLOCKS,
-        went=old.went if old.lost else old.went + (step - old.went) / WENT_BLOCKS)
+        went=went, going=going(went[:k - len(end)], kept[:k - len(end)], root[:k - len(end)]))
 
 
 def is_surprising(size: float, H: Array, widening: float) -> bool:
@@ -122,6 +129,21 @@ def drift(H: Array, g: Array, widening: float) -> float:
         more = np.sum(square / (1.0 + np.exp(middle) * values)) > mean
         low, high = (middle, high) if more else (low, middle)
     return low
+
+
+def going(went: Array, before: Array, after: Array) -> float:
+    """Share of the mean step ``went`` (a,) that is no chance, 0..1.
+
+    before, after: (a, k) roots of the covariance around a block. Estimates of parameters that stay where they
+    are move too, by what a block teaches: T = 1 - after after', in units of the covariance before. Their mean
+    over the blocks has the size tr T / (2 WENT_BLOCKS - 1), with the deviation sqrt(2) |T| / (..).
+    """
+    L = triangle(before.T).T
+    size = float(np.sum(solve_triangular(L, went, lower=True, check_finite=False) ** 2))
+    left = solve_triangular(L, after, lower=True, check_finite=False)
+    T = np.eye(len(went)) - left @ left.T
+    likely = float(np.trace(T)) + CHANCE * np.sqrt(2.0) * float(np.linalg.norm(T))
+    return float(np.sqrt(max(1.0 - likely / (2.0 * WENT_BLOCKS - 1.0) / size, 0.0))) if size > 0.0 else 0.0
 
 
 def refine(config: IdentifierParameters, refined: Refined, samples: Array, fate: Kinds, R: Array, scale: Array

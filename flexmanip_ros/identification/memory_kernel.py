@@ -29,6 +29,8 @@ LARGEST = 1e100
 OUTLIER, PATIENCE, SETTLED = 20.0, 2, 50
 """A value this many times the largest of its channel so far is a sensor's mistake and refused, unless more
 than so many come in a row; looked for from that many regressions on."""
+POWER_RATE = 0.02
+"""Share of a sample in the innovation power, a mean over the latest ones."""
 EXPECTED, SURPRISE = 1.5, 3.0
 """Innovation power below which the model fits, above which the plant is taken to have changed."""
 
@@ -139,4 +141,4 @@ def judge(residual: Array, variance: Array, scalars: Array, counts: Array, b: fl
         power += square / variance[i] if variance[i] > 0.0 else 1.0
         variance[i] += rate * (square - variance[i])
     if counts[USED] > parameters:
-        scalars[POWER] += 0.02 * (min(power / m, 1e6) - scalars[POWER])
+        scalars[POWER] += POWER_RATE * (min(power / m, 1e6) - scalars[POWER])

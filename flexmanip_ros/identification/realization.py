@@ -81,15 +81,18 @@ def stabilized(A: Array) -> Array:
 
 
 def lightly_damped(A: Array, most: float) -> Array:
-    """A (n, n) with every oscillation damped by at most the ratio ``most``, at its own frequency."""
+    """A (n, n) with every oscillation damped by at most the ratio ``most``, at its own frequency.
+
+    A itself where that holds already.
+    """
     values, vectors = np.linalg.eig(A)
     angle = np.abs(np.angle(values))
-    turning = (angle > 1e-9) & (angle < np.pi - 1e-9)
-    if not turning.any() or np.linalg.cond(vectors) > WORST_BASIS:
-        return A
     slow = np.exp(-most / np.sqrt(1.0 - most ** 2) * angle)
     radius = np.abs(values)
-    moved = values * np.where(turning & (radius < slow), slow / np.where(radius > 0.0, radius, 1.0), 1.0)
+    damped = (angle > 1e-9) & (angle < np.pi - 1e-9) & (radius < slow)
+    if not damped.any() or np.linalg.cond(vectors) > WORST_BASIS:
+        return A
+    moved = values * np.where(damped, slow / np.where(radius > 0.0, radius, 1.0), 1.0)
     return np.asarray(np.real(np.linalg.solve(vectors.T, (vectors * moved).T).T), dtype=np.float64)
 
 

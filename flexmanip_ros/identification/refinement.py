@@ -38,13 +38,15 @@ class Job(NamedTuple):
     """A fit to be made.
 
     chunks: its samples, in arrays (CHUNK, r + m); R: (q, q) factor of the moments and scale: (r + m,), both
-    None for the update by a block; old: the fit before, if any.
+    None for the update by a block; old: the fit before, if any; older: that of before the last event, where
+    it is another.
     """
 
     chunks: tuple[Array, ...]
     R: Array | None
     scale: Array | None
     old: Recursion | None
+    older: Recursion | None = None
 
 
 class Answer(NamedTuple):
@@ -120,7 +122,8 @@ def is_block_due(refined: Refined) -> bool:
 
 def ask_fit(refined: Refined, R: Array, scale: Array) -> Refined:
     """Ask for a fit of the whole stretch, see ``stretch.fit_stretch``."""
-    job = Job(refined.chunks, R.copy(), scale.copy(), refined.recursion or refined.before)
+    fits = [fit for fit in (refined.recursion, refined.before) if fit is not None]
+    job = Job(refined.chunks, R.copy(), scale.copy(), *(*fits, None)[:2])
     return refined._replace(job=job, due=refined.total + max(SOONEST, refined.total // DELAY))
 
 
@@ -140,8 +143,9 @@ def deliver(refined: Refined, answer: Answer) -> Refined:
     if answer.failed:  # the subspace model remains; a new stretch begins
         return start(width)
     if job.R is None:
-        return give_up(width) if answer.recursion is None else _seen(
-            refined._replace(recursion=answer.recursion), refined.seen + BLOCK)
+        if answer.recursion is None and not refined.batch:
+            return give_up(width)
+        return _seen(refined._replace(recursion=answer.recursion), refined.seen + BLOCK)
     count = len(job.chunks) * CHUNK
     if answer.recursion is None and count >= LONGEST:
         return give_up(width)

@@ -42,7 +42,8 @@ class Recursion(NamedTuple):
     deviations from the scatter of the gradients; gain: (n, m) published K, theta's own unless that is held;
     singular_values, condition: of the subspace model the fit began with; lost: the state is unknown;
     drift: logarithm of the factor by which variances grow from block to block, as the plant itself moves;
-    went: (k,) how far the coordinates went of late in a block, that far may they go again.
+    went: (k,) how far the coordinates went of late in a block; going: the share of that which is no chance,
+    that far may they go again.
     """
 
     theta: Theta
@@ -60,6 +61,7 @@ class Recursion(NamedTuple):
     went: Array
     lost: bool = False
     drift: float = 0.0
+    going: float = 0.0
 
 
 class Attempt(NamedTuple):
@@ -108,10 +110,10 @@ def _dense(theta: Theta) -> Theta:
 
 
 def fit_stretch(
-    samples: Array, starts: list[Realized], old: Recursion | None, scale: Array, feedthrough: bool,
+    samples: Array, starts: list[Realized], fits: list[Recursion], scale: Array, feedthrough: bool,
     noise: str,
 ) -> Recursion | None:
-    """Fit samples (N, r + m) from subspace models, from means and from the fit before; the best one is kept.
+    """Fit samples (N, r + m) from subspace models, from means and from fits before; the best one is kept.
 
     scale: (r + m,) of the subspace models' signals; noise: ``sensor`` holds K = 0 while the system is fitted,
     ``any`` frees it where that is the better model. None where nothing simulates the stretch.
@@ -130,12 +132,13 @@ def fit_stretch(
         begin, structure = candidate(
             StateSpace(realized.A, realized.B, realized.C, realized.D, realized.K, 1.0), feedthrough)
         found.append(_attempt(samples, begin, structure, scale, noise, floor))
-        found.append(_attempt(
-            samples, begin._replace(A=lightly_damped(begin.A, LIGHT)), structure, scale, noise, floor))
+        light = lightly_damped(begin.A, LIGHT)
+        if light is not begin.A:
+            found.append(_attempt(samples, begin._replace(A=light), structure, scale, noise, floor))
     slow = averaged(*_signals(samples, scale, starts[0].B.shape[1]), starts[0].A.shape[0]) if starts else None
     if slow is not None:
         found.append(_attempt(samples, *candidate(slow, feedthrough), scale, noise, floor))
-    if old is not None:
+    for old in fits:
         begin = old.theta._replace(x=np.zeros_like(old.theta.x), K=old.gain)
         own = floor + 2.0 * float(np.sum(np.log(old.scale[-m:] / scale[-m:]))) if starts else floor
         found.append(_attempt(samples, begin, old.structure, old.scale, noise, own))

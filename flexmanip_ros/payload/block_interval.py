@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from flexmanip_ros.errors import ModelError
+from flexmanip_ros.identification.memory_kernel import POWER_RATE
 from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.payload.modal_basis import to_modal
@@ -24,6 +25,8 @@ STEP = 1e-4
 """Step of the derivatives, in standard deviations."""
 QUANTILE = 1.959963984540054
 """Of the normal distribution, for 95 %."""
+CHANCE = 2.0
+"""Standard deviations of the power of the innovations, a mean over few samples, that are left to chance."""
 
 
 def unknown(status: Status, consistency: float = 1.0) -> Payload:
@@ -62,7 +65,7 @@ def payload(
     if not all(map(math.isfinite, (mass, std, reach))) or directions[0].shape[0] == 0:
         return unknown(Status.ILL_CONDITIONED, power)
     # a fit that is worse than its noise has a wider interval by as much
-    widening = math.sqrt(max(1.0, power))
+    widening = math.sqrt(max(1.0, power - CHANCE * math.sqrt(POWER_RATE / model.C.shape[0])))
     drawn = np.where(np.isfinite(drawn), drawn, np.inf)
     lower, upper = np.quantile(drawn, [0.025, 0.975], method='nearest')
     # First order serves little noise, the draws know the skewness of much; the larger would cover 98 %.
