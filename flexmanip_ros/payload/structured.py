@@ -94,7 +94,7 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
 
 def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
     """Return the payload with its interval; never a NaN."""
-    return judge(config, state.model, state.memory, state.restarts)
+    return judge(config, state.model, state.sensors, state.memory, state.restarts)
 
 
 def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: EventKind) -> float:

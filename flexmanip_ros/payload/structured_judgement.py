@@ -8,8 +8,9 @@ import numpy as np
 
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import memory as mem
+from flexmanip_ros.payload.judgement_kernel import exact, figures, spread
+from flexmanip_ros.payload.measurement_kernel import Sensors
 from flexmanip_ros.payload.motion_kernel import PARAMETERS
-from flexmanip_ros.payload.signals import Quantity
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import Payload, Status
 
@@ -31,21 +32,25 @@ SETTLED = 1000
 """Samples after which a restart is forgotten."""
 
 
-def judge(config: IdentifierParameters, model: Model | None, m: mem.Memory | None, restarts: int) -> Payload:
+def judge(config: IdentifierParameters, model: Model | None, sensors: Sensors | None, m: mem.Memory | None,
+          restarts: int) -> Payload:
     """Return the payload; never a NaN."""
     if model is None:
         return Payload(0.0, math.inf, 0.0, math.inf, 1.0, Status.UNOBSERVABLE)
-    if m is None:
+    if m is None or sensors is None:
         begun = Status.DIVERGED if restarts else Status.WARMING_UP  # it may fall over at every sample
         return Payload(0.0, math.inf, 0.0, math.inf, 1.0, begun)
     state = m.x.size - PARAMETERS
     scale = model.motion.scale
     held = bool(m.counts[mem.HELD])
-    consistency = misfit(model, m)
-    restless = math.sqrt(drift(m) * max(1.0, consistency / POWER_LIMIT))
+    deviation, consistency, drift, is_exact = figures(
+        m.S, state, m.noise, sensors.rate, m.score, m.counts)
+    if math.isnan(consistency):
+        consistency = plain_misfit(sensors, m)
+    restless = math.sqrt(drift * max(1.0, consistency / POWER_LIMIT))
     widening, doubt = (restless * max(1.0, abs(float(m.score[seemed])) / SEEMED_FREE)
                        for seemed in (mem.SEEMED, mem.BEYOND))
-    std = widening * float(np.sqrt(m.S[state] @ m.S[state]))
+    std = widening * deviation
     status = Status.TRACKING
     if consistency > POWER_LIMIT or doubt > WIDENING_LIMIT:
         status = Status.INCONSISTENT
@@ -53,8 +58,8 @@ def judge(config: IdentifierParameters, model: Model | None, m: mem.Memory | Non
         status = Status.WARMING_UP
     if restarts and m.counts[mem.SEEN] < SETTLED:
         status = Status.DIVERGED
-    mass = float(scale * np.exp(min(m.x[state], 12.0))) if held else 0.0
-    misjudged = inexact(config, model, m, mass)
+    mass = scale * math.exp(min(float(m.x[state]), 12.0)) if held else 0.0
+    misjudged = 0.0 if is_exact else inertia_error(config, model, mass)
     if not held:
         return empty(float(m.x[state]), math.hypot(std, misjudged), consistency, status)
     std = math.hypot(std, misjudged / mass)
@@ -76,10 +81,10 @@ def rotary(
     nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     if model.motion.inertia == 0.0:
         return nothing, status
-    std = widening * float(np.sqrt(m.S[-1] @ m.S[-1]))
+    std = widening * spread(m.S, m.x.size - 1)
     if std > VAGUE_STD:
         return nothing, Status.POORLY_EXCITED if status is Status.TRACKING else status
-    about_z = float(model.motion.inertia * np.exp(min(m.x[-1], 12.0)))
+    about_z = model.motion.inertia * math.exp(min(float(m.x[-1]), 12.0))
     return (0.0, 0.0, 0.0, 0.0, 0.0, about_z), status
 
 
@@ -96,35 +101,17 @@ def empty(seeming: float, std: float, consistency: float, status: Status) -> Pay
     return Payload(0.0, std, 0.0, upper, consistency, status)
 
 
-def drift(m: mem.Memory) -> float:
-    """Factor on the payload's variance: how much farther it moved than it should, beyond chance."""
-    batches = int(m.counts[mem.BATCHES])
-    if batches == 0:
-        return 1.0
-    return max(1.0, float(m.score[mem.DRIFT]) - 2.0 * math.sqrt(2.0 / batches))
-
-
 def inexact(config: IdentifierParameters, model: Model, m: mem.Memory, mass: float) -> float:
     """Deviation [kg] of a payload by the error to reckon with in the arm's inertia; 0 for an exact arm."""
-    return 0.0 if exact(m) else config.payload.model_error * (mass + model.motion.scale)
+    return 0.0 if exact(m.noise, m.counts) else inertia_error(config, model, mass)
 
 
-def exact(m: mem.Memory) -> bool:
-    """Whether no sensor shows more than its white noise: then the model is the arm, as far as one can see."""
-    doubt = 2.5 * math.sqrt(2.0 / max(int(m.counts[mem.BLOCKS]), 1))
-    ratio = m.noise[:, mem.EFFECTIVE] / np.maximum(m.noise[:, mem.WHITE], m.noise[:, mem.FLOOR])
-    return bool(np.all(ratio < 1.0 + doubt))
+def inertia_error(config: IdentifierParameters, model: Model, mass: float) -> float:
+    """Deviation [kg] of a payload by ``model_error`` of everything at the tip."""
+    return config.payload.model_error * (mass + model.motion.scale)
 
 
-def misfit(model: Model, m: mem.Memory) -> float:
-    """Innovation power over white noise, each sensor weighted by what it tells of the payload.
-
-    Rates are left out where there are displacements: they show the modes that the model leaves out, and have
-    been given a larger noise for it.
-    """
-    slow = np.array([role.quantity in (Quantity.ANGLE, Quantity.BEND) for role in model.roles])
+def plain_misfit(sensors: Sensors, m: mem.Memory) -> float:
+    """Innovation power over white noise of the sensors of displacements, before any tells of the payload."""
     ratio = m.noise[:, mem.POWER] / np.maximum(m.noise[:, mem.WHITE], m.noise[:, mem.FLOOR])
-    weight = np.where(slow, m.noise[:, mem.WEIGHT], 0.0)
-    if not weight.sum() > 0.0:
-        return float(np.median(ratio[slow]))
-    return float(weight @ ratio / weight.sum())
+    return float(np.median(ratio[~sensors.rate]))
