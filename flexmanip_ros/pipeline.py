@@ -244,30 +244,27 @@ def _hold(state: State, samples: Iterable[Sample], group: int) -> tuple[State, t
     due: list[Due] = []
     dt_ns = int(state.sampling.dt * 1e9) if group == GROUP else 0
     for sample in samples:
-        state = state._replace(held=(*state.held, sample))
+        line, held = state.timeline, (*state.held, sample)
+        assert line is not None
         if _is_due(state, sample.stamp_ns):
-            state = _run_held(state, ahead=True)
-            state = state._replace(published=_instant(state, sample.stamp_ns, config.publish_rate))
-            due.append(_due_now(config, state, sample.stamp_ns))
-        elif len(state.held) >= group or _is_due(state, sample.stamp_ns + dt_ns):
+            line = timeline.advance(config, line, held, ahead=True)
+            state = state._replace(
+                timeline=line, held=(), published=_instant(state, sample.stamp_ns, config.publish_rate))
+            due.append(Due(sample.stamp_ns, line.core, estimator.payload(config, line.core)))
+            continue
+        state = state._replace(held=held)
+        if len(held) >= group or _is_due(state, sample.stamp_ns + dt_ns):
             state = _run_held(state)
     return state, tuple(due)
 
 
-def _due_now(config: IdentifierParameters, state: State, stamp_ns: int) -> Due:
-    assert state.timeline is not None
-    core = state.timeline.core
-    return Due(stamp_ns, core, estimator.payload(config, core))
-
-
-def _run_held(state: State, *, ahead: bool = False) -> State:
-    """Run the samples that are kept; ``ahead`` as in ``timeline.advance``."""
+def _run_held(state: State) -> State:
+    """Run the samples that are kept."""
     if not state.held:
         return state
     assert state.timeline is not None
     assert state.config is not None
-    return state._replace(timeline=timeline.advance(
-        state.config, state.timeline, state.held, ahead=ahead), held=())
+    return state._replace(timeline=timeline.advance(state.config, state.timeline, state.held), held=())
 
 
 def _all_read(state: State, due: tuple[Due, ...]) -> tuple[State, tuple[Estimate, ...]]:

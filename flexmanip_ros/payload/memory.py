@@ -71,5 +71,12 @@ def memory(nx: int, m: int) -> Memory:
 
 
 def copy(state: Memory) -> Memory:
-    """Return the same values in arrays of their own."""
-    return Memory._make(part.copy() for part in state)
+    """Return the same values in arrays of their own.
+
+    All but the samples kept, the largest part, once they are complete: nothing writes them any more.
+    """
+    kept = state.samples if state.counts[STORED] >= HORIZON else state.samples.copy()
+    x, S, noise, recent, counts, score, x0, S0, xi, _, xr, Sr, N, g, innovation, power = state
+    return Memory(x.copy(), S.copy(), noise.copy(), recent.copy(), counts.copy(), score.copy(), x0.copy(),
+                  S0.copy(), xi.copy(), kept, xr.copy(), Sr.copy(), N.copy(), g.copy(), innovation.copy(),
+                  power.copy())

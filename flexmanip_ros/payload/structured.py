@@ -208,11 +208,12 @@ def _run(config: IdentifierParameters, state: StructuredState, samples: Sequence
     stamps = np.array([state.last_ns] + [sample.stamp_ns for sample in samples])
     efforts = np.array([state.effort] + [sample.u for sample in samples])
     m = mem.copy(state.memory)
-    taken = run(state.model.motion, state.sensors, m, np.maximum(np.diff(stamps), 0) * 1e-9, efforts[:-1],
+    durations = np.maximum(stamps[1:] - stamps[:-1], 0) * 1e-9
+    taken = run(state.model.motion, state.sensors, m, durations, efforts[:-1],
                 measurements(state.model, samples))
     if taken < len(samples):
         return _restart(config, state, samples[taken:])
-    return replace(state, memory=m, last_ns=int(stamps[-1]), effort=efforts[-1])
+    return replace(state, memory=m, last_ns=samples[-1].stamp_ns, effort=efforts[-1])
 
 
 def _restart(
@@ -228,8 +229,6 @@ def _restart(
 
 def measurements(model: Model, samples: Sequence[Sample]) -> Array:
     """Return outputs and the angles that are not among them, (N, m)."""
-    Y = np.array([sample.y for sample in samples])
     if not model.extra:
-        return Y
-    angles = np.array([sample.angles for sample in samples])
-    return np.hstack([Y, angles[:, list(model.extra)]])
+        return np.array([sample.y for sample in samples])
+    return np.array([(*sample.y.tolist(), *(sample.angles[i] for i in model.extra)) for sample in samples])
