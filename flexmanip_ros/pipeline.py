@@ -17,8 +17,9 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.sampling import Counters
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Payload, Sample
 
-GROUP, BLOCK = 10, 256
-"""Samples run through the compiled kernels at once, live and when replaying; the numbers are the same."""
+GROUP_S, LEAST, GROUP, BLOCK = 0.005, 4, 20, 256
+"""Samples run through the compiled kernels at once: live those of a time [s], between least and most, so that
+none of them holds up the next for long; when replaying. The numbers are the same."""
 PATIENCE = 2000
 """Messages without a single usable one after which a replay gives up."""
 
@@ -80,11 +81,12 @@ def step(config: IdentifierParameters, state: State, item: JointRecord | Capture
     return _all_read(*take(config, state, item))
 
 
-def take(config: IdentifierParameters, state: State, item: JointRecord | CaptureEvent, group: int = GROUP
-         ) -> tuple[State, tuple[Due, ...]]:
+def take(config: IdentifierParameters, state: State, item: JointRecord | CaptureEvent,
+         group: int | None = None) -> tuple[State, tuple[Due, ...]]:
     """Take one message; return what is due with it, each to be given to ``read`` before the next message.
 
-    Samples are run ``group`` at a time. Those before one that an estimate waits for are not kept until then.
+    Samples are run ``group`` at a time, by ``GROUP_S`` where it is None. Those before one that an estimate
+    waits for are not kept until then.
     Raises ParameterError when the configuration does not fit the signals that the messages carry.
     """
     if isinstance(item, CaptureEvent):
@@ -236,13 +238,15 @@ def _is_due(state: State, stamp_ns: int) -> bool:
     return _instant(state, stamp_ns, state.config.publish_rate) > state.published
 
 
-def _hold(state: State, samples: Iterable[Sample], group: int) -> tuple[State, tuple[Due, ...]]:
+def _hold(state: State, samples: Iterable[Sample], group: int | None) -> tuple[State, tuple[Due, ...]]:
     """Keep samples, and run what is kept: when it is many, at each publishing instant and just before one."""
     config = state.config
     if config is None or state.timeline is None:
         return state, ()
     due: list[Due] = []
-    dt_ns = int(state.sampling.dt * 1e9) if group == GROUP else 0
+    dt, dt_ns = state.sampling.dt, 0
+    if group is None:
+        group, dt_ns = min(max(LEAST, round(GROUP_S / max(dt, 1e-9))), GROUP), int(dt * 1e9)
     for sample in samples:
         line, held = state.timeline, (*state.held, sample)
         assert line is not None

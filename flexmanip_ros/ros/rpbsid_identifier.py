@@ -172,7 +172,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self._publish(messages.outgoing_model(estimate))
             self.estimate = estimate
         if self._worker is not None:
-            self.state = self._worker.attend(self.state)
+            self.state = self._worker.attend(self.state, published=bool(due))
 
     def _publish(self, values: Iterable[tuple[str, messages.Value]]) -> None:
         for name, value in values:

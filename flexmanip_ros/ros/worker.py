@@ -11,6 +11,8 @@ from flexmanip_ros.identification.refinement import Answer, Job
 
 TURN_S = 0.0002
 """A thread that computes gives way to a sample within this time; Python's own default is 5 ms."""
+LATEST = 32
+"""Samples before its result is needed at which a job begins, whatever else is due."""
 
 
 class Worker:
@@ -22,8 +24,12 @@ class Worker:
         self._job: Job | None = None
         self._future: Future[Answer] | None = None
 
-    def attend(self, state: pipeline.State) -> pipeline.State:
-        """Hand in a result that is ready, or wait for one that is needed now; take up what is asked for."""
+    def attend(self, state: pipeline.State, *, published: bool) -> pipeline.State:
+        """Hand in a result that is ready, or wait for one that is needed now; take up what is asked for.
+
+        published: an estimate has just gone out. A job begins then, when nobody waits for the next one yet:
+        beside a computing thread the kernel may keep a sample waiting for as long as that computes.
+        """
         asked = pipeline.job(state)
         if self._future is not None and self._job is not None:
             current = asked is not None and asked[0] is self._job
@@ -34,7 +40,7 @@ class Worker:
             self._future = self._job = None
             if current:
                 return pipeline.answered(state, job, answer)
-        if asked is not None and state.config is not None:
+        if asked is not None and state.config is not None and (published or asked[1] <= LATEST):
             self._job = asked[0]
             self._future = self._pool.submit(solve, state.config, self._job)
         return state

@@ -33,9 +33,9 @@ def test_fits_on_a_thread_beside_the_samples_give_the_bits_of_the_replay():
             if before is not None and before[1] <= 120:  # a while after it was asked for: let it be ready
                 limit = time.monotonic() + 20.0
                 while pipeline.job(state) is not None and time.monotonic() < limit:
-                    state = worker.attend(state)
+                    state = worker.attend(state, published=True)
                 helped += pipeline.job(state) is None
-            state = worker.attend(state)
+            state = worker.attend(state, published=True)
     finally:
         worker.close()
     assert helped >= 2, 'the thread did fits before the event and after it'
