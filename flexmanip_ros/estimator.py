@@ -14,7 +14,8 @@ from flexmanip_ros.identification.modal import modes
 from flexmanip_ros.identification.refinement import Answer, Job
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload import block_extraction, structured
+from flexmanip_ros.payload import block_extraction, model_check, structured
+from flexmanip_ros.payload.model_check import Verdict
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, Payload, Sample, Status
 
 
@@ -26,7 +27,9 @@ class Core(NamedTuple):
     angles: Array
     """The latest measured configuration: (2,) [rad], or (0,) when there is none."""
     swept: Array
-    """What the configuration went through since the last event, see ``block_extraction.sweep``."""
+    """What the configuration went through since the last event, see the ``sweep`` of the payload method."""
+    since_ns: int = 0
+    """Stamp of the last event; 0 before the first."""
     owed: tuple[Sample, ...] = ()
     """Samples that the identifier has still to take; the payload has them already."""
 
@@ -48,7 +51,10 @@ def payload_ahead(config: IdentifierParameters, core: Core, samples: Sequence[Sa
     held = core.structured
     if held is not None:
         held = structured.advance(config, held, samples)
-    swept = block_extraction.sweep(config, core.swept, samples)
+    if held is not None and held.model is not None:
+        swept = model_check.sweep(core.swept, samples, config.arm.angle_convention == 'encoder')
+    else:
+        swept = block_extraction.sweep(config, core.swept, samples)
     return core._replace(structured=held, angles=samples[-1].angles, swept=swept,
                          owed=(*core.owed, *samples))
 
@@ -76,7 +82,8 @@ def event(config: IdentifierParameters, core: Core, event: CaptureEvent) -> Core
     held = core.structured
     if held is not None:
         held = structured.event(config, held, event)
-    return core._replace(rpbsid=rpbsid.restart(config, core.rpbsid), structured=held, swept=np.empty(0))
+    return core._replace(rpbsid=rpbsid.restart(config, core.rpbsid), structured=held, swept=np.empty(0),
+                         since_ns=event.stamp_ns)
 
 
 def anew(config: IdentifierParameters, core: Core, events: Sequence[CaptureEvent]) -> Core:
@@ -86,7 +93,7 @@ def anew(config: IdentifierParameters, core: Core, events: Sequence[CaptureEvent
     held = structured.init(config)
     for event in events:
         held = structured.event(config, held, event)
-    return core._replace(structured=held)
+    return core._replace(structured=held, since_ns=events[-1].stamp_ns)
 
 
 def finish(config: IdentifierParameters, core: Core) -> Core:
@@ -105,23 +112,38 @@ def answered(core: Core, job: Job, answer: Answer) -> Core:
     return core._replace(rpbsid=rpbsid.answered(core.rpbsid, job, answer))
 
 
-def payload(config: IdentifierParameters, core: Core) -> Payload | None:
-    """Return the payload where it does not rest on the model; else None."""
-    return structured.estimate(config, core.structured) if core.structured is not None else None
+def payload(config: IdentifierParameters, core: Core, verdicts: tuple[Verdict, ...] = ()) -> Payload | None:
+    """Return the payload where it does not rest on the model; else None. verdicts: of models read before."""
+    if core.structured is None:
+        return None
+    return model_check.apply(core.structured, structured.estimate(config, core.structured), verdicts,
+                             core.since_ns)
 
 
-def estimate(config: IdentifierParameters, core: Core, stamp_ns: int, dt: float, payload: Payload | None
-             ) -> Estimate:
-    """Read model and modes out of the identifier, the costly part, and a payload that rests on the model."""
+def estimate(config: IdentifierParameters, core: Core, stamp_ns: int, dt: float, payload: Payload | None,
+             verdicts: tuple[Verdict, ...] = (), *, compare: bool = False
+             ) -> tuple[Estimate, tuple[Verdict, ...]]:
+    """Read model and modes out of the identifier, the costly part, and a payload that rests on the model.
+
+    compare: see what the model says of a payload that does not rest on it; returned with the verdicts before.
+    """
     found, without = _identified(config, core.rpbsid, dt)
     if config.payload_method == 'block' and found is not None:
         payload = block_extraction.estimate(config, found, core.angles, core.swept)
     if found is None:
-        return Estimate(stamp_ns, without, None, (), payload, model_status=without)
-    return Estimate(
-        stamp_ns, _overall(config, found.status, payload), found.model, modes(found), payload,
+        return Estimate(stamp_ns, without, None, (), payload, model_status=without), verdicts
+    oscillations = modes(found)
+    verdict = None
+    if compare and core.structured is not None:
+        alone = structured.estimate(config, core.structured)
+        verdict = model_check.check(config, core.structured, alone, core.swept, found, oscillations,
+                                    stamp_ns, core.since_ns)
+    estimate = Estimate(
+        stamp_ns, _overall(config, found.status, payload), found.model, oscillations, payload,
         excitation=found.excitation, condition=found.condition, singular_values=found.singular_values,
-        innovation_power=found.innovation_power, model_status=found.status)
+        innovation_power=found.innovation_power, model_status=found.status,
+        modes_deviation=float('nan') if verdict is None else verdict.deviation)
+    return estimate, model_check.remember(verdicts, verdict, int(2e9 * config.rewind_time))
 
 
 def follow(config: IdentifierParameters, stamp_ns: int, last: Estimate, payload: Payload | None) -> Estimate:

@@ -14,6 +14,7 @@ from flexmanip_ros import estimator, sampling, timeline
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.identification.refinement import Answer, Job
 from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.payload.model_check import Verdict
 from flexmanip_ros.sampling import Counters
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Payload, Sample
 
@@ -54,6 +55,8 @@ class State(NamedTuple):
     """Index of the last publishing instant, counted from the first stamp."""
     reading: Reading | None = None
     """The last estimate whose model was read anew."""
+    verdicts: tuple[Verdict, ...] = ()
+    """What models read so far say of the payloads that follow."""
     held: tuple[Sample, ...] = ()
     """Samples still to be run, none of which an estimate waits for."""
 
@@ -114,9 +117,11 @@ def read(state: State, due: Due) -> tuple[State, Estimate]:
     used = estimator.samples_used(core)
     if last is not None and not young and instant <= last.instant and last.samples <= used:
         return state, estimator.follow(config, due.stamp_ns, last.estimate, due.payload)
-    estimate = estimator.estimate(config, core, due.stamp_ns, state.sampling.dt, due.payload)
+    # while an event may still come late no verdict is given: it would depend on when that came
+    estimate, verdicts = estimator.estimate(config, core, due.stamp_ns, state.sampling.dt, due.payload,
+                                            state.verdicts, compare=not young)
     reading = Reading(estimate, used, instant) if estimate.model is not None else None
-    return state._replace(reading=reading), estimate
+    return state._replace(reading=reading, verdicts=verdicts), estimate
 
 
 def job(state: State) -> tuple[Job, int] | None:
@@ -174,7 +179,9 @@ def current(state: State) -> Estimate | None:
     if line is None or config is None or line.last_ns == timeline.BEFORE_ALL:
         return None
     core = estimator.finish(config, line.core)
-    return estimator.estimate(config, core, line.last_ns, state.sampling.dt, estimator.payload(config, core))
+    estimate, verdicts = estimator.estimate(config, core, line.last_ns, state.sampling.dt, None,
+                                            state.verdicts, compare=True)
+    return estimator.follow(config, line.last_ns, estimate, estimator.payload(config, core, verdicts))
 
 
 def check_used(state: State) -> None:
@@ -254,7 +261,8 @@ def _hold(state: State, samples: Iterable[Sample], group: int | None) -> tuple[S
             line = timeline.advance(config, line, held, ahead=True)
             state = state._replace(
                 timeline=line, held=(), published=_instant(state, sample.stamp_ns, config.publish_rate))
-            due.append(Due(sample.stamp_ns, line.core, estimator.payload(config, line.core)))
+            payload = estimator.payload(config, line.core, state.verdicts)
+            due.append(Due(sample.stamp_ns, line.core, payload))
             continue
         state = state._replace(held=held)
         if len(held) >= group or _is_due(state, sample.stamp_ns + dt_ns):

@@ -135,8 +135,11 @@ class Estimate:
     singular_values: Array | None = None
     """Singular values of observability x controllability, for the choice of the order."""
     innovation_power: float = float('nan')
+    """Mean squared innovation over the variance expected [-]."""
     model_status: Status = Status.TRACKING
     """What the model is worth; ``status`` is that of the payload where one is estimated beside the model."""
     model_is_new: bool = True
     """Whether model and modes were read at this stamp, or are those of an estimate before."""
-    """Mean squared innovation over the variance expected [-]."""
+    modes_deviation: float = float('nan')
+    """How far the model's modes are from those of the arm with this payload, over what is tolerated: beyond 1
+    they disagree; nan where there was nothing to compare."""

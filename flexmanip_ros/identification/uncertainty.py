@@ -32,6 +32,8 @@ class Identified(NamedTuple):
     status: Status
     innovation_covariance: Array
     """(m, m) covariance of the innovations, in JointState units."""
+    refined: bool = False
+    """A prediction-error fit, not the subspace model it began with."""
     known_basis: bool = False
     """The state is y, or [y; dy/dt]; otherwise it is balanced and the spread holds that basis still."""
     samples: float = 0.0

@@ -12,10 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointRecord
 
 STAMP = struct.Struct('<iI')
 COUNT = struct.Struct('<I')
+_ARRAY, _NUMBERS = struct.Struct('<3I'), 20
+"""Dimensions, data offset and size of a Float64MultiArray, and where its numbers begin if it has none."""
 START = 4
 """Where a message begins, after its encapsulation."""
 HEAD = START + STAMP.size
@@ -46,6 +48,14 @@ def stamp_ns(raw: bytes) -> int:
         raise CdrError('a message is not little-endian CDR with a header')
     seconds, nanoseconds = STAMP.unpack_from(raw, START)
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+def doubles(raw: bytes) -> Array:
+    """Return the numbers of a Float64MultiArray without dimensions, as commands are; else CdrError."""
+    dimensions, _, count = _ARRAY.unpack_from(raw, START) if len(raw) >= START + _ARRAY.size else (1, 0, 0)
+    if raw[:2] != LITTLE_ENDIAN or dimensions or len(raw) != _NUMBERS + 8 * count:
+        raise CdrError('not a plain array of numbers')
+    return np.frombuffer(raw, '<f8', count, _NUMBERS)
 
 
 def _string(raw: bytes, at: int) -> tuple[str, int]:

@@ -47,7 +47,7 @@ def read(config: PlantParameters, position: Array, velocity: Array, std: Array, 
 
 def jitter_ns(config: PlantParameters, drawn: Array) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     """Errors (N,) of the stamps [ns]."""
-    limited = np.clip(drawn[:, 8], -3.0, 3.0)
+    limited = np.minimum(np.maximum(drawn[:, 8], -3.0), 3.0)
     return np.round(limited * config.sensors.stamp_jitter * 1e9).astype(np.int64)
 
 
@@ -61,4 +61,4 @@ def saturated(config: PlantParameters, efforts: Array) -> Array:
     """Efforts (N, 2) [N m] within the torque limits."""
     limits = np.array(config.actuators.torque_limit)
     limits[limits == 0.0] = np.inf
-    return np.clip(efforts, -limits, limits)
+    return np.asarray(np.minimum(np.maximum(efforts, -limits), limits))

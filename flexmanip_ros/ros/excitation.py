@@ -19,12 +19,13 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from flexmanip_ros.messages import LabelledArray
 from flexmanip_ros.parameters import ExcitationParameters
 from flexmanip_ros.plant import excitation, excitation_design
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.clock import SampleGrid
-from flexmanip_ros.ros.conversions import doubles
 from flexmanip_ros.ros.diagnostics import WARN, Meter, Report
+from flexmanip_ros.ros.encoding import Encoder
 from flexmanip_ros.ros.node import FlexmanipNode
 from flexmanip_ros.ros.spin import run
 from flexmanip_ros.types import Array
@@ -47,7 +48,7 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
     def make_entities(self) -> None:
         """Publisher, and the timer or the subscription that sets the pace."""
         self.commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.command())
-        self._message = Float64MultiArray()
+        self._encoded = Encoder()
         self._grid = SampleGrid(self, self.config.rate)
         self._timer: Timer | None = None
         if self.config.clock == 'joint_states':
@@ -106,8 +107,7 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
         self._send(excitation.torque(self.config, latest))
 
     def _send(self, torque: Array) -> None:
-        self._message.data = doubles(torque)
-        self.commands.publish(self._message)
+        self.commands.publish(self._encoded(LabelledArray((), torque)))
 
     def report(self, report: Report) -> None:
         """Rate and instants that passed without a command."""

@@ -23,12 +23,12 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
 from std_srvs.srv import Trigger
 
-from flexmanip_ros.errors import FlexmanipError
+from flexmanip_ros.errors import FlexmanipError, SignalError
 from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.plant import simulator
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.clock import SampleGrid
-from flexmanip_ros.ros.conversions import capture_event
+from flexmanip_ros.ros.conversions import capture_event, numbers
 from flexmanip_ros.ros.diagnostics import ERROR, WARN, LossCounter, Meter, Report
 from flexmanip_ros.ros.encoding import JointStateWriter
 from flexmanip_ros.ros.node import FlexmanipNode, sequence_number, with_info
@@ -69,7 +69,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         self._encoded = JointStateWriter()
         self.subscription(
             Float64MultiArray, 'effort_controller/commands', with_info(self._on_command), qos.command(),
-            matched=self._on_publisher)
+            raw=True, matched=self._on_publisher)
         self.subscription(Header, 'capture_event', self._on_event, qos.latched_input())
         self.create_service(Trigger, '~/reset', self._on_reset)
         self._grid = SampleGrid(self, self.config.rate)
@@ -146,15 +146,20 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             change = simulator.attach if event.kind is EventKind.CAPTURE else simulator.release
             self.state = change(self.config, self.state)
 
-    def _on_command(self, message: Float64MultiArray, info: object) -> None:
+    def _on_command(self, raw: bytes, info: object) -> None:
         if not self._several:
             self.lost_commands.note(sequence_number(info))
-        if len(message.data) != 2:
-            self._drop(f'a command has {len(message.data)} values; send one torque for each of the 2 joints')
-        elif not all(map(math.isfinite, message.data)):
+        try:
+            efforts = numbers(raw)
+        except SignalError as error:
+            self._drop(str(error))
+            return
+        if efforts.size != 2:
+            self._drop(f'a command has {efforts.size} values; send one torque for each of the 2 joints')
+        elif not all(map(math.isfinite, efforts.tolist())):
             self._drop('a command has a value that is not finite; look at the controller')
         else:
-            self.efforts = np.array(message.data)
+            self.efforts = efforts
 
     def _on_publisher(self, event: Any) -> None:
         """Each publisher has numbers of its own: count those of one, anew once another is gone."""

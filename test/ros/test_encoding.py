@@ -1,13 +1,17 @@
 """Bytes written without a message class are read as the messages that rclpy would have written."""
 
+from contextlib import suppress
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from flexmanip_ros import messages
-from flexmanip_ros.ros.conversions import joint_state, to_message
+from flexmanip_ros.errors import SignalError
+from flexmanip_ros.ros.conversions import joint_state, numbers, to_message
 from flexmanip_ros.ros.encoding import Encoder, JointStateWriter
 from flexmanip_ros.types import JointRecord, Mode, Payload, StateSpace, Status
 
@@ -24,8 +28,8 @@ def same(raw: bytes, message: object) -> bool:
 @given(st.lists(st.tuples(STAMPS, st.sampled_from(['tip', 'tool0', '', 'a/b']), *[NUMBERS] * 5), max_size=4))
 def test_every_payload_is_encoded_as_rclpy_does(rows: list[tuple]) -> None:
     encoded = Encoder()
-    for stamp, frame, *numbers in rows:
-        payload = Payload(*numbers, Status.TRACKING, (1.0, 2.0, 3.0), (1.0, 2.0, 3.0, 4.0, 5.0, 6.0))
+    for stamp, frame, *values in rows:
+        payload = Payload(*values, Status.TRACKING, (1.0, 2.0, 3.0), (1.0, 2.0, 3.0, 4.0, 5.0, 6.0))
         for _, value in messages.outgoing_payload(payload, stamp, frame):
             assert same(encoded(value), to_message(value))
 
@@ -50,3 +54,17 @@ def test_records_are_encoded_as_rclpy_does_when_names_and_sizes_change(rows: lis
         record = JointRecord(
             stamp, names, np.arange(float(size)) + k, np.arange(2.0) * k, np.full(size, 0.5 * k))
         assert same(encoded(record), joint_state(record))
+
+
+@given(st.lists(st.floats(), max_size=4), st.booleans())
+def test_commands_are_read_from_their_bytes_whatever_their_layout(values: list[float], labelled: bool) -> None:
+    message = Float64MultiArray(data=values)
+    if labelled:
+        message.layout.dim = [MultiArrayDimension(label='joints', size=len(values), stride=len(values))]
+    assert np.array_equal(numbers(serialize_message(message)), np.array(values), equal_nan=True)
+
+
+@given(st.binary(max_size=60))
+def test_bytes_that_are_no_command_are_an_error_of_ours_or_numbers(raw: bytes) -> None:
+    with suppress(SignalError):
+        assert numbers(raw).dtype == np.float64

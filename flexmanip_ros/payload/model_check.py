@@ -1,0 +1,267 @@
+"""The payload of ``structured`` against the identified model: two routes from the same samples, one arm.
+
+``structured`` fits the arm's equations to every sample; RPBSID knows of no arm. What both say of it is
+compared: the lowest two frequencies, and how strongly each torque drives those two modes (the residues of
+both together: close modes share them). Where they disagree by more than they may, the payload's interval
+reaches over what the model says, and the status is INCONSISTENT. See docs/payload.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from flexmanip_ros.identification.uncertainty import Identified
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.payload import memory as mem
+from flexmanip_ros.payload.arm_modes import ArmModes, arm_modes
+from flexmanip_ros.payload.identified_drive import drive
+from flexmanip_ros.payload.motion_kernel import PARAMETERS
+from flexmanip_ros.payload.signals import Quantity
+from flexmanip_ros.payload.structured import StructuredState
+from flexmanip_ros.payload.structured_judgement import QUANTILE
+from flexmanip_ros.payload.structured_model import Model
+from flexmanip_ros.types import Array, Mode, Payload, Sample, Status
+
+EVERY = 32
+"""Of so many samples one tells where the arm is."""
+LEAST = 1000.0
+"""Samples behind a fit that is compared."""
+ANOTHER = 0.2
+"""Relative distance beyond which an identified frequency is that of another mode."""
+DEVIATIONS = 4.0
+"""Standard deviations that the two may differ by, and beside them what no deviation knows:"""
+FREQUENCY, DRIVE = 0.006, 0.035
+"""relative errors of frequencies and drives of a few modes where an arm has many,"""
+FREQUENCY_MOVED, DRIVE_MOVED, STILL = 0.1, 3.0, 0.06
+"""and what is added for each radian that the arm turned, to drives beyond STILL [rad]."""
+STEP = 1e-4
+"""Of derivatives by the logarithms of payload and stiffness."""
+PAYLOADS = np.concatenate([[0.0], np.geomspace(1e-3, 1e4, 71)])
+"""Payloads whose frequencies are looked at, over the lightest tip mass."""
+AGREES = 0.5
+"""Deviation below which a model clears the arm of what was found of it before."""
+BELIEVED = (Status.TRACKING, Status.POORLY_EXCITED, Status.INCONSISTENT)
+
+
+class Verdict(NamedTuple):
+    """What a model says of the payload that was estimated without it."""
+
+    at: int
+    """Stamp at which the model was read [ns]."""
+    since: int
+    """Stamp of the event that model and payload date from [ns]."""
+    held: bool
+    """Whether the arm was to hold something."""
+    deviation: float
+    """Largest difference over what is tolerated: beyond 1 they disagree."""
+    doubt: float = 0.0
+    """Relative error of the arm's inertia that the drive of the modes shows; 0 where that agrees."""
+    lower: float = math.inf
+    upper: float = -math.inf
+    """Payloads [kg] at which the arm has the frequencies; no limits where those agree."""
+
+
+def sweep(before: Array, samples: Sequence[Sample], relative: bool) -> Array:
+    """Return where the arm was since the event, after more samples; relative: angle 2 is from link 1 on.
+
+    (5,) smallest and largest cosine of the angle between the links, then angle of joint 1 [rad]; samples.
+    """
+    count = int(before[4]) if before.size else 0
+    after = before.copy() if before.size else np.array([1.0, -1.0, math.inf, -math.inf, 0.0])
+    for sample in samples[-count % EVERY::EVERY]:
+        if sample.angles.shape != (2,):
+            return before
+        first, second = float(sample.angles[0]), float(sample.angles[1])
+        cosine = math.cos(second if relative else second - first)
+        after[0], after[1] = min(after[0], cosine), max(after[1], cosine)
+        after[2], after[3] = min(after[2], first), max(after[3], first)
+    after[4] = count + len(samples)
+    return after
+
+
+def remember(verdicts: tuple[Verdict, ...], new: Verdict | None, reach: int) -> tuple[Verdict, ...]:
+    """Return the verdicts that may still be asked for: of the arm when it was empty, and the latest.
+
+    reach: time [ns] that an event may come late; what was read meanwhile may turn out to date from after it.
+    """
+    if new is None:
+        return verdicts
+    kept = [old for old in verdicts if not old.held and old.at < new.at
+            and (old.at < new.since or old.since == new.since)]
+    while len(kept) > 1 and kept[1].at < new.at - reach:
+        kept = kept[1:]
+    return (*kept, new)
+
+
+def check(config: IdentifierParameters, state: StructuredState | None, payload: Payload | None, swept: Array,
+          identified: Identified, modes: Sequence[Mode], at: int = 0, since: int = 0) -> Verdict | None:
+    """Compare an identified model with the arm as ``structured`` knows it; None where nothing can be said.
+
+    payload: as estimated without the model; swept: see ``sweep``; modes: of the identified model; at, since:
+    stamps now and of the last event [ns]. Only a refined fit of some length is compared, and only with an
+    estimate that claims something.
+    """
+    if state is None or state.model is None or state.memory is None or payload is None or swept.size == 0:
+        return None
+    if (identified.status is not Status.TRACKING or not identified.refined or identified.samples < LEAST
+            or payload.status not in BELIEVED):
+        return None
+    try:
+        found = _compare(config, state.model, state.memory, payload, swept, identified, modes)
+    except np.linalg.LinAlgError:
+        return None
+    return found if found is None else found._replace(at=at, since=since)
+
+
+def apply(state: StructuredState, payload: Payload, verdicts: tuple[Verdict, ...], since: int) -> Payload:
+    """Return the payload with the interval that the latest verdict leaves it. since: stamp of the last event.
+
+    One that dates from the same event counts. So does what was found of the arm when it was last empty,
+    until a model since the event agrees well.
+    """
+    if not verdicts or state.memory is None or state.model is None or payload.status not in BELIEVED:
+        return payload
+    m = state.memory
+    own = verdicts[-1] if verdicts[-1].since == since else None
+    empty = next((one for one in reversed(verdicts) if one.at < since and not one.held), None)
+    disagree = own is not None and own.deviation > 1.0
+    doubt = own.doubt if own is not None else 0.0
+    if empty is not None and (own is None or own.deviation > AGREES):
+        doubt = max(doubt, empty.doubt)
+    if not disagree and doubt == 0.0:
+        return payload
+    if not m.counts[mem.HELD]:  # an arm that does not move as an empty one may hold anything
+        return replace(payload, lower=0.0, upper=math.inf, std=math.inf, status=Status.INCONSISTENT)
+    std = math.hypot(payload.std, doubt * (payload.mass + state.model.motion.scale))
+    lower, upper = payload.mass - QUANTILE * std, payload.mass + QUANTILE * std
+    if own is not None:
+        lower, upper = min(lower, own.lower), max(upper, own.upper)
+    return replace(payload, std=std, status=Status.INCONSISTENT,
+                   lower=max(0.0, min(payload.lower, lower)), upper=max(payload.upper, upper))
+
+
+def _compare(config: IdentifierParameters, model: Model, m: mem.Memory, payload: Payload, swept: Array,
+             identified: Identified, modes: Sequence[Mode]) -> Verdict | None:
+    """Compare frequencies and drives."""
+    learned = m.x.size - PARAMETERS + np.arange(3)
+    cosines = _configurations(config, model, m, swept)
+    count = cosines.size
+    arm = _predicted(config, model, m, np.append(cosines, cosines[:1].repeat(3)),
+                     np.vstack([np.zeros((count, 3)), STEP * np.eye(3)]))
+    spread = m.S[learned].copy()
+    known = float(np.linalg.norm(spread[0]))
+    if m.counts[mem.HELD] and known > 0.0 and payload.mass > 0.0:
+        spread[0] *= max(1.0, payload.std / payload.mass / known)
+    nearest = _matched(arm.frequency[0], modes)
+    if nearest is None:
+        return None
+    turned = math.acos(max(swept[0], -1.0)) - math.acos(min(swept[1], 1.0))
+    moved = max(turned, float(swept[3] - swept[2]))
+
+    here = arm.frequency[0, :2]
+    found = np.array([modes[k].frequency_hz / math.sqrt(1.0 - modes[k].damping_ratio ** 2) for k in nearest])
+    noise = np.array([modes[k].frequency_std_hz for k in nearest]) / here
+    by_learned = (arm.frequency[count:, :2] / here - 1.0).T / STEP @ spread
+    band = arm.frequency[:count, :2]
+    off = (found - np.clip(found, band.min(axis=0), band.max(axis=0))) / here
+    allowed = FREQUENCY + FREQUENCY_MOVED * moved + DEVIATIONS * np.hypot(
+        noise, np.linalg.norm(by_learned, axis=1))
+    deviation = float(np.max(np.abs(off) / allowed))
+    lower, upper, doubt = math.inf, -math.inf, 0.0
+    if deviation > 1.0:
+        lower, upper = _payloads(config, model, m, cosines, found, allowed, np.abs(off) > allowed)
+
+    rows = _bend_rows(model, len(config.outputs))
+    if rows is not None:
+        index, links, rates = rows
+        # sums over bend sensors, weighted so that those of the arm here are one
+        seen = arm.drive[:, links]
+        weights = seen[0] / (seen[0] ** 2).sum(axis=0)
+        sums = (weights * seen).sum(axis=1)
+        value, noise = drive(identified, np.array(nearest), index, rates, weights)
+        by_learned = (sums[count:] - 1.0).T / STEP @ spread
+        off = value - np.clip(value, sums[:count].min(axis=0), sums[:count].max(axis=0))
+        allowed = DRIVE + DRIVE_MOVED * max(0.0, moved - STILL) + DEVIATIONS * np.hypot(
+            noise, np.linalg.norm(by_learned, axis=1))
+        relative = float(np.max(np.abs(off) / allowed))
+        if relative > 1.0:
+            doubt = float(np.max(np.abs(off)[np.abs(off) > allowed]))
+        deviation = max(deviation, relative)
+    if not math.isfinite(deviation):
+        return None
+    return Verdict(0, 0, bool(m.counts[mem.HELD]), deviation, doubt, lower, upper)
+
+
+def _configurations(config: IdentifierParameters, model: Model, m: mem.Memory, swept: Array) -> Array:
+    """Return cosines between the links: now, and those between which the arm was since the event."""
+    point = config.payload.working_point
+    if model.motion.frozen and len(point) == 2:
+        return np.array([math.cos(point[1] - point[0])])
+    between = [0.0] if swept[0] < 0.0 < swept[1] else []  # frequencies depend on the square
+    return np.array([math.cos(m.x[1] - m.x[0]), swept[0], swept[1], *between])
+
+
+def _predicted(config: IdentifierParameters, model: Model, m: mem.Memory, cosines: Array, steps: Array,
+               masses: Array | None = None) -> ArmModes:
+    """Return the modes of the arm as learned; steps: (j, 3) away from what is known, as logarithms."""
+    n, h = model.motion.q.size, model.motion.q.size - 2
+    p = m.x.size - PARAMETERS
+    uneven = np.zeros((2, h // 2))
+    uneven[:, 1:] = m.x[2 * n:p].reshape(2, -1)
+    stiffness = np.exp((m.x[p + 1:p + 3] + steps[:, 1:])[:, :, None] + uneven).reshape(len(steps), h)
+    held = bool(m.counts[mem.HELD])
+    if masses is None:
+        here = m.x[p] + steps[:, 0] * (1.0 if held else model.motion.scale)
+        masses = (model.motion.scale * np.exp(np.minimum(here, 12.0)) if held
+                  else np.maximum(here, model.motion.least))
+    inertia = model.motion.inertia * math.exp(min(m.x[-1], 12.0)) if held else 0.0
+    return arm_modes(config.arm, cosines, masses, np.full(cosines.size, inertia), stiffness)
+
+
+def _matched(frequency: Array, modes: Sequence[Mode]) -> list[int] | None:
+    """Return which identified modes are the lowest two of the arm, in order; None when they are not there."""
+    usable = [k for k, mode in enumerate(modes) if mode.frequency_hz > 0.0 and abs(mode.damping_ratio) < 0.5
+              and math.isfinite(mode.frequency_std_hz)]
+    found = np.array([modes[k].frequency_hz for k in usable])
+    away = np.abs(np.log(found[:, None] / frequency[:3]))
+    pairs = [(away[i, 0] + away[j, 1], i, j) for i in range(len(usable)) for j in range(i + 1, len(usable))]
+    if not pairs:
+        return None
+    _, i, j = min(pairs)
+    if max(away[i, 0], away[j, 1]) > ANOTHER or (frequency.size > 2 and away[j, 2] < away[j, 1]):
+        return None
+    return [usable[i], usable[j]]
+
+
+def _payloads(config: IdentifierParameters, model: Model, m: mem.Memory, cosines: Array, found: Array,
+              allowed: Array, which: Array) -> tuple[float, float]:
+    """Return between which payloads the arm has the frequencies found, each mode by itself."""
+    masses = model.motion.scale * PAYLOADS
+    many = _predicted(config, model, m, np.repeat(cosines, masses.size),
+                      np.zeros((cosines.size * masses.size, 3)), np.tile(masses, cosines.size))
+    frequency = many.frequency[:, :2].reshape(cosines.size, masses.size, 2)
+    lower, upper = math.inf, -math.inf
+    for k in np.flatnonzero(which):
+        low = frequency[:, :, k].min(axis=0) * (1.0 - allowed[k])
+        high = frequency[:, :, k].max(axis=0) * (1.0 + allowed[k])
+        fits = np.flatnonzero((low <= found[k]) & (found[k] <= high))
+        if fits.size == 0:  # higher than empty, or lower than with anything
+            fits = np.array([0 if found[k] > high.max() else masses.size - 1])
+        lower = min(lower, float(masses[max(fits[0] - 1, 0)]))
+        upper = max(upper, float(masses[fits[-1] + 1]) if fits[-1] + 1 < masses.size else math.inf)
+    return lower, upper
+
+
+def _bend_rows(model: Model, outputs: int) -> tuple[Array, Array, Array] | None:
+    """Return outputs that are bends (their rates where no displacement is), of which link, and if rates."""
+    for quantity in (Quantity.BEND, Quantity.BEND_RATE):
+        rows = [k for k, role in enumerate(model.roles[:outputs]) if role.quantity is quantity]
+        if rows:
+            links = np.array([model.roles[k].link for k in rows])
+            return np.array(rows), links, np.full(len(rows), quantity is Quantity.BEND_RATE)
+    return None
