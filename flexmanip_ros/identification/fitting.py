@@ -23,6 +23,8 @@ NOISE_BLOCKS, DRIFT_BLOCKS, WENT_BLOCKS = 16, 4, 8
 """Blocks over which the noise is remembered, how fast the parameters move, and where they go."""
 SURPRISE = 4.0
 """Standard deviations beyond which a block says that the parameters have gone elsewhere."""
+AGE = 1.25
+"""Blocks from the middle of one to when its result is read, in the mean."""
 CHANCE = 2.0
 """Standard deviations that are left to chance before anything is taken to swell or to move."""
 LARGEST_DRIFT = 1.4
@@ -98,13 +100,14 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
     step[k - len(end):] = 0.0  # the state moves anyway
     moving = old.drift + further if further > 0.0 else 0.0
     went = old.went if old.lost else old.went + (step - old.went) / WENT_BLOCKS
+    lasting, behind = going(went[:k - len(end)], kept[:k - len(end)], root[:k - len(end)])
     return old._replace(
         theta=theta._replace(x=end), root=arrive(root, arrival), strikes=strikes,
         gain=theta.K if old.structure.free_gain else old.gain, lost=False,
         covariance=(1.0 - share) * old.covariance + share * covariance,
         weight=min(old.weight + len(U), MEMORY),
         drift=old.drift + (moving - old.drift) / DRIFT_BLOCKS,
-        went=went, going=going(went[:k - len(end)], kept[:k - len(end)], root[:k - len(end)]))
+        went=went, going=lasting, behind=behind)
 
 
 def is_surprising(size: float, H: Array, widening: float) -> bool:
@@ -131,19 +134,26 @@ def drift(H: Array, g: Array, widening: float) -> float:
     return low
 
 
-def going(went: Array, before: Array, after: Array) -> float:
-    """Share of the mean step ``went`` (a,) that is no chance, 0..1.
+def going(went: Array, before: Array, after: Array) -> tuple[float, float]:
+    """Share of the mean step ``went`` (a,) that is no chance, 0..1, how many steps the fit is behind.
 
     before, after: (a, k) roots of the covariance around a block. Estimates of parameters that stay where they
     are move too, by what a block teaches: T = 1 - after after', in units of the covariance before. Their mean
-    over the blocks has the size tr T / (2 WENT_BLOCKS - 1), with the deviation sqrt(2) |T| / (..).
+    over the blocks has the size tr T / (2 WENT_BLOCKS - 1), with the deviation sqrt(2) |T| / (..). T is also
+    the share of an error that a block takes away: a steady drift stays (1 - T) / T steps ahead of the fit.
     """
     L = triangle(before.T).T
-    size = float(np.sum(solve_triangular(L, went, lower=True, check_finite=False) ** 2))
+    step = solve_triangular(L, went, lower=True, check_finite=False)
+    size = float(step @ step)
+    if not size > 0.0:
+        return 0.0, 0.0
     left = solve_triangular(L, after, lower=True, check_finite=False)
     T = np.eye(len(went)) - left @ left.T
     likely = float(np.trace(T)) + CHANCE * np.sqrt(2.0) * float(np.linalg.norm(T))
-    return float(np.sqrt(max(1.0 - likely / (2.0 * WENT_BLOCKS - 1.0) / size, 0.0))) if size > 0.0 else 0.0
+    share = float(np.sqrt(max(1.0 - likely / (2.0 * WENT_BLOCKS - 1.0) / size, 0.0)))
+    gain = float(step @ T @ step) / size
+    lag = min((1.0 - gain) / max(gain, 1e-9), float(WENT_BLOCKS))
+    return share, share * (AGE + lag)
 
 
 def refine(config: IdentifierParameters, refined: Refined, samples: Array, fate: Kinds, R: Array, scale: Array

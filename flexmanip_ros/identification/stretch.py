@@ -43,7 +43,7 @@ class Recursion(NamedTuple):
     singular_values, condition: of the subspace model the fit began with; lost: the state is unknown;
     drift: logarithm of the factor by which variances grow from block to block, as the plant itself moves;
     went: (k,) how far the coordinates went of late in a block; going: the share of that which is no chance,
-    that far may they go again.
+    that far may they go again; behind: the times it that they may have gone since what the fit rests on.
     """
 
     theta: Theta
@@ -62,6 +62,7 @@ class Recursion(NamedTuple):
     lost: bool = False
     drift: float = 0.0
     going: float = 0.0
+    behind: float = 0.0
 
 
 class Attempt(NamedTuple):
