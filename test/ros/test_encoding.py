@@ -57,7 +57,7 @@ def test_records_are_encoded_as_rclpy_does_when_names_and_sizes_change(rows: lis
 
 
 @given(st.lists(st.floats(), max_size=4), st.booleans())
-def test_commands_are_read_from_their_bytes_whatever_their_layout(values: list[float], labelled: bool) -> None:
+def test_commands_are_read_from_bytes_whatever_their_layout(values: list[float], labelled: bool) -> None:
     message = Float64MultiArray(data=values)
     if labelled:
         message.layout.dim = [MultiArrayDimension(label='joints', size=len(values), stride=len(values))]
