@@ -31,11 +31,13 @@ class Summary:
     vaf_prediction_percent: tuple[float | None, ...] | None = None
     model_status: str = 'TRACKING'
     """What the model is worth, where ``status`` is that of the payload; for people, not in the JSON."""
+    modes_deviation: float = math.nan
+    """Of the model's modes from the arm's with this payload, beyond 1 they disagree; not in the JSON."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the values as JSON has them: no NaN, no infinity, lists instead of tuples."""
         return {item.name: _json(getattr(self, item.name)) for item in fields(self)
-                if item.name != 'model_status'}
+                if item.name not in ('model_status', 'modes_deviation')}
 
 
 def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -> Summary:
@@ -50,6 +52,7 @@ def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -
         wall_s=wall_s,
         status='WARMING_UP' if estimate is None else estimate.status.name,
         model_status='WARMING_UP' if estimate is None else estimate.model_status.name,
+        modes_deviation=math.nan if estimate is None else estimate.modes_deviation,
         frequencies_hz=tuple(mode.frequency_hz for mode in modes),
         damping_ratios=tuple(mode.damping_ratio for mode in modes),
         payload_mass_kg=None if payload is None else _known(payload.mass),

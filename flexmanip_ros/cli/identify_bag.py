@@ -100,6 +100,9 @@ def describe(result: Result) -> list[str]:
         spread = f' +- {1.96 * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else ''
         lines.append(f'mode {k + 1}       {mode.frequency_hz:.4f}{spread} Hz, '
                      f'damping ratio {mode.damping_ratio:.4f}')
+    if summary.modes_deviation > 1.0:
+        lines.append('             they are not those of the arm with this payload: '
+                     f'off by {summary.modes_deviation:.1f} times what is tolerated')
     if summary.payload_ci95_kg is not None:
         low, high = summary.payload_ci95_kg
         lines.append(f'payload      {_text(summary.payload_mass_kg)} kg, '

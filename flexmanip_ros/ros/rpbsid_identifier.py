@@ -52,6 +52,8 @@ _TOPICS = (
 class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
     """Converts, takes one step of the pipeline, publishes."""
 
+    THREAD_PRIORITY = 20
+
     def __init__(self, *, context: Context | None = None, overrides: list[Parameter] | None = None,
                  namespace: str | None = None, cli_args: list[str] | None = None) -> None:
         super().__init__(NAME, IdentifierParameters, context=context, overrides=overrides,
@@ -230,7 +232,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             return
         report.values.update(
             excitation=estimate.excitation, condition=estimate.condition,
-            innovation_power=estimate.innovation_power)
+            innovation_power=estimate.innovation_power, modes_deviation=estimate.modes_deviation)
         if estimate.singular_values is not None:
             report.values['order'] = self.config.order
             report.values['suggested_order'] = suggested_order(estimate.singular_values)
