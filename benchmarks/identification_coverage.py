@@ -2,8 +2,9 @@
 
 Linear plant at 60/45 deg holding 20 kg, kappa = 1 as configured, the paper's torques, sensor noise on
 displacements and rates, 3 s at 1 kHz, default settings; at least 1000 seeds a case, others for each. Beside
-it what chance does to so many runs: `exact` is the coverage of an estimate that errs by the noise's first order
-alone, its interval the Cramer-Rao bound, on the same noise; claimed over bound is how wide the claim is.
+it, what chance does to so many runs: `exact` is the coverage of an estimate that errs by the first order
+of the noise alone, its interval the Cramer-Rao bound, on the same noise; claimed over bound is the claim's
+width.
 Use: identification_coverage.py [runs].
 """
 

@@ -71,7 +71,8 @@ def settle(config: IdentifierParameters, core: Core) -> Core:
         if part[0].gap:
             identifier = rpbsid.window_restart(config, identifier)
         identifier = rpbsid.advance(
-            config, identifier, np.array([s.u for s in part]), np.array([s.y for s in part]))
+            config, identifier, np.array([s.u for s in part]), np.array([s.y for s in part]),
+            np.array([s.stamp_ns for s in part]))
         start = stop
     return core._replace(rpbsid=identifier, owed=())
 

@@ -38,26 +38,29 @@ def restart(decimator: Decimator) -> Decimator:
     return decimator._replace(seen=0)
 
 
-def decimate(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimator, Array]:
-    """Take samples (k, r + m); return the filtered ones that are due (0.., r + m).
+def decimate(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimator, Array, list[int]]:
+    """Take samples (k, r + m); return the filtered ones (0.., r + m), and which sample each is due with.
 
     A sample that is not finite starts the filter anew and is handed on as it is, so that the identifier
     sees the break.
     """
     kept: list[Array] = []
+    at: list[int] = []
     good = np.all(np.isfinite(samples), axis=1)
     begin = 0
     for k in [*np.flatnonzero(~good).tolist(), len(samples)]:
-        decimator, some = _run(decimator, samples[begin:k], factor)
+        decimator, some, due = _run(decimator, samples[begin:k], factor)
         kept.append(some)
+        at.extend(begin + i for i in due)
         if k < len(samples):
             decimator = restart(decimator)
             kept.append(samples[k:k + 1])
+            at.append(k)
         begin = k + 1
-    return decimator, np.vstack(kept)
+    return decimator, np.vstack(kept), at
 
 
-def _run(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimator, Array]:
+def _run(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimator, Array, list[int]]:
     """Filter finite samples of one stretch."""
     taps, history, seen = decimator
     joint = np.vstack([history, samples])
@@ -68,4 +71,5 @@ def _run(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimator, 
     out = np.empty((len(due), samples.shape[1]))
     for row, i in enumerate(due):
         out[row] = taps @ joint[i:i + order + 1]
-    return decimator._replace(history=joint[len(joint) - order:], seen=seen + len(samples)), out
+    going_on = decimator._replace(history=joint[len(joint) - order:], seen=seen + len(samples))
+    return going_on, out, due.tolist()

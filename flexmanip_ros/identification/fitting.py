@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from flexmanip_ros.identification import publication, refinement
@@ -156,26 +157,29 @@ def going(went: Array, before: Array, after: Array) -> tuple[float, float]:
     return share, share * (AGE + lag)
 
 
-def refine(config: IdentifierParameters, refined: Refined, samples: Array, fate: Kinds, R: Array, scale: Array
-           ) -> Refined:
+def refine(
+    config: IdentifierParameters, refined: Refined, samples: Array, stamps_ns: NDArray[np.int64], fate: Kinds,
+    R: Array, scale: Array,
+) -> Refined:
     """Hand samples to the prediction-error fit; ask for the work that is due, take that which was.
 
-    samples: (N, r + m), N <= until_chunk(refined); R, scale: factor of the moments and scale after them.
+    samples: (N, r + m), N <= until_chunk(refined); stamps_ns: (N,), all 0 where unknown; R, scale: factor of
+    the moments and scale after them.
 
     Refused samples break the stretch, and so do quiet ones: there is nothing to learn from them.
     """
     start = 0
     for k in np.flatnonzero(fate):
-        refined = refinement.take(refined, samples[start:k]) if k > start else refined
+        refined = refinement.take(refined, samples[start:k], stamps_ns[start]) if k > start else refined
         refined = broken(config, refined)
         start = int(k) + 1
     if start == len(samples):
         return refined
-    refined = refinement.take(refined, samples[start:])
+    refined = refinement.take(refined, samples[start:], stamps_ns[start])
     if refined.job is not None and refined.total >= refined.due:
         refined = delivered(config, refined)
     if refinement.is_fit_due(refined):
-        refined = refinement.ask_fit(refined, R, scale)
+        refined = refinement.ask_fit(refined, R, scale, int(stamps_ns[-1]))
     elif refinement.is_block_due(refined):
         refined = refinement.ask_block(refined)
     return refined

@@ -11,6 +11,7 @@ meanwhile, and the numbers do not depend on when it was ready.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,10 @@ BLOCK = 256
 DELAY = 4
 """A fit of N samples is taken N / DELAY samples later, and at least SOONEST."""
 SOONEST = 128
+SOONEST_S, EACH_S = 0.1, 1e-4
+"""Nor sooner than this, nor than so much for each of its samples [s]: at 1 kHz that is less."""
+LATEST = 4096
+"""Nor later than this: what is kept meanwhile is bounded, at any rate."""
 PARAMETERS = 80
 """With more parameters than this the subspace model is published as it is."""
 PAUSE = 8192
@@ -62,7 +67,8 @@ class Refined(NamedTuple):
     Closed chunks (CHUNK, r + m) never written to again, the open one, samples since the start (negative:
     still to wait), and the fit. batch: the fit still sees every sample since the start; seen: samples from
     the first chunk on that the fit has taken in; job: under way, its result is taken at ``due`` samples;
-    answer: to it, if it is known by now; before: the fit of before the last event, to start from.
+    answer: to it, if it is known by now; before: the fit of before the last event, to start from; since_ns:
+    stamp of the first sample.
     """
 
     chunks: tuple[Array, ...]
@@ -75,6 +81,7 @@ class Refined(NamedTuple):
     due: int = 0
     answer: Answer | None = None
     before: Recursion | None = None
+    since_ns: int = 0
 
 
 def start(width: int, before: Recursion | None = None) -> Refined:
@@ -92,10 +99,12 @@ def until_chunk(refined: Refined) -> int:
     return CHUNK - refined.total % CHUNK
 
 
-def take(refined: Refined, samples: Array) -> Refined:
-    """Store samples (k, r + m), k <= until_chunk(refined)."""
+def take(refined: Refined, samples: Array, first_ns: int = 0) -> Refined:
+    """Store samples (k, r + m), k <= until_chunk(refined), the first of them stamped first_ns."""
     if refined.total < 0:
         return refined._replace(total=refined.total + len(samples))
+    if refined.total == 0:
+        refined = refined._replace(since_ns=int(first_ns))
     current = refined.current.copy()
     at = refined.total % CHUNK
     current[at:at + len(samples)] = samples
@@ -120,11 +129,22 @@ def is_block_due(refined: Refined) -> bool:
     return refined.recursion is not None and refined.job is None and waiting >= BLOCK
 
 
-def ask_fit(refined: Refined, R: Array, scale: Array) -> Refined:
+def patience(refined: Refined, now_ns: int) -> int:
+    """Samples until the result of a fit is taken, a multiple of CHUNK; now_ns: stamp of the last sample.
+
+    From the stamps of the stretch, so that a replay waits as long as the live node.
+    """
+    count = refined.total
+    spacing = max(now_ns - refined.since_ns, 0) * 1e-9 / (count - 1)
+    needed = max(SOONEST_S, EACH_S * count) / spacing if spacing > 0.0 else 0.0
+    return max(SOONEST, count // DELAY, CHUNK * math.ceil(min(needed, LATEST) / CHUNK))
+
+
+def ask_fit(refined: Refined, R: Array, scale: Array, now_ns: int = 0) -> Refined:
     """Ask for a fit of the whole stretch, see ``stretch.fit_stretch``."""
     fits = [fit for fit in (refined.recursion, refined.before) if fit is not None]
     job = Job(refined.chunks, R.copy(), scale.copy(), *(*fits, None)[:2])
-    return refined._replace(job=job, due=refined.total + max(SOONEST, refined.total // DELAY))
+    return refined._replace(job=job, due=refined.total + patience(refined, now_ns))
 
 
 def ask_block(refined: Refined) -> Refined:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.identification import (
@@ -115,9 +116,13 @@ def step(config: IdentifierParameters, state: RpbsidState, u: Array, y: Array) -
     return advance(config, state, np.asarray(u, dtype=float)[None], np.asarray(y, dtype=float)[None])
 
 
-def advance(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array) -> RpbsidState:
+def advance(
+    config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array,
+    stamps_ns: NDArray[np.int64] | None = None,
+) -> RpbsidState:
     """Take N samples U (N, r), Y (N, m): the same bits as N steps, one copy of the state.
 
+    stamps_ns: (N,), so that long work gets its time at any sample rate (``refinement.patience``).
     A sample that is not finite is refused and breaks the window. Raises SignalError on wrong sizes.
     """
     r, m = len(config.inputs), len(config.outputs)
@@ -127,10 +132,11 @@ def advance(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array
         raise SignalError(
             f'samples of shapes {U.shape} and {Y.shape} do not fit {r} inputs and {m} outputs',
             'give as many rows of both, one column per configured signal')
+    stamps = np.zeros(len(U), dtype=np.int64) if stamps_ns is None else stamps_ns
     new = state.copy()
     if new.decimator is not None:
-        filtered, kept = decimation.decimate(new.decimator, np.hstack([U, Y]), config.decimation)
-        new = replace(new, decimator=filtered)
+        filtered, kept, at = decimation.decimate(new.decimator, np.hstack([U, Y]), config.decimation)
+        new, stamps = replace(new, decimator=filtered), stamps[at]
         U, Y = np.ascontiguousarray(kept[:, :r]), np.ascontiguousarray(kept[:, r:])
     done = 0
     while done < len(U):
@@ -141,7 +147,8 @@ def advance(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array
         fate = _run(config, new, u, y)
         if new.refined is not None:
             new = replace(new, refined=fitting.refine(
-                config, new.refined, np.hstack([u, y]), fate, new.memory[0], new.scale))
+                config, new.refined, np.hstack([u, y]), stamps[done:done + count], fate, new.memory[0],
+                new.scale))
         done += count
     return new
 
