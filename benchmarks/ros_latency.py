@@ -115,6 +115,7 @@ def composed(rate: float) -> None:
     for node in nodes:
         executor.add_node(node)
         node.autostart()
+    nodes[0].take_priority()
     gc.collect()
     gc.freeze()
     spin(executor, None, interrupt)

@@ -28,7 +28,8 @@ _ARRAY = {
 }
 _EXAMPLE = {bool: 'true or false', int: 'a whole number such as 100',
             float: 'a number with a decimal point such as 100.0', str: 'a text'}
-_ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.', 'autostart')
+_ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.', 'autostart',
+            'thread_priority')
 _LARGEST = sys.float_info.max
 _LARGEST_INT = 2**63 - 1
 
