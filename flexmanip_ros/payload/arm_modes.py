@@ -33,8 +33,8 @@ class Parts(NamedTuple):
 class ArmModes(NamedTuple):
     """Undamped modes with the chords free.
 
-    frequency: (..., 2 kappa) [Hz], rising; drive: (..., 2, 2), for the lowest two modes together, how fast
-    each bend sensor is accelerated by each torque [m/s^2 per N m].
+    frequency: (j, 2 kappa) [Hz], rising; drive: (j, 2, 2, 2), how much each bend sensor is accelerated in
+    each of the lowest two modes by each torque [m/s^2 per N m].
     """
 
     frequency: Array
@@ -61,7 +61,8 @@ def arm_modes(arm: ArmParameters, cosine: Array, mass: Array, inertia: Array, st
     slowness, U = slowness[:, ::-1], U[:, :, ::-1]
     shapes = U / root[:, :, None] / np.sqrt(slowness)[:, None, :]  # of unit modal mass
     lowest = shapes[:, :, :2]
-    drive = (parts.bend @ lowest) @ (np.swapaxes(lowest, 1, 2) @ (torque[:, 2:] - bent[:, :, h:]))
+    driven = np.swapaxes(lowest, 1, 2) @ (torque[:, 2:] - bent[:, :, h:])
+    drive = (parts.bend @ lowest)[..., None] * driven[:, None]
     return ArmModes(1.0 / np.sqrt(slowness) / (2.0 * np.pi), drive)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from flexmanip_ros.identification.modal import REAL
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.types import Array
 
@@ -12,7 +13,7 @@ def drive(identified: Identified, chosen: Array, rows: Array, rates: Array, weig
           ) -> tuple[Array, Array]:
     """Return a sum over modes and outputs of (what an output sees of a mode) x (what an input does to it).
 
-    chosen: indices of modes in rising frequency; rows: (k,) outputs, displacements or (rates: (k,) bool)
+    chosen: indices into ``modal.modes``; rows: (k,) outputs, displacements or (rates: (k,) bool)
     their rates; weights: (k, r) of the outputs in the sum of each input. Returns sums (r,) and standard
     deviations (r,), to first order and without the share of the pole's own frequency.
 
@@ -23,7 +24,7 @@ def drive(identified: Identified, chosen: Array, rows: Array, rates: Array, weig
     n, r, m = model.order, model.B.shape[1], model.C.shape[0]
     poles, V = np.linalg.eig(model.A)
     W = np.linalg.inv(V)
-    order = np.flatnonzero(poles.imag > 0.0)
+    order = np.flatnonzero((poles.imag > 0.0) & (np.angle(poles) >= REAL))
     picked = order[np.argsort(np.angle(poles[order]))][chosen]
     s = np.log(poles[picked]) / model.dt
     # a torque that is held drives a pole by (exp(s dt) - 1) / s

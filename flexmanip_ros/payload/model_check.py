@@ -39,6 +39,8 @@ FREQUENCY, DRIVE = 0.006, 0.035
 """relative errors of frequencies and drives of a few modes where an arm has many,"""
 FREQUENCY_MOVED, DRIVE_MOVED, STILL = 0.1, 5.0, 0.045
 """and what is added for each radian that the arm turned, to drives beyond STILL [rad]."""
+VAGUE = 0.02
+"""Relative deviation of a drive beyond which it is not compared: it is biased by far more than that."""
 STEP = 1e-4
 """Of derivatives by the logarithms of payload and stiffness."""
 PAYLOADS = np.concatenate([[0.0], np.geomspace(1e-3, 1e4, 71)])
@@ -179,19 +181,21 @@ def _compare(config: IdentifierParameters, model: Model, m: mem.Memory, payload:
     rows = _bend_rows(model, len(config.outputs))
     if rows is not None:
         index, links, rates = rows
-        # sums over bend sensors, weighted so that those of the arm here are one
-        seen = arm.drive[:, links]
-        weights = seen[0] / (seen[0] ** 2).sum(axis=0)
+        # sums over modes and bend sensors, weighted so that those of the arm here are one
+        parts = arm.drive[:, links]
+        seen = parts.sum(axis=2)
+        weights = seen[0] / np.maximum((seen[0] ** 2).sum(axis=0), np.finfo(float).tiny)
         sums = (weights * seen).sum(axis=1)
+        cancelled = (np.abs(weights) * np.abs(parts[0]).sum(axis=1)).sum(axis=0)  # 1: no part against another
         value, noise = drive(identified, np.array(nearest), index, rates, weights)
         by_learned = (sums[count:] - 1.0).T / STEP @ spread
         off = value - np.clip(value, sums[:count].min(axis=0), sums[:count].max(axis=0))
-        allowed = DRIVE + DRIVE_MOVED * max(0.0, moved - STILL) + DEVIATIONS * np.hypot(
+        allowed = cancelled * (DRIVE + DRIVE_MOVED * max(0.0, moved - STILL)) + DEVIATIONS * np.hypot(
             noise, np.linalg.norm(by_learned, axis=1))
-        relative = float(np.max(np.abs(off) / allowed))
-        if relative > 1.0:
-            doubt = float(np.max(np.abs(off)[np.abs(off) > allowed]))
-        deviation = max(deviation, relative)
+        excess = np.where(noise < VAGUE, np.abs(off) / allowed, 0.0)
+        if excess.max() > 1.0:
+            doubt = float(np.max(np.abs(off)[excess > 1.0]))
+        deviation = max(deviation, float(excess.max()))
     if not math.isfinite(deviation):
         return None
     return Verdict(0, 0, bool(m.counts[mem.HELD]), deviation, doubt, lower, upper)

@@ -86,7 +86,7 @@ def test_an_exact_model_is_driven_as_the_arm_is(rates):
     known = arm_modes(arm, np.cos(THETA[1:] - THETA[0]), np.array([20.0]), np.zeros(1), np.ones((1, 2)))
     rows = np.array([2, 3] if rates else [0, 1])
     value, _ = drive(model_of(arm, 20.0), np.arange(2), rows, np.full(2, rates), np.ones((2, 2)))
-    assert value == pytest.approx(known.drive[0].sum(axis=0), rel=1e-4)
+    assert value == pytest.approx(known.drive[0].sum(axis=(0, 1)), rel=1e-4)
 
 
 def test_the_deviation_of_a_drive_is_that_of_models_drawn_from_the_spread():
