@@ -1,11 +1,12 @@
 """Claim: live at 1 kHz nothing is lost, p99 from sample to estimate is 0.5 ms or less, at a fifth of a core.
 
-Plant, excitation, trigger and identifier over DDS: composed in one process, and one process each; `played`:
-the identifier alone, the samples simulated beforehand; `bare`: publish and subscribe alone, the floor on the
-machine as it is at the time. Latency is from the middleware's source time stamp of a joint state to that of
-the estimate with the same stamp, so that the observer's own delays do not count; `sample` is the identifier's
-callback for every sample, as it reports itself; lost: of the seconds measured, and while the processes start
-on two cores (all of them import and load kernels then). Use: ros_latency.py [seconds a case]
+Plant, excitation, trigger and identifier over DDS: composed in one process, and one process each; `ordinary`:
+the same where no real-time priority is permitted; `played`: the identifier alone, the samples simulated
+beforehand; `bare`: publish and subscribe alone, the floor on the machine as it is at the time. Latency is from
+the middleware's source time stamp of a joint state to that of the estimate with the same stamp, so that the
+observer's own delays do not count; `sample` is the identifier's callback for every sample, as it reports
+itself; lost: of the seconds measured, and while the processes start on two cores (all of them import and load
+kernels then). Use: ros_latency.py [seconds a case]
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ from flexmanip_ros.ros.spin import Interrupt, make_executor, spin
 HERE = Path(__file__).resolve().parent
 SECONDS = 60.0
 SETTLE_S = 3.0
-CASES = (('bare', 1000.0), ('composed', 1000.0), ('separate', 1000.0), ('played', 4000.0),
-         ('separate', 4000.0))
+CASES = (('bare', 1000.0), ('composed', 1000.0), ('separate', 1000.0), ('ordinary', 1000.0),
+         ('played', 4000.0), ('separate', 4000.0))
 NODES = ('rpbsid_identifier', 'capture_trigger', 'excitation', 'plant_simulator')
 TICKS = os.sysconf('SC_CLK_TCK')
 
@@ -136,8 +137,9 @@ def case(name: str, rate: float, seconds: float, domain: int) -> dict[str, Any]:
         commands = {node: [sys.executable, str(HERE / 'parts' / 'bare_nodes.py'), role, str(rate)]
                     for node, role in (('source', 'source'), ('rpbsid_identifier', 'echo'))}
     else:
-        nodes = NODES if name == 'separate' else NODES[:1]
-        commands = {node: [sys.executable, '-m', f'flexmanip_ros.ros.{node}', *parameters(rate)]
+        nodes = NODES[:1] if name == 'played' else NODES
+        more = ['-p', 'thread_priority:=0'] if name == 'ordinary' else []
+        commands = {node: [sys.executable, '-m', f'flexmanip_ros.ros.{node}', *parameters(rate), *more]
                     for node in nodes}
     if name == 'played':
         commands['player'] = [sys.executable, str(HERE / 'parts' / 'bare_nodes.py'), 'player', str(rate),
