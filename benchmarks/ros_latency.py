@@ -2,7 +2,7 @@
 
 Plant, excitation, trigger and identifier over DDS: composed in one process, and one process each; `ordinary`:
 the same where no real-time priority is permitted; `played`: the identifier alone, the samples simulated
-beforehand; `bare`: publish and subscribe alone, the floor on the machine as it is at the time. Latency is from
+beforehand; `bare`: publish and subscribe alone, the floor on the machine as it is. Latency is from
 the middleware's source time stamp of a joint state to that of the estimate with the same stamp, so that the
 observer's own delays do not count; `sample` is the identifier's callback for every sample, as it reports
 itself; lost: of the seconds measured, and while the processes start on two cores (all of them import and load
