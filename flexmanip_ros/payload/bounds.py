@@ -106,7 +106,7 @@ def nonlinear(
     if config.payload.rotary_inertia:
         m.S[-1, -1] = start.PAYLOAD_STD
     start.freeze(config, model, theta)
-    seen = sensors(config, model, dt, np.zeros(m.x.size))
+    seen = sensors(config, model, dt, np.zeros(m.x.size), theta)
     information = np.zeros((m.x.size, m.x.size))
     found = []
     for k in range(max(counts)):

@@ -20,8 +20,12 @@ from flexmanip_ros.payload.memory import (
     WEIGHT,
     WHITE,
 )
+from flexmanip_ros.payload.tail_kernel import doubt
 from flexmanip_ros.plant.compiled import kernel
 from flexmanip_ros.types import Array
+
+TAIL_SHARE = 0.5
+"""Of the error to reckon with, what is left where nothing misfits but the modes beyond kappa, allowed for."""
 
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
@@ -61,17 +65,21 @@ def drift(score: Array, counts: Integers) -> float:
 
 
 @kernel
-def exact(noise: Array, counts: Integers) -> bool:
-    """Whether no sensor shows more than its white noise: then the model is the arm, as far as one can see."""
-    doubt = 2.5 * math.sqrt(2.0 / max(counts[BLOCKS], 1))
+def misjudged(noise: Array, score: Array, counts: Integers) -> float:
+    """How far one has to reckon with an arm that is not quite the model, 0 to 1.
+
+    1 where a sensor shows more than its white noise; else ``TAIL_SHARE`` as far as the ringing of more modes
+    is seen.
+    """
+    chance = 2.5 * math.sqrt(2.0 / max(counts[BLOCKS], 1))
     for i in range(noise.shape[0]):
-        if noise[i, EFFECTIVE] >= (1.0 + doubt) * max(noise[i, WHITE], noise[i, FLOOR]):
-            return False
-    return True
+        if noise[i, EFFECTIVE] >= (1.0 + chance) * max(noise[i, WHITE], noise[i, FLOOR]):
+            return 1.0
+    return TAIL_SHARE * doubt(score)
 
 
 @kernel
 def figures(S: Array, row: int, noise: Array, rate: Booleans, score: Array, counts: Integers
-            ) -> tuple[float, float, float, bool]:
-    """Return deviation of the payload's state, misfit, drift, and whether the model is exact, in one call."""
-    return spread(S, row), misfit(noise, rate), drift(score, counts), exact(noise, counts)
+            ) -> tuple[float, float, float, float]:
+    """Return deviation of the payload's state, misfit, drift and ``misjudged``, in one call."""
+    return spread(S, row), misfit(noise, rate), drift(score, counts), misjudged(noise, score, counts)

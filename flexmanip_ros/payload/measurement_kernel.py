@@ -20,20 +20,24 @@ from flexmanip_ros.payload.memory import (
     MOVE,
     POWER,
     SEEN,
+    SHOWN,
     SINCE_EVENT,
     SLOW,
+    TOLD,
     VARIANCE,
     WEIGHT,
     WHITE,
 )
 from flexmanip_ros.payload.motion_kernel import PARAMETERS
 from flexmanip_ros.payload.square_root_kernel import absorb_measurement, project
+from flexmanip_ros.payload.tail_kernel import amplitude, ringing
 from flexmanip_ros.plant.compiled import kernel
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
     from flexmanip_ros.payload.memory import Memory
     from flexmanip_ros.payload.motion_kernel import Motion
+    from flexmanip_ros.payload.tail_kernel import Tail
 
 OUTLIER = 4.0
 """Innovations beyond this many standard deviations count less (Huber)."""
@@ -52,6 +56,8 @@ class Sensors(NamedTuple):
     """(m,) whether H reads qd."""
     feed: Array
     """(m, 2) direct effect of the torque."""
+    tail: Tail
+    """What rings beyond kappa."""
     block: int
     """Samples in a block: a tenth of the slowest vibration."""
     diffusion: Array
@@ -70,10 +76,12 @@ def measure(motion: Motion, sensors: Sensors, m: Memory, effort: Array, y: Array
     payload = m.x.size - PARAMETERS
     x, S, f = m.x, m.S, sensors.f
     n = motion.q.size
+    share = amplitude(m.score)
     for i in range(y.size):
         r = m.noise[i, EFFECTIVE]
         predicted = project(x, S, sensors.H[i], n if sensors.rate[i] else 0, f)
-        e = y[i] - predicted - sensors.feed[i, 0] * effort[0] - sensors.feed[i, 1] * effort[1]
+        more = ringing(sensors.tail, m, i)
+        e = y[i] - predicted - sensors.feed[i, 0] * effort[0] - sensors.feed[i, 1] * effort[1] - share * more
         spread = 0.0
         for c in range(f.size):
             spread += f[c] * f[c]
@@ -81,6 +89,9 @@ def measure(motion: Motion, sensors: Sensors, m: Memory, effort: Array, y: Array
         square = e * e / variance
         m.innovation[i, 0], m.innovation[i, 1] = e, variance
         m.power[i] += (min(square, 25.0) - m.power[i]) / min(m.counts[SINCE_EVENT] + 100, 1000)
+        more /= np.sqrt(variance)
+        m.score[SHOWN] += more * min(max(e / np.sqrt(variance) + share * more, -5.0), 5.0)
+        m.score[TOLD] += more * more
         residual = min(max(e / np.sqrt(variance), -5.0), 5.0) * np.sqrt(r)
         m.noise[i, BLOCK_SUM] += residual
         m.noise[i, BLOCK_POWER] += residual * residual

@@ -18,7 +18,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT = range(8)
 # elements of ``count``
 HELD, STORED, PASSED, PASSING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN = range(11)
 # elements of ``score``
-MOVE, VARIANCE, DRIFT, NOW, SEEMED, BEYOND = range(6)
+MOVE, VARIANCE, DRIFT, NOW, SEEMED, BEYOND, SHOWN, TOLD = range(8)
 
 
 class Memory(NamedTuple):
@@ -35,9 +35,10 @@ class Memory(NamedTuple):
     counts: NDArray[np.int64]
     """(11,) counters."""
     score: Array
-    """(6,) move of the payload in this batch, its variance; mean squared normalised move; time to diffuse;
+    """(8,) move of the payload in this batch, its variance; mean squared normalised move; time to diffuse;
     what the arm seemed to hold before the event, when it was empty, in standard deviations, then in those
-    that the error to reckon with in its inertia adds to."""
+    that the error to reckon with in its inertia adds to; how much the innovations have in common with the
+    ringing of modes beyond kappa, and how much of it they could show (variance of the former)."""
     x0: Array
     """(nx,) mean just after the last event."""
     S0: Array
@@ -54,20 +55,27 @@ class Memory(NamedTuple):
     """(nx, nx) information gathered in the pass."""
     g: Array
     """(nx,) gradient gathered in the pass."""
+    tail: Array
+    """(2, a) modes beyond kappa: departure from where the torque holds them, its rate."""
+    torque: Array
+    """(2,) held before the latest sample."""
+    torque0: Array
+    """(2,) held before the last event."""
     innovation: Array
     """(m, 2) the latest, and its variance before the update."""
     power: Array
     """(m,) mean squared normalised innovation of each sensor since the event, slowly forgotten."""
 
 
-def memory(nx: int, m: int) -> Memory:
-    """Allocate."""
+def memory(nx: int, m: int, a: int = 0) -> Memory:
+    """Allocate for nx states, m sensors, a modes beyond kappa."""
     return Memory(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 8)), recent=np.zeros((m, 4)),
         counts=np.zeros(11, dtype=np.int64),
-        score=np.zeros(6), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx),
+        score=np.zeros(8), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx),
         samples=np.zeros((HORIZON, 3 + m)), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
-        g=np.zeros(nx), innovation=np.zeros((m, 2)), power=np.ones(m))
+        g=np.zeros(nx), tail=np.zeros((2, a)), torque=np.zeros(2), torque0=np.zeros(2),
+        innovation=np.zeros((m, 2)), power=np.ones(m))
 
 
 def copy(state: Memory) -> Memory:
@@ -76,7 +84,8 @@ def copy(state: Memory) -> Memory:
     All but the samples kept, the largest part, once they are complete: nothing writes them any more.
     """
     kept = state.samples if state.counts[STORED] >= HORIZON else state.samples.copy()
-    x, S, noise, recent, counts, score, x0, S0, xi, _, xr, Sr, N, g, innovation, power = state
+    (x, S, noise, recent, counts, score, x0, S0, xi, _, xr, Sr, N, g, tail, torque, torque0, innovation,
+     power) = state
     return Memory(x.copy(), S.copy(), noise.copy(), recent.copy(), counts.copy(), score.copy(), x0.copy(),
-                  S0.copy(), xi.copy(), kept, xr.copy(), Sr.copy(), N.copy(), g.copy(), innovation.copy(),
-                  power.copy())
+                  S0.copy(), xi.copy(), kept, xr.copy(), Sr.copy(), N.copy(), g.copy(), tail.copy(),
+                  torque.copy(), torque0.copy(), innovation.copy(), power.copy())

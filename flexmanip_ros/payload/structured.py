@@ -13,11 +13,13 @@ import numpy as np
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import memory as mem
 from flexmanip_ros.payload import structured_start as start
+from flexmanip_ros.payload import tail
 from flexmanip_ros.payload.measurement_kernel import Sensors
 from flexmanip_ros.payload.motion_kernel import PARAMETERS, predict
 from flexmanip_ros.payload.structured_judgement import inexact, judge
 from flexmanip_ros.payload.structured_kernel import advance as run
 from flexmanip_ros.payload.structured_model import Model, build, sensors
+from flexmanip_ros.payload.tail_kernel import believed, push, ring
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload, Sample
 
 FIRST_LOOK = 24
@@ -86,8 +88,13 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
         return replace(state, waiting=(*state.waiting, event))
     m = mem.copy(state.memory)
     assert state.effort is not None
+    assert state.sensors is not None
     ahead = max(event.stamp_ns - state.last_ns, 0)
     predict(state.model.motion, m.x, m.S, state.effort, ahead * 1e-9, bool(m.counts[mem.HELD]))
+    if ahead > 0:
+        push(state.model.motion, state.sensors.tail, m.x, m.torque, state.effort, believed(m.score))
+        ring(state.sensors.tail, m, ahead * 1e-9, state.effort)
+        m.torque[:] = state.effort
     released = _change(config, state.model, m, event.kind)
     return replace(state, memory=m, last_ns=state.last_ns + ahead, released=released)
 
@@ -115,6 +122,7 @@ def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: Eve
         opened[payload, 0] = start.EMPTY_STD * model.motion.scale + 0.3 * before
         m.counts[mem.HELD] = 0
     m.S[:] = start.widen(m.S, np.hstack([columns, opened]))
+    start.shake(model, m)
     _anchor(m)
     return before
 
@@ -141,6 +149,7 @@ def _anchor(m: mem.Memory) -> None:
     """Begin a new horizon of refits here."""
     m.x0[:], m.S0[:] = m.x, m.S
     m.xi[:] = 0.0
+    m.torque0[:] = m.torque
     for counter in (mem.STORED, mem.PASSED, mem.PASSING, mem.SINCE_EVENT, mem.SINCE_NOISE, mem.IN_BATCH,
                     mem.BATCHES):
         m.counts[counter] = 0
@@ -160,14 +169,15 @@ def _begin(config: IdentifierParameters, state: StructuredState) -> StructuredSt
     Y = measurements(model, samples)
     steps = np.diff([sample.stamp_ns for sample in samples]) * 1e-9
     dt = float(np.median(steps))
-    m = mem.memory(2 * model.motion.q.size + model.motion.G.shape[1], len(model.roles))
+    m = mem.memory(2 * model.motion.q.size + model.motion.G.shape[1], len(model.roles), 2 * tail.MODES)
     m.noise[:] = start.noise(model, Y)
     start.first(config, model, m, Y[0])
     start.freeze(config, model, np.mean([sample.angles for sample in samples], axis=0))
+    m.torque[:] = samples[0].u
     _anchor(m)
+    seen = sensors(config, model, dt, start.diffusion(config, model, m), m.x[:2])
     state = replace(
-        state, memory=m, sensors=sensors(config, model, dt, start.diffusion(config, model, m)), waiting=(),
-        last_ns=samples[0].stamp_ns, effort=samples[0].u.copy())
+        state, memory=m, sensors=seen, waiting=(), last_ns=samples[0].stamp_ns, effort=samples[0].u.copy())
     for item in items:
         state = event(config, state, item) if isinstance(item, CaptureEvent) else step(config, state, item)
     return state
@@ -177,6 +187,8 @@ def _resume(config: IdentifierParameters, state: StructuredState, sample: Sample
     """After a gap: start at the sample's measurements."""
     assert state.model is not None
     fresh = reopen(config, state, measurements(state.model, [sample])[0])
+    assert fresh.memory is not None
+    fresh.memory.torque[:] = fresh.memory.torque0[:] = sample.u
     return replace(fresh, last_ns=sample.stamp_ns, effort=sample.u.copy())
 
 
@@ -190,6 +202,7 @@ def reopen(
     n = state.model.motion.q.size
     parameters, spread = m.x[2 * n:].copy(), m.S[2 * n:].copy()
     start.first(config, state.model, m, m.recent[:, 0] if y is None else y)
+    m.tail[:] = 0.0
     m.x[2 * n:] = parameters
     m.S[2 * n:] = 0.0
     m.S[2 * n:, 2 * n:] = np.linalg.qr(spread.T)[1].T

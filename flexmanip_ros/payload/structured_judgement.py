@@ -8,7 +8,7 @@ import numpy as np
 
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import memory as mem
-from flexmanip_ros.payload.judgement_kernel import exact, figures, spread
+from flexmanip_ros.payload.judgement_kernel import figures, misjudged, spread
 from flexmanip_ros.payload.measurement_kernel import Sensors
 from flexmanip_ros.payload.motion_kernel import PARAMETERS
 from flexmanip_ros.payload.structured_model import Model
@@ -43,7 +43,7 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Sensors | 
     state = m.x.size - PARAMETERS
     scale = model.motion.scale
     held = bool(m.counts[mem.HELD])
-    deviation, consistency, drift, is_exact = figures(
+    deviation, consistency, drift, reckoned = figures(
         m.S, state, m.noise, sensors.rate, m.score, m.counts)
     if math.isnan(consistency):
         consistency = plain_misfit(sensors, m)
@@ -59,10 +59,10 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Sensors | 
     if restarts and m.counts[mem.SEEN] < SETTLED:
         status = Status.DIVERGED
     mass = scale * math.exp(min(float(m.x[state]), 12.0)) if held else 0.0
-    misjudged = 0.0 if is_exact else inertia_error(config, model, mass)
+    error = reckoned * inertia_error(config, model, mass)
     if not held:
-        return empty(float(m.x[state]), math.hypot(std, misjudged), consistency, status)
-    std = math.hypot(std, misjudged / mass)
+        return empty(float(m.x[state]), math.hypot(std, error), consistency, status)
+    std = math.hypot(std, error / mass)
     if std > UNKNOWN_STD and status is Status.TRACKING:
         status = Status.POORLY_EXCITED
     lower = max(0.0, mass * (1.0 - QUANTILE * std))
@@ -103,7 +103,7 @@ def empty(seeming: float, std: float, consistency: float, status: Status) -> Pay
 
 def inexact(config: IdentifierParameters, model: Model, m: mem.Memory, mass: float) -> float:
     """Deviation [kg] of a payload by the error to reckon with in the arm's inertia; 0 for an exact arm."""
-    return 0.0 if exact(m.noise, m.counts) else inertia_error(config, model, mass)
+    return misjudged(m.noise, m.score, m.counts) * inertia_error(config, model, mass)
 
 
 def inertia_error(config: IdentifierParameters, model: Model, mass: float) -> float:

@@ -35,6 +35,7 @@ from flexmanip_ros.payload.square_root_kernel import (
     forward,
     project,
 )
+from flexmanip_ros.payload.tail_kernel import amplitude, believed, push, ring, ringing
 from flexmanip_ros.plant.compiled import kernel
 from flexmanip_ros.types import Array
 
@@ -72,6 +73,9 @@ def pass_sample(motion: Motion, sensors: Sensors, m: Memory) -> bool:
     effort, f = sample[1:3], sensors.f
     if not predict(motion, m.xr, m.Sr, effort, sample[0], m.counts[HELD] != 0):
         return False
+    if sample[0] > 0.0:
+        before = m.torque0 if m.counts[PASSED] == 0 else m.samples[m.counts[PASSED] - 1, 1:3]
+        push(motion, sensors.tail, m.xr, before, effort, believed(m.score))
     for i in range(m.noise.shape[0]):
         r = m.noise[i, EFFECTIVE]
         predicted = project(m.xr, m.Sr, sensors.H[i], n if sensors.rate[i] else 0, f)
@@ -128,8 +132,9 @@ def refit(motion: Motion, sensors: Sensors, m: Memory, duration: float, effort: 
     m.samples[stored, 0] = duration
     m.samples[stored, 1] = effort[0]
     m.samples[stored, 2] = effort[1]
+    share = amplitude(m.score)
     for i in range(y.size):
-        m.samples[stored, 3 + i] = y[i]
+        m.samples[stored, 3 + i] = y[i] - share * ringing(sensors.tail, m, i)
     m.counts[STORED] = stored + 1
     if m.counts[PASSING] == 0:
         if stored + 1 < FIRST_PASS or 3 * (stored + 1) > 2 * HORIZON:
@@ -166,6 +171,10 @@ def take(motion: Motion, sensors: Sensors, m: Memory, duration: float, effort: A
     """Take one sample, ``duration`` after the one before; False when numbers left the finite range."""
     if not predict(motion, m.x, m.S, effort, duration, m.counts[HELD] != 0):
         return False
+    if duration > 0.0:
+        push(motion, sensors.tail, m.x, m.torque, effort, believed(m.score))
+        ring(sensors.tail, m, duration, effort)
+        m.torque[0], m.torque[1] = effort[0], effort[1]
     measure(motion, sensors, m, effort, y)
     if not abs(m.x[m.x.size - PARAMETERS]) < 1e9:
         return False

@@ -11,6 +11,7 @@ from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload.measurement_kernel import Sensors
 from flexmanip_ros.payload.motion_kernel import PARAMETERS, Motion
 from flexmanip_ros.payload.signals import Quantity, Role, signals
+from flexmanip_ros.payload.tail import tail
 from flexmanip_ros.plant.manipulator import manipulator, workspace
 from flexmanip_ros.types import Array
 
@@ -70,23 +71,27 @@ def motion(config: IdentifierParameters) -> Motion:
         G=np.zeros((n, constants)), X=np.zeros((2 * n, nx)), Y=np.zeros((2 * n, nx)))
 
 
-def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Array) -> Sensors:
-    """Return how each measurement follows from the state; dt: sample time [s]."""
+def sensors(
+    config: IdentifierParameters, model: Model, dt: float, diffusion: Array, theta: Array,
+) -> Sensors:
+    """Return how each measurement follows from the state; dt: sample time [s], theta: first chords (2,)."""
     output = model.motion.arm.output
     direct = truncated_feedthrough(config.arm, model.motion.arm.kappa)
     H = np.empty((len(model.roles), output.shape[1]))
+    rows = np.zeros(len(model.roles), dtype=np.int64)
     rate = np.zeros(len(model.roles), dtype=np.bool_)
     feed = np.zeros((len(model.roles), 2))
     for i, role in enumerate(model.roles):
-        row = role.link + (2 if role.quantity in (Quantity.BEND, Quantity.BEND_RATE) else 0)
+        row = rows[i] = role.link + (2 if role.quantity in (Quantity.BEND, Quantity.BEND_RATE) else 0)
         H[i] = output[row]
         rate[i] = role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE)
         if not rate[i]:
             feed[i] = direct[row]
     nx = diffusion.size
     block = max(2, round(0.1 / (model.slowest * dt)))
-    return Sensors(H=H, rate=rate, feed=feed, block=block, diffusion=diffusion, deviation=np.zeros(nx),
-                   f=np.zeros(nx), W=np.zeros((nx, 2 * nx)))
+    more = tail(config.arm, theta, model.motion.arm.kappa, rows, rate)
+    return Sensors(H=H, rate=rate, feed=feed, tail=more, block=block, diffusion=diffusion,
+                   deviation=np.zeros(nx), f=np.zeros(nx), W=np.zeros((nx, 2 * nx)))
 
 
 def truncated_feedthrough(arm: ArmParameters, kappa: int) -> Array:

@@ -10,6 +10,7 @@ from flexmanip_ros.payload.angles import chords
 from flexmanip_ros.payload.motion_kernel import PARAMETERS, set_parameters
 from flexmanip_ros.payload.signals import Quantity
 from flexmanip_ros.payload.structured_model import Model
+from flexmanip_ros.payload.tail_kernel import doubt
 from flexmanip_ros.plant.capture import body_jacobian
 from flexmanip_ros.plant.manipulator import mass_matrix
 from flexmanip_ros.types import Array
@@ -117,6 +118,14 @@ def jump(config: IdentifierParameters, model: Model, m: mem.Memory) -> Array:
     columns = np.zeros((m.x.size, rates.shape[1] + n))
     columns[n:2 * n] = np.hstack([rates, np.diag(other)])
     return columns
+
+
+def shake(model: Model, m: mem.Memory) -> None:
+    """An event rings modes beyond kappa, and rates show it; by how much nobody knows, unlike at a torque."""
+    for i, role in enumerate(model.roles):
+        if role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE):
+            shaken = m.noise[i, mem.WHITE] * (1.0 + (RATE_NOISE - 1.0) * doubt(m.score))
+            m.noise[i, mem.EFFECTIVE] = max(m.noise[i, mem.EFFECTIVE], shaken)
 
 
 def diffusion(config: IdentifierParameters, model: Model, m: mem.Memory) -> Array:
