@@ -46,7 +46,7 @@ STEP = 1e-4
 PAYLOADS = np.concatenate([[0.0], np.geomspace(1e-3, 1e4, 71)])
 """Payloads whose frequencies are looked at, over the lightest tip mass."""
 AGREES = 0.5
-"""Deviation below which a model clears the arm of what was found of it before."""
+"""Deviation below which a model ends what was found of the arm before."""
 BELIEVED = (Status.TRACKING, Status.POORLY_EXCITED, Status.INCONSISTENT)
 
 
@@ -66,6 +66,8 @@ class Verdict(NamedTuple):
     lower: float = math.inf
     upper: float = -math.inf
     """Payloads [kg] at which the arm has the frequencies; no limits where those agree."""
+    clears: bool = False
+    """Whether it agrees so well in all of it that what was found of the empty arm is over."""
 
 
 def sweep(before: Array, samples: Sequence[Sample], relative: bool) -> Array:
@@ -133,7 +135,7 @@ def apply(state: StructuredState, payload: Payload, verdicts: tuple[Verdict, ...
     empty = next((one for one in reversed(verdicts) if one.at < since and not one.held), None)
     disagree = own is not None and own.deviation > 1.0
     doubt = own.doubt if own is not None else 0.0
-    if empty is not None and (own is None or own.deviation > AGREES):
+    if empty is not None and (own is None or not own.clears):
         doubt = max(doubt, empty.doubt)
     if not disagree and doubt == 0.0:
         return payload
@@ -174,7 +176,7 @@ def _compare(config: IdentifierParameters, model: Model, m: mem.Memory, payload:
     allowed = FREQUENCY + FREQUENCY_MOVED * moved + DEVIATIONS * np.hypot(
         noise, np.linalg.norm(by_learned, axis=1))
     deviation = float(np.max(np.abs(off) / allowed))
-    lower, upper, doubt = math.inf, -math.inf, 0.0
+    lower, upper, doubt, whole = math.inf, -math.inf, 0.0, False
     if deviation > 1.0:
         lower, upper = _payloads(config, model, m, cosines, found, allowed, np.abs(off) > allowed)
 
@@ -195,10 +197,11 @@ def _compare(config: IdentifierParameters, model: Model, m: mem.Memory, payload:
         excess = np.where(noise < VAGUE, np.abs(off) / allowed, 0.0)
         if excess.max() > 1.0:
             doubt = float(np.max(np.abs(off)[excess > 1.0]))
-        deviation = max(deviation, float(excess.max()))
+        deviation, whole = max(deviation, float(excess.max())), bool(np.all(noise < VAGUE))
     if not math.isfinite(deviation):
         return None
-    return Verdict(0, 0, bool(m.counts[mem.HELD]), deviation, doubt, lower, upper)
+    return Verdict(0, 0, bool(m.counts[mem.HELD]), deviation, doubt, lower, upper,
+                   clears=whole and deviation < AGREES)
 
 
 def _configurations(config: IdentifierParameters, model: Model, m: mem.Memory, swept: Array) -> Array:

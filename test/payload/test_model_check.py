@@ -108,6 +108,7 @@ def test_the_deviation_of_a_drive_is_that_of_models_drawn_from_the_spread():
 def test_a_model_that_agrees_changes_nothing():
     found, alone, published = compared(model_of(ARM, 20.0))
     assert found.deviation < 0.5
+    assert found.clears
     assert published is alone
 
 
@@ -140,6 +141,7 @@ def test_torques_of_another_scale_widen_by_the_inertia_they_would_be_the_torques
 def test_a_vague_model_says_nothing():
     found, alone, published = compared(model_of(ARM, 60.0, torque=1.1, std=1e-3))
     assert found.deviation < 1.0
+    assert not found.clears
     assert published is alone
 
 
@@ -167,7 +169,7 @@ def test_what_was_found_of_the_empty_arm_holds_after_the_capture_until_a_model_a
         return model_check.apply(state, alone, verdicts, EVENT)
 
     assert published(empty).status is Status.INCONSISTENT
-    assert published(empty, own._replace(deviation=0.8)).std > 0.05 * 20.0
+    assert published(empty, own._replace(deviation=0.8, clears=False)).std > 0.05 * 20.0
     assert published(empty, own) is alone
     assert published(empty._replace(at=EVENT)) is alone  # read before an event that came late: of another arm
 
