@@ -1,0 +1,117 @@
+"""The modes beyond kappa: seen where the arm has them, not where it has none, and their momentum kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recording import ARM, config, record
+from scipy.linalg import expm
+
+from flexmanip_ros.payload import memory as mem
+from flexmanip_ros.payload import structured, structured_start
+from flexmanip_ros.payload.judgement_kernel import TAIL_SHARE, misjudged
+from flexmanip_ros.payload.structured_model import motion
+from flexmanip_ros.payload.tail import MODES, tail
+from flexmanip_ros.payload.tail_kernel import amplitude, believed, doubt, push, ring, ringing
+from flexmanip_ros.plant import linearization
+
+THETA = np.array([0.4, 1.1])
+ROWS = np.arange(4)
+
+
+def beyond(rate=False):
+    return tail(ARM, THETA, 3, ROWS, np.full(4, rate))
+
+
+def remembered(modes):
+    """What an estimator of three modes a link remembers of 2 s of an empty arm of ``modes`` at 30 dB."""
+    samples = record(2.0, arm=replace(ARM, modes=modes), snr_db=30.0)
+    settings = config(replace(ARM, modes=3))
+    return structured.advance(settings, structured.init(settings), samples).memory
+
+
+@pytest.fixture(scope='module')
+def of_three():
+    return remembered(3)
+
+
+@pytest.fixture(scope='module')
+def of_six():
+    return remembered(6)
+
+
+def test_an_arm_of_more_modes_is_told_from_one_of_just_these_though_neither_misfits(of_three, of_six):
+    assert believed(of_six.score) > 0.999
+    assert amplitude(of_six.score) > 0.5
+    assert believed(of_three.score) < 0.2
+    assert amplitude(of_three.score) < 0.05
+
+
+def test_the_interval_reckons_with_an_error_only_where_modes_beyond_kappa_are_seen(of_three, of_six):
+    assert misjudged(of_three.noise, of_three.score, of_three.counts) == 0.0
+    assert misjudged(of_six.noise, of_six.score, of_six.counts) >= 0.999 * TAIL_SHARE
+
+
+def test_nothing_told_is_an_even_chance_and_no_doubt():
+    score = np.zeros(8)
+    assert believed(score) == pytest.approx(0.5)
+    assert doubt(score) == 0.0
+    score[mem.TOLD] = 1e6  # much could have been seen, and nothing was
+    assert believed(score) < 0.01
+    assert doubt(score) == 0.0
+
+
+def test_ringing_is_the_exact_motion_under_held_torques():
+    more = beyond()
+    m = mem.memory(1, 4, 2 * MODES)
+    effort = np.array([3.0, -2.0])
+    ring(more, m, 0.7e-3, effort)
+    m.torque[:] = effort
+    ring(more, m, 0.5e-3, effort)
+    for i, (square, damping) in enumerate(zip(more.square, more.damping, strict=True)):
+        held = more.load[i] @ effort / square
+        flow = expm(1.2e-3 * np.array([[0.0, 1.0], [-square, -damping]]))
+        assert m.tail[:, i] == pytest.approx(flow @ [-held, 0.0], rel=1e-9, abs=1e-18)
+
+
+def test_sensors_read_the_departure_or_its_rate():
+    m = mem.memory(1, 4, 2 * MODES)
+    m.tail[0], m.tail[1] = 1.0, 2.0
+    for row in range(4):
+        slow, fast = ringing(beyond(), m, row), ringing(beyond(rate=True), m, row)
+        assert fast == pytest.approx(2.0 * slow)
+
+
+def test_a_step_of_the_torque_leaves_the_momentum_of_all_modes():
+    """Against the full arm: M_rr dq_r + M_rt K_t^-1 B_t dtau = 0, summed over as many modes as converge."""
+    moving = motion(config(replace(ARM, modes=3)))
+    x = np.zeros(moving.X.shape[1])
+    x[:2] = THETA
+    effort = np.array([10.0, -5.0])
+    b = linearization.blocks(ARM, THETA, 0.0, 200)
+    M = np.block([[b.Ma, b.Mb], [b.Mb.T, b.Mc]])
+    chosen = np.r_[5:202, 205:402]
+    kept = np.setdiff1d(np.arange(402), chosen)
+    stiffness, load = linearization.stiffness(ARM, 200), linearization.torque_matrix(ARM, 200)
+    held = load[chosen] @ effort / stiffness[chosen - 2]
+    expected = -np.linalg.solve(M[np.ix_(kept, kept)], M[np.ix_(kept, chosen)] @ held)
+    moving.work.M[:] = np.linalg.cholesky(M[np.ix_(kept, kept)])
+    np.fill_diagonal(moving.work.M, 1.0 / np.diag(moving.work.M))  # as ``factor`` leaves it
+    push(moving, beyond(), x, np.zeros(2), effort, 1.0)
+    assert x[:8] - np.r_[THETA, np.zeros(6)] == pytest.approx(expected, rel=2e-3, abs=1e-12)
+
+
+def test_an_arm_whose_torques_do_not_bend_pushes_nothing():
+    paper = replace(ARM, torque_convention='paper', angle_convention='chord')
+    assert not tail(paper, THETA, 3, ROWS, np.zeros(4, bool)).push.any()
+
+
+def test_an_event_shakes_the_rates_of_an_arm_of_more_modes(of_three, of_six):
+    model = structured.init(config(replace(ARM, modes=3))).model
+    for memory, least, most in ((of_three, 0.8, 1.5), (of_six, 8.0, 12.0)):
+        shaken = mem.copy(memory)
+        structured_start.shake(model, shaken)
+        ratio = shaken.noise[2:4, mem.EFFECTIVE] / shaken.noise[2:4, mem.WHITE]
+        assert np.all((ratio > least) & (ratio < most))
