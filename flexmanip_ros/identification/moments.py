@@ -11,13 +11,17 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_discrete_are, solve_triangular
+from scipy.linalg import solve_discrete_are
+from scipy.linalg.lapack import dtrtrs
 
+from flexmanip_ros.identification.riccati_kernel import gain as stationary_gain
 from flexmanip_ros.identification.varx import observability_controllability, open_loop_weight
 from flexmanip_ros.types import Array
 
 RIDGE = 1e-8
 """Relative ridge that picks the solution of least norm where the data leave a direction free."""
+LEAST_KNOWN = 1e-6
+"""Share of an output's noise that the others' must leave for the quick way to the stationary gain."""
 
 
 class Realized(NamedTuple):
@@ -53,6 +57,14 @@ def triangle(tall: Array) -> Array:
     return R
 
 
+def solved(upper: Array, target: Array, trans: int = 0) -> Array:
+    """X with upper X = target (trans 1: upper' X). (d, d), (d, k); raises LinAlgError where singular."""
+    X, info = dtrtrs(upper, target, trans=trans)
+    if info:
+        raise np.linalg.LinAlgError('the factor of the regressors is singular')
+    return np.asarray(X)
+
+
 def regress(regressor: Array, target: Array) -> Array:
     """Least squares: the (k, d) matrix M of least norm with target ~ regressor M'. (q, d), (q, k)."""
     return np.asarray(np.linalg.lstsq(regressor, target, rcond=1e-13)[0].T, dtype=np.float64)
@@ -72,8 +84,7 @@ def solve_regressor(R: Array, d: int, m: int) -> tuple[Array, Array]:
         stacked[d:, :d] = np.diag(RIDGE * size)
         folded = triangle(stacked)
         head, target = folded[:d, :d], folded[:d, d:]
-    solution: Array = solve_triangular(head, target, check_finite=False)
-    return solution.T, head
+    return solved(head, target).T, head
 
 
 def row_whitening(
@@ -90,14 +101,13 @@ def row_whitening(
     moved = np.zeros((f, d, past))
     for i in range(f):
         moved[i, i * width:past] = data.T[:past - i * width]
-    loose = solve_triangular(
-        head, moved.transpose(1, 0, 2).reshape(d, -1), trans='T', check_finite=False
-    ).reshape(d, f, past).transpose(1, 0, 2).reshape(f, -1)
+    loose = solved(head, moved.transpose(1, 0, 2).reshape(d, -1), trans=1)
+    loose = loose.reshape(d, f, past).transpose(1, 0, 2).reshape(f, -1)
     rows = triangle(loose.T)
     noise = triangle(np.vstack([residual, RIDGE * power * np.eye(m)]))
-    inverse: Array = np.kron(
-        np.linalg.inv(rows + RIDGE * np.abs(rows).max() * np.eye(f)).T, np.linalg.inv(noise).T)
-    return inverse
+    outer = np.linalg.inv(rows + RIDGE * np.abs(rows).max() * np.eye(f)).T
+    inner = np.linalg.inv(noise).T
+    return np.asarray((outer[:, None, :, None] * inner[None, :, None, :]).reshape(f * m, f * m))
 
 
 def riccati_gain(A: Array, C: Array, process: Array, measurement: Array, fallback: Array) -> Array:
@@ -106,6 +116,10 @@ def riccati_gain(A: Array, C: Array, process: Array, measurement: Array, fallbac
     R = measurement.T @ measurement + floor * np.eye(C.shape[0])
     scale = np.trace(R)
     Q, S = process.T @ process / scale, process.T @ measurement / scale
+    found: Array = np.empty(S.shape)
+    if stationary_gain(np.ascontiguousarray(A), np.ascontiguousarray(C), np.ascontiguousarray(Q),
+                       np.ascontiguousarray(S), np.asarray(R / scale), LEAST_KNOWN, found):
+        return found
     try:
         P = solve_discrete_are(A.T, C.T, Q, R / scale, s=S)
         gain: Array = np.linalg.solve(C @ P @ C.T + R / scale, (A @ P @ C.T + S).T).T

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from scipy.linalg.lapack import dtrtrs
@@ -200,14 +201,22 @@ def excitation(regression: Array) -> float:
     if not np.all(length > 0.0) or not np.all(np.diag(regression)) or not np.all(np.isfinite(length)):
         return 0.0
     F = np.asfortranarray(regression / length)
-    high: Array = np.random.default_rng(0).standard_normal((F.shape[0],))
-    low: Array = high
+    high = low = _anywhere(F.shape[0])
     for _ in range(4):
         high = F.T @ (F @ high)
-        high = np.asarray(high / np.linalg.norm(high))
+        high = high / np.sqrt(high @ high)
         low = dtrtrs(F, dtrtrs(F, low, trans=1)[0])[0]
-        norm = float(np.linalg.norm(low))
+        norm = float(np.sqrt(low @ low))
         if not np.isfinite(norm) or norm == 0.0:
             return 0.0
-        low = np.asarray(low / norm)
-    return float((np.linalg.norm(F @ low) / np.linalg.norm(F @ high)) ** 2)
+        low = low / norm
+    smallest, largest = F @ low, F @ high
+    return float(smallest @ smallest / (largest @ largest))
+
+
+@cache
+def _anywhere(size: int) -> Array:
+    """Return a direction (size,) with something of every other one, always the same."""
+    direction: Array = np.random.default_rng(0).standard_normal((size,))
+    direction.flags.writeable = False
+    return direction

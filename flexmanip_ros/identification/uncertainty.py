@@ -11,10 +11,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
-from flexmanip_ros.identification.moments import Realized
+from flexmanip_ros.identification.moments import Realized, solved
 from flexmanip_ros.types import Array, StateSpace, Status
+
+NEARLY_SINGULAR = 1e-12
+"""Relative size of a regressor of the state below which it is taken for none."""
 
 
 class Identified(NamedTuple):
@@ -51,7 +53,8 @@ class Tangent(NamedTuple):
 
     def flat(self) -> Array:
         """(k, s) spread of [A, B, C, D, K]."""
-        return np.hstack([part.reshape(part.shape[0], -1) for part in self]).T
+        rows = [part.transpose(1, 2, 0).reshape(-1, part.shape[0]) for part in self]
+        return np.ascontiguousarray(np.concatenate(rows))
 
 
 def variance(identified: Identified, **gradients: Array) -> float:
@@ -67,15 +70,6 @@ def variance(identified: Identified, **gradients: Array) -> float:
     return float(along @ along) if along.size else float('nan')
 
 
-def _lift(Q: Array, block: int, width: int) -> Array:
-    """Rows of Q moved up by ``block`` windows; the rest is zero."""
-    if block == 0:
-        return Q
-    moved = np.zeros_like(Q)
-    moved[:-block * width] = Q[block * width:]
-    return moved
-
-
 def tangent(R: Array, realized: Realized, r: int, deviation: Array) -> Tangent:
     """Propagate dXi = deviation' Omega regression^-T, Omega unit normal.
 
@@ -87,61 +81,87 @@ def tangent(R: Array, realized: Realized, r: int, deviation: Array) -> Tangent:
     width = r + m
     d = realized.regression.shape[0]
     f = realized.S.shape[1] // m
-    joint = R[:, :past + r]
-    known = np.hstack([realized.state, R[:, past:past + r]])
-    Q = joint.T @ np.linalg.lstsq(known, np.eye(R.shape[0]), rcond=1e-12)[0].T  # (past + r, n + r)
+    known, alone = _dual(np.hstack([realized.state, R[:, past:past + r]]), n)
+    Q = R[:, :past + r].T @ known  # (past + r, n + r)
     Qz, Qu = Q[:past], Q[past:]
-    later = _lift(Qz, 1, width)
+    later = np.zeros_like(Qz)
+    later[:past - width] = Qz[width:]
     later[past - width:past - m] += Qu
     later[past - m:] += Xi @ Qz + realized.xi_u @ Qu
-    if d > past:
-        Pz, direct = Qz, Q
-    else:
-        Pz = R[:, :past].T @ np.linalg.lstsq(realized.state, np.eye(R.shape[0]), rcond=1e-12)[0].T
-        direct = Pz
+    Pz, direct = (Qz, Q) if d > past else ((R[:, :past].T @ alone),) * 2
     newest = np.zeros((past, m))
     newest[past - m:] = np.eye(m)
+    lifted = [i * width for i in range(f)]
+    ab, cd, k = 2 * f + 1, f + 1, f
+    rights = np.zeros((d, ab * (n + r) + cd * direct.shape[1] + k * m))
+    at = 0
+    for X, up in (
+            *((later, up) for up in lifted), *((Qz, up) for up in lifted), (Q[:d] if d > past else Qz, 0),
+            (direct, 0), *((Pz, up) for up in lifted), *((newest, up) for up in lifted)):
+        rights[:X.shape[0] - up, at:at + X.shape[1]] = X[up:]
+        at += X.shape[1]
+    found = solved(realized.regression, rights, trans=1)
+    ends = np.cumsum([ab * (n + r), cd * direct.shape[1]])
     select = [realized.S[:, i * m:(i + 1) * m] @ deviation.T for i in range(f)]
-    Ty = T[:, past - m:] @ deviation.T
-    ab = _combine(
-        [*select, *[-A @ s for s in select], Ty],
-        [*[_lift(later, i, width) for i in range(f)], *[_lift(Qz, i, width) for i in range(f)],
-         Q[:d] if d > past else Qz], realized.regression)
-    cd = _combine(
-        [deviation.T, *[-realized.C @ s for s in select]],
-        [direct, *[_lift(Pz, i, width) for i in range(f)]], realized.regression)
-    dK = _combine(select, [_lift(newest, i, width) for i in range(f)], realized.regression)
-    dD = cd[:, :, n:] if d > past else np.zeros((cd.shape[0], m, r))
-    return Tangent(ab[:, :, :n], ab[:, :, n:], cd[:, :, :n], dD, dK)
+    dAB = _combine([*select, *[-A @ s for s in select], T[:, past - m:] @ deviation.T], found[:, :ends[0]])
+    dCD = _combine([deviation.T, *[-realized.C @ s for s in select]], found[:, ends[0]:ends[1]])
+    dK = _combine(select, found[:, ends[1]:])
+    dD = dCD[:, :, n:] if d > past else np.zeros((dCD.shape[0], m, r))
+    return Tangent(dAB[:, :, :n], dAB[:, :, n:], dCD[:, :, :n], dD, dK)
 
 
-def _combine(left: list[Array], right: list[Array], regression: Array) -> Array:
-    """Sum over t of left_t Omega (regression^-T right_t), for every unit Omega: (s, rows, columns)."""
-    d = regression.shape[0]
+def _dual(known: Array, n: int) -> tuple[Array, Array]:
+    """Transposed pseudo-inverses (q, k), (q, n) of known (q, k) and of its first n columns."""
+    basis, factor = np.linalg.qr(known)
+    size = np.abs(np.diag(factor))
+    if not size.min() > NEARLY_SINGULAR * size.max():
+        unit = np.eye(known.shape[0])
+        whole, part = (np.linalg.lstsq(X, unit, rcond=NEARLY_SINGULAR)[0].T for X in (known, known[:, :n]))
+        return np.asarray(whole, dtype=np.float64), np.asarray(part, dtype=np.float64)
+    return solved(factor, basis.T).T, solved(factor[:n, :n], basis[:, :n].T).T
+
+
+def _combine(left: list[Array], right: Array) -> Array:
+    """Sum over t of left_t Omega right_t, for every unit Omega: (s, rows, columns).
+
+    right: (d, terms x columns).
+    """
+    d = right.shape[0]
     rows, a = left[0].shape
-    columns = right[0].shape[1]
-    tall = np.zeros((len(right), d, columns))
-    for t, Q in enumerate(right):
-        tall[t, :Q.shape[0]] = Q
-    flat = tall.transpose(1, 0, 2).reshape(d, -1)
-    solved = solve_triangular(regression, flat, trans='T', check_finite=False).reshape(d, len(right), columns)
-    lefts = np.stack(left).reshape(len(left), -1)
-    joint: Array = lefts.T @ solved.transpose(1, 0, 2).reshape(len(right), -1)
-    return np.asarray(joint.reshape(rows, a, d, columns).transpose(1, 2, 0, 3).reshape(a * d, rows, columns))
+    terms = right.reshape(d, len(left), -1)
+    columns = terms.shape[2]
+    joint = np.stack(left).reshape(len(left), -1).T @ terms.transpose(1, 0, 2).reshape(len(left), -1)
+    whole: Array = joint.reshape(rows, a, d, columns).transpose(1, 2, 0, 3).reshape(a * d, rows, columns)
+    return whole
 
 
 def move(model: StateSpace, along: Tangent, W: Array, dW: Array | None) -> Tangent:
     """Carry a tangent to the state W x, W varying by dW (s, n, n) with the model (None: held still)."""
-    back = np.linalg.inv(W)
-    dA, dB, dC, dK = W @ along.A @ back, W @ along.B, along.C @ back, W @ along.K
+    back = np.asarray(np.linalg.inv(W), dtype=np.float64)
+    # all directions of an entry side by side: few large products instead of many small ones
+    parts = (along.A, along.B, along.C, along.K)
+    dA, dB, dC, dK = (np.ascontiguousarray(part.transpose(1, 2, 0)) for part in parts)
+    dA, dB, dC, dK = _after(_before(W, dA), back), _before(W, dB), _after(dC, back), _before(W, dK)
     if dW is not None:
-        turn = dW @ back
+        turned = np.ascontiguousarray(dW.transpose(1, 2, 0))
+        turn = _after(turned, back)
         moved = W @ model.A @ back
-        dA = dA + turn @ moved - moved @ turn
-        dB = dB + dW @ model.B
-        dC = dC - (model.C @ back) @ turn
-        dK = dK + dW @ model.K
+        dA += _after(turn, moved) - _before(moved, turn)
+        dB += _after(turned, model.B)
+        dC -= _before(model.C @ back, turn)
+        dK += _after(turned, model.K)
+    dA, dB, dC, dK = (part.transpose(2, 0, 1) for part in (dA, dB, dC, dK))
     return Tangent(dA, dB, dC, along.D, dK)
+
+
+def _before(M: Array, X: Array) -> Array:
+    """M X of every direction, X: (rows, columns, s)."""
+    return np.asarray((M @ X.reshape(X.shape[0], -1)).reshape(M.shape[0], *X.shape[1:]))
+
+
+def _after(X: Array, M: Array) -> Array:
+    """X M of every direction, X: (rows, columns, s)."""
+    return np.asarray(np.matmul(M.T, X))
 
 
 def known_basis_tangent(model: StateSpace, along: Tangent) -> Array | None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from flexmanip_ros.identification.varx_kernel import open_loop, predictions
 from flexmanip_ros.types import Array
 
 
@@ -28,28 +29,13 @@ def observability_controllability(Xi: Array, f: int, r: int, weighted: bool) -> 
     weighted False: outputs that have not come yet count as zero (observability of the predictor, A - K C);
     True: they are replaced by their own predictions (observability of the system, A).
     """
-    m = Xi.shape[0]
-    width = r + m
-    past = Xi.shape[1]
-    G = np.zeros((f * m, past))
-    for i in range(f):
-        row = shifted(Xi, i, width).copy()
-        if weighted:
-            for j in range(i):
-                at = past - (i - j) * width + r
-                row += Xi[:, at:at + m] @ G[j * m:(j + 1) * m]
-        G[i * m:(i + 1) * m] = row
+    G = np.empty((f * Xi.shape[0], Xi.shape[1]))
+    predictions(np.ascontiguousarray(Xi), f, r, weighted, G)
     return G
 
 
 def open_loop_weight(Xi: Array, f: int, r: int) -> Array:
     """(f m, f m) lower triangular L with observability of the system = L x observability of the predictor."""
-    m = Xi.shape[0]
-    width = r + m
-    past = Xi.shape[1]
-    L = np.eye(f * m)
-    for i in range(f):
-        for j in range(i):
-            at = past - (i - j) * width + r
-            L[i * m:(i + 1) * m] += Xi[:, at:at + m] @ L[j * m:(j + 1) * m]
+    L = np.eye(f * Xi.shape[0])
+    open_loop(np.ascontiguousarray(Xi), f, r, L)
     return L
