@@ -15,6 +15,7 @@ from flexmanip_ros.identification.refinement import Answer, Job
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, model_check, structured
+from flexmanip_ros.payload.block_extraction import NOWHERE
 from flexmanip_ros.payload.model_check import Verdict
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, Payload, Sample, Status
 
@@ -27,7 +28,9 @@ class Core(NamedTuple):
     angles: Array
     """The latest measured configuration: (2,) [rad], or (0,) when there is none."""
     swept: Array
-    """What the configuration went through since the last event, see the ``sweep`` of the payload method."""
+    """What the configuration went through since the last event, see ``block_extraction.sweep``."""
+    turned: Array = NOWHERE
+    """The same for the model check, see ``model_check.sweep``."""
     since_ns: int = 0
     """Stamp of the last event; 0 before the first."""
     owed: tuple[Sample, ...] = ()
@@ -51,11 +54,11 @@ def payload_ahead(config: IdentifierParameters, core: Core, samples: Sequence[Sa
     held = core.structured
     if held is not None:
         held = structured.advance(config, held, samples)
+    turned = core.turned
     if held is not None and held.model is not None:
-        swept = model_check.sweep(core.swept, samples, config.arm.angle_convention == 'encoder')
-    else:
-        swept = block_extraction.sweep(config, core.swept, samples)
-    return core._replace(structured=held, angles=samples[-1].angles, swept=swept,
+        turned = model_check.sweep(turned, samples, config.arm.angle_convention == 'encoder')
+    swept = block_extraction.sweep(config, core.swept, samples)
+    return core._replace(structured=held, angles=samples[-1].angles, swept=swept, turned=turned,
                          owed=(*core.owed, *samples))
 
 
@@ -84,7 +87,7 @@ def event(config: IdentifierParameters, core: Core, event: CaptureEvent) -> Core
     if held is not None:
         held = structured.event(config, held, event)
     return core._replace(rpbsid=rpbsid.restart(config, core.rpbsid), structured=held, swept=np.empty(0),
-                         since_ns=event.stamp_ns)
+                         turned=NOWHERE, since_ns=event.stamp_ns)
 
 
 def anew(config: IdentifierParameters, core: Core, events: Sequence[CaptureEvent]) -> Core:
@@ -137,7 +140,7 @@ def estimate(config: IdentifierParameters, core: Core, stamp_ns: int, dt: float,
     verdict = None
     if compare and core.structured is not None:
         alone = structured.estimate(config, core.structured)
-        verdict = model_check.check(config, core.structured, alone, core.swept, found, oscillations,
+        verdict = model_check.check(config, core.structured, alone, core.turned, found, oscillations,
                                     stamp_ns, core.since_ns)
     estimate = Estimate(
         stamp_ns, _overall(config, found.status, payload), found.model, oscillations, payload,
