@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from linear_arm import benchmark
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
@@ -36,6 +37,18 @@ def test_default_settings_follow_both_modes_of_the_moving_nonlinear_arm_through_
             assert np.all(np.abs(found - true_frequencies(plant, run, time)) < 4.0 * spread + 0.06)
             assert np.all(spread < 0.5)
     assert seen > 8
+
+
+@pytest.mark.parametrize(('mass', 'degrees'), [(20.0, (-45.0, 45.0)), (100.0, (45.0, 0.0))])
+def test_close_modes_after_a_capture_are_told_apart_though_50_hz_rings_on(
+    mass: float, degrees: tuple[float, float],
+) -> None:
+    study = benchmark('identification_moving_arm')
+    rows = np.array(study.readings(mass, degrees, 1))
+    settled = rows[rows[:, 0] > CAPTURE_S + 2.7]
+    assert len(settled) > 5
+    assert np.all(np.abs(settled[:, 1:3]) < 0.005)
+    assert np.all(settled[:, 5:] < 0.005)
 
 
 def true_frequencies(plant: PlantParameters, run: simulator.Trajectory, time: float) -> np.ndarray:

@@ -82,12 +82,13 @@ def test_variance_of_a_matrix_entry_is_the_diagonal_of_the_covariance():
     assert variance(found, B=gradient) == pytest.approx(covariance[5, 5])
 
 
-def test_intervals_cover_at_40_and_20_db():
+def test_intervals_cover_at_40_and_20_db_and_are_as_wide_as_the_bound():
     study = benchmark('identification_coverage')
     for snr_db in (40.0, 20.0):
         row = study.study(8, snr_db, 0.01)
         assert min(row['coverage_percent']) >= 60.0, row  # 8 runs: less than 1 in 1000 by chance
         assert np.all(np.abs(row['bias'][:4]) < 1.5 * np.array(row['scatter'][:4])), row
+        np.testing.assert_allclose(row['claimed_over_bound'], 1.0, atol=0.02 if snr_db == 40.0 else 0.1)
 
 
 def test_modes_of_a_known_model():
