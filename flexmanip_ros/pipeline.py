@@ -181,7 +181,10 @@ def current(state: State) -> Estimate | None:
     core = estimator.finish(config, line.core)
     estimate, verdicts = estimator.estimate(config, core, line.last_ns, state.sampling.dt, None,
                                             state.verdicts, compare=True)
-    return estimator.follow(config, line.last_ns, estimate, estimator.payload(config, core, verdicts))
+    payload = estimator.payload(config, core, verdicts)
+    if estimate.model is None:
+        return replace(estimate, payload=payload)
+    return replace(estimator.follow(config, line.last_ns, estimate, payload), model_is_new=True)
 
 
 def check_used(state: State) -> None:
