@@ -232,3 +232,15 @@ def test_verdicts_are_the_same_live_replayed_and_of_an_event_that_comes_late():
              if one.stamp_ns > 2_100_000_000]
     assert heard == [repr((one.stamp_ns, one.payload, one.modes_deviation)) for one in live
                      if one.stamp_ns > 2_100_000_000]
+
+
+def test_the_last_estimate_of_a_recording_has_heard_its_own_model():
+    items: list[JointRecord | CaptureEvent] = list(torques_read_too_high())
+    items.insert(2000, event(2.0))
+    *_, (state, _) = pipeline.replay(IdentifierParameters(arm=ARM), items)
+    last = pipeline.current(state)
+    assert last is not None
+    assert last.model_is_new
+    assert last.modes_deviation > 1.0
+    assert last.payload.status is last.status is Status.INCONSISTENT
+    assert last.payload.lower <= 20.0 <= last.payload.upper
