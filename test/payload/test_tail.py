@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recording import ARM, config, record
+from recording import ARM, config, event, record
 from scipy.linalg import expm
 
 from flexmanip_ros.payload import memory as mem
@@ -16,6 +16,7 @@ from flexmanip_ros.payload.structured_model import motion
 from flexmanip_ros.payload.tail import MODES, tail
 from flexmanip_ros.payload.tail_kernel import amplitude, believed, doubt, push, ring, ringing
 from flexmanip_ros.plant import linearization
+from flexmanip_ros.types import Status
 
 THETA = np.array([0.4, 1.1])
 ROWS = np.arange(4)
@@ -115,3 +116,17 @@ def test_an_event_shakes_the_rates_of_an_arm_of_more_modes(of_three, of_six):
         structured_start.shake(model, shaken)
         ratio = shaken.noise[2:4, mem.EFFECTIVE] / shaken.noise[2:4, mem.WHITE]
         assert np.all((ratio > least) & (ratio < most))
+
+
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_an_arm_of_more_modes_than_the_estimator_is_weighed_within_the_interval(seed):
+    capture = event(1.0)
+    samples = record(2.0, (capture,), arm=replace(ARM, modes=6), snr_db=30.0, seed=seed)
+    settings = config(replace(ARM, modes=3))
+    state = structured.advance(settings, structured.init(settings), samples[:1000])
+    state = structured.event(settings, state, capture)
+    for begin, stop in ((1000, 1060), (1060, 1250), (1250, 2000)):
+        state = structured.advance(settings, state, samples[begin:stop])
+        found = structured.estimate(settings, state)
+        assert found.lower < 20.0 < found.upper
+    assert found.status is Status.TRACKING
