@@ -139,7 +139,10 @@ def fit_stretch(
     slow = averaged(*_signals(samples, scale, starts[0].B.shape[1]), starts[0].A.shape[0]) if starts else None
     if slow is not None:
         found.append(_attempt(samples, *candidate(slow, feedthrough), scale, noise, floor))
-    for old in fits:
+    for k, old in enumerate(fits):
+        best = min((attempt.cost for attempt in found if attempt is not None), default=np.inf)
+        if k > 0 and best + 2.0 * float(np.sum(np.log(scale[-m:]))) < floor:
+            break  # as good as the long regression: nothing is missed
         begin = old.theta._replace(x=np.zeros_like(old.theta.x), K=old.gain)
         own = floor + 2.0 * float(np.sum(np.log(old.scale[-m:] / scale[-m:]))) if starts else floor
         found.append(_attempt(samples, begin, old.structure, old.scale, noise, own))
