@@ -20,7 +20,7 @@ from flexmanip_ros.payload.memory import (
     WEIGHT,
     WHITE,
 )
-from flexmanip_ros.payload.tail_kernel import doubt
+from flexmanip_ros.payload.tail_kernel import believed
 from flexmanip_ros.plant.compiled import kernel
 from flexmanip_ros.types import Array
 
@@ -68,14 +68,14 @@ def drift(score: Array, counts: Integers) -> float:
 def misjudged(noise: Array, score: Array, counts: Integers) -> float:
     """How far one has to reckon with an arm that is not quite the model, 0 to 1.
 
-    1 where a sensor shows more than its white noise; else ``TAIL_SHARE`` as far as the ringing of more modes
-    is seen.
+    1 where a sensor shows more than its white noise; else ``TAIL_SHARE`` as far as the arm is believed to
+    have more modes: seen ringing, or not to be told as no torque stepped.
     """
     chance = 2.5 * math.sqrt(2.0 / max(counts[BLOCKS], 1))
     for i in range(noise.shape[0]):
         if noise[i, EFFECTIVE] >= (1.0 + chance) * max(noise[i, WHITE], noise[i, FLOOR]):
             return 1.0
-    return TAIL_SHARE * doubt(score)
+    return TAIL_SHARE * believed(score)
 
 
 @kernel

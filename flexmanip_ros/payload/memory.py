@@ -18,7 +18,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT = range(8)
 # elements of ``count``
 HELD, STORED, PASSED, PASSING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN = range(11)
 # elements of ``score``
-MOVE, VARIANCE, DRIFT, NOW, SEEMED, BEYOND, SHOWN, TOLD = range(8)
+MOVE, VARIANCE, DRIFT, NOW, SEEMED, BEYOND, SHOWN, TOLD, ODDS = range(9)
 
 
 class Memory(NamedTuple):
@@ -35,10 +35,11 @@ class Memory(NamedTuple):
     counts: NDArray[np.int64]
     """(11,) counters."""
     score: Array
-    """(8,) move of the payload in this batch, its variance; mean squared normalised move; time to diffuse;
+    """(9,) move of the payload in this batch, its variance; mean squared normalised move; time to diffuse;
     what the arm seemed to hold before the event, when it was empty, in standard deviations, then in those
     that the error to reckon with in its inertia adds to; how much the innovations have in common with the
-    ringing of modes beyond kappa, and how much of it they could show (variance of the former)."""
+    ringing of modes beyond kappa, and how much of it they could show (variance of the former), and the odds
+    of such modes beforehand (logarithm)."""
     x0: Array
     """(nx,) mean just after the last event."""
     S0: Array
@@ -72,7 +73,7 @@ def memory(nx: int, m: int, a: int = 0) -> Memory:
     return Memory(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 8)), recent=np.zeros((m, 4)),
         counts=np.zeros(11, dtype=np.int64),
-        score=np.zeros(8), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx),
+        score=np.zeros(9), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx),
         samples=np.zeros((HORIZON, 3 + m)), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
         g=np.zeros(nx), tail=np.zeros((2, a)), torque=np.zeros(2), torque0=np.zeros(2),
         innovation=np.zeros((m, 2)), power=np.ones(m))

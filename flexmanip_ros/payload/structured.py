@@ -176,6 +176,7 @@ def _begin(config: IdentifierParameters, state: StructuredState) -> StructuredSt
     m.torque[:] = samples[0].u
     _anchor(m)
     seen = sensors(config, model, dt, start.diffusion(config, model, m), m.x[:2])
+    m.score[mem.ODDS] = 0.0 if seen.tail.push.any() else tail.UNBENT_ODDS
     state = replace(
         state, memory=m, sensors=seen, waiting=(), last_ns=samples[0].stamp_ns, effort=samples[0].u.copy())
     for item in items:

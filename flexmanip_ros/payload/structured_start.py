@@ -10,7 +10,7 @@ from flexmanip_ros.payload.angles import chords
 from flexmanip_ros.payload.motion_kernel import PARAMETERS, set_parameters
 from flexmanip_ros.payload.signals import Quantity
 from flexmanip_ros.payload.structured_model import Model
-from flexmanip_ros.payload.tail_kernel import doubt
+from flexmanip_ros.payload.tail_kernel import believed
 from flexmanip_ros.plant.capture import body_jacobian
 from flexmanip_ros.plant.manipulator import mass_matrix
 from flexmanip_ros.types import Array
@@ -124,7 +124,7 @@ def shake(model: Model, m: mem.Memory) -> None:
     """An event rings modes beyond kappa, and rates show it; by how much nobody knows, unlike at a torque."""
     for i, role in enumerate(model.roles):
         if role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE):
-            shaken = m.noise[i, mem.WHITE] * (1.0 + (RATE_NOISE - 1.0) * doubt(m.score))
+            shaken = m.noise[i, mem.WHITE] * (1.0 + (RATE_NOISE - 1.0) * min(1.0, 2.0 * believed(m.score)))
             m.noise[i, mem.EFFECTIVE] = max(m.noise[i, mem.EFFECTIVE], shaken)
 
 

@@ -18,6 +18,8 @@ MODES = 3
 """Modes of each link beyond kappa that ring; more are above what sensors follow."""
 HELD_MODES = 40
 """Modes of each link beyond kappa that push; their sum falls with the third power of their number."""
+UNBENT_ODDS = -3.0
+"""Odds (logarithm) of modes that matter where torques bend no link: little rings, little is pushed."""
 LEAST_DAMPING = 0.02
 """Damping ratio at least: after that many turns their phase is not known."""
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.payload.memory import SHOWN, TOLD
+from flexmanip_ros.payload.memory import ODDS, SHOWN, TOLD
 from flexmanip_ros.plant.acceleration_kernel import solve
 from flexmanip_ros.plant.compiled import kernel
 from flexmanip_ros.types import Array
@@ -67,20 +67,14 @@ def ringing(tail: Tail, m: Memory, i: int) -> float:
 
 @kernel
 def believed(score: Array) -> float:
-    """Probability that the arm has modes beyond kappa; one half before anything tells.
+    """Probability that the arm has modes beyond kappa that matter.
 
     Either their amplitude a is 0, or it is of the prior N(0, 1); SHOWN ~ N(a TOLD, TOLD): the Bayes factor.
     """
     told = score[TOLD]
     shown = max(score[SHOWN], 0.0)
-    evidence = 0.5 * (shown * shown / (1.0 + told) - np.log(1.0 + told))
+    evidence = score[ODDS] + 0.5 * (shown * shown / (1.0 + told) - np.log(1.0 + told))
     return float(1.0 / (1.0 + np.exp(-min(max(evidence, -50.0), 50.0))))
-
-
-@kernel
-def doubt(score: Array) -> float:
-    """How far the evidence speaks for an arm that is not quite the model: 0 where it is even, up to 1."""
-    return max(0.0, 2.0 * believed(score) - 1.0)
 
 
 @kernel

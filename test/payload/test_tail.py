@@ -14,7 +14,7 @@ from flexmanip_ros.payload import structured, structured_start
 from flexmanip_ros.payload.judgement_kernel import TAIL_SHARE, misjudged
 from flexmanip_ros.payload.structured_model import motion
 from flexmanip_ros.payload.tail import MODES, tail
-from flexmanip_ros.payload.tail_kernel import amplitude, believed, doubt, push, ring, ringing
+from flexmanip_ros.payload.tail_kernel import amplitude, believed, push, ring, ringing
 from flexmanip_ros.plant import linearization
 from flexmanip_ros.types import Status
 
@@ -51,17 +51,15 @@ def test_an_arm_of_more_modes_is_told_from_one_of_just_these_though_neither_misf
 
 
 def test_the_interval_reckons_with_an_error_only_where_modes_beyond_kappa_are_seen(of_three, of_six):
-    assert misjudged(of_three.noise, of_three.score, of_three.counts) == 0.0
+    assert misjudged(of_three.noise, of_three.score, of_three.counts) < 0.1 * TAIL_SHARE
     assert misjudged(of_six.noise, of_six.score, of_six.counts) >= 0.999 * TAIL_SHARE
 
 
-def test_nothing_told_is_an_even_chance_and_no_doubt():
-    score = np.zeros(8)
+def test_nothing_told_is_an_even_chance_and_nothing_seen_speaks_against():
+    score = np.zeros(9)
     assert believed(score) == pytest.approx(0.5)
-    assert doubt(score) == 0.0
     score[mem.TOLD] = 1e6  # much could have been seen, and nothing was
     assert believed(score) < 0.01
-    assert doubt(score) == 0.0
 
 
 def test_ringing_is_the_exact_motion_under_held_torques():
@@ -111,7 +109,7 @@ def test_an_arm_whose_torques_do_not_bend_pushes_nothing():
 
 def test_an_event_shakes_the_rates_of_an_arm_of_more_modes(of_three, of_six):
     model = structured.init(config(replace(ARM, modes=3))).model
-    for memory, least, most in ((of_three, 0.8, 1.5), (of_six, 8.0, 12.0)):
+    for memory, least, most in ((of_three, 0.8, 2.5), (of_six, 8.0, 12.0)):
         shaken = mem.copy(memory)
         structured_start.shake(model, shaken)
         ratio = shaken.noise[2:4, mem.EFFECTIVE] / shaken.noise[2:4, mem.WHITE]
