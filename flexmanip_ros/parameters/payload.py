@@ -28,8 +28,8 @@ class PayloadParameters:
     capture_speed: float = parameter(
         0.3, 'how fast an object may move against the tip when it is caught', unit='m/s', low=0.0, high=100.0)
     model_error: float = parameter(
-        0.003, "relative error of the arm's inertia to reckon with where a sensor shows more than its noise, and "
-               'half of it where the arm shows modes beyond `arm.modes`',
+        0.003, "relative error of the arm's inertia to reckon with where a sensor shows more than its noise, "
+        'and half of it where the arm shows modes beyond `arm.modes`',
         low=0.0, high=1.0)
     rotary_inertia: bool = parameter(
         False, "`structured`: estimate the object's rotary inertia as well, where the signals tell it")
