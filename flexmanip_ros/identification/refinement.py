@@ -29,7 +29,7 @@ BLOCK = 256
 DELAY = 4
 """A fit of N samples is taken N / DELAY samples later, and at least SOONEST."""
 SOONEST = 128
-SOONEST_S, EACH_S = 0.1, 1e-4
+SOONEST_S, EACH_S = 0.1, 2e-4
 """Nor sooner than this, nor than so much for each of its samples [s]: at 1 kHz that is less."""
 LATEST = 4096
 """Nor later than this: what is kept meanwhile is bounded, at any rate."""
