@@ -129,6 +129,9 @@ def _refuse(state: SamplingState, refusal: Refusal) -> SamplingState:
 
 
 def _fault(channels: Channels, record: JointRecord) -> Refusal | None:
+    """Return what is wrong with a record that has the names of ``channels``."""
+    if record.position.size == record.velocity.size == record.effort.size == len(channels.names):
+        return None
     fault = wrong_size(record)
     if fault is not None:
         return fault
