@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -219,15 +220,15 @@ def _run(config: IdentifierParameters, state: StructuredState, samples: Sequence
     assert state.effort is not None
     if not samples:
         return state
-    stamps = np.array([state.last_ns] + [sample.stamp_ns for sample in samples])
-    efforts = np.array([state.effort] + [sample.u for sample in samples])
+    stamps = [state.last_ns, *(sample.stamp_ns for sample in samples)]
+    durations = np.array([max(after - before, 0) * 1e-9 for before, after in pairwise(stamps)])
+    efforts = np.array([state.effort, *(sample.u for sample in samples[:-1])])
     m = mem.copy(state.memory)
-    durations = np.maximum(stamps[1:] - stamps[:-1], 0) * 1e-9
-    taken = run(state.model.motion, state.sensors, m, durations, efforts[:-1],
+    taken = run(state.model.motion, state.sensors, m, durations, efforts,
                 measurements(state.model, samples))
     if taken < len(samples):
         return _restart(config, state, samples[taken:])
-    return replace(state, memory=m, last_ns=samples[-1].stamp_ns, effort=efforts[-1])
+    return replace(state, memory=m, last_ns=stamps[-1], effort=samples[-1].u.copy())
 
 
 def _restart(
