@@ -162,7 +162,10 @@ def case(name: str, rate: float, seconds: float, domain: int) -> dict[str, Any]:
         for process in processes.values():
             process.send_signal(signal.SIGINT)
         for process in processes.values():
-            process.wait(timeout=20)
+            try:
+                process.wait(timeout=20)
+            except subprocess.TimeoutExpired:  # Fast DDS, see ``spin.time_limit``
+                process.kill()
         executor.shutdown()
         observer.destroy_node()
         rclpy.shutdown()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import faulthandler
 import gc
 import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
@@ -24,6 +26,8 @@ from flexmanip_ros.parameters.document import help_text
 from flexmanip_ros.ros.node import FlexmanipNode
 
 BAD_INPUT = 2
+FAREWELL_S = 10.0
+"""Longest time in which a node leaves the middleware; it takes some tenths of a second."""
 POLL_S = 0.1
 """Longest wait inside the executor, hence the longest delay of a signal on an idle node."""
 
@@ -114,12 +118,27 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
         spin(executor, None, interrupt)
     finally:
         node.close()
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown()
-        del executor  # it gives the signals back to their default
+        with time_limit(FAREWELL_S):
+            executor.shutdown()
+            node.destroy_node()
+            rclpy.try_shutdown()
+            del executor  # it gives the signals back to their default
         interrupt.over()
     return 0
+
+
+@contextmanager
+def time_limit(seconds: float) -> Iterator[None]:
+    """End the process with exit code 1 when this takes longer: all is in order, only the middleware hangs.
+
+    Fast DDS 2.14 waits for ever, inside its own code, when a participant is destroyed just as another leaves:
+    one mutex each way between ``set_listener`` and the discovery. Nothing of Python runs then.
+    """
+    faulthandler.dump_traceback_later(seconds, exit=True)
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()
 
 
 def refuse(name: str, problem: str) -> int:
