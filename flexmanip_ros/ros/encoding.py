@@ -51,7 +51,6 @@ class Encoder:
         return layout
 
 
-
 class JointStateWriter:
     """Records of one plant to the bytes of a JointState."""
 
