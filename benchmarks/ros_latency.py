@@ -1,12 +1,12 @@
 """Claim: live at 1 kHz nothing is lost, p99 from sample to estimate is 0.5 ms or less, at a fifth of a core.
 
 Plant, excitation, trigger and identifier over DDS: composed in one process, and one process each; `ordinary`:
-the same where no real-time priority is permitted; `played`: the identifier alone, the samples simulated
-beforehand; `bare`: publish and subscribe alone, the floor on the machine as it is. Latency is from
-the middleware's source time stamp of a joint state to that of the estimate with the same stamp, so that the
-observer's own delays do not count; `sample` is the identifier's callback for every sample, as it reports
-itself; lost: of the seconds measured, and while the processes start on two cores (all of them import and load
-kernels then). Use: ros_latency.py [seconds a case]
+the same where neither real-time priority nor cores that stay awake are permitted; `played`: the identifier
+alone, the samples simulated beforehand; `bare`: publish and subscribe alone, the floor on the machine as it
+is. Latency is from the middleware's source time stamp of a joint state to that of the estimate with the same
+stamp, so that the observer's own delays do not count; `sample` is the identifier's callback for every sample,
+as it reports itself; lost: of the seconds measured, and while the processes start on two cores (all of them
+import and load kernels then). Use: ros_latency.py [seconds a case]
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def composed(rate: float) -> None:
     for node in nodes:
         executor.add_node(node)
         node.autostart()
-    nodes[0].take_priority()
+    nodes[0].real_time.take_priority()
     gc.collect()
     gc.freeze()
     spin(executor, None, interrupt)
@@ -138,7 +138,7 @@ def case(name: str, rate: float, seconds: float, domain: int) -> dict[str, Any]:
                     for node, role in (('source', 'source'), ('rpbsid_identifier', 'echo'))}
     else:
         nodes = NODES[:1] if name == 'played' else NODES
-        more = ['-p', 'thread_priority:=0'] if name == 'ordinary' else []
+        more = ['-p', 'thread_priority:=0', '-p', 'wake_latency:=-1'] if name == 'ordinary' else []
         commands = {node: [sys.executable, '-m', f'flexmanip_ros.ros.{node}', *parameters(rate), *more]
                     for node in nodes}
     if name == 'played':

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
@@ -27,9 +27,11 @@ from rclpy.subscription import Subscription
 
 from flexmanip_ros.errors import FlexmanipError, ParameterError
 from flexmanip_ros.io import cdr
-from flexmanip_ros.ros import priority, qos
+from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.diagnostics import ERROR, WARN, Report
 from flexmanip_ros.ros.parameters import NodeParameters
+from flexmanip_ros.ros.real_time import RealTime
+from flexmanip_ros.ros.wake_latency import UNASKED
 
 Config = TypeVar('Config')
 THROTTLE_S = 2.0
@@ -45,8 +47,8 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
     services are made once and stay: what is not active takes nothing and says nothing.
     """
 
-    THREAD_PRIORITY = 0
-    """Default of ``thread_priority``."""
+    THREAD_PRIORITY, WAKE_LATENCY = 0, UNASKED
+    """Defaults of ``thread_priority`` and ``wake_latency``."""
 
     def __init__(self, name: str, cls: type[Config], *, context: Context | None = None,
                  overrides: list[Parameter] | None = None, namespace: str | None = None,
@@ -63,12 +65,7 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
                 'autostart', True, ParameterDescriptor(
                     description='configure and activate at start; false: wait for ros2 lifecycle set',
                     read_only=True)).value)
-            self.thread_priority = int(self.declare_parameter(
-                'thread_priority', self.THREAD_PRIORITY, ParameterDescriptor(
-                    description='real-time priority (SCHED_FIFO) of the process where the system permits it; '
-                                '0: ordinary scheduling',
-                    read_only=True, integer_range=[IntegerRange(
-                        from_value=priority.LOWEST, to_value=priority.HIGHEST, step=1)])).value)
+            self.real_time = RealTime(self, self.THREAD_PRIORITY, self.WAKE_LATENCY)
             self.parameters: NodeParameters[Config] = NodeParameters(self, cls, self.configuration_changed)
         except BaseException:
             self.destroy_node()
@@ -146,14 +143,6 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
         return not self.autostarts or all(
             transition() == TransitionCallbackReturn.SUCCESS
             for transition in (self.trigger_configure, self.trigger_activate))
-
-    def take_priority(self) -> None:
-        """Take the real-time priority asked for, for this whole process; say where it is refused."""
-        refused = priority.take(self.thread_priority)
-        if refused:
-            self.get_logger().info(
-                f'ordinary scheduling: real-time priority {self.thread_priority} was refused ({refused}); '
-                'permit it (docs/nodes.md), or set thread_priority to 0')
 
     def close(self) -> None:
         """Cease to work before the node is destroyed."""
@@ -241,7 +230,7 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
         report = Report()
         self.report(report)
         report.values['active'] = self.active
-        report.values['thread_priority'] = priority.current()
+        self.real_time.report(report)
         for name, count in self.events.items():
             report.values[name] = count
             if count:

@@ -15,6 +15,7 @@ from rclpy.parameter import Parameter
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import Leaf, check, configure, flatten, leaves
 from flexmanip_ros.parameters.document import NODES, limits
+from flexmanip_ros.ros import real_time
 
 Config = TypeVar('Config')
 
@@ -29,7 +30,7 @@ _ARRAY = {
 _EXAMPLE = {bool: 'true or false', int: 'a whole number such as 100',
             float: 'a number with a decimal point such as 100.0', str: 'a text'}
 _ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.', 'autostart',
-            'thread_priority')
+            *real_time.PARAMETERS)
 _LARGEST = sys.float_info.max
 _LARGEST_INT = 2**63 - 1
 

@@ -52,7 +52,7 @@ _TOPICS = (
 class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
     """Converts, takes one step of the pipeline, publishes."""
 
-    THREAD_PRIORITY = 20
+    THREAD_PRIORITY, WAKE_LATENCY = 20, 0
 
     def __init__(self, *, context: Context | None = None, overrides: list[Parameter] | None = None,
                  namespace: str | None = None, cli_args: list[str] | None = None) -> None:
@@ -100,11 +100,13 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self.get_logger().info(f'resumed after {state.counters.accepted} samples')
 
     def activated(self) -> None:
-        """Have a thread for the fits."""
+        """Have a thread for the fits, and cores that are awake."""
         self._worker = Worker()
+        self.real_time.stay_awake()
 
     def deactivated(self) -> None:
         """Save what is known."""
+        self.real_time.stay_awake(False)
         if self._worker is not None:
             self._worker.close()
             self._worker = None
@@ -207,7 +209,9 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         if line is not None:
             values.update(late_events=line.late_events, repeated_events=line.repeated_events,
                           rewinds=line.rewinds, outliers=estimator.outliers(line.core))
-        if self.active and values['rate_hz'] == 0.0:
+        silent = values['rate_hz'] == 0.0
+        self.real_time.stay_awake(self.active and not silent)
+        if self.active and silent:
             report.worse(STALE, 'no joint_states')
         if self.refused:
             report.worse(ERROR, f'{self.refused} messages refused')
