@@ -31,7 +31,7 @@ from flexmanip_ros.payload.memory import (
 from flexmanip_ros.payload.motion_kernel import PARAMETERS
 from flexmanip_ros.payload.square_root_kernel import absorb_measurement, project
 from flexmanip_ros.payload.tail_kernel import amplitude, ringing
-from flexmanip_ros.plant.compiled import kernel
+from flexmanip_ros.plant.compiled import inlined
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class Sensors(NamedTuple):
     """(nx, 2 nx) scratch."""
 
 
-@kernel
+@inlined
 def measure(motion: Motion, sensors: Sensors, m: Memory, effort: Array, y: Array) -> None:
     """Update the filter with one sample and gather what its innovations say of noise and payload."""
     payload = m.x.size - PARAMETERS
@@ -110,7 +110,7 @@ def measure(motion: Motion, sensors: Sensors, m: Memory, effort: Array, y: Array
     m.counts[SEEN] = min(m.counts[SEEN] + 1, 2000)
 
 
-@kernel
+@inlined
 def white_noise(m: Memory, i: int, y: float) -> None:
     """Variance of sensor i's white noise, from fourth differences, in which slow motion has no part."""
     recent = m.recent[i]
@@ -125,7 +125,7 @@ def white_noise(m: Memory, i: int, y: float) -> None:
     recent[0] = y
 
 
-@kernel
+@inlined
 def learn_noise(sensors: Sensors, m: Memory) -> None:
     """At the end of a block: the variance of each sensor, and its slow part when that is not white."""
     m.counts[IN_BLOCK] += 1
@@ -146,7 +146,7 @@ def learn_noise(sensors: Sensors, m: Memory) -> None:
         row[EFFECTIVE] = max(row[POWER], row[SLOW] - doubt * row[POWER], row[FLOOR], 0.7 * row[EFFECTIVE])
 
 
-@kernel
+@inlined
 def judge_payload(sensors: Sensors, m: Memory) -> None:
     """At the end of a batch: see whether the payload moved farther than its variance allows."""
     m.counts[IN_BATCH] += 1

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from flexmanip_ros.plant.acceleration_kernel import acceleration, factor, solve
-from flexmanip_ros.plant.compiled import kernel
+from flexmanip_ros.plant.compiled import inlined, kernel
 from flexmanip_ros.plant.jacobian_kernel import acceleration_jacobian
 from flexmanip_ros.types import Array
 
@@ -65,7 +65,7 @@ class Motion(NamedTuple):
     Y: Array
 
 
-@kernel
+@inlined
 def payload_mass(motion: Motion, state: float, held: bool) -> float:
     """Payload [kg] from its state: scale exp(state) > 0 when something is held, else the state itself."""
     if held:
@@ -73,7 +73,7 @@ def payload_mass(motion: Motion, state: float, held: bool) -> float:
     return max(state, motion.least)
 
 
-@kernel
+@inlined
 def set_parameters(motion: Motion, x: Array, held: bool) -> None:
     """Write payload, stiffness and damping of the state into the arm."""
     n = motion.q.size
@@ -94,7 +94,7 @@ def set_parameters(motion: Motion, x: Array, held: bool) -> None:
             motion.arm.damping[j] = motion.damping[j] * ratio
 
 
-@kernel
+@inlined
 def accelerate(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array) -> bool:
     """Fill qdd (n,); leaves the factor of M in work.M."""
     if not motion.frozen:
@@ -181,7 +181,7 @@ def predict(motion: Motion, x: Array, S: Array, effort: Array, duration: float, 
     return True
 
 
-@kernel
+@inlined
 def exponential_step(motion: Motion, x: Array, effort: Array, h: float, held: bool) -> bool:
     """Advance x by h, exactly where the motion is linear; leaves the linearisation at the start in motion.
 
@@ -220,7 +220,7 @@ def exponential_step(motion: Motion, x: Array, effort: Array, h: float, held: bo
     return largest < 1e6
 
 
-@kernel
+@inlined
 def series(motion: Motion, h: float, first: int, scale: float) -> None:
     """Fill total with scale x phi_first(h F) v, F the linearisation, phi_l(z) = sum of z^j / (j + l)!.
 
@@ -245,7 +245,7 @@ def series(motion: Motion, h: float, first: int, scale: float) -> None:
                 total[part, i] += scale * following[part, i]
 
 
-@kernel
+@inlined
 def spread(motion: Motion, S: Array, h: float) -> None:
     """S <- F S, F the Taylor series of the linearised flow over h."""
     n = motion.q.size

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from flexmanip_ros.plant.compiled import kernel
+from flexmanip_ros.plant.compiled import inlined, kernel
 from flexmanip_ros.types import Array
 
 
-@kernel
+@inlined
 def project(x: Array, S: Array, H: Array, offset: int, f: Array) -> float:
     """Return H x[offset:] and fill f (nx,) = S' H', the spread of that measurement."""
     value = 0.0
@@ -22,7 +22,7 @@ def project(x: Array, S: Array, H: Array, offset: int, f: Array) -> float:
     return value
 
 
-@kernel
+@inlined
 def absorb_measurement(x: Array, S: Array, f: Array, e: float, r: float, variance: float) -> None:
     """Potter's update: innovation e of variance = f'f + r, r the noise variance, f = S' H'."""
     nx = x.size

@@ -36,7 +36,7 @@ from flexmanip_ros.payload.square_root_kernel import (
     project,
 )
 from flexmanip_ros.payload.tail_kernel import amplitude, believed, push, ring, ringing
-from flexmanip_ros.plant.compiled import kernel
+from flexmanip_ros.plant.compiled import inlined, kernel
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ def refit(motion: Motion, sensors: Sensors, m: Memory, duration: float, effort: 
     return True
 
 
-@kernel
+@inlined
 def diffuse(sensors: Sensors, m: Memory, duration: float) -> None:
     """Add the process noise of a while, so that the memory stays finite."""
     m.score[NOW] += duration

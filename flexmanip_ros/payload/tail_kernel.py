@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flexmanip_ros.payload.memory import ODDS, SHOWN, TOLD
 from flexmanip_ros.plant.acceleration_kernel import solve
-from flexmanip_ros.plant.compiled import kernel
+from flexmanip_ros.plant.compiled import inlined
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class Tail(NamedTuple):
     right angle, and what the cosine of its angle adds."""
 
 
-@kernel
+@inlined
 def ring(tail: Tail, m: Memory, duration: float, effort: Array) -> None:
     """Carry the departure of each oscillator from where the torque holds it over a time, exactly."""
     first, second = effort[0] - m.torque[0], effort[1] - m.torque[1]
@@ -56,7 +56,7 @@ def ring(tail: Tail, m: Memory, duration: float, effort: Array) -> None:
         m.tail[1, i] = v * c - (half * v + tail.square[i] * z) * s
 
 
-@kernel
+@inlined
 def ringing(tail: Tail, m: Memory, i: int) -> float:
     """What sensor i would read more if the arm had these modes; where the torque holds them is known."""
     value = 0.0
@@ -65,7 +65,7 @@ def ringing(tail: Tail, m: Memory, i: int) -> float:
     return value
 
 
-@kernel
+@inlined
 def believed(score: Array) -> float:
     """Probability that the arm has modes beyond kappa that matter.
 
@@ -77,14 +77,14 @@ def believed(score: Array) -> float:
     return float(1.0 / (1.0 + np.exp(-min(max(evidence, -50.0), 50.0))))
 
 
-@kernel
+@inlined
 def amplitude(score: Array) -> float:
     """How much of the ringing to expect: 0 of none, 1 of all. Frequencies a little off show less of it."""
     shown: float = max(score[SHOWN], 0.0) / (1.0 + score[TOLD])
     return believed(score) * min(shown, 1.0)
 
 
-@kernel
+@inlined
 def push(motion: Motion, tail: Tail, x: Array, before: Array, effort: Array, share: float) -> None:
     """Set the kept coordinates aside at a step of the torque from ``before``, by a share of what a tail does.
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.plant.compiled import kernel
+from flexmanip_ros.plant.compiled import inlined, kernel
 from flexmanip_ros.plant.kernels import assemble, elastic
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from flexmanip_ros.types import Array
 
 
-@kernel
+@inlined
 def factor(M: Array) -> bool:
     """Overwrite the lower triangle of M with its Cholesky factor, diagonal inverted; False if indefinite."""
     n = M.shape[0]
@@ -34,7 +34,7 @@ def factor(M: Array) -> bool:
     return True
 
 
-@kernel
+@inlined
 def solve(L: Array, x: Array) -> None:
     """Overwrite x (n,) with M^-1 x, L from ``factor``."""
     n = x.size
@@ -82,7 +82,7 @@ def hold(L: Array, held: Array, qdd: Array, columns: Array) -> None:
             qdd[c] -= second * columns[1, c]
 
 
-@kernel
+@inlined
 def steepen(
     root_slope: Array, tip_slope: Array, torque: Array, q: Array, effort: Array, force: Array,
 ) -> None:
@@ -106,7 +106,7 @@ def steepen(
         force[2 + k + j] += torque[2 + k + j, 1] * third
 
 
-@kernel
+@inlined
 def acceleration(
     arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array, qdd: Array, work: Workspace,
 ) -> bool:

@@ -17,6 +17,20 @@ def kernel(function: Function) -> Function:
     cost more than the arithmetic (1.5 us against 0.4 us an evaluation at kappa = 1). Hence a kernel
     must not create arrays or return them; callers compiled normally may.
     """
-    options: dict[str, Any] = {'cache': True, '_nrt': False}
+    return _compiled(function)
+
+
+def inlined(function: Function) -> Function:
+    """Compile a kernel into those that call it.
+
+    Passing a Manipulator takes some 300 words on the stack and as many instructions at every call: half the
+    time of the small kernels, and most of the code that a processor just woken must fetch. Every caller
+    compiles it anew, so what is called in few places and works long stays a ``kernel``.
+    """
+    return _compiled(function, forceinline=True)
+
+
+def _compiled(function: Function, **more: Any) -> Function:
+    options: dict[str, Any] = {'cache': True, '_nrt': False, **more}
     compiled: Function = njit(**options)(function)
     return compiled

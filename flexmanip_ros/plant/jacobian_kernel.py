@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexmanip_ros.plant.acceleration_kernel import acceleration
-from flexmanip_ros.plant.compiled import kernel
+from flexmanip_ros.plant.compiled import inlined, kernel
 from flexmanip_ros.plant.kernels import assemble
 from flexmanip_ros.plant.link_jacobian_kernel import link_jacobian, point_jacobian
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from flexmanip_ros.types import Array
 
 
-@kernel
+@inlined
 def force_jacobian(
     arm: Manipulator, payload: Array, q: Array, qd: Array, qdd: Array,
     left: Array, right: Array, dp: Array, work: Workspace,
@@ -136,7 +136,7 @@ def force_jacobian(
     _parameter_columns(arm, payload, q, qd, qdd, base_e, base_n, c, s, length, dp)
 
 
-@kernel
+@inlined
 def _parameter_columns(
     arm: Manipulator, payload: Array, q: Array, qd: Array, qdd: Array,
     base_e: float, base_n: float, c: float, s: float, length: float, dp: Array,
@@ -188,7 +188,7 @@ def bias_jacobian(
     force_jacobian(arm, payload, q, qd, qdd, left, right, work.parameters, work)
 
 
-@kernel
+@inlined
 def solve_columns(L: Array, X: Array) -> None:
     """Overwrite X (n, m) with -M^-1 X, L from ``acceleration_kernel.factor``."""
     n, m = X.shape
@@ -213,7 +213,7 @@ def solve_columns(L: Array, X: Array) -> None:
             X[r, c] = -X[r, c]
 
 
-@kernel
+@inlined
 def steep_jacobian(
     root_slope: Array, tip_slope: Array, torque: Array, q: Array, effort: Array, dq: Array,
 ) -> None:
@@ -234,7 +234,7 @@ def steep_jacobian(
             dq[r2, 2 + k + m] -= third * root_slope[1, m]
 
 
-@kernel
+@inlined
 def acceleration_jacobian(
     arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array,
     qdd: Array, dq: Array, dqd: Array, dp: Array, work: Workspace,

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.plant.compiled import kernel
+from flexmanip_ros.plant.compiled import inlined
 
 if TYPE_CHECKING:
     from flexmanip_ros.plant.manipulator import Manipulator, Workspace
     from flexmanip_ros.types import Array
 
 
-@kernel
+@inlined
 def add_point(
     m: float, cx: float, cy: float, arm: Manipulator, i: int, q: Array, qd: Array,
     M: Array, E: Array, moments: Array,
@@ -78,7 +78,7 @@ def add_point(
         moments[1, 2] += m * bdd
 
 
-@kernel
+@inlined
 def add_link(
     arm: Manipulator, i: int, q: Array, qd: Array, M: Array, E: Array, work: Workspace,
 ) -> None:
@@ -166,7 +166,7 @@ def add_link(
                 moments[0, 3 + j] -= s
 
 
-@kernel
+@inlined
 def assemble(
     arm: Manipulator, payload: Array, q: Array, qd: Array, M: Array, E: Array, work: Workspace,
 ) -> None:
@@ -237,7 +237,7 @@ def assemble(
                 M[2 + k + j, 2 + t] -= arm.tip_stretch[0, t] * q[2 + t] * (aj * c - bj * s)
 
 
-@kernel
+@inlined
 def elastic(arm: Manipulator, q: Array, work: Workspace) -> None:
     """Fill work.elastic (n,) with dV/dq and, link by link, work.tangent (n, k) with its part from V4.
 

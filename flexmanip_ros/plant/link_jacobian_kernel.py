@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.plant.compiled import kernel
+from flexmanip_ros.plant.compiled import inlined
 
 if TYPE_CHECKING:
     from flexmanip_ros.plant.manipulator import Manipulator, Workspace
     from flexmanip_ros.types import Array
 
 
-@kernel
+@inlined
 def point_jacobian(
     m: float, cx: float, cy: float, arm: Manipulator, i: int, base_e: float, base_n: float,
     q: Array, qd: Array, qdd: Array, left: Array, right: Array, work: Workspace,
@@ -85,7 +85,7 @@ def point_jacobian(
             columns[5, c] += 2.0 * m * bdc
 
 
-@kernel
+@inlined
 def link_jacobian(
     arm: Manipulator, i: int, base_e: float, base_n: float, q: Array, qd: Array, qdd: Array,
     left: Array, right: Array, work: Workspace,
@@ -123,7 +123,7 @@ def link_jacobian(
             left[i, o + c] += slope_e * base_n - arm.mean_shape[i, c] * base_e
 
 
-@kernel
+@inlined
 def _bending_jacobian(
     arm: Manipulator, i: int, q: Array, qd: Array, qdd: Array, left: Array, right: Array, work: Workspace,
 ) -> None:
