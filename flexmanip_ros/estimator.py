@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.identification import rpbsid
-from flexmanip_ros.identification.memory_kernel import FILLED, REJECTED, USED
+from flexmanip_ros.identification.memory_kernel import FILLED, REJECTED
 from flexmanip_ros.identification.modal import modes
 from flexmanip_ros.identification.refinement import Answer, Job
 from flexmanip_ros.identification.uncertainty import Identified
@@ -18,6 +18,10 @@ from flexmanip_ros.payload import block_extraction, model_check, structured
 from flexmanip_ros.payload.block_extraction import NOWHERE
 from flexmanip_ros.payload.model_check import Verdict
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, Payload, Sample, Status
+
+BATCH, MOST_OWED = 8, 64
+"""Samples that the identifier takes at once, for only who reads a model waits for it: from so many on when
+there is nothing else to do, and at most."""
 
 
 class Core(NamedTuple):
@@ -45,8 +49,12 @@ def init(config: IdentifierParameters) -> Core:
 
 
 def advance(config: IdentifierParameters, core: Core, samples: Sequence[Sample]) -> Core:
-    """Run samples through both estimators; one call of N samples gives the bits of N calls of one."""
-    return settle(config, payload_ahead(config, core, samples))
+    """Run samples through both estimators; the identifier owes the last ones where they are few.
+
+    One call of N samples gives, once settled, the bits of N calls of one.
+    """
+    core = payload_ahead(config, core, samples)
+    return settle(config, core) if len(core.owed) >= MOST_OWED else core
 
 
 def payload_ahead(config: IdentifierParameters, core: Core, samples: Sequence[Sample]) -> Core:
@@ -107,8 +115,9 @@ def finish(config: IdentifierParameters, core: Core) -> Core:
 
 
 def job(core: Core) -> tuple[Job, int] | None:
-    """Return the long work under way, and the samples until its result is taken."""
-    return rpbsid.job(core.rpbsid)
+    """Return the long work under way, and the samples until its result is taken, or fewer."""
+    found = rpbsid.job(core.rpbsid)
+    return None if found is None else (found[0], found[1] - len(core.owed))
 
 
 def answered(core: Core, job: Job, answer: Answer) -> Core:
@@ -155,11 +164,6 @@ def follow(config: IdentifierParameters, stamp_ns: int, last: Estimate, payload:
     payload = last.payload if payload is None else payload
     return replace(last, stamp_ns=stamp_ns, payload=payload, model_is_new=False,
                    status=_overall(config, last.model_status, payload))
-
-
-def samples_used(core: Core) -> int:
-    """Return how many samples the model rests on."""
-    return int(core.rpbsid.counts[USED])
 
 
 def outliers(core: Core) -> int:

@@ -18,7 +18,7 @@ from flexmanip_ros.payload.model_check import Verdict
 from flexmanip_ros.sampling import Counters
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Payload, Sample
 
-GROUP_S, LEAST, GROUP, BLOCK = 0.005, 4, 20, 256
+GROUP_S, LEAST, GROUP, BLOCK = 0.002, 2, 20, 256
 """Samples run through the compiled kernels at once: live those of a time [s], between least and most, so that
 none of them holds up the next for long; when replaying. The numbers are the same."""
 PATIENCE = 2000
@@ -26,10 +26,10 @@ PATIENCE = 2000
 
 
 class Reading(NamedTuple):
-    """A model as it was read: its estimate, the samples it rested on, and the index of its instant."""
+    """A model as it was read: its estimate, the event it came after, and the index of its instant."""
 
     estimate: Estimate
-    samples: int
+    since_ns: int
     instant: int
 
 
@@ -107,20 +107,20 @@ def read(state: State, due: Due) -> tuple[State, Estimate]:
     line, config, last = state.timeline, state.config, state.reading
     assert line is not None
     assert config is not None
-    core = estimator.settle(config, due.core)
-    if due.core is line.core:
-        state = state._replace(timeline=line._replace(core=core))
     settling = 2.0 * config.rewind_time + 1.0 / config.publish_rate
     changes = (state.first_ns, *(event.stamp_ns for event in line.latest))
     young = any(0 <= due.stamp_ns - change <= settling * 1e9 for change in changes)
     instant = _instant(state, due.stamp_ns, config.model_rate)
-    used = estimator.samples_used(core)
-    if last is not None and not young and instant <= last.instant and last.samples <= used:
+    since_ns = due.core.since_ns
+    if last is not None and not young and instant <= last.instant and last.since_ns == since_ns:
         return state, estimator.follow(config, due.stamp_ns, last.estimate, due.payload)
+    core = estimator.settle(config, due.core)
+    if due.core is line.core:
+        state = state._replace(timeline=line._replace(core=core))
     # while an event may still come late no verdict is given: it would depend on when that came
     estimate, verdicts = estimator.estimate(config, core, due.stamp_ns, state.sampling.dt, due.payload,
                                             state.verdicts, compare=not young)
-    reading = Reading(estimate, used, instant) if estimate.model is not None else None
+    reading = Reading(estimate, since_ns, instant) if estimate.model is not None else None
     return state._replace(reading=reading, verdicts=verdicts), estimate
 
 
@@ -270,6 +270,8 @@ def _hold(state: State, samples: Iterable[Sample], group: int | None) -> tuple[S
         state = state._replace(held=held)
         if len(held) >= group or _is_due(state, sample.stamp_ns + dt_ns):
             state = _run_held(state)
+        elif len(line.core.owed) >= estimator.BATCH:
+            state = state._replace(timeline=line._replace(core=estimator.settle(config, line.core)))
     return state, tuple(due)
 
 
