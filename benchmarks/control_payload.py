@@ -10,7 +10,6 @@ the estimate changes the gains, and from the move on. Use: control_payload.py
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +55,7 @@ def run(mass: float, knows: str) -> dict[str, Any]:
         body, record = simulator.step(plant, body, torque)
         positions[k] = record.position
         if knows == 'estimate':
-            identifier, estimates = pipeline.step(wanted, identifier, replace(record))
+            identifier, estimates = pipeline.step(wanted, identifier, record)
             for found in estimates:
                 if found.payload is not None:
                     held = found.payload

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.types import Array, JointRecord
+from flexmanip_ros.types import JointRecord, Sample
 
 _SHRINKABLE = IdentifierParameters().outputs
 
@@ -77,14 +77,16 @@ def wrong_size(record: JointRecord) -> Refusal | None:
     return None
 
 
-def extract(places: tuple[tuple[str, int], ...], record: JointRecord) -> Array:
-    """Return the values at the given places: (len(places),)."""
-    return np.array([getattr(record, field)[index] for field, index in places], dtype=np.float64)
-
-
-def finite(values: Array) -> bool:
-    """Tell whether every value is finite; of so few this is the cheapest way, and a sum may overflow."""
-    return all(map(math.isfinite, values.tolist()))
+def extract(channels: Channels, record: JointRecord) -> Sample | None:
+    """Return the configured signals of a record that ``channels`` fit; None where one is not finite."""
+    fields = {'position': record.position.tolist(), 'velocity': record.velocity.tolist(),
+              'effort': record.effort.tolist()}
+    u, y, angles = ([fields[field][index] for field, index in places]
+                    for places in (channels.u, channels.y, channels.angles))
+    if not all(map(math.isfinite, u + y + angles)):  # a sum may overflow
+        return None
+    return Sample(record.stamp_ns, np.array(u, dtype=np.float64), np.array(y, dtype=np.float64),
+                  np.array(angles, dtype=np.float64))
 
 
 def _find(signal: str, record: JointRecord) -> tuple[str, int] | None:

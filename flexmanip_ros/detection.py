@@ -70,7 +70,7 @@ def advance(
 ) -> tuple[DetectionState, tuple[CaptureEvent, ...]]:
     """Take samples in the order of their stamps; return the events found, the same as one by one."""
     found: list[CaptureEvent] = []
-    left = [replace(sample, y=sample.y[list(state.kept)]) for sample in samples]
+    left = [sample._replace(y=sample.y[list(state.kept)]) for sample in samples]
     while left and state.filter.model is not None:
         if state.watch is None or state.filter.memory is None:
             state = _start(config, state, left[0])
@@ -151,7 +151,7 @@ def _watch(
         return fresh, -taken, None
     w = watch.trace.shape[0]
     seen = (*state.stamps, *(int(stamp) for stamp in stamps[1:taken + 1]))[-w:]
-    filtered = replace(filtered, memory=m, last_ns=int(stamps[taken]), effort=efforts[taken])
+    filtered = filtered._replace(memory=m, last_ns=int(stamps[taken]), effort=efforts[taken])
     state = replace(state, filter=filtered, watch=watch, stamps=seen)
     if watch.clock[kernel.ALARMED] <= confirm:
         return state, taken, None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -162,8 +161,8 @@ def estimate(config: IdentifierParameters, core: Core, stamp_ns: int, dt: float,
 def follow(config: IdentifierParameters, stamp_ns: int, last: Estimate, payload: Payload | None) -> Estimate:
     """Return an estimate with the model of the last one, and the payload if that stands by itself."""
     payload = last.payload if payload is None else payload
-    return replace(last, stamp_ns=stamp_ns, payload=payload, model_is_new=False,
-                   status=_overall(config, last.model_status, payload))
+    return last._replace(stamp_ns=stamp_ns, payload=payload, model_is_new=False,
+                         status=_overall(config, last.model_status, payload))
 
 
 def outliers(core: Core) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 
@@ -43,4 +42,4 @@ def inject(items: Iterable[Item], faults: Faults, rng: np.random.Generator) -> l
 def _with_nan(record: JointRecord, rng: np.random.Generator) -> JointRecord:
     position = record.position.copy()
     position[int(rng.integers(position.size))] = np.nan
-    return replace(record, position=position)
+    return record._replace(position=position)

@@ -116,7 +116,7 @@ def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[
             read = now
             if method in configs:
                 read = (_with_block(configs[method], case, state, now) if held
-                        else replace(now, payload=None))
+                        else now._replace(payload=None))
             found[method].estimates.append(read)
             walls[method] += time.perf_counter() - started
     shared = time.perf_counter() - begun - sum(walls.values())
@@ -132,10 +132,10 @@ def _with_block(config: IdentifierParameters, case: Case, state: pipeline.State,
     except np.linalg.LinAlgError:  # nothing moves yet
         found = None
     if found is None:
-        return replace(now, payload=None, status=now.model_status)
+        return now._replace(payload=None, status=now.model_status)
     payload = block_extraction.estimate(config, found, np.radians(case.angles_deg), core.swept)
     status = payload.status if found.status is Status.TRACKING else found.status
-    return replace(now, payload=payload, status=status)
+    return now._replace(payload=payload, status=status)
 
 
 def _compare(case: Case, methods: Sequence[Method], items: Sequence[Item]) -> dict[str, Reading]:

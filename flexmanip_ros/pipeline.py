@@ -183,8 +183,8 @@ def current(state: State) -> Estimate | None:
                                             state.verdicts, compare=True)
     payload = estimator.payload(config, core, verdicts)
     if estimate.model is None:
-        return replace(estimate, payload=payload)
-    return replace(estimator.follow(config, line.last_ns, estimate, payload), model_is_new=True)
+        return estimate._replace(payload=payload)
+    return estimator.follow(config, line.last_ns, estimate, payload)._replace(model_is_new=True)
 
 
 def check_used(state: State) -> None:

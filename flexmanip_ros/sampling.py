@@ -6,11 +6,10 @@ next one with ``gap``, a jump back resets, and inputs are shifted by ``arm.effor
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
-from flexmanip_ros.channels import Channels, Refusal, extract, finite, resolve, wrong_size
+from flexmanip_ros.channels import Channels, Refusal, extract, resolve, wrong_size
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.types import JointRecord, Sample
 
@@ -48,6 +47,10 @@ class Counters(NamedTuple):
     def received_and(self, name: str) -> Counters:
         """Return the counters after one message with this fate."""
         return self._replace(**{'received': self.received + 1, name: getattr(self, name) + 1})
+
+    def one_accepted(self) -> Counters:
+        """Return the counters after one message that became a sample."""
+        return Counters(self.received + 1, self.accepted + 1, *self[2:])
 
 
 class SamplingState(NamedTuple):
@@ -100,9 +103,8 @@ def step(config: IdentifierParameters, state: SamplingState, record: JointRecord
     fault = _fault(channels, record)
     if fault is not None:
         return _refuse(state, fault), NOTHING
-    raw = Sample(record.stamp_ns, extract(channels.u, record), extract(channels.y, record),
-                 extract(channels.angles, record))
-    if not (finite(raw.u) and finite(raw.y) and finite(raw.angles)):
+    raw = extract(channels, record)
+    if raw is None:
         return _refuse(state, _NOT_FINITE), NOTHING
     return _on_clock(config, state, raw)
 
@@ -176,12 +178,13 @@ def _placed(config: IdentifierParameters, state: SamplingState, raw: Sample
         return _refuse(state, _LATE), NOTHING
     if state.interval_count == 0:
         state = state._replace(learning=(*state.learning, raw), last_ns=raw.stamp_ns,
-                               counters=state.counters.received_and('accepted'))
+                               counters=state.counters.one_accepted())
         return _learned(config, state, reset=False) if len(state.learning) > LEARNING else (state, NOTHING)
-    state, ready, gap = _next(config, state, raw)
+    before = state.counters
+    state, ready, gap = _next(config, state, raw, before.one_accepted())
     if gap and state.irregular >= RELEARN:
-        return _restart(config, state, raw)
-    return state._replace(counters=state.counters.received_and('accepted')), Sampled(ready)
+        return _restart(config, state._replace(counters=before.plus('gaps')), raw)
+    return state, Sampled(ready)
 
 
 def _restart(config: IdentifierParameters, state: SamplingState, raw: Sample
@@ -202,17 +205,20 @@ def _learned(config: IdentifierParameters, state: SamplingState, *, reset: bool
                     interval_sum_ns=steps[len(steps) // 2] if steps else 0)
     ready: list[Sample] = []
     for raw in held:
-        state, complete, _ = _next(config, state, raw)
+        state, complete, _ = _next(config, state, raw, state.counters)
         ready.extend(complete)
     return state._replace(irregular=0), Sampled(tuple(ready), reset)
 
 
-def _next(config: IdentifierParameters, state: SamplingState, raw: Sample
+def _next(config: IdentifierParameters, state: SamplingState, raw: Sample, counters: Counters
           ) -> tuple[SamplingState, tuple[Sample, ...], bool]:
-    """Advance the clock by one sample; return the complete samples and whether a gap precedes ``raw``."""
+    """Advance the clock by one sample; return the complete samples and whether a gap precedes ``raw``.
+
+    counters: with this sample in them, but for the gap.
+    """
     gap = False
     if state.last_ns is None:
-        state = state._replace(last_ns=raw.stamp_ns)
+        state = state._replace(last_ns=raw.stamp_ns, counters=counters)
     else:
         interval = raw.stamp_ns - state.last_ns
         total, count = state.interval_sum_ns, state.interval_count
@@ -220,16 +226,16 @@ def _next(config: IdentifierParameters, state: SamplingState, raw: Sample
         gap = not (interval * count < config.gap_factor * total
                    and interval * count > (2.0 - config.gap_factor) * total)
         if gap:
-            raw = replace(raw, gap=True)
+            raw = raw._replace(gap=True)
             state = state._replace(irregular=state.irregular + 1, pending=(), last_ns=raw.stamp_ns,
-                                   counters=state.counters.plus('gaps'))
+                                   counters=counters.plus('gaps'))
         else:
             state = state._replace(irregular=0, interval_sum_ns=total + interval, interval_count=count + 1,
-                                   last_ns=raw.stamp_ns)
+                                   last_ns=raw.stamp_ns, counters=counters)
     delay = config.arm.effort_delay
     if delay == 0:
         return state, (raw,), gap
     queue = (*state.pending, raw)
     if len(queue) <= delay:
         return state._replace(pending=queue), (), gap
-    return state._replace(pending=queue[1:]), (replace(queue[0], u=raw.u),), gap
+    return state._replace(pending=queue[1:]), (queue[0]._replace(u=raw.u),), gap

@@ -26,8 +26,7 @@ class CaptureEvent(NamedTuple):
     kind: EventKind
 
 
-@dataclass(frozen=True, eq=False)
-class JointRecord:
+class JointRecord(NamedTuple):
     """One JointState as it was published: names and whatever of the three arrays it carried.
 
     position: (j,) [rad or m], velocity: (j,) or (0,), effort: (j,) or (0,) [N m].
@@ -40,8 +39,7 @@ class JointRecord:
     effort: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Sample:
+class Sample(NamedTuple):
     """One instant of the configured signals, in JointState units.
 
     u: (r,) inputs held from ``stamp_ns`` on [N m]; y: (m,) outputs [m, m/s, rad, ...];
@@ -100,8 +98,7 @@ class Mode(NamedTuple):
     damping_ratio_std: float = float('nan')
 
 
-@dataclass(frozen=True, eq=False)
-class Payload:
+class Payload(NamedTuple):
     """What the arm holds.
 
     mass, std, lower, upper: [kg], the last two a 95 % interval; consistency: normalised residual
@@ -119,8 +116,7 @@ class Payload:
     inertia: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
+class Estimate(NamedTuple):
     """Everything published at one stamp. ``model`` and ``payload`` are None until there is one."""
 
     stamp_ns: int

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -140,12 +139,12 @@ def apply(state: StructuredState, payload: Payload, verdicts: tuple[Verdict, ...
     if not disagree and doubt == 0.0:
         return payload
     if not m.counts[mem.HELD]:  # an arm that does not move as an empty one may hold anything
-        return replace(payload, lower=0.0, upper=math.inf, std=math.inf, status=Status.INCONSISTENT)
+        return payload._replace(lower=0.0, upper=math.inf, std=math.inf, status=Status.INCONSISTENT)
     std = math.hypot(payload.std, doubt * (payload.mass + state.model.motion.scale))
     lower, upper = payload.mass - QUANTILE * std, payload.mass + QUANTILE * std
     if own is not None:
         lower, upper = min(lower, own.lower), max(upper, own.upper)
-    return replace(payload, std=std, status=Status.INCONSISTENT,
+    return payload._replace(std=std, status=Status.INCONSISTENT,
                    lower=max(0.0, min(payload.lower, lower)), upper=max(payload.upper, upper))
 
 

@@ -6,8 +6,8 @@ A filter and a refit behind it (``structured_kernel``). States are never written
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,17 +18,18 @@ from flexmanip_ros.payload import tail
 from flexmanip_ros.payload.measurement_kernel import Sensors
 from flexmanip_ros.payload.motion_kernel import PARAMETERS, predict
 from flexmanip_ros.payload.structured_judgement import inexact, judge
-from flexmanip_ros.payload.structured_kernel import advance as run
+from flexmanip_ros.payload.structured_kernel import advance as run_kernel
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.payload.tail_kernel import believed, push, ring
+from flexmanip_ros.plant.compiled import Prepared
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload, Sample
 
 FIRST_LOOK = 24
 """Samples looked at before the filter starts: they tell its noise."""
+run = Prepared(run_kernel, 2)
 
 
-@dataclass(frozen=True, eq=False)
-class StructuredState:
+class StructuredState(NamedTuple):
     """Everything remembered; constant in size."""
 
     model: Model | None
@@ -64,7 +65,7 @@ def advance(
         return state
     if state.memory is None:
         needed = FIRST_LOOK - sum(isinstance(item, Sample) for item in state.waiting)
-        state = replace(state, waiting=(*state.waiting, *samples[:needed]))
+        state = state._replace(waiting=(*state.waiting, *samples[:needed]))
         if len(samples) < needed:
             return state
         state, samples = _begin(config, state), samples[needed:]
@@ -86,7 +87,7 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     if state.model is None:
         return state
     if state.memory is None:
-        return replace(state, waiting=(*state.waiting, event))
+        return state._replace(waiting=(*state.waiting, event))
     m = mem.copy(state.memory)
     assert state.effort is not None
     assert state.sensors is not None
@@ -97,7 +98,7 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
         ring(state.sensors.tail, m, ahead * 1e-9, state.effort)
         m.torque[:] = state.effort
     released = _change(config, state.model, m, event.kind)
-    return replace(state, memory=m, last_ns=state.last_ns + ahead, released=released)
+    return state._replace(memory=m, last_ns=state.last_ns + ahead, released=released)
 
 
 def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
@@ -178,8 +179,8 @@ def _begin(config: IdentifierParameters, state: StructuredState) -> StructuredSt
     _anchor(m)
     seen = sensors(config, model, dt, start.diffusion(config, model, m), m.x[:2])
     m.score[mem.ODDS] = 0.0 if seen.tail.push.any() else tail.UNBENT_ODDS
-    state = replace(
-        state, memory=m, sensors=seen, waiting=(), last_ns=samples[0].stamp_ns, effort=samples[0].u.copy())
+    state = state._replace(
+        memory=m, sensors=seen, waiting=(), last_ns=samples[0].stamp_ns, effort=samples[0].u.copy())
     for item in items:
         state = event(config, state, item) if isinstance(item, CaptureEvent) else step(config, state, item)
     return state
@@ -191,7 +192,7 @@ def _resume(config: IdentifierParameters, state: StructuredState, sample: Sample
     fresh = reopen(config, state, measurements(state.model, [sample])[0])
     assert fresh.memory is not None
     fresh.memory.torque[:] = fresh.memory.torque0[:] = sample.u
-    return replace(fresh, last_ns=sample.stamp_ns, effort=sample.u.copy())
+    return fresh._replace(last_ns=sample.stamp_ns, effort=sample.u.copy())
 
 
 def reopen(
@@ -209,7 +210,7 @@ def reopen(
     m.S[2 * n:] = 0.0
     m.S[2 * n:, 2 * n:] = np.linalg.qr(spread.T)[1].T
     _anchor(m)
-    return replace(state, memory=m)
+    return state._replace(memory=m)
 
 
 def _run(config: IdentifierParameters, state: StructuredState, samples: Sequence[Sample]) -> StructuredState:
@@ -222,13 +223,13 @@ def _run(config: IdentifierParameters, state: StructuredState, samples: Sequence
         return state
     stamps = [state.last_ns, *(sample.stamp_ns for sample in samples)]
     durations = np.array([max(after - before, 0) * 1e-9 for before, after in pairwise(stamps)])
-    efforts = np.array([state.effort, *(sample.u for sample in samples[:-1])])
+    efforts = np.array([state.effort, *(sample.u for sample in samples[:-1])], dtype=np.float64)
     m = mem.copy(state.memory)
     taken = run(state.model.motion, state.sensors, m, durations, efforts,
                 measurements(state.model, samples))
     if taken < len(samples):
         return _restart(config, state, samples[taken:])
-    return replace(state, memory=m, last_ns=stamps[-1], effort=samples[-1].u.copy())
+    return state._replace(memory=m, last_ns=stamps[-1], effort=samples[-1].u.copy())
 
 
 def _restart(
@@ -236,14 +237,15 @@ def _restart(
 ) -> StructuredState:
     """Numbers left the finite range: begin again, still knowing whether something is held."""
     assert state.memory is not None
-    fresh = replace(init(config), restarts=state.restarts + 1)
+    fresh = init(config)._replace(restarts=state.restarts + 1)
     if state.memory.counts[mem.HELD]:
-        fresh = replace(fresh, waiting=(CaptureEvent(samples[0].stamp_ns, EventKind.CAPTURE),))
+        fresh = fresh._replace(waiting=(CaptureEvent(samples[0].stamp_ns, EventKind.CAPTURE),))
     return advance(config, fresh, samples[1:])
 
 
 def measurements(model: Model, samples: Sequence[Sample]) -> Array:
     """Return outputs and the angles that are not among them, (N, m)."""
     if not model.extra:
-        return np.array([sample.y for sample in samples])
-    return np.array([(*sample.y.tolist(), *(sample.angles[i] for i in model.extra)) for sample in samples])
+        return np.array([sample.y for sample in samples], dtype=np.float64)
+    return np.array([(*sample.y.tolist(), *(sample.angles[i] for i in model.extra)) for sample in samples],
+                    dtype=np.float64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +53,7 @@ def finish(config: DemoParameters, facts: Facts, folder: Path, console: Console)
     truth = known_truth(config, facts.plant, items)
     picture = folder / 'overview.png'
     # The two lowest modes are those whose change a payload shows; with the next at 50 Hz they were one line.
-    shown = [replace(estimate, modes=estimate.modes[:len(truth.before)]) for estimate in estimates]
+    shown = [estimate._replace(modes=estimate.modes[:len(truth.before)]) for estimate in estimates]
     overview_figure(collect(facts.identifier, items, shown, truth), picture, _title(config))
     console.print(f'\n{facts.samples} samples in {facts.wall_s:.2f} s, {facts.lost} lost; '
                   f'identifier callback p99 {facts.callback_p99_us:.0f} us')

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -44,9 +42,9 @@ def _arrivals(bad: list[tuple[int, str]], events: list[tuple[int, int, EventKind
         elif fault == 'swap':
             items[k - 1], items[k] = items[k], items[k - 1]
         elif fault == 'nan':
-            items[k] = [replace(record, position=np.full(4, np.nan))]
+            items[k] = [record._replace(position=np.full(4, np.nan))]
         else:
-            items[k] = [replace(record, velocity=np.empty(0))]
+            items[k] = [record._replace(velocity=np.empty(0))]
     for at, stamp_ms, kind in events:
         items.insert(min(at, len(items)), [CaptureEvent(stamp_ms * MS, kind)])
     return [item for group in items for item in group]

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -58,7 +56,7 @@ def test_joints_are_matched_by_name_in_any_order_and_extra_joints_are_ignored() 
 
 
 def test_one_stamp_from_far_ahead_costs_one_message() -> None:
-    wrong = replace(record(50), stamp_ns=record(50).stamp_ns + 10**11)
+    wrong = record(50)._replace(stamp_ns=record(50).stamp_ns + 10**11)
     for after in ([], [record(49)]):  # the next may be one that was there before
         state, samples, resets = drive([*map(record, range(50)), wrong, *after, *map(record, range(51, 100))])
         assert (resets, state.counters.resets, len(samples)) == (0, 0, 99)
@@ -166,6 +164,6 @@ def test_a_recording_shorter_than_the_learning_is_not_lost() -> None:
 
 
 def test_stamps_of_zero_are_explained() -> None:
-    state, _, _ = drive([replace(record(k), stamp_ns=0) for k in range(10)])
+    state, _, _ = drive([record(k)._replace(stamp_ns=0) for k in range(10)])
     assert state.refusal is not None
     assert 'stamps do not advance' in state.refusal.problem

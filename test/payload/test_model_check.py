@@ -201,7 +201,7 @@ def torques_read_too_high(seconds: float = 3.9) -> list[JointRecord]:
     plant = PlantParameters(payload_mass=20.0, snr_db=25.0, arm=ARM, seed=3, initial_angles=(0.2, 1.4))
     torque = excitation.sequence(ExcitationParameters(), round(1000 * seconds))
     made = simulator.simulate(plant, torque, (event(2.0),))
-    return [replace(one, effort=1.1 * one.effort) for one in simulator.records(made, ())]
+    return [one._replace(effort=1.1 * one.effort) for one in simulator.records(made, ())]
 
 
 def followed(late: int = 0, replayed: bool = False) -> list[Estimate]:

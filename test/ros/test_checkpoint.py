@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 from identifier_harness import CAPTURE, Live, recording, replayed
@@ -58,7 +57,7 @@ def test_a_state_of_other_parameters_or_damaged_or_old_is_not_used_and_the_node_
     ros.remove(same.node)
     old = Live(ros, checkpoint_file=str(file), payload_method='none', order=6)
     assert old.node.state.counters.received == 60
-    late = replace(recording(1)[0], stamp_ns=recording(1)[0].stamp_ns + 3600 * 10**9)
+    late = recording(1)[0]._replace(stamp_ns=recording(1)[0].stamp_ns + 3600 * 10**9)
     old.joint_states.publish(conversions.joint_state(late))
     ros.wait(lambda: old.node.state.counters.received == 1, what='a fresh start')
     ros.remove(old.node)

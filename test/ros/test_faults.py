@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
 
 import numpy as np
 from identifier_harness import CAPTURE, START_NS, Live, recording, replayed
@@ -81,7 +80,7 @@ def test_one_stamp_from_far_ahead_does_not_cost_what_was_identified(ros: Ros) ->
     live = Live(ros)
     announce(ros, live)
     samples = list(recording(1500))
-    samples[900] = replace(samples[900], stamp_ns=samples[900].stamp_ns + 10**12)
+    samples[900] = samples[900]._replace(stamp_ns=samples[900].stamp_ns + 10**12)
     live.send(*samples[:899])
     live.send(*samples[899:])
     counters = live.node.state.counters
@@ -135,7 +134,7 @@ def test_a_flood_is_taken_or_counted_as_lost_to_the_last_message(ros: Ros) -> No
         live.joint_states.publish(conversions.joint_state(sample))
     ros.wait(lambda: live.node.state.timeline and live.node.meter.idle_s() > 0.5, timeout=60.0)
     last = samples[-1]
-    live.send(replace(last, stamp_ns=last.stamp_ns + 1_000_000))
+    live.send(last._replace(stamp_ns=last.stamp_ns + 1_000_000))
     node = live.node
     ros.wait(lambda: node.state.counters.received + node.losses.lost == 4001, what='every message')
     assert node.state.counters.accepted == node.state.counters.received
