@@ -28,7 +28,7 @@ from flexmanip_ros.ros.composition import Composition, foreign_arm
 from flexmanip_ros.ros.composition import arguments as composition_arguments
 from flexmanip_ros.ros.demo_progress import Progress
 from flexmanip_ros.ros.demo_result import finish
-from flexmanip_ros.ros.spin import BAD_INPUT, Interrupt, first_line, make_executor, spin
+from flexmanip_ros.ros.spin import BAD_INPUT, Interrupt, bury, first_line, make_executor, spin
 
 NAME = 'demo'
 LOOK_AROUND_S = 0.5
@@ -69,6 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refuse(str(error), FAILED)
     finally:
         rclpy.try_shutdown()
+        bury()
 
 
 def _run(config: DemoParameters, folder: Path, console: Console, interrupt: Interrupt) -> int:
