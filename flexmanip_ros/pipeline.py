@@ -8,66 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import NamedTuple
 
 from flexmanip_ros import estimator, sampling, timeline
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.identification.refinement import Answer, Job
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload.model_check import Verdict
-from flexmanip_ros.sampling import Counters
-from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Payload, Sample
+from flexmanip_ros.schedule import Due as Due
+from flexmanip_ros.schedule import Reading, instant_of, is_due, is_read_anew, is_young
+from flexmanip_ros.schedule import State as State
+from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Sample
 
 GROUP_S, LEAST, GROUP, BLOCK = 0.002, 2, 20, 256
 """Samples run through the compiled kernels at once: live those of a time [s], between least and most, so that
 none of them holds up the next for long; when replaying. The numbers are the same."""
 PATIENCE = 2000
 """Messages without a single usable one after which a replay gives up."""
-
-
-class Reading(NamedTuple):
-    """A model as it was read: its estimate, the event it came after, and the index of its instant."""
-
-    estimate: Estimate
-    since_ns: int
-    instant: int
-
-
-class Due(NamedTuple):
-    """An estimate that is due: its payload where that stands by itself, and what its model is read from."""
-
-    stamp_ns: int
-    core: estimator.Core
-    payload: Payload | None
-
-
-class State(NamedTuple):
-    """All that the identifier remembers."""
-
-    sampling: sampling.SamplingState = sampling.SamplingState()
-    timeline: timeline.Timeline | None = None
-    config: IdentifierParameters | None = None
-    """The configuration with the outputs that the messages really carry."""
-    early: tuple[CaptureEvent, ...] = ()
-    """Events that came before the first usable message."""
-    first_ns: int = 0
-    published: int = -1
-    """Index of the last publishing instant, counted from the first stamp."""
-    reading: Reading | None = None
-    """The last estimate whose model was read anew."""
-    verdicts: tuple[Verdict, ...] = ()
-    """What models read so far say of the payloads that follow."""
-    held: tuple[Sample, ...] = ()
-    """Samples still to be run, none of which an estimate waits for."""
-
-    @property
-    def counters(self) -> Counters:
-        """What became of the messages."""
-        return self.sampling.counters
-
-    def stamp_of(self, kind: EventKind) -> int | None:
-        """Return the stamp of the latest event of a kind [ns], None when there was none."""
-        return self.timeline.stamp_of(kind) if self.timeline is not None else None
 
 
 def init() -> State:
@@ -99,29 +54,33 @@ def take(config: IdentifierParameters, state: State, item: JointRecord | Capture
 
 
 def read(state: State, due: Due) -> tuple[State, Estimate]:
-    """Return the estimate that is due, its model read anew when it is time for that.
-
-    That is by ``model_rate``, and with every estimate for as long after an event as it may arrive late: so
-    any order of arrival reads models at the same stamps.
-    """
+    """Return the estimate that is due, its model read anew when it is time for that."""
     line, config, last = state.timeline, state.config, state.reading
     assert line is not None
     assert config is not None
-    settling = 2.0 * config.rewind_time + 1.0 / config.publish_rate
-    changes = (state.first_ns, *(event.stamp_ns for event in line.latest))
-    young = any(0 <= due.stamp_ns - change <= settling * 1e9 for change in changes)
-    instant = _instant(state, due.stamp_ns, config.model_rate)
-    since_ns = due.core.since_ns
-    if last is not None and not young and instant <= last.instant and last.since_ns == since_ns:
+    if last is not None and not is_read_anew(state, due):
         return state, estimator.follow(config, due.stamp_ns, last.estimate, due.payload)
     core = estimator.settle(config, due.core)
     if due.core is line.core:
         state = state._replace(timeline=line._replace(core=core))
     # while an event may still come late no verdict is given: it would depend on when that came
     estimate, verdicts = estimator.estimate(config, core, due.stamp_ns, state.sampling.dt, due.payload,
-                                            state.verdicts, compare=not young)
-    reading = Reading(estimate, since_ns, instant) if estimate.model is not None else None
+                                            state.verdicts, compare=not is_young(state, due.stamp_ns))
+    instant = instant_of(state, due.stamp_ns, config.model_rate)
+    reading = Reading(estimate, core.since_ns, instant) if estimate.model is not None else None
     return state._replace(reading=reading, verdicts=verdicts), estimate
+
+
+def adopted(state: State, read: State) -> State:
+    """Return the state knowing the model with which ``read`` has answered an earlier one.
+
+    So a model may be read elsewhere while samples go on, if this is done before a sample comes for which
+    ``schedule.awaits`` an estimate. No change where all was forgotten since.
+    """
+    if (state.timeline is None or state.config is not read.config
+            or state.counters.resets != read.counters.resets):
+        return state
+    return state._replace(reading=read.reading, verdicts=read.verdicts)
 
 
 def job(state: State) -> tuple[Job, int] | None:
@@ -202,7 +161,7 @@ def reconfigure(config: IdentifierParameters, state: State) -> State:
     state = state._replace(config=replace(config, outputs=state.config.outputs))
     if state.published < 0 or state.timeline is None:
         return state
-    last = _instant(state, state.timeline.last_ns, config.publish_rate)
+    last = instant_of(state, state.timeline.last_ns, config.publish_rate)
     return state._replace(published=last, reading=None)
 
 
@@ -238,16 +197,6 @@ def _begin(config: IdentifierParameters, state: State, first_ns: int) -> State:
     return state
 
 
-def _instant(state: State, stamp_ns: int, rate: float) -> int:
-    """Index of the instant at or before a stamp on the grid of a rate [Hz] from the first stamp on."""
-    return int((stamp_ns - state.first_ns) * rate * 1e-9 + 1e-6)
-
-
-def _is_due(state: State, stamp_ns: int) -> bool:
-    assert state.config is not None
-    return _instant(state, stamp_ns, state.config.publish_rate) > state.published
-
-
 def _hold(state: State, samples: Iterable[Sample], group: int | None) -> tuple[State, tuple[Due, ...]]:
     """Keep samples, and run what is kept: when it is many, at each publishing instant and just before one."""
     config = state.config
@@ -260,15 +209,15 @@ def _hold(state: State, samples: Iterable[Sample], group: int | None) -> tuple[S
     for sample in samples:
         line, held = state.timeline, (*state.held, sample)
         assert line is not None
-        if _is_due(state, sample.stamp_ns):
+        if is_due(state, sample.stamp_ns):
             line = timeline.advance(config, line, held, ahead=True)
             state = state._replace(
-                timeline=line, held=(), published=_instant(state, sample.stamp_ns, config.publish_rate))
+                timeline=line, held=(), published=instant_of(state, sample.stamp_ns, config.publish_rate))
             payload = estimator.payload(config, line.core, state.verdicts)
             due.append(Due(sample.stamp_ns, line.core, payload))
             continue
         state = state._replace(held=held)
-        if len(held) >= group or _is_due(state, sample.stamp_ns + dt_ns):
+        if len(held) >= group or is_due(state, sample.stamp_ns + dt_ns):
             state = _run_held(state)
         elif len(line.core.owed) >= estimator.BATCH:
             state = state._replace(timeline=line._replace(core=estimator.settle(config, line.core)))

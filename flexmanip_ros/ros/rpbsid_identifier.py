@@ -26,7 +26,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
 from std_srvs.srv import Trigger
 
-from flexmanip_ros import estimator, messages, pipeline
+from flexmanip_ros import estimator, messages, pipeline, schedule
 from flexmanip_ros.errors import CheckpointError, FlexmanipError, SignalError
 from flexmanip_ros.identification.realization import suggested_order
 from flexmanip_ros.parameters import IdentifierParameters
@@ -35,6 +35,7 @@ from flexmanip_ros.ros.conversions import JointStateReader, capture_event
 from flexmanip_ros.ros.diagnostics import ERROR, STALE, WARN, LossCounter, Meter, Report
 from flexmanip_ros.ros.encoding import Encoder
 from flexmanip_ros.ros.keeper import Keeper, too_old
+from flexmanip_ros.ros.model_reader import ModelReader
 from flexmanip_ros.ros.node import FlexmanipNode, sequence_number, with_info
 from flexmanip_ros.ros.spin import run
 from flexmanip_ros.ros.warm_up import warm_up
@@ -69,6 +70,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self._keeper: Keeper | None = None
         self._resumed = False
         self._worker: Worker | None = None
+        self._models: ModelReader | None = None
 
     def make_entities(self) -> None:
         """Publishers, subscriptions and the reset service."""
@@ -100,25 +102,29 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self.get_logger().info(f'resumed after {state.counters.accepted} samples')
 
     def activated(self) -> None:
-        """Have a thread for the fits, and cores that are awake."""
-        self._worker = Worker()
+        """Have a thread for the fits and one for reading models, and cores that are awake."""
+        self._worker, self._models = Worker(), ModelReader()
         self.real_time.stay_awake()
 
     def deactivated(self) -> None:
         """Save what is known."""
         self.real_time.stay_awake(False)
-        if self._worker is not None:
-            self._worker.close()
-            self._worker = None
+        self._conclude()
+        for helper in (self._worker, self._models):
+            if helper is not None:
+                helper.close()
+        self._worker = self._models = None
         if self._keeper is not None:
             self._keeper.finish()
             self._keeper.save(self.config, self.state)
 
     def configuration_changed(self, config: IdentifierParameters) -> None:
         """Go on with what may change at run time."""
+        self._conclude()
         self.state = pipeline.reconfigure(config, self.state)
 
     def _forget(self) -> None:
+        self._conclude()
         self.state = pipeline.init()
         self.estimate = None
 
@@ -158,6 +164,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def _take(self, item: JointRecord | CaptureEvent) -> None:
         """One step; whatever is wrong with the message is said and counted, and the node goes on."""
+        self._conclude(item)
         dropped = self.state.counters.dropped
         try:
             self.state, due = pipeline.take(self.config, self.state, item)
@@ -169,14 +176,37 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self.complain(refusal.reason, f'message dropped: {refusal.problem}; {refusal.remedy}')
         for one in due:  # the payload first: nobody should wait for it while a model is read
             self._publish(messages.outgoing_payload(one.payload, one.stamp_ns, self.config.payload_frame))
-            self.state, estimate = pipeline.read(self.state, one)
-            if one.payload is None:
-                self._publish(messages.outgoing_payload(
-                    estimate.payload, one.stamp_ns, self.config.payload_frame))
-            self._publish(messages.outgoing_model(estimate))
-            self.estimate = estimate
+            self._conclude()
+            if self._models is not None and schedule.is_read_anew(self.state, one):
+                self._models.ask(self.state, one, self._model_is_there)
+            else:
+                self.state, estimate = pipeline.read(self.state, one)
+                self._tell(estimate)
         if self._worker is not None:
             self.state = self._worker.attend(self.state, published=bool(due))
+
+    def _model_is_there(self) -> None:
+        """Have the executor publish it; on the thread of the reader."""
+        if self.executor is not None:
+            self.executor.create_task(self._conclude_done)
+
+    def _conclude_done(self) -> None:
+        if self._models is not None and self._models.done:
+            self._conclude()
+
+    def _conclude(self, before: JointRecord | CaptureEvent | None = None) -> None:
+        """Take the model under way, if there is one and it is ready, or must be taken before that."""
+        if self._models is not None and self._models.ready(self.state, before):
+            self.state, estimate = self._models.take(self.state)
+            self._tell(estimate)
+
+    def _tell(self, estimate: Estimate) -> None:
+        """Publish what is new in an estimate and has not gone out ahead of it."""
+        if self.config.payload_method == 'block':
+            self._publish(messages.outgoing_payload(
+                estimate.payload, estimate.stamp_ns, self.config.payload_frame))
+        self._publish(messages.outgoing_model(estimate))
+        self.estimate = estimate
 
     def _publish(self, values: Iterable[tuple[str, messages.Value]]) -> None:
         for name, value in values:

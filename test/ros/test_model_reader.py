@@ -1,0 +1,78 @@
+"""Models read on a thread while samples go on: the same bits, and none of a time that was forgotten."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+
+import pytest
+from test_worker import CAPTURE, said
+
+from flexmanip_ros import pipeline, schedule
+from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
+from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.ros.model_reader import ModelReader
+from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord
+
+CONFIG = IdentifierParameters()
+
+
+def recording(count: int = 900) -> list[JointRecord | CaptureEvent]:
+    efforts = excitation.sequence(ExcitationParameters(), count)
+    made = simulator.simulate(PlantParameters(), efforts, (CAPTURE,))
+    return list(simulator.records(made, (CAPTURE,)))
+
+
+def live(items: Iterable[JointRecord | CaptureEvent], pause: float) -> list[Estimate]:
+    """Go on with the samples while models are read, as the node does; some come slowly, some at once."""
+    reader, state, estimates, asked = ModelReader(), pipeline.init(), [], 0
+    try:
+        for k, item in enumerate(items):
+            if k % 3 == 0:
+                time.sleep(pause)
+            if reader.ready(state, item):
+                state, estimate = reader.take(state)
+                estimates.append(estimate)
+            state, due = pipeline.take(CONFIG, state, item)
+            for one in due:
+                if reader.ready(state, None):
+                    state, estimate = reader.take(state)
+                    estimates.append(estimate)
+                if schedule.is_read_anew(state, one):
+                    reader.ask(state, one, lambda: None)
+                    asked += 1
+                else:
+                    state, estimate = pipeline.read(state, one)
+                    estimates.append(estimate)
+        if reader.ready(state, None):
+            estimates.append(reader.take(state)[1])
+    finally:
+        reader.close()
+    assert asked > 20
+    return estimates
+
+
+@pytest.mark.parametrize('pause', [0.0, 0.0005])
+def test_models_read_meanwhile_are_those_of_the_replay_bit_for_bit(pause: float) -> None:
+    items = recording()
+    late = [*items[:540], CaptureEvent(CAPTURE.stamp_ns + 50_000_000, CAPTURE.kind), *items[540:]]
+    for run in (items, late):
+        replayed = list(pipeline.run(CONFIG, run))
+        assert [said(estimate) for estimate in live(run, pause)] == [said(one) for one in replayed]
+
+
+def test_a_model_of_before_a_reset_is_not_taken_for_one_of_after_it() -> None:
+    items = recording(600)
+    state = pipeline.init()
+    for item in items[:500]:
+        state, due = pipeline.take(CONFIG, state, item)
+        for one in due:
+            state, _ = pipeline.read(state, one)
+    again = [item._replace(stamp_ns=item.stamp_ns - 10**10) for item in items
+             if isinstance(item, JointRecord)]
+    after = state
+    for item in again[:50]:
+        after, _ = pipeline.take(CONFIG, after, item)
+    assert state.reading is not None
+    assert pipeline.adopted(after, state) is after
+    assert pipeline.adopted(pipeline.init(), state) == pipeline.init()
