@@ -134,6 +134,7 @@ class Composition:
         sent, recorder, identifier = self.plant.samples, self.recorder, self.identifier
         return bool(recorder.joint_states + recorder.losses.lost >= sent
                     and identifier.state.counters.received + identifier.losses.lost >= sent
+                    and not identifier.is_reading
                     and sum(map(len, recorder.said.values())) >= identifier.published)
 
     def facts(self) -> Facts:

@@ -28,7 +28,16 @@ from flexmanip_ros.ros.composition import Composition, foreign_arm
 from flexmanip_ros.ros.composition import arguments as composition_arguments
 from flexmanip_ros.ros.demo_progress import Progress
 from flexmanip_ros.ros.demo_result import finish
-from flexmanip_ros.ros.spin import BAD_INPUT, Interrupt, bury, first_line, make_executor, spin
+from flexmanip_ros.ros.spin import (
+    BAD_INPUT,
+    FAREWELL_S,
+    Interrupt,
+    bury,
+    first_line,
+    make_executor,
+    spin,
+    time_limit,
+)
 
 NAME = 'demo'
 LOOK_AROUND_S = 0.5
@@ -68,8 +77,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except FlexmanipError as error:
         return _refuse(str(error), FAILED)
     finally:
-        rclpy.try_shutdown()
-        bury()
+        with time_limit(FAREWELL_S):
+            rclpy.try_shutdown()
+            bury()
 
 
 def _run(config: DemoParameters, folder: Path, console: Console, interrupt: Interrupt) -> int:

@@ -185,6 +185,11 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         if self._worker is not None:
             self.state = self._worker.attend(self.state, published=bool(due))
 
+    @property
+    def is_reading(self) -> bool:
+        """Whether a model has still to be published."""
+        return self._models is not None and self._models.ready(self.state, None)
+
     def _model_is_there(self) -> None:
         """Have the executor publish it; on the thread of the reader."""
         if self.executor is not None:
