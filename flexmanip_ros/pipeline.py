@@ -16,7 +16,7 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.schedule import Due as Due
 from flexmanip_ros.schedule import Reading, instant_of, is_due, is_read_anew, is_young
 from flexmanip_ros.schedule import State as State
-from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Sample
+from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, Sample
 
 GROUP_S, LEAST, GROUP, BLOCK = 0.002, 2, 20, 256
 """Samples run through the compiled kernels at once: live those of a time [s], between least and most, so that
@@ -69,6 +69,14 @@ def read(state: State, due: Due) -> tuple[State, Estimate]:
     instant = instant_of(state, due.stamp_ns, config.model_rate)
     reading = Reading(estimate, core.since_ns, instant) if estimate.model is not None else None
     return state._replace(reading=reading, verdicts=verdicts), estimate
+
+
+def payload(state: State) -> tuple[Payload | None, int]:
+    """Return the payload as of the last sample run, where it stands by itself, and its stamp [ns]."""
+    line, config = state.timeline, state.config
+    assert line is not None
+    assert config is not None
+    return estimator.payload(config, line.core, state.verdicts), line.last_ns
 
 
 def adopted(state: State, read: State) -> State:

@@ -92,3 +92,10 @@ def is_read_anew(state: State, due: Due) -> bool:
 def awaits(state: State, stamp_ns: int) -> bool:
     """Whether an estimate is due once a sample of this stamp [ns] has come."""
     return state.config is not None and state.timeline is not None and is_due(state, stamp_ns)
+
+
+def is_next_due(state: State) -> bool:
+    """Whether an estimate is to be expected with the next sample, and all before it has been run."""
+    line = state.timeline
+    return (line is not None and not state.held and line.last_ns != timeline.BEFORE_ALL
+            and awaits(state, line.last_ns + int(state.sampling.dt * 1e9)))

@@ -14,7 +14,6 @@ services    rpbsid_identifier/reset   std_srvs/Trigger   forget everything
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Iterable
 from functools import partial
@@ -28,19 +27,19 @@ from std_srvs.srv import Trigger
 
 from flexmanip_ros import estimator, messages, pipeline, schedule
 from flexmanip_ros.errors import CheckpointError, FlexmanipError, SignalError
-from flexmanip_ros.identification.realization import suggested_order
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, capture_event
 from flexmanip_ros.ros.diagnostics import ERROR, STALE, WARN, LossCounter, Meter, Report
 from flexmanip_ros.ros.encoding import Encoder
+from flexmanip_ros.ros.estimate_report import report_estimate
 from flexmanip_ros.ros.keeper import Keeper, too_old
 from flexmanip_ros.ros.model_reader import ModelReader
 from flexmanip_ros.ros.node import FlexmanipNode, sequence_number, with_info
 from flexmanip_ros.ros.spin import run
 from flexmanip_ros.ros.warm_up import warm_up
 from flexmanip_ros.ros.worker import Worker
-from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Status
+from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord
 
 NAME = 'rpbsid_identifier'
 _TOPICS = (
@@ -182,8 +181,20 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             else:
                 self.state, estimate = pipeline.read(self.state, one)
                 self._tell(estimate)
+        if not due and schedule.is_next_due(self.state):
+            self._rehearse()
         if self._worker is not None:
             self.state = self._worker.attend(self.state, published=bool(due))
+
+    def _rehearse(self) -> None:
+        """Work out what is to be said of the payload a sample ahead, and say it to nobody.
+
+        What runs at the publishing rate alone is in no cache when somebody waits for it, and takes ten times
+        as long as in a loop: 0.03 ms of the time from a sample to its estimate.
+        """
+        payload, stamp_ns = pipeline.payload(self.state)
+        for _, value in messages.outgoing_payload(payload, stamp_ns, self.config.payload_frame):
+            self._encoded(value)
 
     @property
     def is_reading(self) -> bool:
@@ -254,32 +265,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             report.worse(WARN, f'{counters.dropped} messages dropped')
         if not several and self.losses.lost:
             report.worse(WARN, f'{self.losses.lost} messages lost')
-        self._report_estimate(report)
-
-    def _report_estimate(self, report: Report) -> None:
-        estimate = self.estimate
-        status = Status.WARMING_UP if estimate is None else estimate.status
-        payload = None if estimate is None else estimate.payload
-        report.values['status'] = status.name
-        model = Status.WARMING_UP if estimate is None else estimate.model_status
-        report.values['model_status'] = model.name
-        report.values['converged'] = status in (Status.TRACKING, Status.NO_PAYLOAD_METHOD)
-        report.values['consistent'] = payload is None or payload.status is not Status.INCONSISTENT
-        if status not in (Status.TRACKING, Status.WARMING_UP, Status.NO_PAYLOAD_METHOD):
-            report.worse(WARN, status.value)
-        if estimate is None:
-            return
-        report.values.update(
-            excitation=estimate.excitation, condition=estimate.condition,
-            innovation_power=estimate.innovation_power, modes_deviation=estimate.modes_deviation)
-        if estimate.singular_values is not None:
-            report.values['order'] = self.config.order
-            report.values['suggested_order'] = suggested_order(estimate.singular_values)
-            report.values['singular_values'] = ' '.join(f'{value:.4g}' for value in estimate.singular_values)
-        if payload is not None:
-            report.values.update(
-                payload_mass_kg=payload.mass, payload_std_kg=payload.std,
-                consistency=payload.consistency if payload.consistency is not None else math.nan)
+        report_estimate(report, self.estimate, self.config.order)
 
 
 def main(argv: list[str] | None = None) -> int:
