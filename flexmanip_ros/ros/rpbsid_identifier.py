@@ -59,7 +59,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         super().__init__(NAME, IdentifierParameters, context=context, overrides=overrides,
                          namespace=namespace, cli_args=cli_args)
         self.state = pipeline.init()
-        self.estimate: Estimate | None = None
+        self._read: Estimate | None = None
+        self._followed: pipeline.Due | None = None
         self.refused = 0
         self.published = 0
         self.losses = LossCounter()
@@ -125,7 +126,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
     def _forget(self) -> None:
         self._conclude()
         self.state = pipeline.init()
-        self.estimate = None
+        self._read = self._followed = None
 
     def _on_joint_states(self, raw: bytes, info: object) -> None:
         if not self.active:
@@ -178,9 +179,11 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self._conclude()
             if self._models is not None and schedule.is_read_anew(self.state, one):
                 self._models.ask(self.state, one, self._model_is_there)
-            else:
+            elif one.payload is None:
                 self.state, estimate = pipeline.read(self.state, one)
                 self._tell(estimate)
+            else:
+                self._followed = one  # all there is to say of it has been said
         if not due and schedule.is_next_due(self.state):
             self._rehearse()
         if self._worker is not None:
@@ -222,7 +225,15 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self._publish(messages.outgoing_payload(
                 estimate.payload, estimate.stamp_ns, self.config.payload_frame))
         self._publish(messages.outgoing_model(estimate))
-        self.estimate = estimate
+        self._read, self._followed = estimate, None
+
+    @property
+    def estimate(self) -> Estimate | None:
+        """The latest estimate, put together when it is asked for."""
+        last, due = self._read, self._followed
+        if last is None or due is None:
+            return last
+        return estimator.follow(self.config, due.stamp_ns, last, due.payload)
 
     def _publish(self, values: Iterable[tuple[str, messages.Value]]) -> None:
         for name, value in values:
