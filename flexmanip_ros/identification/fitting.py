@@ -181,7 +181,7 @@ def refine(
     if refinement.is_fit_due(refined):
         refined = refinement.ask_fit(refined, R, scale, int(stamps_ns[-1]))
     elif refinement.is_block_due(refined):
-        refined = refinement.ask_block(refined)
+        refined = refinement.ask_block(refined, int(stamps_ns[-1]))
     return refined
 
 

@@ -31,6 +31,8 @@ DELAY = 4
 SOONEST = 128
 SOONEST_S, EACH_S = 0.1, 2e-4
 """Nor sooner than this, nor than so much for each of its samples [s]: at 1 kHz that is less."""
+BLOCK_S = 0.06
+"""A block is taken so much later [s], at least CHUNK and at most BLOCK samples."""
 LATEST = 4096
 """Nor later than this: what is kept meanwhile is bounded, at any rate."""
 PARAMETERS = 80
@@ -135,9 +137,14 @@ def patience(refined: Refined, now_ns: int) -> int:
     From the stamps of the stretch, so that a replay waits as long as the live node.
     """
     count = refined.total
-    spacing = max(now_ns - refined.since_ns, 0) * 1e-9 / (count - 1)
-    needed = max(SOONEST_S, EACH_S * count) / spacing if spacing > 0.0 else 0.0
-    return max(SOONEST, count // DELAY, CHUNK * math.ceil(min(needed, LATEST) / CHUNK))
+    needed = _chunks(refined, now_ns, max(SOONEST_S, EACH_S * count), LATEST)
+    return max(SOONEST, count // DELAY, needed)
+
+
+def _chunks(refined: Refined, now_ns: int, duration: float, most: int) -> int:
+    """Samples, a multiple of CHUNK, that take a time [s] by the stamps since ``since_ns``; 0 where unknown."""
+    spacing = max(now_ns - refined.since_ns, 0) * 1e-9 / (refined.total - 1)
+    return CHUNK * math.ceil(min(duration / spacing, most) / CHUNK) if spacing > 0.0 else 0
 
 
 def ask_fit(refined: Refined, R: Array, scale: Array, now_ns: int = 0) -> Refined:
@@ -147,11 +154,12 @@ def ask_fit(refined: Refined, R: Array, scale: Array, now_ns: int = 0) -> Refine
     return refined._replace(job=job, due=refined.total + patience(refined, now_ns))
 
 
-def ask_block(refined: Refined) -> Refined:
+def ask_block(refined: Refined, now_ns: int = 0) -> Refined:
     """Ask for an update by the oldest block that the fit has not seen."""
     first = refined.seen // CHUNK
     job = Job(refined.chunks[first:first + BLOCK // CHUNK], None, None, refined.recursion)
-    return refined._replace(job=job, due=refined.total + CHUNK)
+    later = max(CHUNK, _chunks(refined, now_ns, BLOCK_S, BLOCK))
+    return refined._replace(job=job, due=refined.total + later)
 
 
 def deliver(refined: Refined, answer: Answer) -> Refined:
