@@ -16,8 +16,9 @@ class ModelReader:
     taken.
     """
 
-    def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(1, 'model')
+    def __init__(self, begin: Callable[[], object] = lambda: None) -> None:
+        """begin: called first on the thread."""
+        self._pool = ThreadPoolExecutor(1, 'model', initializer=begin)
         self._future: Future[tuple[pipeline.State, Estimate]] | None = None
 
     def ask(self, state: pipeline.State, due: pipeline.Due, done: Callable[[], object]) -> None:

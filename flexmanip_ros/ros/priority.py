@@ -5,6 +5,7 @@ With ordinary scheduling a woken thread may wait for milliseconds behind whateve
 
 from __future__ import annotations
 
+import contextlib
 import os
 
 LOWEST, HIGHEST = 0, 99
@@ -19,12 +20,25 @@ def take(priority: int) -> str:
     if priority == 0:
         return ''
     try:
-        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
         for thread in os.listdir('/proc/self/task'):
-            os.sched_setscheduler(int(thread), policy, os.sched_param(priority))
+            _set(int(thread), priority)
     except (AttributeError, OSError) as error:
         return error.strerror or str(error) if isinstance(error, OSError) else 'not on this system'
     return ''
+
+
+def join(priority: int) -> None:
+    """Give the calling thread SCHED_FIFO just below ``priority``, for a process that has it.
+
+    For a thread that the others will wait for, but not at once.
+    """
+    if priority > 0:
+        with contextlib.suppress(AttributeError, OSError):
+            _set(0, max(priority - 1, 1))
+
+
+def _set(thread: int, priority: int) -> None:
+    os.sched_setscheduler(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
 
 
 def current() -> int:

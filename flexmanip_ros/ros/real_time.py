@@ -26,7 +26,7 @@ class RealTime:
             'wake_latency', wake_latency, UNASKED, LONGEST,
             'time within which the cores of the processor must wake while samples come, where the system '
             'permits to ask for it (PM QoS) [us]; 0: they do not sleep, -1: as they like'))
-        self._refused = False
+        self._taken = self._refused = False
 
     def _declared(self, name: str, default: int, lowest: int, highest: int, words: str) -> int:
         descriptor = ParameterDescriptor(description=words, read_only=True, integer_range=[
@@ -36,10 +36,16 @@ class RealTime:
     def take_priority(self) -> None:
         """Take the priority, for this whole process."""
         refused = priority.take(self._priority)
+        self._taken = not refused
         if refused:
             self._node.get_logger().info(
                 f'ordinary scheduling: real-time priority {self._priority} was refused ({refused}); '
                 'permit it (docs/nodes.md), or set thread_priority to 0')
+
+    def join(self) -> None:
+        """Give the calling thread the priority that comes next to this, if it was taken."""
+        if self._taken:
+            priority.join(self._priority)
 
     def stay_awake(self, wanted: bool = True) -> None:
         """Ask for cores that wake in time, or no longer."""

@@ -103,7 +103,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def activated(self) -> None:
         """Have a thread for the fits and one for reading models, and cores that are awake."""
-        self._worker, self._models = Worker(), ModelReader()
+        self._worker, self._models = Worker(), ModelReader(self.real_time.join)
         self.real_time.stay_awake()
 
     def deactivated(self) -> None:
