@@ -18,6 +18,7 @@ from flexmanip_ros import detection_kernel as kernel
 from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
 from flexmanip_ros.payload import memory as mem
 from flexmanip_ros.payload import structured
+from flexmanip_ros.plant.compiled import Prepared
 from flexmanip_ros.types import CaptureEvent, EventKind, Sample
 
 SETTLE = 0.5
@@ -30,6 +31,7 @@ INDEPENDENT = 0.5
 """Samples a look that is as good as independent, over all onsets of the window (for the false alarms)."""
 SPEED, ACCELERATION, JERK = 0.3, 5.0, 200.0
 """Prior deviations of what the tip's light mass would gain: impulse [m/s], step [m/s^2], ramp [m/s^3]."""
+watch_samples = Prepared(kernel.watch_samples, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,10 +140,10 @@ def _watch(
     m = mem.copy(filtered.memory)
     watch = kernel.Watch._make(part.copy() for part in watch)
     stamps = np.array([filtered.last_ns] + [sample.stamp_ns for sample in samples])
-    efforts = np.array([filtered.effort] + [sample.u for sample in samples])
+    efforts = np.array([filtered.effort, *(sample.u for sample in samples)], dtype=np.float64)
     confirm = round(CONFIRM / state.dt)
     light = filtered.model.motion.scale
-    taken = kernel.watch_samples(
+    taken = watch_samples(
         filtered.model.motion, filtered.sensors, m, watch, light * np.array([SPEED, ACCELERATION, JERK]),
         state.dt, float(np.exp(-state.dt / PEAK_MEMORY)), round(SETTLE / state.dt), confirm,
         np.diff(stamps) * 1e-9, efforts[:-1], structured.measurements(filtered.model, samples),

@@ -142,7 +142,7 @@ def patience(refined: Refined, now_ns: int) -> int:
 
 
 def _chunks(refined: Refined, now_ns: int, duration: float, most: int) -> int:
-    """Samples, a multiple of CHUNK, that take a time [s] by the stamps since ``since_ns``; 0 where unknown."""
+    """Samples, a multiple of CHUNK, that come in a time [s], by the stamps so far; 0 where unknown."""
     spacing = max(now_ns - refined.since_ns, 0) * 1e-9 / (refined.total - 1)
     return CHUNK * math.ceil(min(duration / spacing, most) / CHUNK) if spacing > 0.0 else 0
 

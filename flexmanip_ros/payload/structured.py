@@ -245,7 +245,6 @@ def _restart(
 
 def measurements(model: Model, samples: Sequence[Sample]) -> Array:
     """Return outputs and the angles that are not among them, (N, m)."""
-    if not model.extra:
-        return np.array([sample.y for sample in samples], dtype=np.float64)
-    return np.array([(*sample.y.tolist(), *(sample.angles[i] for i in model.extra)) for sample in samples],
-                    dtype=np.float64)
+    rows = ([sample.y for sample in samples] if not model.extra else
+            [(*sample.y.tolist(), *(sample.angles[i] for i in model.extra)) for sample in samples])
+    return np.array(rows, dtype=np.float64).reshape(len(samples), len(model.roles))
