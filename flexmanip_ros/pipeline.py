@@ -18,7 +18,7 @@ from flexmanip_ros.schedule import Reading, instant_of, is_due, is_read_anew, is
 from flexmanip_ros.schedule import State as State
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, Sample
 
-GROUP_S, LEAST, GROUP, BLOCK = 0.002, 2, 20, 256
+GROUP_S, LEAST, GROUP, BLOCK = 0.003, 2, 20, 256
 """Samples run through the compiled kernels at once: live those of a time [s], between least and most, so that
 none of them holds up the next for long; when replaying. The numbers are the same."""
 PATIENCE = 2000
