@@ -57,7 +57,11 @@ def advance(config: IdentifierParameters, core: Core, samples: Sequence[Sample])
 
 
 def payload_ahead(config: IdentifierParameters, core: Core, samples: Sequence[Sample]) -> Core:
-    """Run samples through the payload's estimator alone: the identifier owes them, see ``settle``."""
+    """Run samples through the payload's estimator alone: the identifier owes them, see ``settle``.
+
+    Where every sample is awaited, it still has to take those before.
+    """
+    core = settle(config, core) if len(core.owed) >= MOST_OWED else core
     held = core.structured
     if held is not None:
         held = structured.advance(config, held, samples)

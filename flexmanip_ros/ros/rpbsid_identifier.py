@@ -230,7 +230,9 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
     @property
     def estimate(self) -> Estimate | None:
         """The latest estimate, put together when it is asked for."""
-        last, due = self._read, self._followed
+        last, due, reading = self._read, self._followed, self.state.reading
+        if last is None and reading is not None:
+            last = reading.estimate  # of before it was resumed
         if last is None or due is None:
             return last
         return estimator.follow(self.config, due.stamp_ns, last, due.payload)

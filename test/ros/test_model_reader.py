@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from dataclasses import replace
 
 import pytest
 from test_worker import CAPTURE, said
 
 from flexmanip_ros import pipeline, schedule
+from flexmanip_ros.estimator import MOST_OWED
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.plant import excitation, simulator
 from flexmanip_ros.ros.model_reader import ModelReader
@@ -23,7 +25,8 @@ def recording(count: int = 900) -> list[JointRecord | CaptureEvent]:
     return list(simulator.records(made, (CAPTURE,)))
 
 
-def live(items: Iterable[JointRecord | CaptureEvent], pause: float) -> list[Estimate]:
+def live(items: Iterable[JointRecord | CaptureEvent], pause: float,
+         config: IdentifierParameters = CONFIG) -> list[Estimate]:
     """Go on with the samples while models are read, as the node does; some come slowly, some at once."""
     reader, state, estimates, asked = ModelReader(), pipeline.init(), [], 0
     try:
@@ -33,7 +36,8 @@ def live(items: Iterable[JointRecord | CaptureEvent], pause: float) -> list[Esti
             if reader.ready(state, item):
                 state, estimate = reader.take(state)
                 estimates.append(estimate)
-            state, due = pipeline.take(CONFIG, state, item)
+            state, due = pipeline.take(config, state, item)
+            assert state.timeline is None or len(state.timeline.core.owed) <= MOST_OWED + pipeline.GROUP
             for one in due:
                 if reader.ready(state, None):
                     state, estimate = reader.take(state)
@@ -59,6 +63,14 @@ def test_models_read_meanwhile_are_those_of_the_replay_bit_for_bit(pause: float)
     for run in (items, late):
         replayed = list(pipeline.run(CONFIG, run))
         assert [said(estimate) for estimate in live(run, pause)] == [said(one) for one in replayed]
+
+
+@pytest.mark.parametrize('rate', [1000.0, 500.0])
+def test_an_estimate_with_every_sample_is_that_of_the_replay_and_nothing_piles_up(rate: float) -> None:
+    config = replace(CONFIG, publish_rate=rate)
+    items = recording(700)
+    replayed = pipeline.run(config, items)
+    assert [said(one) for one in live(items, 0.0, config)] == [said(one) for one in replayed]
 
 
 def test_a_model_of_before_a_reset_is_not_taken_for_one_of_after_it() -> None:
