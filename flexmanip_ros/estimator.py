@@ -15,7 +15,7 @@ from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, model_check, structured
 from flexmanip_ros.payload.block_extraction import NOWHERE
-from flexmanip_ros.payload.model_check import Verdict
+from flexmanip_ros.payload.model_comparison import Verdict
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, Payload, Sample, Status
 
 BATCH, MOST_OWED = 8, 64

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from flexmanip_ros import estimator, sampling, timeline
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload.model_check import Verdict
+from flexmanip_ros.payload.model_comparison import Verdict
 from flexmanip_ros.sampling import Counters
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, Payload, Sample
 

@@ -10,63 +10,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import memory as mem
-from flexmanip_ros.payload.arm_modes import ArmModes, arm_modes
-from flexmanip_ros.payload.identified_drive import drive
-from flexmanip_ros.payload.motion_kernel import PARAMETERS
-from flexmanip_ros.payload.signals import Quantity
+from flexmanip_ros.payload.model_comparison import Verdict, compare
 from flexmanip_ros.payload.structured import StructuredState
 from flexmanip_ros.payload.structured_judgement import QUANTILE
-from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import Array, Mode, Payload, Sample, Status
 
 EVERY = 32
 """Of so many samples one tells where the arm is."""
 LEAST = 1000.0
 """Samples behind a fit that is compared."""
-ANOTHER = 0.2
-"""Relative distance beyond which an identified frequency is that of another mode."""
-DEVIATIONS = 4.0
-"""Standard deviations that the two may differ by, and beside them what no deviation knows:"""
-FREQUENCY, DRIVE = 0.006, 0.035
-"""relative errors of frequencies and drives of a few modes where an arm has many,"""
-FREQUENCY_MOVED, DRIVE_MOVED, STILL = 0.1, 5.0, 0.045
-"""and what is added for each radian that the arm turned, to drives beyond STILL [rad]."""
-VAGUE = 0.02
-"""Relative deviation of a drive beyond which it is not compared: it is biased by far more than that."""
-STEP = 1e-4
-"""Of derivatives by the logarithms of payload and stiffness."""
-PAYLOADS = np.concatenate([[0.0], np.geomspace(1e-3, 1e4, 71)])
-"""Payloads whose frequencies are looked at, over the lightest tip mass."""
-AGREES = 0.5
-"""Deviation below which a model ends what was found of the arm before."""
 BELIEVED = (Status.TRACKING, Status.POORLY_EXCITED, Status.INCONSISTENT)
-
-
-class Verdict(NamedTuple):
-    """What a model says of the payload that was estimated without it."""
-
-    at: int
-    """Stamp at which the model was read [ns]."""
-    since: int
-    """Stamp of the event that model and payload date from [ns]."""
-    held: bool
-    """Whether the arm was to hold something."""
-    deviation: float
-    """Largest difference over what is tolerated: beyond 1 they disagree."""
-    doubt: float = 0.0
-    """Relative error of the arm's inertia that the drive of the modes shows; 0 where that agrees."""
-    lower: float = math.inf
-    upper: float = -math.inf
-    """Payloads [kg] at which the arm has the frequencies; no limits where those agree."""
-    clears: bool = False
-    """Whether it agrees so well in all of it that what was found of the empty arm is over."""
 
 
 def sweep(before: Array, samples: Sequence[Sample], relative: bool) -> Array:
@@ -115,7 +74,7 @@ def check(config: IdentifierParameters, state: StructuredState | None, payload: 
             or payload.status not in BELIEVED):
         return None
     try:
-        found = _compare(config, state.model, state.memory, payload, swept, identified, modes)
+        found = compare(config, state.model, state.memory, payload, swept, identified, modes)
     except np.linalg.LinAlgError:
         return None
     return found if found is None else found._replace(at=at, since=since)
@@ -146,128 +105,3 @@ def apply(state: StructuredState, payload: Payload, verdicts: tuple[Verdict, ...
         lower, upper = min(lower, own.lower), max(upper, own.upper)
     return payload._replace(std=std, status=Status.INCONSISTENT,
                    lower=max(0.0, min(payload.lower, lower)), upper=max(payload.upper, upper))
-
-
-def _compare(config: IdentifierParameters, model: Model, m: mem.Memory, payload: Payload, swept: Array,
-             identified: Identified, modes: Sequence[Mode]) -> Verdict | None:
-    """Compare frequencies and drives."""
-    learned = m.x.size - PARAMETERS + np.arange(3)
-    cosines = _configurations(config, model, m, swept)
-    count = cosines.size
-    arm = _predicted(config, model, m, np.append(cosines, cosines[:1].repeat(3)),
-                     np.vstack([np.zeros((count, 3)), STEP * np.eye(3)]))
-    spread = m.S[learned].copy()
-    known = float(np.linalg.norm(spread[0]))
-    if m.counts[mem.HELD] and known > 0.0 and payload.mass > 0.0:
-        spread[0] *= max(1.0, payload.std / payload.mass / known)
-    nearest = _matched(arm.frequency[0], modes)
-    if nearest is None:
-        return None
-    turned = math.acos(max(swept[0], -1.0)) - math.acos(min(swept[1], 1.0))
-    moved = max(turned, float(swept[3] - swept[2]))
-
-    here = arm.frequency[0, :2]
-    found = np.array([modes[k].frequency_hz / math.sqrt(1.0 - modes[k].damping_ratio ** 2) for k in nearest])
-    noise = np.array([modes[k].frequency_std_hz for k in nearest]) / here
-    by_learned = (arm.frequency[count:, :2] / here - 1.0).T / STEP @ spread
-    band = arm.frequency[:count, :2]
-    off = (found - np.clip(found, band.min(axis=0), band.max(axis=0))) / here
-    allowed = FREQUENCY + FREQUENCY_MOVED * moved + DEVIATIONS * np.hypot(
-        noise, np.linalg.norm(by_learned, axis=1))
-    deviation = float(np.max(np.abs(off) / allowed))
-    lower, upper, doubt, whole = math.inf, -math.inf, 0.0, False
-    if deviation > 1.0:
-        lower, upper = _payloads(config, model, m, cosines, found, allowed, np.abs(off) > allowed)
-
-    rows = _bend_rows(model, len(config.outputs))
-    if rows is not None:
-        index, links, rates = rows
-        # sums over modes and bend sensors, weighted so that those of the arm here are one
-        parts = arm.drive[:, links]
-        seen = parts.sum(axis=2)
-        weights = seen[0] / np.maximum((seen[0] ** 2).sum(axis=0), np.finfo(float).tiny)
-        sums = (weights * seen).sum(axis=1)
-        cancelled = (np.abs(weights) * np.abs(parts[0]).sum(axis=1)).sum(axis=0)  # 1: no part against another
-        value, noise = drive(identified, np.array(nearest), index, rates, weights)
-        by_learned = (sums[count:] - 1.0).T / STEP @ spread
-        off = value - np.clip(value, sums[:count].min(axis=0), sums[:count].max(axis=0))
-        allowed = cancelled * (DRIVE + DRIVE_MOVED * max(0.0, moved - STILL)) + DEVIATIONS * np.hypot(
-            noise, np.linalg.norm(by_learned, axis=1))
-        excess = np.where(noise < VAGUE, np.abs(off) / allowed, 0.0)
-        if excess.max() > 1.0:
-            doubt = float(np.max(np.abs(off)[excess > 1.0]))
-        deviation, whole = max(deviation, float(excess.max())), bool(np.all(noise < VAGUE))
-    if not math.isfinite(deviation):
-        return None
-    return Verdict(0, 0, bool(m.counts[mem.HELD]), deviation, doubt, lower, upper,
-                   clears=whole and deviation < AGREES)
-
-
-def _configurations(config: IdentifierParameters, model: Model, m: mem.Memory, swept: Array) -> Array:
-    """Return cosines between the links: now, and those between which the arm was since the event."""
-    point = config.payload.working_point
-    if model.motion.frozen and len(point) == 2:
-        return np.array([math.cos(point[1] - point[0])])
-    between = [0.0] if swept[0] < 0.0 < swept[1] else []  # frequencies depend on the square
-    return np.array([math.cos(m.x[1] - m.x[0]), swept[0], swept[1], *between])
-
-
-def _predicted(config: IdentifierParameters, model: Model, m: mem.Memory, cosines: Array, steps: Array,
-               masses: Array | None = None) -> ArmModes:
-    """Return the modes of the arm as learned; steps: (j, 3) away from what is known, as logarithms."""
-    n, h = model.motion.q.size, model.motion.q.size - 2
-    p = m.x.size - PARAMETERS
-    uneven = np.zeros((2, h // 2))
-    uneven[:, 1:] = m.x[2 * n:p].reshape(2, -1)
-    stiffness = np.exp((m.x[p + 1:p + 3] + steps[:, 1:])[:, :, None] + uneven).reshape(len(steps), h)
-    held = bool(m.counts[mem.HELD])
-    if masses is None:
-        here = m.x[p] + steps[:, 0] * (1.0 if held else model.motion.scale)
-        masses = (model.motion.scale * np.exp(np.minimum(here, 12.0)) if held
-                  else np.maximum(here, model.motion.least))
-    inertia = model.motion.inertia * math.exp(min(m.x[-1], 12.0)) if held else 0.0
-    return arm_modes(config.arm, cosines, masses, np.full(cosines.size, inertia), stiffness)
-
-
-def _matched(frequency: Array, modes: Sequence[Mode]) -> list[int] | None:
-    """Return which identified modes are the lowest two of the arm, in order; None when they are not there."""
-    usable = [k for k, mode in enumerate(modes) if mode.frequency_hz > 0.0 and abs(mode.damping_ratio) < 0.5
-              and math.isfinite(mode.frequency_std_hz)]
-    found = np.array([modes[k].frequency_hz for k in usable])
-    away = np.abs(np.log(found[:, None] / frequency[:3]))
-    pairs = [(away[i, 0] + away[j, 1], i, j) for i in range(len(usable)) for j in range(i + 1, len(usable))]
-    if not pairs:
-        return None
-    _, i, j = min(pairs)
-    if max(away[i, 0], away[j, 1]) > ANOTHER or (frequency.size > 2 and away[j, 2] < away[j, 1]):
-        return None
-    return [usable[i], usable[j]]
-
-
-def _payloads(config: IdentifierParameters, model: Model, m: mem.Memory, cosines: Array, found: Array,
-              allowed: Array, which: Array) -> tuple[float, float]:
-    """Return between which payloads the arm has the frequencies found, each mode by itself."""
-    masses = model.motion.scale * PAYLOADS
-    many = _predicted(config, model, m, np.repeat(cosines, masses.size),
-                      np.zeros((cosines.size * masses.size, 3)), np.tile(masses, cosines.size))
-    frequency = many.frequency[:, :2].reshape(cosines.size, masses.size, 2)
-    lower, upper = math.inf, -math.inf
-    for k in np.flatnonzero(which):
-        low = frequency[:, :, k].min(axis=0) * (1.0 - allowed[k])
-        high = frequency[:, :, k].max(axis=0) * (1.0 + allowed[k])
-        fits = np.flatnonzero((low <= found[k]) & (found[k] <= high))
-        if fits.size == 0:  # higher than empty, or lower than with anything
-            fits = np.array([0 if found[k] > high.max() else masses.size - 1])
-        lower = min(lower, float(masses[max(fits[0] - 1, 0)]))
-        upper = max(upper, float(masses[fits[-1] + 1]) if fits[-1] + 1 < masses.size else math.inf)
-    return lower, upper
-
-
-def _bend_rows(model: Model, outputs: int) -> tuple[Array, Array, Array] | None:
-    """Return outputs that are bends (their rates where no displacement is), of which link, and if rates."""
-    for quantity in (Quantity.BEND, Quantity.BEND_RATE):
-        rows = [k for k, role in enumerate(model.roles[:outputs]) if role.quantity is quantity]
-        if rows:
-            links = np.array([model.roles[k].link for k in rows])
-            return np.array(rows), links, np.full(len(rows), quantity is Quantity.BEND_RATE)
-    return None

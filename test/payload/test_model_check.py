@@ -21,7 +21,7 @@ from flexmanip_ros.parameters import (
 from flexmanip_ros.payload import model_check, structured
 from flexmanip_ros.payload.arm_modes import arm_modes
 from flexmanip_ros.payload.identified_drive import drive
-from flexmanip_ros.payload.model_check import Verdict
+from flexmanip_ros.payload.model_comparison import Verdict
 from flexmanip_ros.plant import excitation, linearization, simulator
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, StateSpace, Status
 
