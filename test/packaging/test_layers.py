@@ -18,8 +18,8 @@ WRITTEN = ('flexmanip_ros', 'test', 'benchmarks', 'launch', 'docs')
 # leaves <- core <- pipeline <- doors; what is not named here is core.
 FORBIDDEN_TO_BAGS = ('flexmanip_ros.ros', 'flexmanip_ros.cli')
 LEAVES = {'', 'types', 'errors', 'parameters'}
-PIPELINE = {'estimator', 'timeline', 'pipeline', 'summary', 'study', 'paper', 'paper_response', 'paper_run',
-            'paper_summary', 'rivals'}
+PIPELINE = {'estimator', 'timeline', 'schedule', 'pipeline', 'summary', 'study', 'paper', 'paper_response',
+            'paper_run', 'paper_summary', 'rivals'}
 DOORS = {'io', 'ros', 'cli'}
 ROS_LIBRARIES = {
     'rclpy', 'launch', 'launch_ros', 'ament_index_python', 'rosidl_runtime_py', 'rosbag2_py',
