@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from flexmanip_ros.payload.block_extraction import NOWHERE
 from flexmanip_ros.payload.model_comparison import Verdict
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, Payload, Sample, Status
 
-BATCH, MOST_OWED = 8, 64
+BATCH, MOST_OWED = 8, 16
 """Samples that the identifier takes at once, for only who reads a model waits for it: from so many on when
 there is nothing else to do, and at most."""
 
@@ -117,10 +118,10 @@ def finish(config: IdentifierParameters, core: Core) -> Core:
     return core._replace(rpbsid=rpbsid.finish(config, core.rpbsid))
 
 
-def job(core: Core) -> tuple[Job, int] | None:
+def job(config: IdentifierParameters, core: Core) -> tuple[Job, int] | None:
     """Return the long work under way, and the samples until its result is taken, or fewer."""
     found = rpbsid.job(core.rpbsid)
-    return None if found is None else (found[0], found[1] - len(core.owed))
+    return None if found is None else (found[0], found[1] - math.ceil(len(core.owed) / config.decimation))
 
 
 def answered(core: Core, job: Job, answer: Answer) -> Core:

@@ -97,7 +97,8 @@ def job(state: State) -> tuple[Job, int] | None:
     Whoever has the time may ``solve`` it on another thread and give ``answered`` the result; otherwise it is
     done when its turn comes. The numbers are the same.
     """
-    return estimator.job(state.timeline.core) if state.timeline is not None else None
+    line, config = state.timeline, state.config
+    return estimator.job(config, line.core) if line is not None and config is not None else None
 
 
 def answered(state: State, job: Job, answer: Answer) -> State:
@@ -164,13 +165,20 @@ def check_used(state: State) -> None:
 def reconfigure(config: IdentifierParameters, state: State) -> State:
     """Go on with parameters that were changed while running (those declared ``live``)."""
     state = _run_held(state)
-    if state.config is None:
+    line, before = state.timeline, state.config
+    if before is None:
         return state
-    state = state._replace(config=replace(config, outputs=state.config.outputs))
+    if line is not None:  # what came before the change is of the parameters before it
+        state = state._replace(timeline=line._replace(
+            core=estimator.settle(before, line.core),
+            checkpoints=tuple(one._replace(core=estimator.settle(before, one.core))
+                              for one in line.checkpoints)))
+    state = state._replace(config=replace(config, outputs=before.outputs))
     if state.published < 0 or state.timeline is None:
         return state
     last = instant_of(state, state.timeline.last_ns, config.publish_rate)
-    return state._replace(published=last, reading=None)
+    again = state.reading._replace(instant=-1) if state.reading is not None else None  # to be read anew
+    return state._replace(published=last, reading=again)
 
 
 def _event(state: State, event: CaptureEvent) -> State:

@@ -32,7 +32,7 @@ SOONEST = 128
 SOONEST_S, EACH_S = 0.1, 2e-4
 """Nor sooner than this, nor than so much for each of its samples [s]: at 1 kHz that is less."""
 BLOCK_S = 0.06
-"""A block is taken so much later [s], at least CHUNK and at most BLOCK samples."""
+"""A block is taken so much later [s], at least CHUNK samples, and less than BLOCK: so it catches up."""
 LATEST = 4096
 """Nor later than this: what is kept meanwhile is bounded, at any rate."""
 PARAMETERS = 80
@@ -158,7 +158,7 @@ def ask_block(refined: Refined, now_ns: int = 0) -> Refined:
     """Ask for an update by the oldest block that the fit has not seen."""
     first = refined.seen // CHUNK
     job = Job(refined.chunks[first:first + BLOCK // CHUNK], None, None, refined.recursion)
-    later = max(CHUNK, _chunks(refined, now_ns, BLOCK_S, BLOCK))
+    later = max(CHUNK, _chunks(refined, now_ns, BLOCK_S, BLOCK - CHUNK))
     return refined._replace(job=job, due=refined.total + later)
 
 

@@ -53,6 +53,8 @@ class Prepared:
     def __call__(self, *arguments: Any) -> Any:
         """Call the kernel."""
         known, entry = self._known
+        if not hasattr(self._function, 'compile'):  # numba is switched off
+            return self._function(*arguments)
         if len(known) != self._fixed or any(a is not b for a, b in zip(known, arguments, strict=False)):
             types = tuple(typeof(argument) for argument in arguments)
             self._function.compile(types)

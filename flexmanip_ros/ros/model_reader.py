@@ -41,9 +41,9 @@ class ModelReader:
 
     def take(self, state: pipeline.State) -> tuple[pipeline.State, Estimate]:
         """Return the state knowing the model, and the estimate it came with; waits for it."""
-        assert self._future is not None, 'no model was asked for'
-        read, estimate = self._future.result()
-        self._future = None
+        future, self._future = self._future, None
+        assert future is not None, 'no model was asked for'
+        read, estimate = future.result()
         return pipeline.adopted(state, read), estimate
 
     def close(self) -> None:

@@ -109,14 +109,16 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
     def deactivated(self) -> None:
         """Save what is known."""
         self.real_time.stay_awake(False)
-        self._conclude()
-        for helper in (self._worker, self._models):
-            if helper is not None:
-                helper.close()
-        self._worker = self._models = None
-        if self._keeper is not None:
-            self._keeper.finish()
-            self._keeper.save(self.config, self.state)
+        try:
+            self._conclude()
+        finally:
+            for helper in (self._worker, self._models):
+                if helper is not None:
+                    helper.close()
+            self._worker = self._models = None
+            if self._keeper is not None:
+                self._keeper.finish()
+                self._keeper.save(self.config, self.state)
 
     def configuration_changed(self, config: IdentifierParameters) -> None:
         """Go on with what may change at run time."""
@@ -238,7 +240,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         return estimator.follow(self.config, due.stamp_ns, last, due.payload)
 
     def _publish(self, values: Iterable[tuple[str, messages.Value]]) -> None:
-        for name, value in values:
+        for name, value in values if self.context.ok() else ():  # nobody hears the last words of a context
             self.outputs[name].publish(self._encoded(value))
             self.published += 1
 

@@ -21,6 +21,8 @@ def test_an_identifier_that_is_restarted_goes_on_as_if_it_had_only_missed_sample
     first.send(*samples[300:500])
     ros.remove(first.node)
     second = Live(ros, checkpoint_file=file)
+    assert second.node.estimate is not None  # the last one, of before
+    assert second.node.estimate.model is not None
     second.send(*samples[550:])
     straight = replayed(second, [*samples[:300], CAPTURE, *samples[300:500], *samples[550:]])
     count = {name: len(values) for name, values in second.said.items()}

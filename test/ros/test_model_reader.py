@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 from test_worker import CAPTURE, said
 
-from flexmanip_ros import pipeline, schedule
+from flexmanip_ros import estimator, pipeline, schedule
 from flexmanip_ros.estimator import MOST_OWED
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.plant import excitation, simulator
@@ -88,3 +88,34 @@ def test_a_model_of_before_a_reset_is_not_taken_for_one_of_after_it() -> None:
     assert state.reading is not None
     assert pipeline.adopted(after, state) is after
     assert pipeline.adopted(pipeline.init(), state) == pipeline.init()
+
+
+def test_a_parameter_changed_meanwhile_counts_from_then_on_whoever_reads_the_models() -> None:
+    config = replace(CONFIG, forgetting='constant')
+    factors = []
+    for elsewhere in (False, True):
+        state = pipeline.init()
+        for item in recording()[:702]:
+            state, due = pipeline.take(config, state, item)
+            for one in due:
+                read, _ = pipeline.read(state, one)
+                state = pipeline.adopted(state, read) if elsewhere else read
+        state = pipeline.reconfigure(replace(config, forgetting_factor=(0.9, 0.9, 0.9)), state)
+        assert state.timeline is not None
+        assert state.config is not None
+        factors.append(estimator.settle(state.config, state.timeline.core).rpbsid.memory[0])
+    assert factors[0].tobytes() == factors[1].tobytes()
+
+
+def test_a_model_that_could_not_be_read_is_told_once() -> None:
+    state = pipeline.init()
+    for item in recording(60):
+        state, due = pipeline.take(CONFIG, state, item)
+        if due:
+            break
+    reader = ModelReader()
+    reader.ask(pipeline.init(), due[0], lambda: None)
+    with pytest.raises(AssertionError):
+        reader.take(state)
+    assert not reader.ready(state, None)
+    reader.close()
