@@ -53,8 +53,7 @@ def advance(config: IdentifierParameters, core: Core, samples: Sequence[Sample])
 
     One call of N samples gives, once settled, the bits of N calls of one.
     """
-    core = payload_ahead(config, core, samples)
-    return settle(config, core) if len(core.owed) >= MOST_OWED else core
+    return settle(config, payload_ahead(config, core, samples), MOST_OWED)
 
 
 def payload_ahead(config: IdentifierParameters, core: Core, samples: Sequence[Sample]) -> Core:
@@ -62,7 +61,7 @@ def payload_ahead(config: IdentifierParameters, core: Core, samples: Sequence[Sa
 
     Where every sample is awaited, it still has to take those before.
     """
-    core = settle(config, core) if len(core.owed) >= MOST_OWED else core
+    core = settle(config, core, MOST_OWED)
     held = core.structured
     if held is not None:
         held = structured.advance(config, held, samples)
@@ -74,10 +73,10 @@ def payload_ahead(config: IdentifierParameters, core: Core, samples: Sequence[Sa
                          owed=(*core.owed, *samples))
 
 
-def settle(config: IdentifierParameters, core: Core) -> Core:
-    """Run the samples that the identifier owes."""
+def settle(config: IdentifierParameters, core: Core, least: int = 1) -> Core:
+    """Run the samples that the identifier owes, if they are at least so many."""
     samples = core.owed
-    if not samples:
+    if len(samples) < least:
         return core
     identifier = core.rpbsid
     start = 0

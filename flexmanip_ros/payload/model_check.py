@@ -104,4 +104,4 @@ def apply(state: StructuredState, payload: Payload, verdicts: tuple[Verdict, ...
     if own is not None:
         lower, upper = min(lower, own.lower), max(upper, own.upper)
     return payload._replace(std=std, status=Status.INCONSISTENT,
-                   lower=max(0.0, min(payload.lower, lower)), upper=max(payload.upper, upper))
+                            lower=max(0.0, min(payload.lower, lower)), upper=max(payload.upper, upper))

@@ -47,14 +47,12 @@ class Prepared:
     def __init__(self, function: Callable[..., Any], fixed: int) -> None:
         """fixed: how many of the first arguments are looked at anew when they are other objects."""
         self._function: Any = function
-        self._fixed = fixed
+        self._fixed = fixed if hasattr(function, 'compile') else 0  # numba may be switched off
         self._known: tuple[tuple[object, ...], Callable[..., Any]] = ((), function)
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the kernel."""
         known, entry = self._known
-        if not hasattr(self._function, 'compile'):  # numba is switched off
-            return self._function(*arguments)
         if len(known) != self._fixed or any(a is not b for a, b in zip(known, arguments, strict=False)):
             types = tuple(typeof(argument) for argument in arguments)
             self._function.compile(types)

@@ -168,7 +168,8 @@ def test_the_publishing_rate_changes_while_it_runs(ros: Ros) -> None:
     assert result.successful
     before = live.node.published
     live.send(*samples[350:])
-    ros.wait(lambda: live.node.published - before == 2 * len({k // 4 for k in range(352, 700)}))
+    ros.wait(lambda: not live.node.is_reading, what='the last model')
+    assert live.node.published - before == 2 * len({k // 4 for k in range(352, 700)})
     (result,) = live.node.set_parameters([Parameter('publish_rate', value=-1.0)])
     assert not result.successful
     (result,) = live.node.set_parameters([Parameter('order', value=6)])
