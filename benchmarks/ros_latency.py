@@ -1,12 +1,13 @@
 """Claim: live at 1 kHz nothing is lost, p99 from sample to estimate is 0.5 ms or less, at a fifth of a core.
 
-Plant, excitation, trigger and identifier over DDS: composed in one process, and one process each; `ordinary`:
-the same where neither real-time priority nor cores that stay awake are permitted; `played`: the identifier
-alone, the samples simulated beforehand; `bare`: publish and subscribe alone, the floor on the machine as it
-is. Latency is from the middleware's source time stamp of a joint state to that of the estimate with the same
-stamp, so that the observer's own delays do not count; `sample` is the identifier's callback for every sample,
-as it reports itself; lost: of the seconds measured, and while the processes start on two cores (all of them
-import and load kernels then). Use: ros_latency.py [seconds a case]
+Plant, excitation, trigger and identifier over DDS: composed in one process, and one process each; `apart`:
+the same with all but the identifier kept to one core (`cpu_affinity`), so that the other is its own;
+`ordinary`: the same where neither real-time priority nor cores that stay awake are permitted; `played`: the
+identifier alone, the samples simulated beforehand; `bare`: publish and subscribe alone, the floor on the
+machine as it is. Latency is from the middleware's source time stamp of a joint state to that of the estimate
+with the same stamp, so that the observer's own delays do not count; `sample` is the identifier's callback for
+every sample, as it reports itself; lost: of the seconds measured, and while the processes start on two cores
+(all of them import and load kernels then). Use: ros_latency.py [seconds a case]
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from flexmanip_ros.io import cdr
-from flexmanip_ros.ros import qos
+from flexmanip_ros.ros import affinity, qos
 from flexmanip_ros.ros.conversions import stamp_ns
 from flexmanip_ros.ros.node import sequence_number, with_info
 from flexmanip_ros.ros.spin import Interrupt, make_executor, spin
@@ -37,8 +38,11 @@ from flexmanip_ros.ros.spin import Interrupt, make_executor, spin
 HERE = Path(__file__).resolve().parent
 SECONDS = 60.0
 SETTLE_S = 3.0
-CASES = (('bare', 1000.0), ('composed', 1000.0), ('separate', 1000.0), ('ordinary', 1000.0),
-         ('played', 4000.0), ('separate', 4000.0))
+CASES = (('bare', 1000.0), ('composed', 1000.0), ('separate', 1000.0), ('apart', 1000.0),
+         ('ordinary', 1000.0), ('played', 4000.0), ('separate', 4000.0))
+CORES = sorted(os.sched_getaffinity(0))
+MORE = {'ordinary': ['-p', 'thread_priority:=0', '-p', 'wake_latency:=-1'],
+        'apart': ['-p', f'cpu_affinity:=[{CORES[0]}]']}
 NODES = ('rpbsid_identifier', 'capture_trigger', 'excitation', 'plant_simulator')
 TICKS = os.sysconf('SC_CLK_TCK')
 
@@ -116,7 +120,7 @@ def composed(rate: float) -> None:
     for node in nodes:
         executor.add_node(node)
         node.autostart()
-    nodes[0].real_time.take_priority()
+    nodes[0].real_time.take()
     gc.collect()
     gc.freeze()
     spin(executor, None, interrupt)
@@ -138,13 +142,14 @@ def case(name: str, rate: float, seconds: float, domain: int) -> dict[str, Any]:
                     for node, role in (('source', 'source'), ('rpbsid_identifier', 'echo'))}
     else:
         nodes = NODES[:1] if name == 'played' else NODES
-        more = ['-p', 'thread_priority:=0', '-p', 'wake_latency:=-1'] if name == 'ordinary' else []
-        commands = {node: [sys.executable, '-m', f'flexmanip_ros.ros.{node}', *parameters(rate), *more]
-                    for node in nodes}
+        spared = NODES[:1] if name == 'apart' else ()
+        commands = {node: [sys.executable, '-m', f'flexmanip_ros.ros.{node}', *parameters(rate),
+                           *(() if node in spared else MORE.get(name, ()))] for node in nodes}
     if name == 'played':
         commands['player'] = [sys.executable, str(HERE / 'parts' / 'bare_nodes.py'), 'player', str(rate),
                               str(seconds + 2 * SETTLE_S)]
     processes = {node: subprocess.Popen(command) for node, command in commands.items()}
+    affinity.take(CORES[:1] if name == 'apart' else [])
     try:
         wait(executor, lambda: bool(observer.latencies), 120.0)
         wait(executor, lambda: False, SETTLE_S)
@@ -169,6 +174,7 @@ def case(name: str, rate: float, seconds: float, domain: int) -> dict[str, Any]:
         executor.shutdown()
         observer.destroy_node()
         rclpy.shutdown()
+        affinity.take(CORES)
     p50, p99 = np.percentile(latencies, [50, 99]) if latencies.size else (np.nan, np.nan)
     sample = [[float(r[f'callback_{what}_us']) for r in reports] or [0.0] for what in ('p50', 'p99', 'max')]
     return {

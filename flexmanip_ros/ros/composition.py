@@ -104,7 +104,7 @@ class Composition:
 
     def start(self) -> None:
         """Begin: who listens first, the plant's clock last."""
-        self.identifier.real_time.take_priority()
+        self.identifier.real_time.take()
         gc.collect()
         self._started = time.monotonic()
         gc.freeze()  # what lives from here on is not looked through again while the clock runs

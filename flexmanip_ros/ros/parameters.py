@@ -16,6 +16,7 @@ from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import Leaf, check, configure, flatten, leaves
 from flexmanip_ros.parameters.document import NODES, limits
 from flexmanip_ros.ros import real_time
+from flexmanip_ros.ros.declaration import declare, overrides
 
 Config = TypeVar('Config')
 
@@ -109,31 +110,25 @@ def _type(leaf: Leaf) -> Parameter.Type:
 def _declare(node: Node, leaf: Leaf) -> Any:
     """Declare one parameter and return its value, from an override or the default."""
     try:
-        value = node.declare_parameter(leaf.name, ros_value(leaf, leaf.default), descriptor(leaf)).value
+        value = declare(node, leaf.name, ros_value(leaf, leaf.default), _type(leaf), descriptor(leaf))
     except InvalidParameterTypeException as error:
         raise ParameterError(
             f"parameter '{leaf.name}' is of type {_given_type(node, leaf)}",
             f'give {"a list, each " if leaf.is_array else ""}{_EXAMPLE[leaf.kind]}') from error
     except InvalidParameterValueException as error:
-        given = _overrides(node)[leaf.name].value
+        given = overrides(node)[leaf.name].value
         check(leaf, given)  # says it in our words
         raise ParameterError(f"parameter '{leaf.name}' is {given!r}", str(error)) from error
     return check(leaf, value)
 
 
 def _given_type(node: Node, leaf: Leaf) -> str:
-    return str(_overrides(node)[leaf.name].type_.name).lower().replace('_', ' ')
-
-
-def _overrides(node: Node) -> dict[str, Parameter]:
-    """Return what was given at start by file, command line or code; rclpy has no public name for it."""
-    given: dict[str, Parameter] = node._parameter_overrides
-    return given
+    return str(overrides(node)[leaf.name].type_.name).lower().replace('_', ' ')
 
 
 def _refuse_unknown(node: Node, known: dict[str, Leaf]) -> None:
     """Refuse an override that no node of this package has: a typing error must not pass silently."""
-    for name in _overrides(node):
+    for name in overrides(node):
         if name in known or name.startswith(_ROS_OWN) or name in _package_names():
             continue
         near = difflib.get_close_matches(name, known, n=1)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
-from flexmanip_ros.ros import priority
+from flexmanip_ros.ros import affinity, priority
+from flexmanip_ros.ros.declaration import declare
 from flexmanip_ros.ros.diagnostics import Report
 from flexmanip_ros.ros.wake_latency import LONGEST, UNASKED, WakeLatency
 
-PARAMETERS = 'thread_priority', 'wake_latency'
+PARAMETERS = 'thread_priority', 'wake_latency', 'cpu_affinity'
 
 
 class RealTime:
-    """Declares both parameters; asks for what they say, and says once where the system refuses."""
+    """Declares the parameters; asks for what they say, and says once where the system refuses."""
 
     def __init__(self, node: Node, thread_priority: int, wake_latency: int) -> None:
         """Declare with these defaults; raises what rclpy raises for values out of range."""
@@ -26,6 +28,10 @@ class RealTime:
             'wake_latency', wake_latency, UNASKED, LONGEST,
             'time within which the cores of the processor must wake while samples come, where the system '
             'permits to ask for it (PM QoS) [us]; 0: they do not sleep, -1: as they like'))
+        self._cores: list[int] = list(declare(
+            node, 'cpu_affinity', [], Parameter.Type.INTEGER_ARRAY, ParameterDescriptor(
+                description='cores of the processor that the process may use, such as [0, 2]; empty: any',
+                read_only=True)))
         self._taken = self._refused = False
 
     def _declared(self, name: str, default: int, lowest: int, highest: int, words: str) -> int:
@@ -33,8 +39,13 @@ class RealTime:
             IntegerRange(from_value=lowest, to_value=highest, step=1)])
         return int(self._node.declare_parameter(name, default, descriptor).value)
 
-    def take_priority(self) -> None:
-        """Take the priority, for this whole process."""
+    def take(self) -> None:
+        """Take cores and priority, for this whole process."""
+        refused = affinity.take(self._cores)
+        if refused:
+            self._node.get_logger().warning(
+                f'any core: cpu_affinity {self._cores} was refused ({refused}); '
+                f'this process may use {affinity.current()}')
         refused = priority.take(self._priority)
         self._taken = not refused
         if refused:
@@ -62,4 +73,5 @@ class RealTime:
     def report(self, report: Report) -> None:
         """Tell what the node really has."""
         report.values['thread_priority'] = priority.current()
+        report.values['cpu_affinity'] = affinity.current()
         report.values['wake_latency'] = self._wake.current

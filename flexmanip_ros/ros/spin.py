@@ -112,7 +112,7 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
         executor.add_node(node)
         if not node.autostart():
             return BAD_INPUT  # the node has said why
-        node.real_time.take_priority()
+        node.real_time.take()
         gc.collect()
         gc.freeze()  # what lives from here on is not looked through again while samples come
         spin(executor, None, interrupt)

@@ -44,6 +44,16 @@ def test_overrides_reach_the_configuration_and_an_empty_text_list_is_written_as_
     assert node.get_parameter('angles').value == ['']
 
 
+@pytest.mark.parametrize('given', [[0.1, -0.2], []])
+def test_a_list_that_is_empty_by_default_may_be_given(ros: Ros, given: list[float]) -> None:
+    empty = {leaf.name for cls in NODES.values() for leaf in leaves(cls)
+             if leaf.default == () and leaf.kind is not str}
+    assert empty == {'payload.working_point'}
+    node = ros.add(Node('declaring', context=ros.context,
+                        parameter_overrides=overrides(payload__working_point=given)))
+    assert NodeParameters(node, IdentifierParameters).config.payload.working_point == tuple(given)
+
+
 @pytest.mark.parametrize(('name', 'value', 'said'), [
     ('order', 0, "'order' is 0; give a value from 1 to 60"),
     ('order', 4.0, "'order' is of type double; give a whole number"),

@@ -1,0 +1,29 @@
+"""Declaring a parameter whose default may be an empty array."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+
+def overrides(node: Node) -> dict[str, Parameter]:
+    """Return what was given at start by file, command line or code; rclpy has no public name for it."""
+    given: dict[str, Parameter] = node._parameter_overrides
+    return given
+
+
+def declare(node: Node, name: str, default: Any, kind: Parameter.Type, descriptor: ParameterDescriptor
+            ) -> Any:
+    """Declare a parameter and return its value, from an override or the default; raises what rclpy raises.
+
+    rclpy reads the type off the default, takes an empty array for one of bytes, and would refuse every
+    override of it but an empty one (which has no type, and no value).
+    """
+    if not isinstance(default, list) or default:
+        return node.declare_parameter(name, default, descriptor).value
+    given = overrides(node).get(name)
+    return node.declare_parameter(name, kind if given is not None and given.value else default, descriptor
+                                  ).value or []
