@@ -20,6 +20,7 @@ ARGUMENTS = (
     ('release_time', '-1.0', 'release this long after the first sample [s]; negative: never'),
     ('payload_method', 'structured', 'none | block | structured'),
     ('namespace', '', 'namespace of all nodes'),
+    ('cpu_affinity', '[]', 'cores of all nodes but the identifier, such as [0]; empty: any'),
     ('log_level', 'info', 'debug | info | warn | error'),
 )
 
@@ -34,6 +35,11 @@ def _node(executable, parameters):
         parameters=[parameters], arguments=['--ros-args', '--log-level', LaunchConfiguration('log_level')])
 
 
+def _kept(parameters):
+    return {**parameters, 'cpu_affinity': ParameterValue(LaunchConfiguration('cpu_affinity'),
+                                                         value_type=list[int])}
+
+
 def generate_launch_description():
     """Return the nodes with their arguments."""
     return LaunchDescription([
@@ -41,9 +47,10 @@ def generate_launch_description():
           for name, default, words in ARGUMENTS),
         _node('rpbsid_identifier', {
             'payload_method': ParameterValue(LaunchConfiguration('payload_method'), value_type=str)}),
-        _node('capture_trigger', {
+        _node('capture_trigger', _kept({
             'mode': 'time', 'capture_time': _number('capture_time'),
-            'release_time': _number('release_time')}),
-        _node('excitation', {'rate': _number('rate'), 'clock': 'joint_states'}),
-        _node('plant_simulator', {'rate': _number('rate'), 'payload_mass': _number('payload_mass')}),
+            'release_time': _number('release_time')})),
+        _node('excitation', _kept({'rate': _number('rate'), 'clock': 'joint_states'})),
+        _node('plant_simulator', _kept({
+            'rate': _number('rate'), 'payload_mass': _number('payload_mass')})),
     ])

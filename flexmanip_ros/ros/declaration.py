@@ -20,10 +20,16 @@ def declare(node: Node, name: str, default: Any, kind: Parameter.Type, descripto
     """Declare a parameter and return its value, from an override or the default; raises what rclpy raises.
 
     rclpy reads the type off the default, takes an empty array for one of bytes, and would refuse every
-    override of it but an empty one (which has no type, and no value).
+    override of it but an empty one (which has no type, and no value). So such a one is declared by its type
+    alone, and set.
     """
     if not isinstance(default, list) or default:
         return node.declare_parameter(name, default, descriptor).value
     given = overrides(node).get(name)
-    return node.declare_parameter(name, kind if given is not None and given.value else default, descriptor
-                                  ).value or []
+    has_value = given is not None and bool(given.value)
+    node.declare_parameter(name, kind, ignore_override=not has_value)
+    if not has_value:
+        node.set_parameters([Parameter(name, kind, [])])
+    descriptor.type = kind.value
+    node.set_descriptor(name, descriptor)
+    return node.get_parameter(name).value

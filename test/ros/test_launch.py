@@ -78,7 +78,7 @@ def test_every_node_and_parameter_is_of_the_package(described: list[Any]) -> Non
         declared = {leaf.name: leaf for leaf in leaves(NODES[node.kwargs['executable']])}
         for group in node.kwargs['parameters']:
             for name, value in (group.items() if isinstance(group, dict) else ()):
-                if name == 'use_sim_time':
+                if name in ('use_sim_time', 'cpu_affinity'):  # every node has them
                     continue
                 assert name in declared
                 wanted = list if declared[name].is_array else declared[name].kind

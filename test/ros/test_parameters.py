@@ -52,6 +52,10 @@ def test_a_list_that_is_empty_by_default_may_be_given(ros: Ros, given: list[floa
     node = ros.add(Node('declaring', context=ros.context,
                         parameter_overrides=overrides(payload__working_point=given)))
     assert NodeParameters(node, IdentifierParameters).config.payload.working_point == tuple(given)
+    described = node.describe_parameter('payload.working_point')
+    assert described.type == Parameter.Type.DOUBLE_ARRAY.value
+    assert described.read_only
+    assert list(node.get_parameter('payload.working_point').value) == given
 
 
 @pytest.mark.parametrize(('name', 'value', 'said'), [
