@@ -17,18 +17,15 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.identification.moments import triangle
-from flexmanip_ros.identification.stretch import Recursion
+from flexmanip_ros.identification.stretch import BLOCK, DELAY, Recursion
 from flexmanip_ros.types import Array
 
 CHUNK = 64
 """Samples handed over at once."""
 FIRST, LONGEST = 256, 2048
 """Samples of the first fit, and of the last one that sees them all; multiples of CHUNK."""
-BLOCK = 256
-"""Samples of a recursive update; a multiple of CHUNK."""
-DELAY = 4
-"""A fit of N samples is taken N / DELAY samples later, and at least SOONEST."""
 SOONEST = 128
+"""A fit of N samples is taken N / DELAY samples later, and at least so many."""
 SOONEST_S, EACH_S = 0.1, 2e-4
 """Nor sooner than this, nor than so much for each of its samples [s]: at 1 kHz that is less."""
 BLOCK_S = 0.06

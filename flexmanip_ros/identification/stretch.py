@@ -1,4 +1,4 @@
-"""The prediction-error fit of a whole stretch: starting points, noise model, what the result is worth."""
+"""The prediction-error fit of a whole stretch: attempts, noise model, what the result is worth."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.errors import ModelError
-from flexmanip_ros.identification.moments import Realized
-from flexmanip_ros.identification.pbsid import pbsid
+from flexmanip_ros.identification.mode_drift import drifting
+from flexmanip_ros.identification.moments import Realized, triangle
 from flexmanip_ros.identification.prediction_error import (
     Fit,
     Structure,
@@ -20,12 +19,15 @@ from flexmanip_ros.identification.prediction_error import (
     directions,
     forgets,
 )
-from flexmanip_ros.identification.realization import lightly_damped, to_continuous, to_discrete
+from flexmanip_ros.identification.realization import lightly_damped
+from flexmanip_ros.identification.starts import averaged, candidate
 from flexmanip_ros.types import Array, StateSpace
 
 ITERATIONS = 12
-ROWS, PAST, RIDGE = 128, 8, 1e-3
-"""Means over the stretch, their past window, and the ridge on them, of a start for slow modes."""
+BLOCK = 256
+"""Samples of a recursive update; a multiple of refinement.CHUNK."""
+DELAY = 4
+"""A fit of N samples is taken N / DELAY samples later."""
 LIGHT = 0.005
 """Largest damping ratio of a second start: a short past makes modes seem damped, and fits start lost."""
 CLEAN = 1e-20
@@ -74,40 +76,6 @@ class Attempt(NamedTuple):
     cost: float
     wants_gain: bool
     begin: Array
-
-
-def candidate(model: StateSpace, feedthrough: bool) -> tuple[Theta, Structure]:
-    """Starting point from a model of scaled signals, C held when it can fix the basis."""
-    n, m = model.A.shape[0], model.C.shape[0]
-    theta = Theta(model.A, model.B, model.C, model.D, model.K, np.zeros(n))
-    if n == m and np.linalg.cond(model.C) < 1e6:
-        W = model.C
-        A = np.asarray(np.linalg.solve(W.T, (W @ model.A).T).T, dtype=np.float64)
-        theta = Theta(A, W @ model.B, np.eye(n), model.D, W @ model.K, np.zeros(n))
-        return _dense(theta), Structure(False, feedthrough, False)
-    return _dense(theta), Structure(True, feedthrough, False)
-
-
-def averaged(U: Array, Y: Array, n: int) -> StateSpace | None:
-    """Model of order n from the means over many samples (N, r), (N, m): a short past that reaches far back.
-
-    Its own past is as many samples as the window of the recursion, and yet sees whole periods of slow modes.
-    """
-    every = len(U) // ROWS
-    if every < 2:
-        return None
-    u, y = (X[:every * ROWS].reshape(ROWS, every, -1).mean(axis=1) for X in (U, Y))
-    try:
-        model, _ = pbsid(u, y, n=n, p=PAST, f=PAST, dt=float(every), regularization=RIDGE)
-        A, B = to_discrete(*to_continuous(model.A, model.B, float(every)), 1.0)
-    except (ModelError, np.linalg.LinAlgError):
-        return None
-    found = StateSpace(A, B, model.C, np.zeros_like(model.D), np.zeros((n, Y.shape[1])), 1.0)
-    return found if all(np.all(np.isfinite(part)) for part in (A, B, model.C)) else None
-
-
-def _dense(theta: Theta) -> Theta:
-    return Theta(*(np.ascontiguousarray(part) for part in theta))
 
 
 def fit_stretch(
@@ -230,12 +198,18 @@ def _recursion(samples: Array, attempt: Attempt) -> Recursion:
     if attempt.wants_gain:
         alone = structure._replace(free_gain=True, only_gain=True)
         gain = _gain_alone(U, Y, fit.theta, attempt.begin, alone)
+    root, blocks = arrive(covariance_root(fit.information), fit.arrival), len(U) / BLOCK
+    went, going, behind = np.zeros(fit.directions.shape[1]), 0.0, 0.0
+    drift = drifting(U, Y, fit, structure)
+    if drift is not None:  # the fit is of the middle of the stretch, and the arm has gone on since
+        root = triangle(np.hstack([root, drift.ahead[:, None]]).T).T
+        went, going, behind = drift.rate / blocks, 1.0, blocks / DELAY + 1.0
     return Recursion(
         theta=fit.theta._replace(x=fit.end), structure=structure, scale=attempt.scale, P=fit.directions,
-        root=arrive(covariance_root(fit.information), fit.arrival),
+        root=root,
         covariance=fit.covariance + CLEAN * np.diag(np.mean(Y ** 2, axis=0)), weight=float(len(U)),
         widening=_widening(U, Y, fit, structure), strikes=0, gain=fit.theta.K if gain is None else gain,
-        singular_values=np.zeros(0), condition=float('nan'), went=np.zeros(fit.directions.shape[1]))
+        singular_values=np.zeros(0), condition=float('nan'), went=went, going=going, behind=behind)
 
 
 def _gain_alone(U: Array, Y: Array, theta: Theta, begin: Array, structure: Structure) -> Array | None:

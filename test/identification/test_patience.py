@@ -7,7 +7,7 @@ import pytest
 from linear_arm import configuration, random_system, record
 from test_rpbsid import same
 
-from flexmanip_ros.identification import refinement, rpbsid
+from flexmanip_ros.identification import refinement, rpbsid, stretch
 
 COUNT = 1300
 CONFIG = configuration(1, 2, order=2, past_window=4, future_window=2)
@@ -65,4 +65,4 @@ def test_a_block_has_a_twentieth_of_a_second_and_is_over_before_the_next(
         rate: float, samples: int) -> None:
     refined = refinement.start(3)._replace(total=1024, chunks=(np.zeros((refinement.CHUNK, 3)),) * 4)
     asked = refinement.ask_block(refined, round(1023 * 1e9 / rate))
-    assert asked.due - asked.total == samples < refinement.BLOCK
+    assert asked.due - asked.total == samples < stretch.BLOCK

@@ -1,0 +1,97 @@
+"""Whether an arm's frequencies drift along a stretch that a fit takes for that of one model.
+
+A moving arm is not linear, and its frequencies go with it. A fit of the whole stretch is the model of its
+middle, and its covariance knows nothing of how far the arm has gone since. So each mode gets a steady drift
+of its frequency, and a score test says whether the residuals ask for it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from flexmanip_ros.identification.mode_drift_kernel import sway
+from flexmanip_ros.identification.prediction_error import Fit, Structure, covariance_root, derivatives
+from flexmanip_ros.types import Array
+
+SURPRISE = 4.0
+"""Standard deviations beyond which a drift is no chance."""
+MOST_SKEW = 1e8
+"""Condition of the eigenvectors of an A that is as good as defective."""
+
+
+class Drift(NamedTuple):
+    """What the residuals say of a steady drift, in the coordinates of the fit and the state at the end.
+
+    ahead: (k,) from the fit to the arm at the end of the stretch; rate: (k,) further in as much time again.
+    """
+
+    ahead: Array
+    rate: Array
+
+
+def turns(A: Array) -> Array:
+    """Return dA (g, n, n) by the angle that each oscillation turns in a step [rad]; none of a defective A."""
+    values, vectors = np.linalg.eig(A)
+    if not np.linalg.cond(vectors) < MOST_SKEW:
+        return np.zeros((0, *A.shape))
+    left = np.linalg.solve(vectors, np.eye(len(A)))
+    return np.array([2.0 * np.real(1j * values[i] * np.outer(vectors[:, i], left[i]))
+                     for i in np.flatnonzero(values.imag > 0.0)]).reshape(-1, *A.shape)
+
+
+def drifting(U: Array, Y: Array, fit: Fit, structure: Structure) -> Drift | None:
+    """Return the drift of a fit with K = 0 to U (N, r), Y (N, m), None where it may be chance."""
+    theta = fit.theta
+    if theta.K.any():  # then the prediction rests on the outputs too
+        return None
+    n = theta.A.shape[0]
+    moving = turns(theta.A)
+    if not len(moving):
+        return None
+    end, X = theta.x.copy(), np.zeros((len(moving), n))
+    E, S = np.empty(Y.shape), np.empty((len(moving), *Y.shape))
+    sway(U, Y, *theta[:4], moving, end, X, E, S)
+    lower = np.linalg.cholesky(fit.covariance)
+    e, *s = (solve_triangular(lower, part.T, lower=True, check_finite=False).ravel() for part in (E, *S))
+    own = np.array(s)
+    # what the parameters of the fit can take up: derivatives of the prediction against those by the drift
+    shared = np.array([_gradient(U, Y - E + part, fit, structure) for part in S]).T
+    root = covariance_root(fit.information)
+    taken = root.T @ shared
+    information = own @ own.T - taken.T @ taken
+    gradient = own @ e - taken.T @ (root.T @ _gradient(U, Y, fit, structure))
+    if not np.all(np.isfinite(information)) or not np.all(np.isfinite(gradient)):
+        return None
+    rho = _beyond_chance(information, gradient)
+    if not rho.any():
+        return None
+    k = fit.directions.shape[1]
+    flat = np.zeros(fit.directions.shape[0])
+    flat[:n * n] = np.einsum('g,gij->ij', rho, moving).ravel()
+    rate = fit.directions.T @ flat
+    other = root @ (taken @ rho)
+    ahead = 0.5 * rate - other
+    ahead[k - n:] = X.T @ rho - fit.arrival @ other
+    return Drift(ahead, rate)
+
+
+def _beyond_chance(information: Array, gradient: Array) -> Array:
+    """Return rates (g,) of this information (g, g) and gradient: 0, and left out, where it may be chance."""
+    left = np.arange(len(gradient))
+    rates = np.zeros(len(gradient))
+    while left.size:
+        root = covariance_root(information[np.ix_(left, left)])
+        rho = root @ (root.T @ gradient[left])
+        deviations = np.abs(rho) / np.linalg.norm(root, axis=1)
+        if deviations.min() > SURPRISE:
+            rates[left] = rho
+            break
+        left = np.delete(left, deviations.argmin())
+    return rates
+
+
+def _gradient(U: Array, Y: Array, fit: Fit, structure: Structure) -> Array:
+    return derivatives(U, Y, fit.theta, structure, fit.covariance, fit.directions)[1]
