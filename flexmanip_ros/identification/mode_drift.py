@@ -18,6 +18,8 @@ from flexmanip_ros.types import Array
 
 SURPRISE = 4.0
 """Standard deviations beyond which a drift is no chance."""
+PERIODS = 5.0
+"""Of a mode in the stretch at least: over few of them, whatever else the model lacks looks like a drift."""
 MOST_SKEW = 1e8
 """Condition of the eigenvectors of an A that is as good as defective."""
 
@@ -32,23 +34,30 @@ class Drift(NamedTuple):
     rate: Array
 
 
-def turns(A: Array) -> Array:
-    """Return dA (g, n, n) by the angle that each oscillation turns in a step [rad]; none of a defective A."""
+def turns(A: Array, least: float = 0.0) -> Array:
+    """Return dA (g, n, n) by the angle that each oscillation turns in a step [rad]; none of a defective A.
+
+    least: angle [rad] below which an oscillation is left out.
+    """
     values, vectors = np.linalg.eig(A)
     if not np.linalg.cond(vectors) < MOST_SKEW:
         return np.zeros((0, *A.shape))
     left = np.linalg.solve(vectors, np.eye(len(A)))
-    return np.array([2.0 * np.real(1j * values[i] * np.outer(vectors[:, i], left[i]))
-                     for i in np.flatnonzero(values.imag > 0.0)]).reshape(-1, *A.shape)
+    chosen = np.flatnonzero((values.imag > 0.0) & (np.angle(values) >= least))
+    return np.array([2.0 * np.real(1j * values[i] * np.outer(vectors[:, i], left[i])) for i in chosen]
+                    ).reshape(-1, *A.shape)
 
 
-def drifting(U: Array, Y: Array, fit: Fit, structure: Structure) -> Drift | None:
-    """Return the drift of a fit with K = 0 to U (N, r), Y (N, m), None where it may be chance."""
+def drifting(U: Array, Y: Array, fit: Fit, structure: Structure, widening: float = 1.0) -> Drift | None:
+    """Return the drift of a fit with K = 0 to U (N, r), Y (N, m), None where it may be chance.
+
+    widening: factor on standard deviations from what else is wrong with the residuals.
+    """
     theta = fit.theta
     if theta.K.any():  # then the prediction rests on the outputs too
         return None
     n = theta.A.shape[0]
-    moving = turns(theta.A)
+    moving = turns(theta.A, 2.0 * np.pi * PERIODS / len(U))
     if not len(moving):
         return None
     end, X = theta.x.copy(), np.zeros((len(moving), n))
@@ -65,7 +74,7 @@ def drifting(U: Array, Y: Array, fit: Fit, structure: Structure) -> Drift | None
     gradient = own @ e - taken.T @ (root.T @ _gradient(U, Y, fit, structure))
     if not np.all(np.isfinite(information)) or not np.all(np.isfinite(gradient)):
         return None
-    rho = _beyond_chance(information, gradient)
+    rho = _beyond_chance(information, gradient, SURPRISE * widening ** 2)
     if not rho.any():
         return None
     k = fit.directions.shape[1]
@@ -78,7 +87,7 @@ def drifting(U: Array, Y: Array, fit: Fit, structure: Structure) -> Drift | None
     return Drift(ahead, rate)
 
 
-def _beyond_chance(information: Array, gradient: Array) -> Array:
+def _beyond_chance(information: Array, gradient: Array, least: float) -> Array:
     """Return rates (g,) of this information (g, g) and gradient: 0, and left out, where it may be chance."""
     left = np.arange(len(gradient))
     rates = np.zeros(len(gradient))
@@ -86,7 +95,7 @@ def _beyond_chance(information: Array, gradient: Array) -> Array:
         root = covariance_root(information[np.ix_(left, left)])
         rho = root @ (root.T @ gradient[left])
         deviations = np.abs(rho) / np.linalg.norm(root, axis=1)
-        if deviations.min() > SURPRISE:
+        if deviations.min() > least:
             rates[left] = rho
             break
         left = np.delete(left, deviations.argmin())

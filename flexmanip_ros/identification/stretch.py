@@ -200,7 +200,8 @@ def _recursion(samples: Array, attempt: Attempt) -> Recursion:
         gain = _gain_alone(U, Y, fit.theta, attempt.begin, alone)
     root, blocks = arrive(covariance_root(fit.information), fit.arrival), len(U) / BLOCK
     went, going, behind = np.zeros(fit.directions.shape[1]), 0.0, 0.0
-    drift = drifting(U, Y, fit, structure)
+    widening = _widening(U, Y, fit, structure)
+    drift = drifting(U, Y, fit, structure, widening)
     if drift is not None:  # the fit is of the middle of the stretch, and the arm has gone on since
         root = triangle(np.hstack([root, drift.ahead[:, None]]).T).T
         went, going, behind = drift.rate / blocks, 1.0, blocks / DELAY + 1.0
@@ -208,7 +209,7 @@ def _recursion(samples: Array, attempt: Attempt) -> Recursion:
         theta=fit.theta._replace(x=fit.end), structure=structure, scale=attempt.scale, P=fit.directions,
         root=root,
         covariance=fit.covariance + CLEAN * np.diag(np.mean(Y ** 2, axis=0)), weight=float(len(U)),
-        widening=_widening(U, Y, fit, structure), strikes=0, gain=fit.theta.K if gain is None else gain,
+        widening=widening, strikes=0, gain=fit.theta.K if gain is None else gain,
         singular_values=np.zeros(0), condition=float('nan'), went=went, going=going, behind=behind)
 
 
