@@ -39,8 +39,10 @@ class Timeline(NamedTuple):
 
     core: estimator.Core
     checkpoints: tuple[Checkpoint, ...] = ()
-    samples: tuple[Sample, ...] = ()
-    """From the oldest checkpoint on."""
+    blocks: tuple[tuple[Sample, ...], ...] = ()
+    """Samples from the oldest checkpoint on, as they were run; no block reaches over a checkpoint."""
+    kept: int = 0
+    """How many samples these are."""
     applied: tuple[CaptureEvent, ...] = ()
     """Events at or after the oldest checkpoint, in the order of their stamps."""
     waiting: tuple[CaptureEvent, ...] = ()
@@ -72,7 +74,7 @@ def advance(config: IdentifierParameters, line: Timeline, samples: Sequence[Samp
         checkpoint_due = (
             not line.checkpoints
             or sample.stamp_ns - line.checkpoints[-1].stamp_ns >= spacing_ns * (3 if awaited else 2) // 2
-            or len(line.samples) + len(block) >= MOST_SAMPLES)
+            or line.kept + len(block) >= MOST_SAMPLES)
         if block and (due or checkpoint_due):
             line = _run(config, line, block)
             block = []
@@ -110,7 +112,7 @@ def _all_along(config: IdentifierParameters, line: Timeline) -> Timeline:
     """Every sample came after the events: forget a payload that was read as if they had not happened."""
     core = estimator.anew(config, line.core, sorted(line.latest, key=lambda e: e.stamp_ns))
     return line._replace(core=core, checkpoints=(Checkpoint(line.last_ns, line.last_ns + 1, core),),
-                         samples=(), applied=(), late_events=line.late_events + 1)
+                         blocks=(), kept=0, applied=(), late_events=line.late_events + 1)
 
 
 def _wait(line: Timeline, event: CaptureEvent) -> Timeline:
@@ -121,20 +123,20 @@ def _wait(line: Timeline, event: CaptureEvent) -> Timeline:
 def _run(config: IdentifierParameters, line: Timeline, block: list[Sample], *, ahead: bool = False
          ) -> Timeline:
     run = estimator.payload_ahead if ahead else estimator.advance
-    return line._replace(core=run(config, line.core, block),
-                         samples=(*line.samples, *block), last_ns=block[-1].stamp_ns)
+    return line._replace(core=run(config, line.core, block), blocks=(*line.blocks, tuple(block)),
+                         kept=line.kept + len(block), last_ns=block[-1].stamp_ns)
 
 
 def _checkpoint(config: IdentifierParameters, line: Timeline, stamp_ns: int) -> Timeline:
     """Remember the estimator as it is before the sample at ``stamp_ns``; forget what is too old."""
     kept = (*line.checkpoints, Checkpoint(line.last_ns, stamp_ns, line.core))
     oldest_needed = stamp_ns - int(config.rewind_time * 1e9)
-    too_many = len(line.samples) >= MOST_SAMPLES
+    too_many = line.kept >= MOST_SAMPLES
     while len(kept) > 1 and (kept[1].stamp_ns <= oldest_needed or too_many):
         kept = kept[1:]
     start = kept[0].after_ns
-    return line._replace(checkpoints=kept,
-                         samples=tuple(s for s in line.samples if s.stamp_ns > start),
+    blocks = tuple(block for block in line.blocks if block[-1].stamp_ns > start)
+    return line._replace(checkpoints=kept, blocks=blocks, kept=sum(map(len, blocks)),
                          applied=tuple(e for e in line.applied if e.stamp_ns > start))
 
 
@@ -142,12 +144,12 @@ def _rewind(config: IdentifierParameters, line: Timeline, event: CaptureEvent) -
     """Go back to the last checkpoint not after the event, and run samples and events again from there."""
     kept = tuple(c for c in line.checkpoints if c.after_ns < event.stamp_ns)
     start = kept[-1].after_ns
-    again = tuple(sample for sample in line.samples if sample.stamp_ns > start)
-    before = tuple(sample for sample in line.samples if sample.stamp_ns <= start)
+    again = tuple(sample for block in line.blocks for sample in block if block[-1].stamp_ns > start)
+    before = tuple(block for block in line.blocks if block[-1].stamp_ns <= start)
     redo = sorted((*(e for e in line.applied if e.stamp_ns > start), *line.waiting, event),
                   key=lambda e: e.stamp_ns)
     back = line._replace(
-        core=kept[-1].core, checkpoints=kept, samples=before,
+        core=kept[-1].core, checkpoints=kept, blocks=before, kept=sum(map(len, before)),
         applied=tuple(e for e in line.applied if e.stamp_ns <= start),
         waiting=tuple(redo), last_ns=start, rewinds=line.rewinds + 1)
     return advance(config, back, again)
