@@ -23,6 +23,8 @@ class Channels:
     u: tuple[tuple[str, int], ...]
     y: tuple[tuple[str, int], ...]
     angles: tuple[tuple[str, int], ...]
+    places: tuple[tuple[str, int], ...]
+    """All of them, in this order."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ def resolve(
                 return _missing(group, name, record)
             places.append(place)
         groups.append(tuple(places))
-    return Channels(record.names, wanted, groups[0], groups[1], groups[2])
+    return Channels(record.names, wanted, groups[0], groups[1], groups[2], sum(groups, start=()))
 
 
 def wrong_size(record: JointRecord) -> Refusal | None:
@@ -81,12 +83,12 @@ def extract(channels: Channels, record: JointRecord) -> Sample | None:
     """Return the configured signals of a record that ``channels`` fit; None where one is not finite."""
     fields = {'position': record.position.tolist(), 'velocity': record.velocity.tolist(),
               'effort': record.effort.tolist()}
-    u, y, angles = ([fields[field][index] for field, index in places]
-                    for places in (channels.u, channels.y, channels.angles))
-    if not all(map(math.isfinite, u + y + angles)):  # a sum may overflow
+    values = [fields[field][index] for field, index in channels.places]
+    if not all(map(math.isfinite, values)):  # a sum may overflow
         return None
-    return Sample(record.stamp_ns, np.array(u, dtype=np.float64), np.array(y, dtype=np.float64),
-                  np.array(angles, dtype=np.float64))
+    row = np.array(values, dtype=np.float64)
+    r, m = len(channels.u), len(channels.y)
+    return Sample(record.stamp_ns, row[:r], row[r:r + m], row[r + m:])
 
 
 def _find(signal: str, record: JointRecord) -> tuple[str, int] | None:

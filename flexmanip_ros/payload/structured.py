@@ -6,7 +6,6 @@ A filter and a refit behind it (``structured_kernel``). States are never written
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -221,15 +220,23 @@ def _run(config: IdentifierParameters, state: StructuredState, samples: Sequence
     assert state.effort is not None
     if not samples:
         return state
-    stamps = [state.last_ns, *(sample.stamp_ns for sample in samples)]
-    durations = np.array([max(after - before, 0) * 1e-9 for before, after in pairwise(stamps)])
-    efforts = np.array([state.effort, *(sample.u for sample in samples[:-1])], dtype=np.float64)
     m = mem.copy(state.memory)
-    taken = run(state.model.motion, state.sensors, m, durations, efforts,
-                measurements(state.model, samples))
+    table = _table(state.model, state.last_ns, state.effort, samples)
+    taken = run(state.model.motion, state.sensors, m, table)
     if taken < len(samples):
         return _restart(config, state, samples[taken:])
-    return state._replace(memory=m, last_ns=stamps[-1], effort=samples[-1].u.copy())
+    return state._replace(memory=m, last_ns=samples[-1].stamp_ns, effort=samples[-1].u)
+
+
+def _table(model: Model, before: int, effort: Array, samples: Sequence[Sample]) -> Array:
+    """Return what the kernel takes, (N, 3 + m), after a sample at ``before`` [ns] with that effort (2,)."""
+    rows, held, extra = [], effort.tolist(), model.extra
+    for sample in samples:
+        angles = sample.angles.tolist() if extra else ()
+        rows.append([max(sample.stamp_ns - before, 0) * 1e-9, *held, *sample.y.tolist(),
+                     *(angles[i] for i in extra)])
+        before, held = sample.stamp_ns, sample.u.tolist()
+    return np.array(rows, dtype=np.float64)
 
 
 def _restart(

@@ -188,15 +188,13 @@ def take(motion: Motion, sensors: Sensors, m: Memory, duration: float, effort: A
 
 
 @kernel
-def advance(
-    motion: Motion, sensors: Sensors, m: Memory, durations: Array, efforts: Array, Y: Array,
-) -> int:
-    """Take samples: durations (N,) since the one before, efforts (N, 2) held meanwhile, Y (N, m).
+def advance(motion: Motion, sensors: Sensors, m: Memory, table: Array) -> int:
+    """Take samples, table (N, 3 + m): duration since the one before, torques held meanwhile, measurements.
 
     Returns how many were taken; fewer than N when numbers left the finite range.
     """
-    for k in range(Y.shape[0]):
-        if not take(motion, sensors, m, durations[k], efforts[k], Y[k]):
+    for k in range(table.shape[0]):
+        if not take(motion, sensors, m, table[k, 0], table[k, 1:3], table[k, 3:]):
             return k
-    taken: int = Y.shape[0]
+    taken: int = table.shape[0]
     return taken
