@@ -233,7 +233,9 @@ def _hold(state: State, samples: Iterable[Sample], group: int | None) -> tuple[S
             due.append(Due(sample.stamp_ns, line.core, payload))
             continue
         state = state._replace(held=held)
-        if len(held) >= group or is_due(state, sample.stamp_ns + dt_ns):
+        following = sample.stamp_ns + dt_ns
+        if (len(held) >= group or is_due(state, following)
+                or timeline.is_checkpoint_due(config, line, following)):  # that would part the group in two
             state = _run_held(state)
         elif len(line.core.owed) >= estimator.BATCH:
             state = state._replace(timeline=line._replace(core=estimator.settle(config, line.core)))

@@ -8,6 +8,7 @@ One from before the first sample (latched, heard only now) held all along: the p
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -22,6 +23,8 @@ CHECKPOINTS = 2
 
 MOST_EVENTS = 100
 """Events that wait for their stamps at most, the earliest ones."""
+LET_GO = 2
+"""Blocks no longer needed that are let go of with each new one."""
 MOST_SAMPLES = 20_000
 """Samples kept at most; at rates (or with stamps) that need more the time to go back is shorter."""
 
@@ -43,6 +46,8 @@ class Timeline(NamedTuple):
     """Samples from the oldest checkpoint on, as they were run; no block reaches over a checkpoint."""
     kept: int = 0
     """How many samples these are."""
+    stale: int = 0
+    """Blocks in front of these, of before it: let go of a few at a time, or a sample would wait for it."""
     applied: tuple[CaptureEvent, ...] = ()
     """Events at or after the oldest checkpoint, in the order of their stamps."""
     waiting: tuple[CaptureEvent, ...] = ()
@@ -66,15 +71,11 @@ def advance(config: IdentifierParameters, line: Timeline, samples: Sequence[Samp
     ahead: somebody waits for the payload of the last one; what can be done after it is left for later (the
     identifier's step to ``estimator.settle``, a checkpoint to the next sample).
     """
-    spacing_ns = int(config.rewind_time * 1e9) // CHECKPOINTS
     block: list[Sample] = []
     for sample in samples:
         due = tuple(event for event in line.waiting if event.stamp_ns <= sample.stamp_ns)
-        awaited = ahead and sample is samples[-1]  # a checkpoint may be late, but at the same sample always
-        checkpoint_due = (
-            not line.checkpoints
-            or sample.stamp_ns - line.checkpoints[-1].stamp_ns >= spacing_ns * (3 if awaited else 2) // 2
-            or line.kept + len(block) >= MOST_SAMPLES)
+        checkpoint_due = (is_checkpoint_due(config, line, sample.stamp_ns, ahead and sample is samples[-1])
+                          or line.kept + len(block) >= MOST_SAMPLES)
         if block and (due or checkpoint_due):
             line = _run(config, line, block)
             block = []
@@ -86,6 +87,18 @@ def advance(config: IdentifierParameters, line: Timeline, samples: Sequence[Samp
                                  waiting=tuple(e for e in line.waiting if e is not event))
         block.append(sample)
     return _run(config, line, block, ahead=ahead) if block else line
+
+
+def is_checkpoint_due(config: IdentifierParameters, line: Timeline, stamp_ns: int, awaited: bool = False
+                      ) -> bool:
+    """Whether there is to be a checkpoint before a sample of this stamp [ns].
+
+    awaited: somebody waits for it, and the checkpoint may be late, but at the same sample always.
+    """
+    if not line.checkpoints:
+        return True
+    spacing_ns = int(config.rewind_time * 1e9) // CHECKPOINTS
+    return stamp_ns - line.checkpoints[-1].stamp_ns >= spacing_ns * (3 if awaited else 2) // 2
 
 
 def event(config: IdentifierParameters, line: Timeline, event: CaptureEvent, first_ns: int = BEFORE_ALL
@@ -112,7 +125,7 @@ def _all_along(config: IdentifierParameters, line: Timeline) -> Timeline:
     """Every sample came after the events: forget a payload that was read as if they had not happened."""
     core = estimator.anew(config, line.core, sorted(line.latest, key=lambda e: e.stamp_ns))
     return line._replace(core=core, checkpoints=(Checkpoint(line.last_ns, line.last_ns + 1, core),),
-                         blocks=(), kept=0, applied=(), late_events=line.late_events + 1)
+                         blocks=(), kept=0, stale=0, applied=(), late_events=line.late_events + 1)
 
 
 def _wait(line: Timeline, event: CaptureEvent) -> Timeline:
@@ -123,8 +136,13 @@ def _wait(line: Timeline, event: CaptureEvent) -> Timeline:
 def _run(config: IdentifierParameters, line: Timeline, block: list[Sample], *, ahead: bool = False
          ) -> Timeline:
     run = estimator.payload_ahead if ahead else estimator.advance
-    return line._replace(core=run(config, line.core, block), blocks=(*line.blocks, tuple(block)),
-                         kept=line.kept + len(block), last_ns=block[-1].stamp_ns)
+    gone = min(line.stale, LET_GO)
+    return line._replace(core=run(config, line.core, block), blocks=(*line.blocks[gone:], tuple(block)),
+                         stale=line.stale - gone, kept=line.kept + len(block), last_ns=block[-1].stamp_ns)
+
+
+def _last_ns(block: tuple[Sample, ...]) -> int:
+    return block[-1].stamp_ns
 
 
 def _checkpoint(config: IdentifierParameters, line: Timeline, stamp_ns: int) -> Timeline:
@@ -135,8 +153,9 @@ def _checkpoint(config: IdentifierParameters, line: Timeline, stamp_ns: int) -> 
     while len(kept) > 1 and (kept[1].stamp_ns <= oldest_needed or too_many):
         kept = kept[1:]
     start = kept[0].after_ns
-    blocks = tuple(block for block in line.blocks if block[-1].stamp_ns > start)
-    return line._replace(checkpoints=kept, blocks=blocks, kept=sum(map(len, blocks)),
+    stale = bisect_right(line.blocks, start, key=_last_ns)
+    return line._replace(checkpoints=kept, stale=stale,
+                         kept=line.kept - sum(map(len, line.blocks[line.stale:stale])),
                          applied=tuple(e for e in line.applied if e.stamp_ns > start))
 
 
@@ -144,12 +163,12 @@ def _rewind(config: IdentifierParameters, line: Timeline, event: CaptureEvent) -
     """Go back to the last checkpoint not after the event, and run samples and events again from there."""
     kept = tuple(c for c in line.checkpoints if c.after_ns < event.stamp_ns)
     start = kept[-1].after_ns
-    again = tuple(sample for block in line.blocks for sample in block if block[-1].stamp_ns > start)
-    before = tuple(block for block in line.blocks if block[-1].stamp_ns <= start)
+    first = bisect_right(line.blocks, start, key=_last_ns)
+    again = tuple(sample for block in line.blocks[first:] for sample in block)
     redo = sorted((*(e for e in line.applied if e.stamp_ns > start), *line.waiting, event),
                   key=lambda e: e.stamp_ns)
     back = line._replace(
-        core=kept[-1].core, checkpoints=kept, blocks=before, kept=sum(map(len, before)),
+        core=kept[-1].core, checkpoints=kept, blocks=line.blocks[:first], kept=line.kept - len(again),
         applied=tuple(e for e in line.applied if e.stamp_ns <= start),
         waiting=tuple(redo), last_ns=start, rewinds=line.rewinds + 1)
     return advance(config, back, again)
