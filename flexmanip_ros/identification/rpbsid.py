@@ -8,8 +8,7 @@ per sample bounded in both; decompositions happen only in ``identified``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +38,7 @@ FRESH = 3.0
 """A fit is published while the subspace model rests on at most this many times its samples."""
 
 
-@dataclass(frozen=True, eq=False)
-class RpbsidState:
+class RpbsidState(NamedTuple):
     """All the identifier remembers; nothing grows.
 
     z: (p (r + m),) past window, scaled; scale: (r + m,); mean: (2, r + m) slow means and peaks;
@@ -59,7 +57,7 @@ class RpbsidState:
     refined: refinement.Refined | None
     decimator: decimation.Decimator | None
 
-    def copy(self) -> RpbsidState:
+    def owned(self) -> RpbsidState:
         """Return a state whose arrays may be overwritten."""
         return RpbsidState(
             self.z.copy(), self.scale.copy(), self.mean.copy(), self.variance.copy(), self.scalars.copy(),
@@ -133,10 +131,10 @@ def advance(
             f'samples of shapes {U.shape} and {Y.shape} do not fit {r} inputs and {m} outputs',
             'give as many rows of both, one column per configured signal')
     stamps = np.zeros(len(U), dtype=np.int64) if stamps_ns is None else stamps_ns
-    new = state.copy()
+    new = state.owned()
     if new.decimator is not None:
         filtered, kept, at = decimation.decimate(new.decimator, np.hstack([U, Y]), config.decimation)
-        new, stamps = replace(new, decimator=filtered), stamps[at]
+        new, stamps = new._replace(decimator=filtered), stamps[at]
         U, Y = np.ascontiguousarray(kept[:, :r]), np.ascontiguousarray(kept[:, r:])
     done = 0
     while done < len(U):
@@ -146,7 +144,7 @@ def advance(
         u, y = U[done:done + count], Y[done:done + count]
         fate = _run(config, new, u, y)
         if new.refined is not None:
-            new = replace(new, refined=fitting.refine(
+            new = new._replace(refined=fitting.refine(
                 config, new.refined, np.hstack([u, y]), stamps[done:done + count], fate, new.memory[0],
                 new.scale))
         done += count
@@ -189,26 +187,26 @@ def answered(state: RpbsidState, job: refinement.Job, answer: refinement.Answer)
     refined = state.refined
     if refined is None or refined.job is not job:
         return state
-    return replace(state, refined=refined._replace(answer=answer))
+    return state._replace(refined=refined._replace(answer=answer))
 
 
 def finish(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
     """No sample follows: take the result of the fit under way now."""
     if state.refined is None:
         return state
-    return replace(state, refined=fitting.delivered(config, state.refined))
+    return state._replace(refined=fitting.delivered(config, state.refined))
 
 
 def window_restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
     """Samples are missing: no regressor will straddle the gap; what was learnt is kept."""
-    new = state.copy()
+    new = state.owned()
     new.counts[FILLED] = 0
     if config.estimator == 'paper':
         new.memory[-1][-1] = 0.0
     if new.decimator is not None:
-        new = replace(new, decimator=decimation.restart(new.decimator))
+        new = new._replace(decimator=decimation.restart(new.decimator))
     if new.refined is not None:
-        new = replace(new, refined=fitting.broken(config, new.refined))
+        new = new._replace(refined=fitting.broken(config, new.refined))
     return new
 
 
@@ -220,7 +218,7 @@ def restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
     """
     new = window_restart(config, state)
     if new.refined is not None:
-        new = replace(new, refined=refinement.restart(new.refined))
+        new = new._replace(refined=refinement.restart(new.refined))
     if not config.restart_on_event or not new.counts[USED]:
         return new
     new.counts[USED] = 0

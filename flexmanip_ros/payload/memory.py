@@ -84,9 +84,22 @@ def copy(state: Memory) -> Memory:
 
     All but the samples kept, the largest part, once they are complete: nothing writes them any more.
     """
-    kept = state.samples if state.counts[STORED] >= HORIZON else state.samples.copy()
-    (x, S, noise, recent, counts, score, x0, S0, xi, _, xr, Sr, N, g, tail, torque, torque0, innovation,
+    own = for_samples(state)
+    if own.S0 is not state.S0:
+        return own
+    return own._replace(x0=own.x0.copy(), S0=own.S0.copy(), xi=own.xi.copy(), xr=own.xr.copy(),
+                        Sr=own.Sr.copy(), N=own.N.copy(), g=own.g.copy(), torque0=own.torque0.copy())
+
+
+def for_samples(state: Memory) -> Memory:
+    """Return the same values for the kernel to take samples with.
+
+    What belongs to the refit is shared once its samples are complete: only an event writes it then.
+    """
+    (x, S, noise, recent, counts, score, x0, S0, xi, samples, xr, Sr, N, g, tail, torque, torque0, innovation,
      power) = state
-    return Memory(x.copy(), S.copy(), noise.copy(), recent.copy(), counts.copy(), score.copy(), x0.copy(),
-                  S0.copy(), xi.copy(), kept, xr.copy(), Sr.copy(), N.copy(), g.copy(), tail.copy(),
-                  torque.copy(), torque0.copy(), innovation.copy(), power.copy())
+    if counts[STORED] < HORIZON:
+        x0, S0, xi, samples, xr = x0.copy(), S0.copy(), xi.copy(), samples.copy(), xr.copy()
+        Sr, N, g, torque0 = Sr.copy(), N.copy(), g.copy(), torque0.copy()
+    return Memory(x.copy(), S.copy(), noise.copy(), recent.copy(), counts.copy(), score.copy(), x0, S0, xi,
+                  samples, xr, Sr, N, g, tail.copy(), torque.copy(), torque0, innovation.copy(), power.copy())

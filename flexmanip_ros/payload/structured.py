@@ -220,7 +220,7 @@ def _run(config: IdentifierParameters, state: StructuredState, samples: Sequence
     assert state.effort is not None
     if not samples:
         return state
-    m = mem.copy(state.memory)
+    m = mem.for_samples(state.memory)
     table = _table(state.model, state.last_ns, state.effort, samples)
     taken = run(state.model.motion, state.sensors, m, table)
     if taken < len(samples):

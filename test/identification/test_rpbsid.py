@@ -21,8 +21,7 @@ ESTIMATORS = [
 
 
 def arrays(state: rpbsid.RpbsidState) -> list[np.ndarray]:
-    named = [getattr(state, field.name) for field in dataclasses.fields(state)]
-    return list(flat(named))
+    return list(flat(state))
 
 
 def flat(item: object) -> Iterator[np.ndarray]:

@@ -60,12 +60,17 @@ def test_a_block_of_samples_gives_the_bits_of_single_ones(caught):
     assert structured.estimate(settings, whole) == structured.estimate(settings, single)
 
 
-def test_a_state_is_never_written_to(caught):
+@pytest.mark.parametrize('begin', [200, 500, 700])  # before, across and beyond the samples that are kept
+def test_a_state_is_never_written_to(caught, begin):
     settings = config()
-    state = structured.advance(settings, structured.init(settings), caught[:200])
-    before = [part.copy() for part in state.memory]
-    structured.event(settings, structured.advance(settings, state, caught[200:400]), event(0.4))
-    assert all(np.array_equal(a, b) for a, b in zip(before, state.memory, strict=True))
+    state = structured.advance(settings, structured.init(settings), caught[:begin])
+    later = structured.advance(settings, state, caught[begin:begin + 200])
+    before = [[part.copy() for part in one.memory] for one in (state, later)]
+    changed = structured.event(settings, later, event(0.001 * (begin + 200)))
+    structured.advance(settings, changed, caught[begin + 200:begin + 250])
+    structured.reopen(settings, later)
+    for values, one in zip(before, (state, later), strict=True):
+        assert all(np.array_equal(a, b) for a, b in zip(values, one.memory, strict=True))
 
 
 def test_an_empty_arm_holds_nothing(caught):
