@@ -19,7 +19,7 @@ from flexmanip_ros.payload.block_extraction import NOWHERE
 from flexmanip_ros.payload.model_comparison import Verdict
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, Payload, Sample, Status
 
-BATCH, MOST_OWED = 8, 16
+BATCH, MOST_OWED = 4, 16
 """Samples that the identifier takes at once, for only who reads a model waits for it: from so many on when
 there is nothing else to do, and at most."""
 
