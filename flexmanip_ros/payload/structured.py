@@ -25,6 +25,8 @@ from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload, Sample
 
 FIRST_LOOK = 24
 """Samples looked at before the filter starts: they tell its noise."""
+LONGEST_S = 10.0
+"""An event this long after the last sample finds a motion nobody knows; the next sample starts anew."""
 run = Prepared(run_kernel, 2)
 
 
@@ -90,8 +92,8 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     m = mem.copy(state.memory)
     assert state.effort is not None
     assert state.sensors is not None
-    ahead = max(event.stamp_ns - state.last_ns, 0)
-    predict(state.model.motion, m.x, m.S, state.effort, ahead * 1e-9, bool(m.counts[mem.HELD]))
+    ahead, held = max(event.stamp_ns - state.last_ns, 0), bool(m.counts[mem.HELD])
+    predict(state.model.motion, m.x, m.S, state.effort, min(ahead * 1e-9, LONGEST_S), held)
     if ahead > 0:
         push(state.model.motion, state.sensors.tail, m.x, m.torque, state.effort, believed(m.score))
         ring(state.sensors.tail, m, ahead * 1e-9, state.effort)

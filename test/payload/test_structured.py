@@ -194,6 +194,15 @@ def test_events_in_any_order_give_a_status_never_a_nan(events, caught):
     assert finite(structured.estimate(settings, state))
 
 
+def test_an_event_years_after_the_last_sample_is_taken_at_once(caught):
+    settings, years = config(), 10 ** 18
+    state = structured.advance(settings, structured.init(settings), caught[:700])
+    changed = structured.event(settings, state, event(0.7)._replace(stamp_ns=years))
+    then = [sample._replace(stamp_ns=years + sample.stamp_ns) for sample in caught[700:]]
+    then[0] = then[0]._replace(gap=True)
+    assert finite(structured.estimate(settings, structured.advance(settings, changed, then)))
+
+
 def test_a_gap_keeps_what_is_known_of_the_payload(caught):
     settings = config()
     state = run(settings, caught[:2500], (event(1.5),))
