@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import math
 from collections.abc import Iterator
+from itertools import chain
 from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -125,7 +126,7 @@ class Bench:
             return len(self.node._pending)
         state = self.node.state
         line = state.timeline
-        kept = () if line is None else (*line.samples, *line.applied, *line.waiting, *line.checkpoints)
+        kept = () if line is None else (*chain(*line.blocks), *line.applied, *line.waiting, *line.checkpoints)
         return len(state.early) + len(kept)
 
     def alive(self) -> None:
