@@ -65,7 +65,7 @@ def read(state: State, due: Due) -> tuple[State, Estimate]:
         state = state._replace(timeline=line._replace(core=core))
     # while an event may still come late no verdict is given: it would depend on when that came
     estimate, verdicts = estimator.estimate(config, core, due.stamp_ns, state.sampling.dt, due.payload,
-                                            state.verdicts, compare=not is_young(state, due.stamp_ns))
+                                            state.verdicts, compare=not is_young(state, due))
     instant = instant_of(state, due.stamp_ns, config.model_rate)
     reading = Reading(estimate, core.since_ns, instant) if estimate.model is not None else None
     return state._replace(reading=reading, verdicts=verdicts), estimate
@@ -235,7 +235,7 @@ def _hold(state: State, samples: Iterable[Sample], group: int | None) -> tuple[S
         state = state._replace(held=held)
         following = sample.stamp_ns + dt_ns
         if (len(held) >= group or is_due(state, following)
-                or timeline.is_checkpoint_due(config, line, following)):  # that would part the group in two
+                or timeline.is_checkpoint_due(config, line, following)):  # a group is run in one piece
             state = _run_held(state)
         elif len(line.core.owed) >= estimator.BATCH:
             state = state._replace(timeline=line._replace(core=estimator.settle(config, line.core)))

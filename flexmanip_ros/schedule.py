@@ -61,14 +61,15 @@ def instant_of(state: State, stamp_ns: int, rate: float) -> int:
     return int((stamp_ns - state.first_ns) * rate * 1e-9 + 1e-6)
 
 
-def is_young(state: State, stamp_ns: int) -> bool:
-    """Whether an event may still come late, or the first sample was as little ago."""
-    config, line = state.config, state.timeline
+def is_young(state: State, due: Due) -> bool:
+    """Whether an event before this estimate may still come late, or the first sample was as little ago.
+
+    By the stamp of the last event that counts, not of the last one heard: these may have changed places.
+    """
+    config = state.config
     assert config is not None
-    assert line is not None
     settling = 2.0 * config.rewind_time + 1.0 / config.publish_rate
-    changes = (state.first_ns, *(event.stamp_ns for event in line.latest))
-    return any(0 <= stamp_ns - change <= settling * 1e9 for change in changes)
+    return due.stamp_ns - max(state.first_ns, due.core.since_ns) <= settling * 1e9
 
 
 def is_due(state: State, stamp_ns: int) -> bool:
@@ -85,7 +86,7 @@ def is_read_anew(state: State, due: Due) -> bool:
     """
     last = state.reading
     assert state.config is not None
-    return (last is None or last.since_ns != due.core.since_ns or is_young(state, due.stamp_ns)
+    return (last is None or last.since_ns != due.core.since_ns or is_young(state, due)
             or instant_of(state, due.stamp_ns, state.config.model_rate) > last.instant)
 
 

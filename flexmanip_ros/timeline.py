@@ -24,9 +24,9 @@ CHECKPOINTS = 2
 MOST_EVENTS = 100
 """Events that wait for their stamps at most, the earliest ones."""
 LET_GO = 2
-"""Blocks no longer needed that are let go of with each new one."""
+"""Blocks no longer needed that are let go of with each new one, or more until as many samples have gone."""
 MOST_SAMPLES = 20_000
-"""Samples kept at most; at rates (or with stamps) that need more the time to go back is shorter."""
+"""Samples needed at most; at rates (or with stamps) that need more the time to go back is shorter."""
 
 
 class Checkpoint(NamedTuple):
@@ -91,7 +91,7 @@ def advance(config: IdentifierParameters, line: Timeline, samples: Sequence[Samp
 
 def is_checkpoint_due(config: IdentifierParameters, line: Timeline, stamp_ns: int, awaited: bool = False
                       ) -> bool:
-    """Whether there is to be a checkpoint before a sample of this stamp [ns].
+    """Whether it is time for a checkpoint before a sample of this stamp [ns].
 
     awaited: somebody waits for it, and the checkpoint may be late, but at the same sample always.
     """
@@ -123,13 +123,18 @@ def event(config: IdentifierParameters, line: Timeline, event: CaptureEvent, fir
 
 def _all_along(config: IdentifierParameters, line: Timeline) -> Timeline:
     """Every sample came after the events: forget a payload that was read as if they had not happened."""
-    core = estimator.anew(config, line.core, sorted(line.latest, key=lambda e: e.stamp_ns))
+    core = estimator.anew(config, line.core, sorted(line.latest, key=_order))
     return line._replace(core=core, checkpoints=(Checkpoint(line.last_ns, line.last_ns + 1, core),),
                          blocks=(), kept=0, stale=0, applied=(), late_events=line.late_events + 1)
 
 
+def _order(event: CaptureEvent) -> tuple[int, bool]:
+    """By stamp, whatever the order of arrival; with the same stamp the arm lets go before it catches."""
+    return event.stamp_ns, event.kind is EventKind.CAPTURE
+
+
 def _wait(line: Timeline, event: CaptureEvent) -> Timeline:
-    waiting = sorted((*line.waiting, event), key=lambda e: e.stamp_ns)
+    waiting = sorted((*line.waiting, event), key=_order)
     return line._replace(waiting=tuple(waiting[:MOST_EVENTS]))
 
 
@@ -137,6 +142,8 @@ def _run(config: IdentifierParameters, line: Timeline, block: list[Sample], *, a
          ) -> Timeline:
     run = estimator.payload_ahead if ahead else estimator.advance
     gone = min(line.stale, LET_GO)
+    while gone < line.stale and sum(map(len, line.blocks[:gone])) < len(block):
+        gone += 1
     return line._replace(core=run(config, line.core, block), blocks=(*line.blocks[gone:], tuple(block)),
                          stale=line.stale - gone, kept=line.kept + len(block), last_ns=block[-1].stamp_ns)
 
@@ -165,8 +172,7 @@ def _rewind(config: IdentifierParameters, line: Timeline, event: CaptureEvent) -
     start = kept[-1].after_ns
     first = bisect_right(line.blocks, start, key=_last_ns)
     again = tuple(sample for block in line.blocks[first:] for sample in block)
-    redo = sorted((*(e for e in line.applied if e.stamp_ns > start), *line.waiting, event),
-                  key=lambda e: e.stamp_ns)
+    redo = sorted((*(e for e in line.applied if e.stamp_ns > start), *line.waiting, event), key=_order)
     back = line._replace(
         core=kept[-1].core, checkpoints=kept, blocks=line.blocks[:first], kept=line.kept - len(again),
         applied=tuple(e for e in line.applied if e.stamp_ns <= start),

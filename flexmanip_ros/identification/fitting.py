@@ -14,7 +14,14 @@ from flexmanip_ros.identification.moments import triangle
 from flexmanip_ros.identification.prediction_error import derivatives, moved, run
 from flexmanip_ros.identification.prediction_error_kernel import condition
 from flexmanip_ros.identification.refinement import Answer, Job, Refined
-from flexmanip_ros.identification.stretch import UNEXPLAINED, Recursion, arrive, fit_stretch, unexplained
+from flexmanip_ros.identification.stretch import (
+    BLOCK,
+    UNEXPLAINED,
+    Recursion,
+    arrive,
+    fit_stretch,
+    unexplained,
+)
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.types import Array
 
@@ -49,10 +56,13 @@ def _stretch(config: IdentifierParameters, job: Job, R: Array, scale: Array) -> 
     if config.order > len(config.outputs) and config.past_window > config.future_window:
         longer = replace(config, future_window=config.past_window)
         starts.append(publication.from_factor(longer, R, scale))
-    return fit_stretch(
+    found = fit_stretch(
         np.vstack(job.chunks), [realized for realized, _, _ in starts if realized is not None],
         [fit for fit in (job.old, job.older) if fit is not None],
         starts[0][2], config.direct_feedthrough, 'sensor' if config.refinement == 'output_error' else 'any')
+    if found is None or found.going == 0.0:
+        return found
+    return found._replace(behind=job.later / BLOCK + 1.0)  # the arm goes on until it is read
 
 
 def _block(old: Recursion, samples: Array) -> Recursion | None:

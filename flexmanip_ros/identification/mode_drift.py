@@ -1,7 +1,7 @@
 """Whether an arm's frequencies drift along a stretch that a fit takes for that of one model.
 
-A moving arm is not linear, and its frequencies go with it. A fit of the whole stretch is the model of its
-middle, and its covariance knows nothing of how far the arm has gone since. So each mode gets a steady drift
+A moving arm is not linear, and its frequencies go with it. A fit of the whole stretch is the model of an
+earlier arm, and its covariance knows nothing of how far that has gone since. So each mode gets a steady drift
 of its frequency, and a score test says whether the residuals ask for it.
 """
 
@@ -20,6 +20,8 @@ SURPRISE = 4.0
 """Standard deviations beyond which a drift is no chance."""
 PERIODS = 5.0
 """Of a mode in the stretch at least: over few of them, whatever else the model lacks looks like a drift."""
+APART = 1e-4
+"""Share of what a drift does that the parameters of the fit must not be able to do as well."""
 MOST_SKEW = 1e8
 """Condition of the eigenvectors of an A that is as good as defective."""
 
@@ -48,6 +50,14 @@ def turns(A: Array, least: float = 0.0) -> Array:
                     ).reshape(-1, *A.shape)
 
 
+def drift_of(U: Array, Y: Array, fit: Fit, structure: Structure, widening: float = 1.0) -> Drift | None:
+    """Return the drift of a fit, see ``drifting``; None, too, where the numbers do not allow to tell."""
+    try:
+        return drifting(U, Y, fit, structure, widening)
+    except np.linalg.LinAlgError:  # the fit itself is sound
+        return None
+
+
 def drifting(U: Array, Y: Array, fit: Fit, structure: Structure, widening: float = 1.0) -> Drift | None:
     """Return the drift of a fit with K = 0 to U (N, r), Y (N, m), None where it may be chance.
 
@@ -74,13 +84,15 @@ def drifting(U: Array, Y: Array, fit: Fit, structure: Structure, widening: float
     gradient = own @ e - taken.T @ (root.T @ _gradient(U, Y, fit, structure))
     if not np.all(np.isfinite(information)) or not np.all(np.isfinite(gradient)):
         return None
-    rho = _beyond_chance(information, gradient, SURPRISE * widening ** 2)
+    apart = np.diag(information) > APART * np.sum(own ** 2, axis=1)
+    rho = np.zeros(len(moving))
+    rho[apart] = _beyond_chance(information[np.ix_(apart, apart)], gradient[apart], SURPRISE * widening ** 2)
     if not rho.any():
         return None
     k = fit.directions.shape[1]
     flat = np.zeros(fit.directions.shape[0])
     flat[:n * n] = np.einsum('g,gij->ij', rho, moving).ravel()
-    rate = fit.directions.T @ flat
+    rate = fit.directions.T @ flat  # a change of basis in it is dropped; the state's share of that is small
     other = root @ (taken @ rho)
     ahead = 0.5 * rate - other
     ahead[k - n:] = X.T @ rho - fit.arrival @ other

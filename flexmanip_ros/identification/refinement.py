@@ -17,13 +17,14 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.identification.moments import triangle
-from flexmanip_ros.identification.stretch import BLOCK, DELAY, Recursion
+from flexmanip_ros.identification.stretch import BLOCK, Recursion
 from flexmanip_ros.types import Array
 
 CHUNK = 64
 """Samples handed over at once."""
 FIRST, LONGEST = 256, 2048
 """Samples of the first fit, and of the last one that sees them all; multiples of CHUNK."""
+DELAY = 4
 SOONEST = 128
 """A fit of N samples is taken N / DELAY samples later, and at least so many."""
 SOONEST_S, EACH_S = 0.1, 2e-4
@@ -43,7 +44,7 @@ class Job(NamedTuple):
 
     chunks: its samples, in arrays (CHUNK, r + m); R: (q, q) factor of the moments and scale: (r + m,), both
     None for the update by a block; old: the fit before, if any; older: that of before the last event, where
-    it is another.
+    it is another; later: samples from its last one until the result is taken.
     """
 
     chunks: tuple[Array, ...]
@@ -51,6 +52,7 @@ class Job(NamedTuple):
     scale: Array | None
     old: Recursion | None
     older: Recursion | None = None
+    later: int = 0
 
 
 class Answer(NamedTuple):
@@ -146,9 +148,10 @@ def _chunks(refined: Refined, now_ns: int, duration: float, most: int) -> int:
 
 def ask_fit(refined: Refined, R: Array, scale: Array, now_ns: int = 0) -> Refined:
     """Ask for a fit of the whole stretch, see ``stretch.fit_stretch``."""
-    fits = [fit for fit in (refined.recursion, refined.before) if fit is not None]
-    job = Job(refined.chunks, R.copy(), scale.copy(), *(*fits, None)[:2])
-    return refined._replace(job=job, due=refined.total + patience(refined, now_ns))
+    old, older, *_ = *(fit for fit in (refined.recursion, refined.before) if fit is not None), None, None
+    later = patience(refined, now_ns)
+    job = Job(refined.chunks, R.copy(), scale.copy(), old, older, later)
+    return refined._replace(job=job, due=refined.total + later)
 
 
 def ask_block(refined: Refined, now_ns: int = 0) -> Refined:

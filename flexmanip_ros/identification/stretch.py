@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.identification.mode_drift import drifting
+from flexmanip_ros.identification.mode_drift import drift_of
 from flexmanip_ros.identification.moments import Realized, triangle
 from flexmanip_ros.identification.prediction_error import (
     Fit,
@@ -26,8 +26,6 @@ from flexmanip_ros.types import Array, StateSpace
 ITERATIONS = 12
 BLOCK = 256
 """Samples of a recursive update; a multiple of refinement.CHUNK."""
-DELAY = 4
-"""A fit of N samples is taken N / DELAY samples later."""
 LIGHT = 0.005
 """Largest damping ratio of a second start: a short past makes modes seem damped, and fits start lost."""
 CLEAN = 1e-20
@@ -199,18 +197,18 @@ def _recursion(samples: Array, attempt: Attempt) -> Recursion:
         alone = structure._replace(free_gain=True, only_gain=True)
         gain = _gain_alone(U, Y, fit.theta, attempt.begin, alone)
     root, blocks = arrive(covariance_root(fit.information), fit.arrival), len(U) / BLOCK
-    went, going, behind = np.zeros(fit.directions.shape[1]), 0.0, 0.0
+    went, going = np.zeros(fit.directions.shape[1]), 0.0
     widening = _widening(U, Y, fit, structure)
-    drift = drifting(U, Y, fit, structure, widening)
-    if drift is not None:  # the fit is of the middle of the stretch, and the arm has gone on since
+    drift = drift_of(U, Y, fit, structure, widening)
+    if drift is not None:  # the fit is of an earlier arm
         root = triangle(np.hstack([root, drift.ahead[:, None]]).T).T
-        went, going, behind = drift.rate / blocks, 1.0, blocks / DELAY + 1.0
+        went, going = drift.rate / blocks, 1.0
     return Recursion(
         theta=fit.theta._replace(x=fit.end), structure=structure, scale=attempt.scale, P=fit.directions,
         root=root,
         covariance=fit.covariance + CLEAN * np.diag(np.mean(Y ** 2, axis=0)), weight=float(len(U)),
         widening=widening, strikes=0, gain=fit.theta.K if gain is None else gain,
-        singular_values=np.zeros(0), condition=float('nan'), went=went, going=going, behind=behind)
+        singular_values=np.zeros(0), condition=float('nan'), went=went, going=going)
 
 
 def _gain_alone(U: Array, Y: Array, theta: Theta, begin: Array, structure: Structure) -> Array | None:

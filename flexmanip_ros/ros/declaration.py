@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor
@@ -26,10 +27,14 @@ def declare(node: Node, name: str, default: Any, kind: Parameter.Type, descripto
     if not isinstance(default, list) or default:
         return node.declare_parameter(name, default, descriptor).value
     given = overrides(node).get(name)
-    has_value = given is not None and bool(given.value)
+    has_value = given is not None and not _is_empty(given.value)
     node.declare_parameter(name, kind, ignore_override=not has_value)
     if not has_value:
         node.set_parameters([Parameter(name, kind, [])])
     descriptor.type = kind.value
     node.set_descriptor(name, descriptor)
     return node.get_parameter(name).value
+
+
+def _is_empty(value: Any) -> bool:
+    return value is None or (isinstance(value, Sequence) and not isinstance(value, str) and not value)

@@ -21,7 +21,8 @@ def take(priority: int) -> str:
         return ''
     try:
         for thread in os.listdir('/proc/self/task'):
-            _set(int(thread), priority)
+            with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
+                _set(int(thread), priority)
     except (AttributeError, OSError) as error:
         return error.strerror or str(error) if isinstance(error, OSError) else 'not on this system'
     return ''

@@ -44,7 +44,7 @@ class RealTime:
         refused = affinity.take(self._cores)
         if refused:
             self._node.get_logger().warning(
-                f'any core: cpu_affinity {self._cores} was refused ({refused}); '
+                f'cpu_affinity {self._cores} was refused ({refused}); '
                 f'this process may use {affinity.current()}')
         refused = priority.take(self._priority)
         self._taken = not refused

@@ -86,6 +86,25 @@ def test_two_events_out_of_order_give_the_result_of_their_order() -> None:
     assert same(ordered[-3:], swapped[-3:])
 
 
+def test_an_event_announced_early_changes_nothing_before_its_stamp() -> None:
+    items, first = records(560), CaptureEvent(150 * MS, EventKind.CAPTURE)
+    second = CaptureEvent(500 * MS, EventKind.CAPTURE)
+    _, on_time = step_through([*items[:150], first, *items[150:500], second, *items[500:]])
+    _, early = step_through([*items[:150], first, *items[150:165], second, *items[165:]])
+    assert same(on_time, early)
+
+
+def test_of_two_events_of_one_stamp_the_release_comes_first() -> None:
+    items, at = records(320), 200 * MS
+    capture, release = CaptureEvent(at, EventKind.CAPTURE), CaptureEvent(at, EventKind.RELEASE)
+    config = configure(IdentifierParameters, {'rewind_time': 0.05})
+    (_, one), (_, two) = (
+        step_through([*items[:150], *pair, *items[150:]], config)
+        for pair in ((capture, release), (release, capture)))
+    assert same(one, two)
+    assert [repr(e.payload) for e in one] == [repr(e.payload) for e in two]
+
+
 def test_an_event_too_old_to_go_back_for_is_applied_at_once_and_counted() -> None:
     state, _ = step_through(with_event(records(400), 100.0, 350))
     assert state.timeline is not None

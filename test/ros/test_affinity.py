@@ -47,6 +47,12 @@ def test_cores_that_are_not_there_are_told_and_change_nothing(cores: list[int]) 
     assert os.sched_getaffinity(0) == before
 
 
+def test_a_core_that_is_not_there_among_others_is_told() -> None:
+    there = sorted(os.sched_getaffinity(0))
+    assert '100000' in affinity.take([*there, 100_000])
+    assert sorted(os.sched_getaffinity(0)) == there
+
+
 def test_a_node_says_what_it_has(ros: Ros) -> None:
     live = Live(ros, cpu_affinity=[100_000], thread_priority=0)
     live.node.real_time.take()

@@ -58,6 +58,14 @@ def test_a_list_that_is_empty_by_default_may_be_given(ros: Ros, given: list[floa
     assert list(node.get_parameter('payload.working_point').value) == given
 
 
+@pytest.mark.parametrize('given', [0, 0.0, False, '', 1])
+def test_what_is_no_list_is_not_taken_for_an_empty_one(ros: Ros, given: object) -> None:
+    node = ros.add(Node('declaring', context=ros.context,
+                        parameter_overrides=overrides(payload__working_point=given)))
+    with pytest.raises(ParameterError, match='give a list'):
+        NodeParameters(node, IdentifierParameters)
+
+
 @pytest.mark.parametrize(('name', 'value', 'said'), [
     ('order', 0, "'order' is 0; give a value from 1 to 60"),
     ('order', 4.0, "'order' is of type double; give a whole number"),
