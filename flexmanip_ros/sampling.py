@@ -137,7 +137,7 @@ def _fault(channels: Channels, record: JointRecord) -> Refusal | None:
     fault = wrong_size(record)
     if fault is not None:
         return fault
-    for field, _ in channels.u + channels.y + channels.angles:
+    for field, _ in channels.places:
         if getattr(record, field).size == 0:
             return Refusal('missing_signal', f'a message carries no {field}',
                            'make the publisher fill it in every message')

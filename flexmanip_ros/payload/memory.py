@@ -79,27 +79,19 @@ def memory(nx: int, m: int, a: int = 0) -> Memory:
         innovation=np.zeros((m, 2)), power=np.ones(m))
 
 
-def copy(state: Memory) -> Memory:
+def copy(state: Memory, *, refit: bool = True) -> Memory:
     """Return the same values in arrays of their own.
 
-    All but the samples kept, the largest part, once they are complete: nothing writes them any more.
-    """
-    own = for_samples(state)
-    if own.S0 is not state.S0:
-        return own
-    return own._replace(x0=own.x0.copy(), S0=own.S0.copy(), xi=own.xi.copy(), xr=own.xr.copy(),
-                        Sr=own.Sr.copy(), N=own.N.copy(), g=own.g.copy(), torque0=own.torque0.copy())
-
-
-def for_samples(state: Memory) -> Memory:
-    """Return the same values for the kernel to take samples with.
-
-    What belongs to the refit is shared once its samples are complete: only an event writes it then.
+    All but the samples kept, the largest part, once they are complete: nothing writes them any more. refit
+    False: nor what belongs to the refit of them, which only an event writes then.
     """
     (x, S, noise, recent, counts, score, x0, S0, xi, samples, xr, Sr, N, g, tail, torque, torque0, innovation,
      power) = state
-    if counts[STORED] < HORIZON:
-        x0, S0, xi, samples, xr = x0.copy(), S0.copy(), xi.copy(), samples.copy(), xr.copy()
-        Sr, N, g, torque0 = Sr.copy(), N.copy(), g.copy(), torque0.copy()
+    complete = counts[STORED] >= HORIZON
+    if not complete:
+        samples = samples.copy()
+    if refit or not complete:
+        x0, S0, xi, xr, Sr = x0.copy(), S0.copy(), xi.copy(), xr.copy(), Sr.copy()
+        N, g, torque0 = N.copy(), g.copy(), torque0.copy()
     return Memory(x.copy(), S.copy(), noise.copy(), recent.copy(), counts.copy(), score.copy(), x0, S0, xi,
                   samples, xr, Sr, N, g, tail.copy(), torque.copy(), torque0, innovation.copy(), power.copy())

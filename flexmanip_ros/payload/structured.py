@@ -222,7 +222,7 @@ def _run(config: IdentifierParameters, state: StructuredState, samples: Sequence
     assert state.effort is not None
     if not samples:
         return state
-    m = mem.for_samples(state.memory)
+    m = mem.copy(state.memory, refit=False)
     table = _table(state.model, state.last_ns, state.effort, samples)
     taken = run(state.model.motion, state.sensors, m, table)
     if taken < len(samples):
@@ -232,11 +232,9 @@ def _run(config: IdentifierParameters, state: StructuredState, samples: Sequence
 
 def _table(model: Model, before: int, effort: Array, samples: Sequence[Sample]) -> Array:
     """Return what the kernel takes, (N, 3 + m), after a sample at ``before`` [ns] with that effort (2,)."""
-    rows, held, extra = [], effort.tolist(), model.extra
+    rows, held = [], effort.tolist()
     for sample in samples:
-        angles = sample.angles.tolist() if extra else ()
-        rows.append([max(sample.stamp_ns - before, 0) * 1e-9, *held, *sample.y.tolist(),
-                     *(angles[i] for i in extra)])
+        rows.append([max(sample.stamp_ns - before, 0) * 1e-9, *held, *_measured(model, sample)])
         before, held = sample.stamp_ns, sample.u.tolist()
     return np.array(rows, dtype=np.float64)
 
@@ -254,6 +252,10 @@ def _restart(
 
 def measurements(model: Model, samples: Sequence[Sample]) -> Array:
     """Return outputs and the angles that are not among them, (N, m)."""
-    rows = ([sample.y for sample in samples] if not model.extra else
-            [(*sample.y.tolist(), *(sample.angles[i] for i in model.extra)) for sample in samples])
+    rows = [_measured(model, sample) for sample in samples]
     return np.array(rows, dtype=np.float64).reshape(len(samples), len(model.roles))
+
+
+def _measured(model: Model, sample: Sample) -> list[float]:
+    angles = sample.angles.tolist() if model.extra else []
+    return [*sample.y.tolist(), *(angles[i] for i in model.extra)]

@@ -5,9 +5,10 @@ Two nodes that share a core push each other's code and numbers out of its caches
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Sequence
+
+from flexmanip_ros.ros import threads
 
 
 def take(cores: Sequence[int]) -> str:
@@ -18,16 +19,12 @@ def take(cores: Sequence[int]) -> str:
     if not cores:
         return ''
     try:
-        for thread in os.listdir('/proc/self/task'):
-            with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
-                os.sched_setaffinity(int(thread), cores)
-        missing = sorted(set(cores) - os.sched_getaffinity(0))
-    except OSError as error:
-        return error.strerror or str(error)
+        refused = threads.for_each(lambda thread: os.sched_setaffinity(thread, cores))
     except (ValueError, OverflowError) as error:  # not a number of a core on any machine
         return str(error)
-    except AttributeError:
-        return 'not on this system'
+    if refused:
+        return refused
+    missing = sorted(set(cores) - os.sched_getaffinity(0))
     return f'there is no {", ".join(map(str, missing))}' if missing else ''
 
 

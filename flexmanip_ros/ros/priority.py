@@ -8,6 +8,8 @@ from __future__ import annotations
 import contextlib
 import os
 
+from flexmanip_ros.ros import threads
+
 LOWEST, HIGHEST = 0, 99
 
 
@@ -19,13 +21,7 @@ def take(priority: int) -> str:
     """
     if priority == 0:
         return ''
-    try:
-        for thread in os.listdir('/proc/self/task'):
-            with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
-                _set(int(thread), priority)
-    except (AttributeError, OSError) as error:
-        return error.strerror or str(error) if isinstance(error, OSError) else 'not on this system'
-    return ''
+    return threads.for_each(lambda thread: _set(thread, priority))
 
 
 def join(priority: int) -> None:

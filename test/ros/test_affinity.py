@@ -1,37 +1,18 @@
 """A process stays on the cores it is given, its later threads too; cores that are not there are told."""
 
 import os
-import subprocess
-import sys
 
 import pytest
 from identifier_harness import Live
 from ros_harness import Ros
+from thread_program import said
 
 from flexmanip_ros.ros import affinity
-
-PROGRAM = """
-import os, threading
-from flexmanip_ros.ros import affinity
-seen = []
-before = threading.Event()
-early = threading.Thread(target=lambda: (before.wait(), seen.append(affinity.current())))
-early.start()
-refused = affinity.take([CORE])
-before.set()
-early.join()
-late = threading.Thread(target=lambda: seen.append(affinity.current()))
-late.start()
-late.join()
-print(refused or f'{affinity.current()} {seen[0]} {seen[1]}')
-"""
 
 
 def test_threads_of_now_and_later_ones_stay_on_the_core() -> None:
     core = max(os.sched_getaffinity(0))
-    command = [sys.executable, '-c', PROGRAM.replace('CORE', str(core))]
-    said = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    assert said.stdout.split() == [str(core)] * 3
+    assert said('affinity', [core]).split() == [str(core)] * 3
 
 
 def test_no_cores_leave_everything_as_it_is() -> None:

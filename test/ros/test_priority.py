@@ -2,36 +2,18 @@
 
 import errno
 import os
-import subprocess
-import sys
 
 import pytest
+from thread_program import said
 
 from flexmanip_ros.ros import priority
-
-PROGRAM = """
-import os, threading
-from flexmanip_ros.ros import priority
-seen = []
-before = threading.Event()
-early = threading.Thread(target=lambda: (before.wait(), seen.append(priority.current())))
-early.start()
-refused = priority.take(7)
-before.set()
-early.join()
-late = threading.Thread(target=lambda: seen.append(priority.current()))
-late.start()
-late.join()
-print(refused or f'{priority.current()} {seen[0]} {seen[1]}')
-"""
 
 
 def test_threads_of_now_get_the_priority_and_later_ones_do_not() -> None:
-    command = [sys.executable, '-c', PROGRAM]
-    said = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    if os.strerror(errno.EPERM) in said.stdout:
+    what = said('priority', 7)
+    if os.strerror(errno.EPERM) in what:
         pytest.skip('this system permits no real-time priority')
-    assert said.stdout.split() == ['7', '7', '0']
+    assert what.split() == ['7', '7', '0']
 
 
 def test_zero_leaves_everything_as_it_is() -> None:
