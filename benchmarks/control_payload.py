@@ -24,7 +24,7 @@ from flexmanip_ros.parameters import (
     IdentifierParameters,
     PlantParameters,
 )
-from flexmanip_ros.plant import simulator
+from flexmanip_ros.simulation import simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 HERE = Path(__file__).resolve().parent

@@ -13,9 +13,9 @@ import argparse
 import numpy as np
 from parts import payload_trials as trials
 
-from flexmanip_ros import detection
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters, TriggerParameters
-from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.payload import capture_detection
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 ARM = ArmParameters(damping_ratio=0.003)
@@ -33,9 +33,9 @@ def samples_of(efforts: np.ndarray, seed: int, event: CaptureEvent | None = None
 
 def told(samples: list) -> list[tuple[CaptureEvent, int]]:
     """Events and the stamps at which they were told."""
-    state, found = detection.init(CONFIG), []
+    state, found = capture_detection.init(CONFIG), []
     for sample in samples:
-        state, event = detection.step(CONFIG, state, sample)
+        state, event = capture_detection.step(CONFIG, state, sample)
         if event is not None:
             found.append((event, sample.stamp_ns))
     return found
@@ -75,7 +75,8 @@ def false_alarms(hours: float) -> dict[str, object]:
     slow = np.sin(2 * np.pi * np.arange(10_000) / 5000)[:, None] * [80.0, 30.0]
     for seed in range(pieces):
         efforts = SQUARES + slow if seed % 2 else SQUARES
-        alarms += len(detection.advance(CONFIG, detection.init(CONFIG), samples_of(efforts, seed))[1])
+        start = capture_detection.init(CONFIG)
+        alarms += len(capture_detection.advance(CONFIG, start, samples_of(efforts, seed))[1])
     return {'case': 'false alarms', 'hours': round(pieces / 360, 3), 'alarms': alarms}
 
 

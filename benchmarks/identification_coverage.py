@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
+from flexmanip_ros.arm.linearization import discretize, vibration_model
 from flexmanip_ros.identification import rpbsid
-from flexmanip_ros.identification.modal import modes
+from flexmanip_ros.identification.modes import modes
 from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
 from flexmanip_ros.payload.block_extraction import estimate, extract
-from flexmanip_ros.plant.linearization import discretize, vibration_model
 
 DT, COUNT, MASS = 1e-3, 3000, 20.0
 THETA = np.radians([60.0, 45.0])

@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from flexmanip_ros import pipeline
+from flexmanip_ros.arm.linearization import vibration_model
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
 from flexmanip_ros.payload.angles import chords
-from flexmanip_ros.plant import excitation, simulator
-from flexmanip_ros.plant.linearization import vibration_model
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 CAPTURE_S, AFTER_S, END_S, LATELY_S = 3.0, 0.8, 7.0, 0.5

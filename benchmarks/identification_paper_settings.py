@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
+from flexmanip_ros.arm.linearization import discretize, vibration_model
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
 from flexmanip_ros.payload.block_extraction import extract
-from flexmanip_ros.plant.linearization import discretize, vibration_model
 
 DT = 1e-3
 SETTINGS = {

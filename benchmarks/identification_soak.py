@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from flexmanip_ros.arm.linearization import discretize, vibration_model
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
-from flexmanip_ros.plant.linearization import discretize, vibration_model
 
 DT = 1e-3
 LONG = {'forgetting_factor': [0.9995] * 3}

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from flexmanip_ros.identification import rpbsid
-from flexmanip_ros.identification.factor_kernel import rotate
+from flexmanip_ros.identification.factor import rotate
 from flexmanip_ros.parameters import IdentifierParameters, configure
 
 

@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 from parts import payload_trials as trials
 
+from flexmanip_ros.arm.linearization import discretize, vibration_model
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.parameters import (
     ArmParameters,
@@ -22,9 +23,8 @@ from flexmanip_ros.parameters import (
     IdentifierParameters,
     PayloadParameters,
 )
-from flexmanip_ros.payload import block_extraction, bounds
-from flexmanip_ros.plant import excitation
-from flexmanip_ros.plant.linearization import discretize, vibration_model
+from flexmanip_ros.payload import block_extraction, cramer_rao
+from flexmanip_ros.simulation import excitation
 
 ARM = ArmParameters(torque_convention='paper', angle_convention='chord', modes=1)
 THETA = np.radians([60.0, 45.0])
@@ -71,7 +71,7 @@ def main() -> None:
             for known, gathered in found.items():
                 done[known].append(trials.Trial(payload, tuple(gathered)))
         for known, runs_of in done.items():
-            least = 100 / payload * bounds.structure_unknown(
+            least = 100 / payload * cramer_rao.structure_unknown(
                 ARM, THETA, payload, X[3000:], efforts[3000:], noise, 1e-3, MARKS, known)
             rms = trials.rms(trials.errors(runs_of))
             row = {

@@ -15,7 +15,7 @@ import numpy as np
 from parts import payload_trials as trials
 
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
-from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, Status
 
 PAPER = {'torque_convention': 'paper', 'angle_convention': 'chord', 'shortening': False,

@@ -14,10 +14,10 @@ import argparse
 import numpy as np
 from parts import payload_trials as trials
 
+from flexmanip_ros.arm.linearization import discretize, vibration_model
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
-from flexmanip_ros.payload import bounds
-from flexmanip_ros.plant import excitation, simulator
-from flexmanip_ros.plant.linearization import discretize, vibration_model
+from flexmanip_ros.payload import cramer_rao
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 ARM = ArmParameters(torque_convention='paper', angle_convention='chord', modes=1)
@@ -35,7 +35,7 @@ def bound(theta: np.ndarray, payload: float, efforts: np.ndarray) -> np.ndarray:
         states[k] = x
         A, B = empty if k < CAPTURE else loaded
         x = A @ x + B @ efforts[k]
-    found = bounds.structure_known(
+    found = cramer_rao.structure_known(
         ARM, theta, payload, states[CAPTURE:], efforts[CAPTURE:6000], 0.01 * states.std(axis=0), 1e-3, MARKS)
     return 100 * found / payload
 

@@ -22,7 +22,7 @@ from parts.rigid_chain import Chain, noisy
 
 from flexmanip_ros.io import bag
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
-from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
 ARM = ArmParameters(damping_ratio=0.003)

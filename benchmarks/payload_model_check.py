@@ -31,9 +31,9 @@ from flexmanip_ros.parameters import (
     PayloadParameters,
     PlantParameters,
 )
-from flexmanip_ros.payload import memory as mem
+from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured
-from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, Payload, Status
 
 ARM = ArmParameters(damping_ratio=0.003)

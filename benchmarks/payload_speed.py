@@ -16,7 +16,7 @@ from parts import payload_trials as trials
 
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
 from flexmanip_ros.payload import structured
-from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 ARM = ArmParameters(damping_ratio=0.003)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
-from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.simulation import excitation, simulator
 
 RATE = 1000
 

@@ -29,7 +29,7 @@ def plant(seconds: float, bare: bool, results: Any) -> None:
     from rclpy.context import Context
     from rclpy.parameter import Parameter
 
-    from flexmanip_ros.ros.plant_simulator import PlantSimulator
+    from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
     from flexmanip_ros.ros.spin import make_executor
 
     context = Context()

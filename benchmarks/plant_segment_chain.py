@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
-from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.simulation import excitation, simulator
 
 SEGMENTS = 40
 STEP = 1e-5

@@ -19,8 +19,9 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from flexmanip_ros.arm import manipulator
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
-from flexmanip_ros.plant import excitation, manipulator, simulator
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 SAMPLES = 4000

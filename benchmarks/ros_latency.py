@@ -107,10 +107,10 @@ def parameters(rate: float) -> list[str]:
 
 def composed(rate: float) -> None:
     """Run the four nodes in this process until a signal."""
-    from flexmanip_ros.ros.capture_trigger import CaptureTrigger
-    from flexmanip_ros.ros.excitation import Excitation
-    from flexmanip_ros.ros.plant_simulator import PlantSimulator
-    from flexmanip_ros.ros.rpbsid_identifier import RpbsidIdentifier
+    from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
+    from flexmanip_ros.ros.nodes.excitation import Excitation
+    from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
+    from flexmanip_ros.ros.nodes.rpbsid_identifier import RpbsidIdentifier
 
     interrupt = Interrupt()
     rclpy.init(args=['composed', *parameters(rate)])

@@ -20,7 +20,7 @@ from typing import Any
 
 from flexmanip_ros.cli import tasks, workers
 from flexmanip_ros.io.journal import Journal
-from flexmanip_ros.scenario import scenario
+from flexmanip_ros.studies.scenario import scenario
 
 RUNS, WARM = 24, 4
 """Runs that are timed; runs a worker before those."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.memory_kernel import FILLED, REJECTED
-from flexmanip_ros.identification.modal import modes
-from flexmanip_ros.identification.refinement import Answer, Job
+from flexmanip_ros.identification.modes import modes
+from flexmanip_ros.identification.recursive_fit import Answer, Job
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, model_check, structured

@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
-from flexmanip_ros import estimator, sampling, timeline
+from flexmanip_ros import estimator, event_replay
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.identification.refinement import Answer, Job
+from flexmanip_ros.identification.recursive_fit import Answer, Job
 from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.samples import sampling
 from flexmanip_ros.schedule import Due as Due
 from flexmanip_ros.schedule import Reading, instant_of, is_due, is_read_anew, is_young
 from flexmanip_ros.schedule import State as State
@@ -144,7 +145,7 @@ def current(state: State) -> Estimate | None:
     """
     state = _run_held(state)
     line, config = state.timeline, state.config
-    if line is None or config is None or line.last_ns == timeline.BEFORE_ALL:
+    if line is None or config is None or line.last_ns == event_replay.BEFORE_ALL:
         return None
     core = estimator.finish(config, line.core)
     estimate, verdicts = estimator.estimate(config, core, line.last_ns, state.sampling.dt, None,
@@ -183,8 +184,8 @@ def reconfigure(config: IdentifierParameters, state: State) -> State:
 
 def _event(state: State, event: CaptureEvent) -> State:
     if state.timeline is None or state.config is None:
-        return state._replace(early=(*state.early, event)[-timeline.MOST_EVENTS:])
-    return state._replace(timeline=timeline.event(
+        return state._replace(early=(*state.early, event)[-event_replay.MOST_EVENTS:])
+    return state._replace(timeline=event_replay.event(
         state.config, state.timeline, event, state.first_ns))
 
 
@@ -204,7 +205,7 @@ def _begin(config: IdentifierParameters, state: State, first_ns: int) -> State:
     assert state.sampling.outputs is not None
     settled = config if config.outputs == state.sampling.outputs else replace(
         config, outputs=state.sampling.outputs)
-    state = state._replace(config=settled, timeline=timeline.Timeline(estimator.init(settled)),
+    state = state._replace(config=settled, timeline=event_replay.Timeline(estimator.init(settled)),
                            first_ns=first_ns, published=-1)
     early = state.early
     state = state._replace(early=())
@@ -226,7 +227,7 @@ def _hold(state: State, samples: Iterable[Sample], group: int | None) -> tuple[S
         line, held = state.timeline, (*state.held, sample)
         assert line is not None
         if is_due(state, sample.stamp_ns):
-            line = timeline.advance(config, line, held, ahead=True)
+            line = event_replay.advance(config, line, held, ahead=True)
             state = state._replace(
                 timeline=line, held=(), published=instant_of(state, sample.stamp_ns, config.publish_rate))
             payload = estimator.payload(config, line.core, state.verdicts)
@@ -235,7 +236,7 @@ def _hold(state: State, samples: Iterable[Sample], group: int | None) -> tuple[S
         state = state._replace(held=held)
         following = sample.stamp_ns + dt_ns
         if (len(held) >= group or is_due(state, following)
-                or timeline.is_checkpoint_due(config, line, following)):  # a group is run in one piece
+                or event_replay.is_checkpoint_due(config, line, following)):  # a group is run in one piece
             state = _run_held(state)
         elif len(line.core.owed) >= estimator.BATCH:
             state = state._replace(timeline=line._replace(core=estimator.settle(config, line.core)))
@@ -248,7 +249,7 @@ def _run_held(state: State) -> State:
         return state
     assert state.timeline is not None
     assert state.config is not None
-    return state._replace(timeline=timeline.advance(state.config, state.timeline, state.held), held=())
+    return state._replace(timeline=event_replay.advance(state.config, state.timeline, state.held), held=())
 
 
 def _all_read(state: State, due: tuple[Due, ...]) -> tuple[State, tuple[Estimate, ...]]:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from flexmanip_ros import estimator, sampling, timeline
+from flexmanip_ros import estimator, event_replay
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload.model_comparison import Verdict
-from flexmanip_ros.sampling import Counters
+from flexmanip_ros.samples import sampling
+from flexmanip_ros.samples.sampling import Counters
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, Payload, Sample
 
 
@@ -31,7 +32,7 @@ class State(NamedTuple):
     """All that the identifier remembers."""
 
     sampling: sampling.SamplingState = sampling.SamplingState()
-    timeline: timeline.Timeline | None = None
+    timeline: event_replay.Timeline | None = None
     config: IdentifierParameters | None = None
     """The configuration with the outputs that the messages really carry."""
     early: tuple[CaptureEvent, ...] = ()
@@ -98,5 +99,5 @@ def awaits(state: State, stamp_ns: int) -> bool:
 def is_next_due(state: State) -> bool:
     """Whether an estimate is to be expected with the next sample, and all before it has been run."""
     line = state.timeline
-    return (line is not None and not state.held and line.last_ns != timeline.BEFORE_ALL
+    return (line is not None and not state.held and line.last_ns != event_replay.BEFORE_ALL
             and awaits(state, line.last_ns + int(state.sampling.dt * 1e9)))

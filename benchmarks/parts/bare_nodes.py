@@ -17,11 +17,11 @@ from sensor_msgs.msg import JointState
 
 from flexmanip_ros.io import cdr
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, configure
-from flexmanip_ros.plant import excitation, simulator
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import joint_state, time_message
 from flexmanip_ros.ros.node import with_info
 from flexmanip_ros.ros.spin import Interrupt, make_executor, spin
+from flexmanip_ros.simulation import excitation, simulator
 
 EVERY = 20
 """Samples to an estimate: 50 Hz at 1 kHz."""

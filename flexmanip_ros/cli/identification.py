@@ -9,17 +9,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flexmanip_ros import holdout, pipeline
-from flexmanip_ros.achievable import payload_std
+from flexmanip_ros import pipeline
 from flexmanip_ros.cli.console import require_pictures
-from flexmanip_ros.detected_events import with_detected
 from flexmanip_ros.errors import BagError, FlexmanipError, ParameterError
-from flexmanip_ros.history import History, Signals
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.outputs import Outputs, TableOutput, open_output
 from flexmanip_ros.io.table import check_place
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.summary import Summary, summarize
+from flexmanip_ros.payload.detected_events import with_detected
+from flexmanip_ros.samples.history import History, Signals
+from flexmanip_ros.studies import holdout
+from flexmanip_ros.studies.achievable import payload_std
+from flexmanip_ros.studies.summary import Summary, summarize
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Mode
 
 
@@ -199,7 +200,7 @@ def _remark(state: pipeline.State, foreign: int) -> str:
 def _report(request: Request, summary: Summary, feed: _Feed, kept: list[Estimate], signals: Signals,
             last: Estimate | None, scores: holdout.Scores | None, state: pipeline.State,
             fault: FlexmanipError | None) -> None:
-    from flexmanip_ros.io import pictures, report  # matplotlib only when asked for
+    from flexmanip_ros.io import pictures, report
 
     assert request.report is not None
     config = state.config or request.config

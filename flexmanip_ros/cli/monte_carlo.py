@@ -19,10 +19,10 @@ from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io.journal import Journal
 from flexmanip_ros.io.parameter_file import load, parse, parse_overrides
 from flexmanip_ros.io.table import check_place
-from flexmanip_ros.metrics import score
 from flexmanip_ros.parameters import IdentifierParameters, flatten
-from flexmanip_ros.scenario import Scenario, scenario
-from flexmanip_ros.study import Row
+from flexmanip_ros.studies.metrics import score
+from flexmanip_ros.studies.scenario import Scenario, scenario
+from flexmanip_ros.studies.trial import Row
 
 PROG = 'monte_carlo'
 EXAMPLES = """examples:
@@ -81,7 +81,7 @@ def _main(given: argparse.Namespace) -> int:
             interrupted = True
         journal.finish(('estimator', 'seed', tasks.KEY))
     if given.report is not None:
-        from flexmanip_ros.io import study_report  # matplotlib only when asked for
+        from flexmanip_ros.io import study_report
 
         study_report.report(given.report, Path(given.source).stem, journal.rows)
     for line in describe(journal.rows):

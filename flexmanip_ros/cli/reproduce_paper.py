@@ -14,13 +14,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from flexmanip_ros import paper, paper_run, paper_summary, study
 from flexmanip_ros.cli import console, workers
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io.table import OutputError, check_place, write_file
+from flexmanip_ros.paper import case_run, experiments, summary
+from flexmanip_ros.studies import trial
 
 if TYPE_CHECKING:
-    from flexmanip_ros.io.paper_sections import Planned
+    from flexmanip_ros.paper.sections import Planned
 
 PROG = 'reproduce_paper'
 EXAMPLES = """examples:
@@ -32,9 +33,9 @@ summary.csv. The same seeds give the same numbers.
 exit status: 0 on success, 2 on bad arguments, 130 when interrupted.
 """
 PAGE, ROWS, SUMMARY = 'report.html', 'runs.csv', 'summary.csv'
-GROUPS: Mapping[str, tuple[paper.Case, ...]] = {
-    'payloads': paper.PAYLOADS, 'configurations': paper.CONFIGURATIONS,
-    'finite_element': (paper.FINITE_ELEMENT,)}
+GROUPS: Mapping[str, tuple[experiments.Case, ...]] = {
+    'payloads': experiments.PAYLOADS, 'configurations': experiments.CONFIGURATIONS,
+    'finite_element': (experiments.FINITE_ELEMENT,)}
 """Cases whose figures belong together; they are drawn as soon as the last run of the group is done."""
 SHOWN = ('mean error [%]', 'rms error at 6 s [%]', 'bound at 6 s [%]', '95 % interval holds [%]',
          'time per sample [us]')
@@ -45,8 +46,8 @@ def _parser() -> console.Parser:
         PROG, "Regenerate the results of the paper's section 4, our estimators beside its own.", EXAMPLES)
     add = made.add_argument
     add('--runs', type=int, default=30, metavar='N', help='runs a case (default 30, as the paper)')
-    add('--case', action='append', choices=[case.name for case in paper.CASES], metavar='NAME',
-        help=f'only this case, may be repeated: {", ".join(case.name for case in paper.CASES)}')
+    add('--case', action='append', choices=[case.name for case in experiments.CASES], metavar='NAME',
+        help=f'only this case, may be repeated: {", ".join(case.name for case in experiments.CASES)}')
     add('--first-seed', type=console.whole, default=0, metavar='SEED', help='default: 0')
     add('--output', default='paper_reproduction', metavar='DIR', help='default: paper_reproduction')
     add('--workers', type=int, metavar='N', help='processes; default: one a core; 0: this one only')
@@ -75,10 +76,10 @@ def work(job: Job) -> Any:
 class Collected:
     """What came back, and what can be drawn of it."""
 
-    def __init__(self, cases: Sequence[paper.Case], seeds: Sequence[int]) -> None:
+    def __init__(self, cases: Sequence[experiments.Case], seeds: Sequence[int]) -> None:
         self.groups = {name: [case for case in group if case in cases] for name, group in GROUPS.items()}
         self.seeds = seeds
-        self.runs: dict[tuple[str, int], tuple[list[study.Row], dict[str, paper_run.Track]]] = {}
+        self.runs: dict[tuple[str, int], tuple[list[trial.Row], dict[str, case_run.Track]]] = {}
         self.bounds: dict[tuple[str, str], float] = {}
         self.planned: dict[str, Sequence[Planned]] = {}
         self.drawn: dict[tuple[str, int], bytes] = {}
@@ -86,12 +87,12 @@ class Collected:
     def first(self) -> list[Job]:
         """Return what can be done at once; the runs of one group after the other."""
         cases = [case for group in self.groups.values() for case in group]
-        bounds = [Job('bounds', (case.name,), partial(paper.bounds_of, case)) for case in cases]
-        runs = [Job('run', (case, seed), partial(paper_run.run, case, seed))
+        bounds = [Job('bounds', (case.name,), partial(experiments.bounds_of, case)) for case in cases]
+        runs = [Job('run', (case, seed), partial(case_run.run, case, seed))
                 for group in self.groups.values() for seed in self.seeds for case in group]
-        from flexmanip_ros.io import paper_sections
+        from flexmanip_ros.paper import sections
 
-        return [*bounds, *self._drawings('signals', paper_sections.without_results()), *runs]
+        return [*bounds, *self._drawings('signals', sections.without_results()), *runs]
 
     def take(self, outcome: workers.Outcome) -> list[Job]:
         """Keep an outcome; return what can be drawn now."""
@@ -109,7 +110,7 @@ class Collected:
                 return self._figures(group)
         return []
 
-    def rows(self) -> list[study.Row]:
+    def rows(self) -> list[trial.Row]:
         """Return every row there is, in the order of cases and seeds."""
         return [row for group in self.groups.values() for case in group for seed in self.seeds
                 for row in self.runs.get((case.name, seed), ([], {}))[0]]
@@ -120,24 +121,24 @@ class Collected:
                 for group, planned in self.planned.items()}
 
     def _figures(self, group: str) -> list[Job]:
-        from flexmanip_ros.io import paper_sections
+        from flexmanip_ros.paper import sections
 
-        plan = {'payloads': paper_sections.payload_example,
-                'configurations': paper_sections.configuration_example,
-                'finite_element': paper_sections.finite_element_example}[group]
+        plan = {'payloads': sections.payload_example,
+                'configurations': sections.configuration_example,
+                'finite_element': sections.finite_element_example}[group]
         return self._drawings(group, plan(self._tracks(), self.rows()))
 
-    def _tracks(self) -> dict[str, dict[str, list[paper_run.Track]]]:
+    def _tracks(self) -> dict[str, dict[str, list[case_run.Track]]]:
         return {case.name: {
             method.name: [self.runs[case.name, seed][1][method.name] for seed in self.seeds
                           if method.name in self.runs.get((case.name, seed), ([], {}))[1]]
-            for method in paper.METHODS} for case in paper.CASES}
+            for method in experiments.METHODS} for case in experiments.CASES}
 
     def _drawings(self, group: str, planned: Sequence[Planned]) -> list[Job]:
-        from flexmanip_ros.io import paper_sections
+        from flexmanip_ros.paper import sections
 
         self.planned[group] = planned
-        return [Job('figure', (group, k), partial(paper_sections.drawing, one))
+        return [Job('figure', (group, k), partial(sections.drawing, one))
                 for k, one in enumerate(planned)]
 
 
@@ -147,7 +148,7 @@ def _main(given: argparse.Namespace) -> int:
     if given.workers is not None and given.workers < 0:
         raise ParameterError(f'--workers is {given.workers}', 'give 0 or more')
     console.require_pictures()
-    from flexmanip_ros.io import paper_report
+    from flexmanip_ros.paper import report
 
     folder = Path(given.output)
     try:
@@ -158,7 +159,7 @@ def _main(given: argparse.Namespace) -> int:
     for name in (PAGE, ROWS, SUMMARY):
         check_place(folder / name)
     started = time.perf_counter()
-    cases = [case for case in paper.CASES if given.case is None or case.name in given.case]
+    cases = [case for case in experiments.CASES if given.case is None or case.name in given.case]
     collected = Collected(cases, range(given.first_seed, given.first_seed + given.runs))
     feed = workers.Feed(collected.first())
     with console.progress('reproducing', 'steps') as progress:
@@ -167,10 +168,10 @@ def _main(given: argparse.Namespace) -> int:
             progress(count, feed.total)
     wall = time.perf_counter() - started
     rows = collected.rows()
-    lines = paper_summary.summary(rows, collected.bounds)
+    lines = summary.summary(rows, collected.bounds)
     write_csv(folder / ROWS, rows)
     write_csv(folder / SUMMARY, lines)
-    paper_report.report(folder / PAGE, paper_report.Study(
+    report.report(folder / PAGE, report.Study(
         rows, collected.bounds, collected.pictures(), given.runs, wall))
     print('\n'.join(describe(lines)))
     print(f"{len(collected.runs)} runs in {wall:.1f} s; wrote '{folder / PAGE}', {ROWS} and {SUMMARY}")
@@ -182,9 +183,9 @@ def _compute(count: int | None, jobs: Iterable[Job]) -> Iterator[workers.Outcome
     return workers.processes(work, jobs, cores) if cores > 0 else workers.serial(work, jobs)
 
 
-def _failed(case: paper.Case, seed: int, error: BaseException) -> list[study.Row]:
-    return [{'case': case.name, 'method': method.name, 'seed': seed, 'error': study.describe(error)}
-            for method in paper.METHODS]
+def _failed(case: experiments.Case, seed: int, error: BaseException) -> list[trial.Row]:
+    return [{'case': case.name, 'method': method.name, 'seed': seed, 'error': trial.describe(error)}
+            for method in experiments.METHODS]
 
 
 def describe(lines: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from flexmanip_ros.arm import linearization
 from flexmanip_ros.cli import console
 from flexmanip_ros.errors import BagError, ParameterError
 from flexmanip_ros.io.bag_writer import BagWriter
@@ -19,8 +20,8 @@ from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.io.table import check_place, write_file
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, flatten
 from flexmanip_ros.parameters.document import help_text
-from flexmanip_ros.plant import excitation, excitation_design, linearization, simulator
-from flexmanip_ros.scenario import for_plant
+from flexmanip_ros.simulation import excitation, excitation_design, simulator
+from flexmanip_ros.studies.scenario import for_plant
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
 PROG = 'simulate_bag'

@@ -33,7 +33,7 @@ def _program(where: str, *, unfinished: bool) -> Main:
 
 
 def _node(name: str) -> Main:
-    return _program(f'flexmanip_ros.ros.{name}', unfinished=False)
+    return _program(f'flexmanip_ros.ros.nodes.{name}', unfinished=False)
 
 
 def _tool(name: str, package: str = 'cli') -> Main:
@@ -46,7 +46,7 @@ capture_trigger = _node('capture_trigger')
 rpbsid_identifier = _node('rpbsid_identifier')
 payload_controller = _node('payload_controller')
 payload_adapter = _node('payload_adapter')
-demo = _tool('demo', 'ros')
+demo = _tool('program', 'ros.demo')
 identify_bag = _tool('identify_bag')
 simulate_bag = _tool('simulate_bag')
 reproduce_paper = _tool('reproduce_paper')

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flexmanip_ros import study
 from flexmanip_ros.errors import BagError
 from flexmanip_ros.io import bag
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.scenario import Scenario
+from flexmanip_ros.studies import trial
+from flexmanip_ros.studies.scenario import Scenario
 
 KEY = 'run'
 """Column that names a run; a study continues with the runs whose name it has not."""
@@ -49,18 +49,18 @@ class Recorded:
 Task = Simulated | Recorded
 
 
-def work(task: Task) -> list[study.Row]:
+def work(task: Task) -> list[trial.Row]:
     """Do one run; its rows, each with the run's name."""
-    rows = study.trial(task.scenario, task.seed) if isinstance(task, Simulated) else [_recorded(task)]
+    rows = trial.trial(task.scenario, task.seed) if isinstance(task, Simulated) else [_recorded(task)]
     return [{KEY: task.key, **row} for row in rows]
 
 
-def failed(task: Task, error: BaseException) -> list[study.Row]:
+def failed(task: Task, error: BaseException) -> list[trial.Row]:
     """Return the row of a run that gave none."""
-    return [{KEY: task.key, 'error': study.describe(error)}]
+    return [{KEY: task.key, 'error': trial.describe(error)}]
 
 
-def _recorded(task: Recorded) -> study.Row:
+def _recorded(task: Recorded) -> trial.Row:
     truth = true_payload(Path(task.path))
     items: list[bag.Item] = []
     fault = ''
@@ -70,7 +70,7 @@ def _recorded(task: Recorded) -> study.Row:
         if not items:
             raise
         fault = str(error)
-    row = study.measure(task.config, items, truth, task.window, settled=SETTLED)
+    row = trial.measure(task.config, items, truth, task.window, settled=SETTLED)
     return {'bag': task.path, 'estimator': task.config.payload_method, **row, 'error': fault}
 
 

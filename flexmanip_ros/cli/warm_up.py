@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from flexmanip_ros import pipeline
-from flexmanip_ros.detected_events import with_detected
 from flexmanip_ros.identification import validation
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
-from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.payload.detected_events import with_detected
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, StateSpace
 
 Item = JointRecord | CaptureEvent
@@ -79,7 +79,7 @@ def drop_stale(package: Path) -> int:
     numba looks at the file of a function alone, not at those of the functions it calls.
     """
     newest = max(path.stat().st_mtime_ns for path in package.rglob('*.py')
-                 if 'kernel' in path.stem or path.stem == 'compiled')
+                 if '@kernel' in (text := path.read_text(encoding='utf-8')) or '@inlined' in text)
     stale = [path for path in package.rglob('__pycache__/*.nb[ic]') if path.stat().st_mtime_ns < newest]
     for path in stale:
         path.unlink(missing_ok=True)

@@ -6,11 +6,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from flexmanip_ros.arm.urdf import urdf
 from flexmanip_ros.cli import console
 from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import PlantParameters
-from flexmanip_ros.plant.urdf import urdf
 
 PROG = 'write_urdf'
 EXAMPLES = """examples:

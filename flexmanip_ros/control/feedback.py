@@ -12,15 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve, solve_discrete_are
 
+from flexmanip_ros.arm.linearization import blocks, damping, discretize, root_slopes, tip_slopes
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters.controller import ControllerParameters
-from flexmanip_ros.plant.linearization import (
-    blocks,
-    damping,
-    discretize,
-    root_slopes,
-    tip_slopes,
-)
 from flexmanip_ros.types import Array
 
 RATE_SCALE = 8.0

@@ -1,4 +1,4 @@
-"""The work that a ``refinement.Job`` asks for, and its place among the samples."""
+"""The work that a ``recursive_fit.Job`` asks for, and its place among the samples."""
 
 from __future__ import annotations
 
@@ -8,13 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from flexmanip_ros.identification import publication, refinement
-from flexmanip_ros.identification.factor_kernel import Kinds
-from flexmanip_ros.identification.moments import triangle
-from flexmanip_ros.identification.prediction_error import derivatives, moved, run
-from flexmanip_ros.identification.prediction_error_kernel import condition
-from flexmanip_ros.identification.refinement import Answer, Job, Refined
-from flexmanip_ros.identification.stretch import (
+from flexmanip_ros.identification import model_output, recursive_fit
+from flexmanip_ros.identification.batch_fit import (
     BLOCK,
     UNEXPLAINED,
     Recursion,
@@ -22,6 +17,11 @@ from flexmanip_ros.identification.stretch import (
     fit_stretch,
     unexplained,
 )
+from flexmanip_ros.identification.factor import Kinds
+from flexmanip_ros.identification.moments import triangle
+from flexmanip_ros.identification.prediction_error import derivatives, moved, run
+from flexmanip_ros.identification.prediction_error_kernel import condition
+from flexmanip_ros.identification.recursive_fit import Answer, Job, Refined
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.types import Array
 
@@ -52,10 +52,10 @@ def solve(config: IdentifierParameters, job: Job) -> Answer:
 
 def _stretch(config: IdentifierParameters, job: Job, R: Array, scale: Array) -> Recursion | None:
     """Fit the whole stretch, see ``stretch.fit_stretch``, from the subspace model of one or two windows."""
-    starts = [publication.from_factor(config, R, scale)]
+    starts = [model_output.from_factor(config, R, scale)]
     if config.order > len(config.outputs) and config.past_window > config.future_window:
         longer = replace(config, future_window=config.past_window)
-        starts.append(publication.from_factor(longer, R, scale))
+        starts.append(model_output.from_factor(longer, R, scale))
     found = fit_stretch(
         np.vstack(job.chunks), [realized for realized, _, _ in starts if realized is not None],
         [fit for fit in (job.old, job.older) if fit is not None],
@@ -180,28 +180,28 @@ def refine(
     """
     start = 0
     for k in np.flatnonzero(fate):
-        refined = refinement.take(refined, samples[start:k], stamps_ns[start]) if k > start else refined
+        refined = recursive_fit.take(refined, samples[start:k], stamps_ns[start]) if k > start else refined
         refined = broken(config, refined)
         start = int(k) + 1
     if start == len(samples):
         return refined
-    refined = refinement.take(refined, samples[start:], stamps_ns[start])
+    refined = recursive_fit.take(refined, samples[start:], stamps_ns[start])
     if refined.job is not None and refined.total >= refined.due:
         refined = delivered(config, refined)
-    if refinement.is_fit_due(refined):
-        refined = refinement.ask_fit(refined, R, scale, int(stamps_ns[-1]))
-    elif refinement.is_block_due(refined):
-        refined = refinement.ask_block(refined, int(stamps_ns[-1]))
+    if recursive_fit.is_fit_due(refined):
+        refined = recursive_fit.ask_fit(refined, R, scale, int(stamps_ns[-1]))
+    elif recursive_fit.is_block_due(refined):
+        refined = recursive_fit.ask_block(refined, int(stamps_ns[-1]))
     return refined
 
 
 def broken(config: IdentifierParameters, refined: Refined) -> Refined:
     """Samples are missing: take what is under way, and begin another stretch."""
-    return refinement.break_window(delivered(config, refined)) if refined.total > 0 else refined
+    return recursive_fit.break_window(delivered(config, refined)) if refined.total > 0 else refined
 
 
 def delivered(config: IdentifierParameters, refined: Refined) -> Refined:
     """Take the result of the fit under way, computed here and now if nobody did."""
     if refined.job is None:
         return refined
-    return refinement.deliver(refined, refined.answer or solve(config, refined.job))
+    return recursive_fit.deliver(refined, refined.answer or solve(config, refined.job))

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.identification import (
     decimation,
-    factor_kernel,
+    factor,
     fitting,
     memory_kernel,
-    paper_kernel,
-    publication,
-    refinement,
+    model_output,
+    paper_recursion,
+    recursive_fit,
 )
-from flexmanip_ros.identification.factor_kernel import Kinds
+from flexmanip_ros.identification.factor import Kinds
 from flexmanip_ros.identification.memory_kernel import FILLED, POWER, PRIOR, USED, WEIGHT, WEIGHT2
 from flexmanip_ros.identification.moments import solve_regressor
 from flexmanip_ros.identification.uncertainty import Identified
@@ -54,7 +54,7 @@ class RpbsidState(NamedTuple):
     scalars: Array
     counts: Array
     memory: tuple[Array, ...]
-    refined: refinement.Refined | None
+    refined: recursive_fit.Refined | None
     decimator: decimation.Decimator | None
 
     def owned(self) -> RpbsidState:
@@ -75,7 +75,7 @@ def init(config: IdentifierParameters) -> RpbsidState:
     return RpbsidState(
         z=np.zeros(p * (r + m)), scale=np.zeros(r + m), mean=np.zeros((2, r + m)), variance=np.zeros(m),
         scalars=scalars, counts=np.zeros(memory_kernel.COUNTS, dtype=np.int64), memory=memory,
-        refined=refinement.start(r + m) if _is_refined(config, r, m) else None,
+        refined=recursive_fit.start(r + m) if _is_refined(config, r, m) else None,
         decimator=decimation.start(config.decimation, r + m) if config.decimation > 1 else None)
 
 
@@ -84,7 +84,7 @@ def _is_refined(config: IdentifierParameters, r: int, m: int) -> bool:
     n = config.order
     size = n * (n + r + 2 * m + 1) + m * r
     return (config.refinement != 'none' and config.estimator == 'factor'
-            and config.forgetting == 'innovation' and size <= refinement.PARAMETERS)
+            and config.forgetting == 'innovation' and size <= recursive_fit.PARAMETERS)
 
 
 def _regressors(config: IdentifierParameters, r: int, m: int) -> int:
@@ -120,7 +120,7 @@ def advance(
 ) -> RpbsidState:
     """Take N samples U (N, r), Y (N, m): the same bits as N steps, one copy of the state.
 
-    stamps_ns: (N,), so that long work gets its time at any sample rate (``refinement.patience``).
+    stamps_ns: (N,), so that long work gets its time at any sample rate (``recursive_fit.patience``).
     A sample that is not finite is refused and breaks the window. Raises SignalError on wrong sizes.
     """
     r, m = len(config.inputs), len(config.outputs)
@@ -140,7 +140,7 @@ def advance(
     while done < len(U):
         count = len(U) - done
         if new.refined is not None:
-            count = min(count, refinement.until_chunk(new.refined))
+            count = min(count, recursive_fit.until_chunk(new.refined))
         u, y = U[done:done + count], Y[done:done + count]
         fate = _run(config, new, u, y)
         if new.refined is not None:
@@ -164,17 +164,17 @@ def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array) -
             int(config.weighted_observability), int(config.state_basis == 'tracked'),
             np.array(config.regularization), np.array(config.forgetting_factor), mode)
         memory: tuple[Any, ...] = state.memory
-        paper_kernel.advance_paper(U, Y, *memory, *common, *options)
+        paper_recursion.advance_paper(U, Y, *memory, *common, *options)
         return fate
     R, row, scratch, peaks, prior = state.memory
-    factor_kernel.advance_factor(
+    factor.advance_factor(
         U, Y, R, state.z, row, scratch, peaks, prior, state.scale, state.mean, state.variance, state.scalars,
         state.counts, config.past_window, int(config.direct_feedthrough), config.regularization[0],
         config.forgetting_factor[0], mode, fate)
     return fate
 
 
-def job(state: RpbsidState) -> tuple[refinement.Job, int] | None:
+def job(state: RpbsidState) -> tuple[recursive_fit.Job, int] | None:
     """Return the fit under way, its result not known, and the samples until that is taken."""
     refined = state.refined
     if refined is None or refined.job is None or refined.answer is not None:
@@ -182,7 +182,7 @@ def job(state: RpbsidState) -> tuple[refinement.Job, int] | None:
     return refined.job, refined.due - refined.total
 
 
-def answered(state: RpbsidState, job: refinement.Job, answer: refinement.Answer) -> RpbsidState:
+def answered(state: RpbsidState, job: recursive_fit.Job, answer: recursive_fit.Answer) -> RpbsidState:
     """Return the state knowing the result of ``job``, for when its turn comes; no change if it is over."""
     refined = state.refined
     if refined is None or refined.job is not job:
@@ -218,7 +218,7 @@ def restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
     """
     new = window_restart(config, state)
     if new.refined is not None:
-        new = new._replace(refined=refinement.restart(new.refined))
+        new = new._replace(refined=recursive_fit.restart(new.refined))
     if not config.restart_on_event or not new.counts[USED]:
         return new
     new.counts[USED] = 0
@@ -249,22 +249,22 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> I
     d = _regressors(config, len(config.inputs), len(config.outputs))
     refined = state.refined
     if refined is not None and refined.recursion and FRESH * refined.recursion.weight >= state.counts[USED]:
-        return publication.from_fit(
-            config, refined.recursion, state.scalars, publication.excitation(state.memory[0][:d, :d]), dt)
+        return model_output.from_fit(
+            config, refined.recursion, state.scalars, model_output.excitation(state.memory[0][:d, :d]), dt)
     few = state.counts[USED] <= max(config.past_window, config.order)
     if few or not np.all(np.isfinite(state.memory[0])):
         return None
     if config.estimator == 'paper':
         scale = state.scale
-        realized, R = publication.from_recursion(
+        realized, R = model_output.from_recursion(
             config, state.memory, np.tile(state.mean[1, len(config.inputs):], config.future_window))
     else:
-        realized, R, scale = publication.from_factor(config, state.memory[0], state.scale)
+        realized, R, scale = model_output.from_factor(config, state.memory[0], state.scale)
     if realized is None:
         return None
-    found = publication.publish(
+    found = model_output.publish(
         config, realized, R, scale, state.scalars, state.variance, int(state.counts[USED]), d, dt)
-    early = refined is not None and state.counts[USED] < refinement.FIRST + refinement.SOONEST
+    early = refined is not None and state.counts[USED] < recursive_fit.FIRST + recursive_fit.SOONEST
     if found is not None and early and found.status is Status.TRACKING:
         return found._replace(status=Status.WARMING_UP)  # a short past is biased, and no fit has been made
     return found

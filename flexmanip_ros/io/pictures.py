@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from flexmanip_ros.history import History, Signals
-from flexmanip_ros.holdout import Scores
 from flexmanip_ros.io import plots
 from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.samples.history import History, Signals
+from flexmanip_ros.studies.holdout import Scores
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointRecord
 
 

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from flexmanip_ros.io import plots
 from flexmanip_ros.io.html import Section, page, picture, table, write
-from flexmanip_ros.metrics import Score, score
-from flexmanip_ros.study import Row
+from flexmanip_ros.studies.metrics import Score, score
+from flexmanip_ros.studies.trial import Row
 
 SHOWN_FAILURES = 50
 

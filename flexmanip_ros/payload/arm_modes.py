@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flexmanip_ros.arm.linearization import Blocks, blocks
 from flexmanip_ros.parameters import ArmParameters
-from flexmanip_ros.plant.linearization import Blocks, blocks
 from flexmanip_ros.types import Array
 
 

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flexmanip_ros.arm.linearization import Blocks, blocks
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import block_interval, block_truncation
 from flexmanip_ros.payload.angles import chords
 from flexmanip_ros.payload.modal_basis import sensor_matrix
-from flexmanip_ros.plant.linearization import Blocks, blocks
 from flexmanip_ros.types import Array, Payload, Sample, Status
 
 

@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from flexmanip_ros.arm.linearization import vibration_model
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload.modal_basis import sensor_matrix
-from flexmanip_ros.plant.linearization import vibration_model
 from flexmanip_ros.types import Array
 
 STEPS = 3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flexmanip_ros.identification.modal import REAL
+from flexmanip_ros.identification.modes import REAL
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.types import Array
 

@@ -10,7 +10,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.payload.memory import (
+from flexmanip_ros.numerics.compiled import kernel
+from flexmanip_ros.payload.filter_state import (
     BATCHES,
     BLOCKS,
     DRIFT,
@@ -21,7 +22,6 @@ from flexmanip_ros.payload.memory import (
     WHITE,
 )
 from flexmanip_ros.payload.tail_kernel import believed
-from flexmanip_ros.plant.compiled import kernel
 from flexmanip_ros.types import Array
 
 TAIL_SHARE = 0.5

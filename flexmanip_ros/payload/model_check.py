@@ -15,10 +15,10 @@ import numpy as np
 
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload import memory as mem
+from flexmanip_ros.payload import filter_state as mem
+from flexmanip_ros.payload.interval import QUANTILE
 from flexmanip_ros.payload.model_comparison import Verdict, compare
 from flexmanip_ros.payload.structured import StructuredState
-from flexmanip_ros.payload.structured_judgement import QUANTILE
 from flexmanip_ros.types import Array, Mode, Payload, Sample, Status
 
 EVERY = 32

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload import memory as mem
+from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.arm_modes import ArmModes, arm_modes
 from flexmanip_ros.payload.identified_drive import drive
-from flexmanip_ros.payload.motion_kernel import PARAMETERS
+from flexmanip_ros.payload.process_model import PARAMETERS
 from flexmanip_ros.payload.signals import Quantity
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import Array, Mode, Payload

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.plant.compiled import kernel
+from flexmanip_ros.numerics.compiled import kernel
 from flexmanip_ros.types import Array
 
 

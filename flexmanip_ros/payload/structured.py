@@ -10,17 +10,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flexmanip_ros.numerics.compiled import Prepared
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload import memory as mem
+from flexmanip_ros.payload import filter_state as mem
+from flexmanip_ros.payload import residual_modes
 from flexmanip_ros.payload import structured_start as start
-from flexmanip_ros.payload import tail
-from flexmanip_ros.payload.measurement_kernel import Sensors
-from flexmanip_ros.payload.motion_kernel import PARAMETERS, predict
-from flexmanip_ros.payload.structured_judgement import inexact, judge
-from flexmanip_ros.payload.structured_kernel import advance as run_kernel
+from flexmanip_ros.payload.interval import inexact, judge
+from flexmanip_ros.payload.measurement_update import Sensors
+from flexmanip_ros.payload.moving_horizon import advance as run_kernel
+from flexmanip_ros.payload.process_model import PARAMETERS, predict
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.payload.tail_kernel import believed, push, ring
-from flexmanip_ros.plant.compiled import Prepared
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload, Sample
 
 FIRST_LOOK = 24
@@ -172,14 +172,15 @@ def _begin(config: IdentifierParameters, state: StructuredState) -> StructuredSt
     Y = measurements(model, samples)
     steps = np.diff([sample.stamp_ns for sample in samples]) * 1e-9
     dt = float(np.median(steps))
-    m = mem.memory(2 * model.motion.q.size + model.motion.G.shape[1], len(model.roles), 2 * tail.MODES)
+    size = 2 * model.motion.q.size + model.motion.G.shape[1]
+    m = mem.memory(size, len(model.roles), 2 * residual_modes.MODES)
     m.noise[:] = start.noise(model, Y)
     start.first(config, model, m, Y[0])
     start.freeze(config, model, np.mean([sample.angles for sample in samples], axis=0))
     m.torque[:] = samples[0].u
     _anchor(m)
     seen = sensors(config, model, dt, start.diffusion(config, model, m), m.x[:2])
-    m.score[mem.ODDS] = 0.0 if seen.tail.push.any() else tail.UNBENT_ODDS
+    m.score[mem.ODDS] = 0.0 if seen.tail.push.any() else residual_modes.UNBENT_ODDS
     state = state._replace(
         memory=m, sensors=seen, waiting=(), last_ns=samples[0].stamp_ns, effort=samples[0].u.copy())
     for item in items:

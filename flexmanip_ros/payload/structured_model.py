@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flexmanip_ros.arm.manipulator import manipulator, workspace
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
-from flexmanip_ros.payload.measurement_kernel import Sensors
-from flexmanip_ros.payload.motion_kernel import PARAMETERS, Motion
+from flexmanip_ros.payload.measurement_update import Sensors
+from flexmanip_ros.payload.process_model import PARAMETERS, Motion
+from flexmanip_ros.payload.residual_modes import tail
 from flexmanip_ros.payload.signals import Quantity, Role, signals
-from flexmanip_ros.payload.tail import tail
-from flexmanip_ros.plant.manipulator import manipulator, workspace
 from flexmanip_ros.types import Array
 
 STEP_ANGLE = 1.0

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from flexmanip_ros.arm.capture import body_jacobian
+from flexmanip_ros.arm.manipulator import mass_matrix
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload import memory as mem
+from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.angles import chords
-from flexmanip_ros.payload.motion_kernel import PARAMETERS, set_parameters
+from flexmanip_ros.payload.process_model import PARAMETERS, set_parameters
 from flexmanip_ros.payload.signals import Quantity
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.payload.tail_kernel import believed
-from flexmanip_ros.plant.capture import body_jacobian
-from flexmanip_ros.plant.manipulator import mass_matrix
 from flexmanip_ros.types import Array
 
 CERTAIN = 1e-9

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.payload.memory import ODDS, SHOWN, TOLD
-from flexmanip_ros.plant.acceleration_kernel import solve
-from flexmanip_ros.plant.compiled import inlined
+from flexmanip_ros.arm.acceleration import solve
+from flexmanip_ros.numerics.compiled import inlined
+from flexmanip_ros.payload.filter_state import ODDS, SHOWN, TOLD
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
-    from flexmanip_ros.payload.memory import Memory
-    from flexmanip_ros.payload.motion_kernel import Motion
+    from flexmanip_ros.payload.filter_state import Memory
+    from flexmanip_ros.payload.process_model import Motion
 
 
 class Tail(NamedTuple):

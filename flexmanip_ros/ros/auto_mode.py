@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from flexmanip_ros import detection, sampling
-from flexmanip_ros.channels import Refusal
 from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
+from flexmanip_ros.payload import capture_detection
+from flexmanip_ros.samples import sampling
+from flexmanip_ros.samples.signals import Refusal
 from flexmanip_ros.types import CaptureEvent, JointRecord
 
 REHEARSAL = 1500
@@ -25,7 +26,7 @@ class Watcher:
             inputs=config.inputs, outputs=config.outputs, angles=config.angles, arm=config.arm,
             payload=config.payload)
         self._clock = sampling.init()
-        self._state: detection.DetectionState | None = None
+        self._state: capture_detection.DetectionState | None = None
 
     def take(self, record: JointRecord) -> tuple[CaptureEvent, ...]:
         """Take one message; return the events found with it, each dated at its onset."""
@@ -34,8 +35,8 @@ class Watcher:
             return ()
         if self._state is None or sampled.reset:
             self._settled = replace(self._config, outputs=self._clock.outputs)
-            self._state = detection.init(self._settled)
-        self._state, events = detection.advance(self._settled, self._state, sampled.samples)
+            self._state = capture_detection.init(self._settled)
+        self._state, events = capture_detection.advance(self._settled, self._state, sampled.samples)
         return events
 
     @property
@@ -51,7 +52,7 @@ class Watcher:
     @property
     def statistic(self) -> tuple[float, float]:
         """The latest statistic and its threshold."""
-        return (0.0, math.inf) if self._state is None else detection.statistic(self._state)
+        return (0.0, math.inf) if self._state is None else capture_detection.statistic(self._state)
 
 
 def rehearse(config: TriggerParameters) -> None:

@@ -9,13 +9,13 @@ import numpy as np
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.identification import refinement, stretch
+from flexmanip_ros.identification import batch_fit, recursive_fit
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
 EVENT = 40
 """Samples before the event; enough to learn the sample time."""
-SAMPLES = EVENT + 3 * stretch.BLOCK + 2 * refinement.CHUNK
+SAMPLES = EVENT + 3 * batch_fit.BLOCK + 2 * recursive_fit.CHUNK
 """Until the fits after it have begun and a block has followed."""
 STEP_NS = 1_000_000
 

@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.identification.fitting import solve
-from flexmanip_ros.identification.refinement import Answer, Job
+from flexmanip_ros.identification.recursive_fit import Answer, Job
 
 TURN_S = 0.0002
 """A thread that computes gives way to a sample within this time; Python's own default is 5 ms."""

@@ -11,7 +11,7 @@ import pytest
 from flexmanip_ros.cli.simulate_bag import START_NS, main
 from flexmanip_ros.io import bag
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, configure
-from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
-from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord
 
 Item = JointRecord | CaptureEvent

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexmanip_ros import sampling
 from flexmanip_ros.parameters import IdentifierParameters, configure
+from flexmanip_ros.samples import sampling
 from flexmanip_ros.types import JointRecord, Sample
 
 NAMES = ('joint1', 'joint2', 'link1_bend', 'link2_bend')

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
-from flexmanip_ros.plant.excitation import sequence
-from flexmanip_ros.plant.simulator import simulate
+from flexmanip_ros.simulation.excitation import sequence
+from flexmanip_ros.simulation.simulator import simulate
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Status
 
 NAMES = ('joint1', 'joint2', 'link1_bend', 'link2_bend')

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from recording import ARM, BENDS, RATES, event, record
 
-from flexmanip_ros import detection
 from flexmanip_ros.parameters import PlantParameters, TriggerParameters
-from flexmanip_ros.plant import simulator
+from flexmanip_ros.payload import capture_detection
+from flexmanip_ros.simulation import simulator
 from flexmanip_ros.types import EventKind, Sample
 
 
@@ -18,10 +18,10 @@ def settings(outputs=BENDS + RATES, **parameters):
 
 def detect(config, samples, block=5):
     """Events found, with the stamp at which each was told."""
-    state, found = detection.init(config), []
+    state, found = capture_detection.init(config), []
     for start in range(0, len(samples), block):
         part = samples[start:start + block]
-        state, events = detection.advance(config, state, part)
+        state, events = capture_detection.advance(config, state, part)
         found.extend((one, part[-1].stamp_ns) for one in events)
     return found
 
@@ -66,18 +66,19 @@ def test_a_capture_at_rest_is_told_when_the_torque_resumes():
 def test_single_samples_give_the_events_of_a_block():
     samples = record(1.6, (event(1.3),))
     config = settings()
-    state, single = detection.init(config), []
+    state, single = capture_detection.init(config), []
     for sample in samples:
-        state, one = detection.step(config, state, sample)
+        state, one = capture_detection.step(config, state, sample)
         single.extend([one] if one is not None else [])
-    assert single == list(detection.advance(config, detection.init(config), samples)[1])
+    assert single == list(capture_detection.advance(config, capture_detection.init(config), samples)[1])
 
 
 def test_fewer_false_alarms_mean_a_higher_threshold():
-    often, rarely = (detection.threshold(settings(false_alarms_per_hour=rate), 1e-3) for rate in (1.0, 1e-6))
+    often, rarely = (capture_detection.threshold(settings(false_alarms_per_hour=rate), 1e-3)
+                     for rate in (1.0, 1e-6))
     assert 30.0 < often < rarely < 100.0
 
 
 def test_signals_of_no_arm_detect_nothing():
     config = settings(angles=())
-    assert detection.advance(config, detection.init(config), record(0.2))[1] == ()
+    assert capture_detection.advance(config, capture_detection.init(config), record(0.2))[1] == ()

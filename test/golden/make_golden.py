@@ -9,10 +9,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from flexmanip_ros import paper, paper_run, study
+from flexmanip_ros.paper import case_run, experiments
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, configure
-from flexmanip_ros.plant import excitation, simulator
-from flexmanip_ros.scenario import scenario
+from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.studies import trial
+from flexmanip_ros.studies.scenario import scenario
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 PLACE = Path(__file__).with_name('golden.json')
@@ -26,15 +27,15 @@ PLANTS = ('nonlinear', 'linear', 'finite_element')
 
 def results() -> dict[str, Any]:
     """Return run -> column -> number, computed now."""
-    rows: dict[str, study.Row] = {f'plant {model}': _plant(model) for model in PLANTS}
-    for row in paper_run.run(paper.PAYLOADS[0], 0)[0]:
+    rows: dict[str, trial.Row] = {f'plant {model}': _plant(model) for model in PLANTS}
+    for row in case_run.run(experiments.PAYLOADS[0], 0)[0]:
         rows[f'paper 20 kg, {row["method"]}'] = row
-    rows['nonlinear'] = study.trial(scenario(NONLINEAR), 0)[0]
+    rows['nonlinear'] = trial.trial(scenario(NONLINEAR), 0)[0]
     return {name: {key: value for key, value in row.items() if key not in NOT_NUMBERS_OF_OURS}
             for name, row in rows.items()}
 
 
-def _plant(model: str) -> study.Row:
+def _plant(model: str) -> trial.Row:
     """Return where a plant is after a capture."""
     config = configure(PlantParameters, {'model': model, 'seed': 7})
     event = CaptureEvent(150_000_000, EventKind.CAPTURE)

@@ -7,9 +7,9 @@ import pytest
 from linear_arm import benchmark
 
 from flexmanip_ros import pipeline
+from flexmanip_ros.arm.linearization import vibration_model
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
-from flexmanip_ros.plant import excitation, simulator
-from flexmanip_ros.plant.linearization import vibration_model
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, Status
 
 CAPTURE_S = 3.0

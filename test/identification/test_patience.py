@@ -7,7 +7,7 @@ import pytest
 from linear_arm import configuration, random_system, record
 from test_rpbsid import same
 
-from flexmanip_ros.identification import refinement, rpbsid, stretch
+from flexmanip_ros.identification import batch_fit, recursive_fit, rpbsid
 
 COUNT = 1300
 CONFIG = configuration(1, 2, order=2, past_window=4, future_window=2)
@@ -15,8 +15,8 @@ CONFIG = configuration(1, 2, order=2, past_window=4, future_window=2)
 
 def due(rate: float, count: int) -> int:
     """Samples from the question after ``count`` of them to its answer."""
-    refined = refinement.start(3)._replace(total=count)
-    return refinement.patience(refined, round((count - 1) * 1e9 / rate))
+    refined = recursive_fit.start(3)._replace(total=count)
+    return recursive_fit.patience(refined, round((count - 1) * 1e9 / rate))
 
 
 @pytest.mark.parametrize('count', [256, 512, 1024, 2048])
@@ -28,9 +28,9 @@ def test_a_fit_has_a_quarter_of_its_samples_up_to_1_khz(count: int) -> None:
 def test_at_any_rate_a_fit_has_a_tenth_of_a_second_and_more_for_many_samples(rate: float) -> None:
     for count in (256, 512, 1024, 2048):
         samples = due(rate, count)
-        assert samples % refinement.CHUNK == 0
+        assert samples % recursive_fit.CHUNK == 0
         assert samples / rate >= max(0.1, 2e-4 * count)
-        assert samples / rate <= max(0.1, 2e-4 * count, 0.25 * count / rate) + refinement.CHUNK / rate
+        assert samples / rate <= max(0.1, 2e-4 * count, 0.25 * count / rate) + recursive_fit.CHUNK / rate
 
 
 @pytest.mark.parametrize('decimation', [1, 2])
@@ -63,6 +63,6 @@ def test_a_fit_at_4_khz_is_awaited_for_a_tenth_of_a_second() -> None:
     (100.0, 64), (1000.0, 64), (2000.0, 128), (4000.0, 192), (10000.0, 192)])
 def test_a_block_has_a_twentieth_of_a_second_and_is_over_before_the_next(
         rate: float, samples: int) -> None:
-    refined = refinement.start(3)._replace(total=1024, chunks=(np.zeros((refinement.CHUNK, 3)),) * 4)
-    asked = refinement.ask_block(refined, round(1023 * 1e9 / rate))
-    assert asked.due - asked.total == samples < stretch.BLOCK
+    refined = recursive_fit.start(3)._replace(total=1024, chunks=(np.zeros((recursive_fit.CHUNK, 3)),) * 4)
+    asked = recursive_fit.ask_block(refined, round(1023 * 1e9 / rate))
+    assert asked.due - asked.total == samples < batch_fit.BLOCK

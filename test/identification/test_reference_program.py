@@ -7,7 +7,7 @@ import pytest
 from linear_arm import configuration, shared_data
 
 from flexmanip_ros.identification import rpbsid
-from flexmanip_ros.identification.publication import from_factor
+from flexmanip_ros.identification.model_output import from_factor
 
 SETTINGS = {'order': 3, 'past_window': 5, 'future_window': 3, 'forgetting_factor': [0.98] * 3,
             'regularization': [1e-6] * 3, 'direct_feedthrough': True, 'forgetting': 'constant'}

@@ -7,9 +7,9 @@ import pytest
 from linear_arm import benchmark, configuration, random_system, record
 
 from flexmanip_ros.identification import rpbsid
-from flexmanip_ros.identification.modal import modes
+from flexmanip_ros.identification.model_output import based, from_factor
+from flexmanip_ros.identification.modes import modes
 from flexmanip_ros.identification.moments import realize
-from flexmanip_ros.identification.publication import based, from_factor
 from flexmanip_ros.identification.uncertainty import Tangent, tangent, variance
 from flexmanip_ros.types import StateSpace
 

@@ -16,7 +16,7 @@ from flexmanip_ros import pipeline
 from flexmanip_ros.errors import CheckpointError
 from flexmanip_ros.io import checkpoint
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
-from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 CONFIG = IdentifierParameters()

@@ -10,7 +10,7 @@ from flexmanip_ros.parameters import (
     IdentifierParameters,
     PlantParameters,
 )
-from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, Sample
 
 BENDS = ('link1_bend/position', 'link2_bend/position')

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import logm
 
+from flexmanip_ros.arm.linearization import discretize, vibration_model
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.identification.uncertainty import Identified
@@ -17,7 +18,6 @@ from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, config
 from flexmanip_ros.payload import block_truncation
 from flexmanip_ros.payload.block_extraction import estimate, extract, sweep
 from flexmanip_ros.payload.modal_basis import to_modal
-from flexmanip_ros.plant.linearization import discretize, vibration_model
 from flexmanip_ros.types import Sample, StateSpace, Status
 
 CONFIGURATIONS = [(60.0, 45.0), (0.0, 0.0), (45.0, 0.0), (-45.0, 45.0)]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from recording import config
 
+from flexmanip_ros.arm import linearization
 from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.payload import frequency
-from flexmanip_ros.plant import linearization
 from flexmanip_ros.types import Mode, Status
 
 ARM = ArmParameters(angle_convention='chord')

@@ -10,7 +10,8 @@ import pytest
 from recording import ARM, config, event, record
 
 from flexmanip_ros import pipeline
-from flexmanip_ros.identification import modal
+from flexmanip_ros.arm import linearization
+from flexmanip_ros.identification import modes
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import (
     ArmParameters,
@@ -22,7 +23,7 @@ from flexmanip_ros.payload import model_check, structured
 from flexmanip_ros.payload.arm_modes import arm_modes
 from flexmanip_ros.payload.identified_drive import drive
 from flexmanip_ros.payload.model_comparison import Verdict
-from flexmanip_ros.plant import excitation, linearization, simulator
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, StateSpace, Status
 
 THETA = np.radians([60.0, 45.0])
@@ -56,7 +57,7 @@ def compared(identified: Identified) -> tuple[Verdict, Payload, Payload]:
     settings, state = holding_20_kg()
     alone = structured.estimate(settings, state)
     swept = np.array([*np.repeat(np.cos(THETA[1] - THETA[0]), 2), THETA[0], THETA[0], 0.0])
-    found = model_check.check(settings, state, alone, swept, identified, modal.modes(identified), 2500, EVENT)
+    found = model_check.check(settings, state, alone, swept, identified, modes.modes(identified), 2500, EVENT)
     assert found is not None
     return found, alone, model_check.apply(state, alone, (found,), EVENT)
 
@@ -150,7 +151,7 @@ def test_only_a_refined_fit_of_some_length_is_heard(change):
     settings, state = holding_20_kg()
     identified = model_of(ARM, 60.0)._replace(**change)
     assert model_check.check(settings, state, structured.estimate(settings, state), np.zeros(5), identified,
-                             modal.modes(identified)) is None
+                             modes.modes(identified)) is None
 
 
 def test_a_verdict_counts_until_the_next_event():

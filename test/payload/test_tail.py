@@ -9,13 +9,13 @@ import pytest
 from recording import ARM, config, event, record
 from scipy.linalg import expm
 
-from flexmanip_ros.payload import memory as mem
+from flexmanip_ros.arm import linearization
+from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured, structured_start
 from flexmanip_ros.payload.judgement_kernel import TAIL_SHARE, misjudged
+from flexmanip_ros.payload.residual_modes import MODES, tail
 from flexmanip_ros.payload.structured_model import motion
-from flexmanip_ros.payload.tail import MODES, tail
 from flexmanip_ros.payload.tail_kernel import amplitude, believed, push, ring, ringing
-from flexmanip_ros.plant import linearization
 from flexmanip_ros.types import Status
 
 THETA = np.array([0.4, 1.1])

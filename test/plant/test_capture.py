@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flexmanip_ros.arm import capture, manipulator
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
-from flexmanip_ros.plant import capture, excitation, manipulator, simulator
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import Array
 
 CONFIG = PlantParameters(noise='none', arm=ArmParameters(modes=2))

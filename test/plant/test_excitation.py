@@ -9,7 +9,7 @@ import pytest
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import ExcitationParameters
-from flexmanip_ros.plant import excitation
+from flexmanip_ros.simulation import excitation
 
 SHAPES = ['square', 'multisine', 'prbs', 'chirp', 'zero']
 

@@ -9,7 +9,7 @@ import pytest
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters
-from flexmanip_ros.plant import excitation, excitation_design, simulator
+from flexmanip_ros.simulation import excitation, excitation_design, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 CONFIG = ExcitationParameters(design_time=2.0, arm=ArmParameters(modes=1, damping_ratio=0.003))

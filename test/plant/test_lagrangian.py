@@ -6,8 +6,8 @@ import lagrangian
 import numpy as np
 import pytest
 
+from flexmanip_ros.arm import manipulator
 from flexmanip_ros.parameters import ArmParameters
-from flexmanip_ros.plant import manipulator
 
 BODIES = {'point': (20.0, 0.0, 0.0, 0.0), 'body': (20.0, 1.5, 0.2, -0.1)}
 

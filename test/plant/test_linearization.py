@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flexmanip_ros.arm import linearization, manipulator
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
-from flexmanip_ros.plant import linearization, manipulator
 
 POINT = np.radians([60.0, 45.0])
 TABLE = {

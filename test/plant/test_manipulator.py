@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flexmanip_ros.arm import manipulator as m
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
-from flexmanip_ros.plant import manipulator as m
 from flexmanip_ros.types import Array
 
 ARM = ArmParameters(hub_inertia=(1.0, 2.0), joint_inertia=0.5, tip_inertia=0.3, damping_ratio=0.01)

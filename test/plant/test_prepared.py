@@ -10,9 +10,9 @@ from numba import njit
 from numba.core.errors import TypingError
 from numpy.typing import NDArray
 
+from flexmanip_ros.numerics.compiled import Prepared
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import structured
-from flexmanip_ros.plant.compiled import Prepared
 
 
 class Table(NamedTuple):

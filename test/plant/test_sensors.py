@@ -10,7 +10,7 @@ import pytest
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
 from flexmanip_ros.parameters.sensing import ActuatorParameters, SensorParameters
-from flexmanip_ros.plant import excitation, simulator
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import JointRecord
 
 CLEAN = PlantParameters(noise='none', arm=ArmParameters(modes=1))

@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flexmanip_ros.arm import manipulator
 from flexmanip_ros.errors import ModelError, ParameterError, SignalError
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
-from flexmanip_ros.plant import excitation, manipulator, simulator
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 CLEAN = PlantParameters(noise='none', arm=ArmParameters(modes=2))

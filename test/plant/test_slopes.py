@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flexmanip_ros.arm import residual_modes, slope_correction
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
-from flexmanip_ros.plant import excitation, simulator, slope_correction, tail
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import Array, CaptureEvent, EventKind
 
 ARM = ArmParameters(damping_ratio=0.003, hub_inertia=(0.02, 0.01), joint_inertia=0.01, tip_inertia=0.005)
@@ -85,7 +86,7 @@ def test_a_jump_of_the_torque_shows_one_sample_later() -> None:
 
 
 def test_the_tail_takes_over_from_the_quasi_static_part() -> None:
-    few = tail.slopes_with_tail(ARM, CONFIG.initial_angles, 3, 5, 1e-3)
+    few = residual_modes.slopes_with_tail(ARM, CONFIG.initial_angles, 3, 5, 1e-3)
     static = few.output / np.array([np.linalg.solve(np.eye(2) - s, g + h)[0] for s, g, h in zip(
         few.step, few.start, few.end, strict=True)]) ** -1 @ few.load
     total = slope_correction.slopes(ARM, 3).flexibility

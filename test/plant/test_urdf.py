@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from urdf_parser_py.urdf import URDF
 
+from flexmanip_ros.arm import manipulator
+from flexmanip_ros.arm.urdf import urdf
 from flexmanip_ros.cli import write_urdf
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
-from flexmanip_ros.plant import manipulator
-from flexmanip_ros.plant.urdf import urdf
 from flexmanip_ros.types import Array
 
 ARM = ArmParameters(modes=1, sensor_position=(0.5, 0.4), shortening=False, slope_correction=False)

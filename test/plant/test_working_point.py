@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flexmanip_ros.arm import linearization, manipulator, working_point
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
-from flexmanip_ros.plant import linearization, manipulator, working_point
 from flexmanip_ros.types import Array
 
 PARAMETERS = ArmParameters(modes=2, damping_ratio=0.01, hub_inertia=(0.3, 0.2))

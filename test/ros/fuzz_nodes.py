@@ -19,13 +19,13 @@ from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Empty, Float64, Float64MultiArray, Header
 
-from flexmanip_ros.ros.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.conversions import time_message
-from flexmanip_ros.ros.excitation import Excitation
-from flexmanip_ros.ros.payload_adapter import PayloadAdapter
-from flexmanip_ros.ros.payload_controller import PayloadController
-from flexmanip_ros.ros.plant_simulator import PlantSimulator
-from flexmanip_ros.ros.rpbsid_identifier import RpbsidIdentifier
+from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
+from flexmanip_ros.ros.nodes.excitation import Excitation
+from flexmanip_ros.ros.nodes.payload_adapter import PayloadAdapter
+from flexmanip_ros.ros.nodes.payload_controller import PayloadController
+from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
+from flexmanip_ros.ros.nodes.rpbsid_identifier import RpbsidIdentifier
 
 EVENTS = {'capture_event': Header, 'capture_detected': Header}
 ESTIMATE = 'rpbsid_identifier/payload_estimate'

@@ -13,10 +13,10 @@ from std_msgs.msg import Float64, Float64MultiArray, Header
 
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters
-from flexmanip_ros.plant import excitation, simulator
 from flexmanip_ros.ros import conversions, qos
-from flexmanip_ros.ros.demo_result import outgoing
-from flexmanip_ros.ros.rpbsid_identifier import RpbsidIdentifier
+from flexmanip_ros.ros.demo.result import outgoing
+from flexmanip_ros.ros.nodes.rpbsid_identifier import RpbsidIdentifier
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
 START_NS = 1_700_000_000_000_000_000

@@ -7,12 +7,12 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters
-from flexmanip_ros.plant import simulator
-from flexmanip_ros.plant.excitation import sequence
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.conversions import joint_state as joint_state_message
 from flexmanip_ros.ros.conversions import stamp_ns
+from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
+from flexmanip_ros.simulation import simulator
+from flexmanip_ros.simulation.excitation import sequence
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 

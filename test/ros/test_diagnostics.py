@@ -11,8 +11,8 @@ from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
 
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.diagnostics import LossCounter, Meter
+from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
 
 
 def entries(heard: list[DiagnosticArray], name: str) -> list[Any]:

@@ -7,9 +7,9 @@ from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from flexmanip_ros.plant.excitation import torque
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.excitation import Excitation
+from flexmanip_ros.ros.nodes.excitation import Excitation
+from flexmanip_ros.simulation.excitation import torque
 
 
 def test_torques_follow_the_clock_and_end_at_zero(ros: Ros) -> None:

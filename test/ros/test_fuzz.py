@@ -13,7 +13,7 @@ from ros_harness import Ros
 from std_msgs.msg import Float64MultiArray, Header
 from std_srvs.srv import Trigger
 
-from flexmanip_ros import timeline
+from flexmanip_ros import event_replay
 from flexmanip_ros.ros.conversions import header, time_message
 from flexmanip_ros.ros.conversions import joint_state as message_of
 from flexmanip_ros.types import Status
@@ -66,7 +66,7 @@ def test_events_without_end_do_not_fill_the_memory(ros: Ros, name: str) -> None:
 
 def test_samples_whose_stamps_hardly_advance_do_not_fill_the_memory(
         ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(timeline, 'MOST_SAMPLES', 1000)
+    monkeypatch.setattr(event_replay, 'MOST_SAMPLES', 1000)
     bench = Bench(ros, 'rpbsid_identifier')
     for first in range(0, 4000, 100):
         message = [joint_state(k) for k in range(first, first + 100)]

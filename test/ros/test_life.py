@@ -16,12 +16,12 @@ from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
 
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.capture_trigger import CaptureTrigger
-from flexmanip_ros.ros.excitation import Excitation
-from flexmanip_ros.ros.payload_adapter import PayloadAdapter
-from flexmanip_ros.ros.payload_controller import PayloadController
-from flexmanip_ros.ros.plant_simulator import PlantSimulator
-from flexmanip_ros.ros.rpbsid_identifier import RpbsidIdentifier
+from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
+from flexmanip_ros.ros.nodes.excitation import Excitation
+from flexmanip_ros.ros.nodes.payload_adapter import PayloadAdapter
+from flexmanip_ros.ros.nodes.payload_controller import PayloadController
+from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
+from flexmanip_ros.ros.nodes.rpbsid_identifier import RpbsidIdentifier
 
 TRANSITIONS = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP, Transition.TRANSITION_ACTIVATE,
                Transition.TRANSITION_DEACTIVATE)

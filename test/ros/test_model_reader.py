@@ -12,8 +12,8 @@ from test_worker import CAPTURE, said
 from flexmanip_ros import estimator, pipeline, schedule
 from flexmanip_ros.estimator import MOST_OWED
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
-from flexmanip_ros.plant import excitation, simulator
 from flexmanip_ros.ros.model_reader import ModelReader
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord
 
 CONFIG = IdentifierParameters()

@@ -13,9 +13,10 @@ from ros_harness import Ros, overrides
 from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.ros import payload_adapter, qos
-from flexmanip_ros.ros.payload_adapter import PayloadAdapter, fill, refusal, service_class
-from flexmanip_ros.ros.plant_simulator import PlantSimulator
+from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.nodes import payload_adapter
+from flexmanip_ros.ros.nodes.payload_adapter import PayloadAdapter, fill, refusal, service_class
+from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
 
 
 def say(ros: Ros, mass: float, std: float) -> tuple[Any, Any]:

@@ -14,8 +14,8 @@ from flexmanip_ros.control import controller
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import joint_record
-from flexmanip_ros.ros.payload_controller import PayloadController
-from flexmanip_ros.ros.plant_simulator import PlantSimulator
+from flexmanip_ros.ros.nodes.payload_controller import PayloadController
+from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
 
 
 def start(ros: Ros, readers: int = 1, **values: object) -> PayloadController:

@@ -13,10 +13,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
 from std_srvs.srv import Trigger
 
-from flexmanip_ros.plant import simulator
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import header, joint_record, stamp_ns, time_message
-from flexmanip_ros.ros.plant_simulator import PlantSimulator
+from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
+from flexmanip_ros.simulation import simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 RATE = 200.0

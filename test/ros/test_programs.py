@@ -138,7 +138,7 @@ def test_an_interrupted_demonstration_leaves_a_readable_bag(tmp_path: Path) -> N
 
 
 def test_runs_never_share_a_folder(tmp_path: Path) -> None:
-    from flexmanip_ros.ros.demo import new_folder
+    from flexmanip_ros.ros.demo.program import new_folder
 
     (tmp_path / 'run_007').mkdir()
     assert [new_folder(tmp_path).name, new_folder(tmp_path).name] == ['run_008', 'run_009']
@@ -152,7 +152,7 @@ def test_a_full_disk_ends_the_recording_with_the_reason_and_keeps_what_was_writt
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     process = subprocess.run(
-        [sys.executable, '-m', 'flexmanip_ros.ros.demo', str(tmp_path), '--duration', '2',
+        [sys.executable, '-m', 'flexmanip_ros.ros.demo.program', str(tmp_path), '--duration', '2',
          '--capture-time', '1'],
         env=environment, text=True, capture_output=True, timeout=120, preexec_fn=small_files, check=False)
     assert process.returncode == 1, process.stdout + process.stderr

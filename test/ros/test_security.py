@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 from ros_harness import Ros, overrides
 
-from flexmanip_ros.ros.capture_trigger import CaptureTrigger
-from flexmanip_ros.ros.excitation import Excitation
-from flexmanip_ros.ros.payload_adapter import PayloadAdapter
-from flexmanip_ros.ros.payload_controller import PayloadController
-from flexmanip_ros.ros.plant_simulator import PlantSimulator
-from flexmanip_ros.ros.rpbsid_identifier import RpbsidIdentifier
+from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
+from flexmanip_ros.ros.nodes.excitation import Excitation
+from flexmanip_ros.ros.nodes.payload_adapter import PayloadAdapter
+from flexmanip_ros.ros.nodes.payload_controller import PayloadController
+from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
+from flexmanip_ros.ros.nodes.rpbsid_identifier import RpbsidIdentifier
 
 POLICY = Path(__file__).resolve().parents[2] / 'config' / 'sros2' / 'policy.xml'
 NODES = (PlantSimulator, Excitation, CaptureTrigger, RpbsidIdentifier, PayloadController, PayloadAdapter)

@@ -4,8 +4,8 @@ import time
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
-from flexmanip_ros.plant import excitation, simulator
 from flexmanip_ros.ros.worker import Worker
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind
 
 COUNT = 900

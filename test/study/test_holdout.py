@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from flexmanip_ros.errors import ModelError, ParameterError
-from flexmanip_ros.history import Signals
-from flexmanip_ros.holdout import score
+from flexmanip_ros.samples.history import Signals
+from flexmanip_ros.studies.holdout import score
 from flexmanip_ros.types import StateSpace
 
 DT = 0.01

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexmanip_ros import paper, paper_run, pipeline, study
+from flexmanip_ros import pipeline
+from flexmanip_ros.arm.linearization import discretize, vibration_model
 from flexmanip_ros.cli.reproduce_paper import main
-from flexmanip_ros.io import paper_sections
-from flexmanip_ros.paper_response import RATE, arm, identified_response, true_response
-from flexmanip_ros.plant.linearization import discretize, vibration_model
+from flexmanip_ros.paper import case_run, experiments, sections
+from flexmanip_ros.paper.model_response import RATE, arm, identified_response, true_response
+from flexmanip_ros.studies import trial
 from flexmanip_ros.types import StateSpace
 
 PAGE_OF_ONE_CASE = ('Fig. 2:', 'Fig. 3:', 'Figs. 4, 5:', 'Fig. 6:', 'Fig. 7:', 'Fig. 8:', 'Fig. 9:',
@@ -34,7 +35,7 @@ def output(tmp_path_factory):
 
 def test_every_method_has_its_row_and_nothing_failed(output):
     rows = _rows(output / 'runs.csv')
-    assert [row['method'] for row in rows] == [method.name for method in paper.METHODS]
+    assert [row['method'] for row in rows] == [method.name for method in experiments.METHODS]
     assert all(row['error'] == '' for row in rows)
     errors = {row['method']: float(row['error_percent']) for row in rows}
     assert errors['structured'] < 0.5
@@ -49,23 +50,23 @@ def test_two_workers_give_the_bits_of_one(output, tmp_path):
 
 @pytest.mark.parametrize('name', ['paper', 'structured'])
 def test_methods_that_share_an_identifier_get_what_a_pass_of_their_own_gives(name):
-    case = paper.PAYLOADS[0]
-    shared = paper_run.run(case, 0)[1][name]
-    made = paper.scenario(case, next(known for known in paper.METHODS if known.name == name))
+    case = experiments.PAYLOADS[0]
+    shared = case_run.run(case, 0)[1][name]
+    made = experiments.scenario(case, next(known for known in experiments.METHODS if known.name == name))
     run = made.configuration(0, name)
-    own = paper_run.follow(list(pipeline.run(run.identifier, study.messages(made, run, 0))))
-    held = own.time >= paper.CAPTURE_TIME
+    own = run.follow(list(pipeline.run(run.identifier, trial.messages(made, run, 0))))
+    held = own.time >= experiments.CAPTURE_TIME
     np.testing.assert_array_equal(own.mass[held], shared.mass[:-1][held])  # the last: at the last sample
     np.testing.assert_array_equal(own.frequencies, shared.frequencies[:-1])
 
 
 def test_every_figure_of_the_paper_is_on_the_page():
-    rows, tracks = paper_run.run(paper.PAYLOADS[0], 0)
-    everywhere = {case.name: {name: [track] for name, track in tracks.items()} for case in paper.CASES}
-    all_rows = [row | {'case': case.name} for case in paper.CASES for row in rows]
-    planned = [*paper_sections.without_results(),
-               *(one for example in (paper_sections.payload_example, paper_sections.configuration_example,
-                                     paper_sections.finite_element_example)
+    rows, tracks = case_run.run(experiments.PAYLOADS[0], 0)
+    everywhere = {case.name: {name: [track] for name, track in tracks.items()} for case in experiments.CASES}
+    all_rows = [row | {'case': case.name} for case in experiments.CASES for row in rows]
+    planned = [*sections.without_results(),
+               *(one for example in (sections.payload_example, sections.configuration_example,
+                                     sections.finite_element_example)
                  for one in example(everywhere, all_rows))]
     numbers = {int(number) for one in planned for number in one.numbers.split(',')}
     assert numbers == set(range(2, 20))
@@ -73,7 +74,7 @@ def test_every_figure_of_the_paper_is_on_the_page():
 
 
 def test_the_working_point_of_a_linear_plant_leaves_known_coupling_unbiased():
-    row = next(row for row in paper_run.run(paper.PAYLOADS[0], 1)[0] if row['method'] == 'known M_b')
+    row = next(row for row in case_run.run(experiments.PAYLOADS[0], 1)[0] if row['method'] == 'known M_b')
     assert abs(row['payload_mass_kg'] / 20.0 - 1.0) < 0.02
     assert row['covered']
 
@@ -93,12 +94,12 @@ def test_the_page_has_every_figure_and_needs_nothing_else(output):
 
 
 def test_the_exact_model_answers_the_test_input_as_the_arm_does():
-    case = paper.PAYLOADS[0]
+    case = experiments.PAYLOADS[0]
 
     A, B = discretize(*vibration_model(arm(), np.radians(case.angles_deg), case.payload), 1.0 / RATE)
     exact = StateSpace(A, B, np.eye(4), np.zeros((4, 2)), np.zeros((4, 4)), 1.0 / RATE)
     mass = np.array([case.payload])
-    track = paper_run.Track(mass, mass, mass, mass, np.empty((1, 2)), exact)
+    track = case_run.Track(mass, mass, mass, mass, np.empty((1, 2)), exact)
     found, true = identified_response(case, track), true_response(case)
     np.testing.assert_allclose(found.angles, true.angles, atol=1e-12)
     np.testing.assert_allclose(found.bends, true.bends, atol=1e-12)
@@ -107,8 +108,8 @@ def test_the_exact_model_answers_the_test_input_as_the_arm_does():
 
 def test_a_run_without_a_model_has_no_test_response():
     empty = np.empty(0)
-    track = paper_run.Track(empty, empty, empty, empty, np.empty((0, 2)), None)
-    assert identified_response(paper.PAYLOADS[0], track) is None
+    track = case_run.Track(empty, empty, empty, empty, np.empty((0, 2)), None)
+    assert identified_response(experiments.PAYLOADS[0], track) is None
 
 
 @pytest.mark.parametrize('arguments', [['--runs', '0'], ['--output', '/dev/null/x']])

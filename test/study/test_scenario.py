@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexmanip_ros import study
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.faults import inject
-from flexmanip_ros.scenario import Faults, scenario
+from flexmanip_ros.studies import trial
+from flexmanip_ros.studies.fault_injection import inject
+from flexmanip_ros.studies.scenario import Faults, scenario
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
 VARIED = {
@@ -54,7 +54,7 @@ def test_what_is_varied_does_not_depend_on_what_else_is():
 def test_every_estimator_sees_the_same_samples_and_a_broken_one_stops_nobody():
     made = scenario({**VARIED, 'estimators': {
         'good': {}, 'bad': {'inputs': ['nobody/effort']}, 'twin': {}}})
-    rows = {row['estimator']: row for row in study.trial(pickle.loads(pickle.dumps(made)), 1)}
+    rows = {row['estimator']: row for row in trial.trial(pickle.loads(pickle.dumps(made)), 1)}
     assert 'nobody/effort' in rows['bad']['error']
     assert rows['good']['error'] == ''
     assert rows['good']['frequencies_1'] == rows['twin']['frequencies_1']

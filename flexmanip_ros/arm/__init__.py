@@ -1,0 +1,1 @@
+"""The mechanics of the arm: equations of motion, linearization, natural modes, capture."""

@@ -1,0 +1,222 @@
+"""From the estimator's memory to a published model: units, basis, uncertainty, what it is worth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from scipy.linalg.lapack import dtrtrs
+
+from flexmanip_ros.identification import realization, uncertainty
+from flexmanip_ros.identification.batch_fit import Recursion
+from flexmanip_ros.identification.memory_kernel import POWER, WEIGHT, WEIGHT2
+from flexmanip_ros.identification.moments import Realized, realize, triangle
+from flexmanip_ros.identification.uncertainty import Identified, Tangent
+from flexmanip_ros.identification.varx import observability_controllability, open_loop_weight
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.types import Array, StateSpace, Status
+
+LARGEST_SPREAD = 4_000_000
+"""Elements beyond which no covariance is computed (very long windows with many outputs and states)."""
+UNEXPLAINED = 0.9
+"""Share of the outputs' power left to the innovations above which there is nothing to identify."""
+WORST_CONDITION = 1e12
+NEGLECTED = 0.005
+"""Share of an innovation's variance that the order may leave out before the order is called too low."""
+SIGNIFICANT = 25.0
+"""Likelihood ratio (doubled logarithm) beyond which what is left out is no chance."""
+
+
+def from_factor(config: IdentifierParameters, R: Array, scale: Array) -> tuple[Realized | None, Array, Array]:
+    """Solve the method from the factor R of the moments: model, factor and scale of signals of unit power."""
+    r, m = len(config.inputs), len(config.outputs)
+    width = r + m
+    power = np.linalg.norm(R[:, -width:], axis=0)
+    unit = np.divide(1.0, power, out=np.ones(width), where=power > 0.0)
+    R = R * np.tile(unit, R.shape[1] // width)
+    realized = realize(
+        R, r, m, config.order, config.future_window, feedthrough=config.direct_feedthrough,
+        weighted=config.weighted_observability, fixed=config.state_basis == 'fixed',
+        riccati=config.kalman_gain == 'riccati')
+    return realized, R, scale * unit
+
+
+def from_recursion(
+    config: IdentifierParameters, memory: tuple[Array, ...], peaks: Array,
+) -> tuple[Realized | None, Array]:
+    """Read the model off the paper's three recursions; the moments are the inverse of their covariance.
+
+    peaks: (f m,) of the outputs, by which a tracked state selection was scaled.
+    """
+    S1, xi, _, _, _, theta_x, _, _, theta_y, _, W = memory[:11]
+    if config.state_basis == 'tracked':
+        W = np.divide(W, peaks, out=np.zeros_like(W), where=peaks > 0.0)
+    r, m, n, f = len(config.inputs), len(config.outputs), config.order, config.future_window
+    width = r + m
+    past = config.past_window * width
+    d = S1.shape[0]
+    Xi = xi[:, :past]
+    xi_u = xi[:, past:] if d > past else np.zeros((m, r))
+    G = observability_controllability(Xi, f, r, config.weighted_observability)
+    S = W @ open_loop_weight(Xi, f, r) if config.weighted_observability else W
+    T = S @ observability_controllability(Xi, f, r, False)
+    if not np.all(np.isfinite(theta_x)) or not np.all(np.isfinite(theta_y)) or not np.diag(S1).all():
+        return None, S1
+    # a square root of the information: root' root = (S S')^-1
+    root: Array = np.asarray(np.linalg.inv(S1), dtype=np.float64)
+    R = np.zeros((d + width, past + width))
+    R[:d, :past] = root[:, :past]
+    if d > past:
+        R[:d, past:past + r] = root[:, past:]
+    R[:d, past + r:] = root @ xi.T
+    head = triangle(root)
+    values = np.asarray(np.linalg.svd(G @ root[:, :past].T, compute_uv=False), dtype=np.float64)
+    return Realized(
+        A=theta_x[:, :n], B=theta_x[:, n:n + r], C=theta_y[:, :n],
+        D=theta_y[:, n:] if d > past else np.zeros((m, r)), K=theta_x[:, n + r:], Xi=Xi, xi_u=xi_u, S=S, T=T,
+        state=R[:, :past] @ T.T, residual=np.zeros((m, m)), regression=head,
+        singular_values=values, neglected=np.zeros(m)), R
+
+
+def from_fit(
+    config: IdentifierParameters, recursion: Recursion, scalars: Array, excited: float, dt: float,
+) -> Identified:
+    """Publish the prediction-error fit with its own covariance."""
+    r, m, n = len(config.inputs), len(config.outputs), config.order
+    theta, structure, P = recursion.theta, recursion.structure, recursion.P
+    su, sy = recursion.scale[:r], recursion.scale[r:]
+    su, sy = np.where(su > 0.0, su, 1.0), np.where(sy > 0.0, sy, 1.0)
+    k = P.shape[1] - n
+    known = recursion.widening * np.exp(0.5 * recursion.drift) * recursion.root[:k]
+    spread = (P[:-n, :k] @ np.hstack([known, recursion.behind * recursion.went[:k, None]])).T
+    free = (True, True, structure.free_gain, structure.free_output, structure.free_direct)
+    shapes = ((n, n), (n, r), (n, m), (m, n), (m, r))
+    sizes = [a * b if is_free else 0 for (a, b), is_free in zip(shapes, free, strict=True)]
+    parts = np.split(spread, np.cumsum(sizes)[:-1], axis=1)
+    dA, dB, dK, dC, dD = (
+        (part if part.size else np.zeros((len(spread), a * b))).reshape(-1, a, b)
+        for part, (a, b) in zip(parts, shapes, strict=True))
+    along = Tangent(dA, dB, dC, dD, dK)
+    along = Tangent(*_in_units(*along, su, sy))
+    model = StateSpace(*_in_units(theta.A, theta.B, theta.C, theta.D, recursion.gain, su, sy), dt=dt)
+    model, moved_along, known = based(model, along, config.stable_model)
+    assert moved_along is not None
+    return Identified(
+        model=model, spread=moved_along.flat(), singular_values=recursion.singular_values,
+        excitation=excited, condition=recursion.condition, innovation_power=float(scalars[POWER]),
+        status=Status.TRACKING, innovation_covariance=recursion.covariance / np.outer(sy, sy),
+        refined=True, known_basis=known, samples=recursion.weight)
+
+
+def publish(
+    config: IdentifierParameters, realized: Realized, R: Array, scale: Array, scalars: Array, variance: Array,
+    used: int, d: int, dt: float,
+) -> Identified | None:
+    """Model, tangent and status in JointState units. scale: (r + m,) of the signals, 0 where silent."""
+    r, m = len(config.inputs), len(config.outputs)
+    su = np.where(scale[:r] > 0.0, scale[:r], 1.0)
+    sy = np.where(scale[r:] > 0.0, scale[r:], 1.0)
+    raw = Tangent(*_in_units(realized.A, realized.B, realized.C, realized.D, realized.K, su, sy))
+    model = StateSpace(*raw, dt=dt)
+    if not all(np.all(np.isfinite(part)) for part in (model.A, model.B, model.C, model.D, model.K)):
+        return None
+    effective = scalars[WEIGHT] ** 2 / scalars[WEIGHT2]
+    free = max(effective - d, 0.05 * effective)
+    if realized.residual.any():
+        innovation = realized.residual / np.sqrt(scalars[WEIGHT] * free / effective)
+    else:
+        innovation = np.diag(np.sqrt(variance))
+    parameters = m * d
+    entries = model.order * (model.order + r + 2 * m) + m * r
+    along = None
+    if parameters * entries <= LARGEST_SPREAD:
+        along = uncertainty.tangent(R, realized, r, innovation * np.sqrt(scalars[WEIGHT2] / scalars[WEIGHT]))
+        along = Tangent(*_in_units(*along, su, sy))
+    model, along, known = based(model, along, config.stable_model)
+    spread = along.flat() if along is not None else np.zeros((entries, 0))
+    ratio = float(effective * np.log1p(realized.neglected).sum())
+    too_low = ratio > SIGNIFICANT and float(realized.neglected.max()) > NEGLECTED
+    if too_low:  # a model that misses dynamics is off by more than its noise
+        spread = spread * np.sqrt(ratio)
+    condition = float(np.linalg.cond(realized.state / np.linalg.norm(realized.state, axis=0)))
+    power = float(scalars[POWER])
+    covariance = innovation.T @ innovation
+    total = np.einsum('ij,ij->j', R[:, -m:], R[:, -m:]) / scalars[WEIGHT]
+    unexplained = float(np.min(np.diag(covariance) / np.where(total > 0.0, total, np.inf)))
+    return Identified(
+        model=model, spread=spread, singular_values=realized.singular_values,
+        excitation=excitation(realized.regression), condition=condition, innovation_power=power,
+        status=judge(used, d, condition, unexplained, too_low),
+        innovation_covariance=covariance / np.outer(sy, sy),
+        known_basis=known, samples=float(effective))
+
+
+def _in_units(
+    A: Array, B: Array, C: Array, D: Array, K: Array, su: Array, sy: Array,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Matrices of scaled signals su u, sy y (or stacks of them) in outside units."""
+    return A, B * su, C / sy[:, None], D * su / sy[:, None], K * sy
+
+
+def based(
+    model: StateSpace, along: Tangent | None, stable: bool = False,
+) -> tuple[StateSpace, Tangent | None, bool]:
+    """Bring model and tangent to the published basis: y = C x with the known C, else balanced.
+
+    stable: poles outside the unit circle are drawn back onto it.
+    """
+    if stable:
+        model = replace(model, A=realization.stabilized(model.A))
+    W = realization.known_output_basis(model)
+    known = W is not None
+    if W is None:
+        W = realization.balancing(model)
+    moved = realization.transform(model, W)
+    if along is not None:
+        dW = uncertainty.known_basis_tangent(model, along) if known else None
+        along = uncertainty.move(model, along, W, dW)
+    return moved, along, known
+
+
+def judge(used: int, parameters: int, condition: float, unexplained: float, too_low: bool) -> Status:
+    """Name what the model is worth."""
+    if used < 2 * parameters:
+        return Status.WARMING_UP
+    if not condition < WORST_CONDITION:
+        return Status.ILL_CONDITIONED
+    if unexplained > UNEXPLAINED:
+        return Status.POORLY_EXCITED
+    if too_low:
+        return Status.ORDER_TOO_LOW
+    return Status.TRACKING
+
+
+def excitation(regression: Array) -> float:
+    """Smallest over largest eigenvalue of the regressors' information, each regressor at unit power.
+
+    A few steps of power and inverse iteration on the triangular factor (d, d); to 10 % or so.
+    """
+    length: Array = np.sqrt(np.einsum('ij,ij->j', regression, regression))
+    if not np.all(length > 0.0) or not np.all(np.diag(regression)) or not np.all(np.isfinite(length)):
+        return 0.0
+    F = np.asfortranarray(regression / length)
+    high = low = _anywhere(F.shape[0])
+    for _ in range(4):
+        high = F.T @ (F @ high)
+        high = high / np.sqrt(high @ high)
+        low = dtrtrs(F, dtrtrs(F, low, trans=1)[0])[0]
+        norm = float(np.sqrt(low @ low))
+        if not np.isfinite(norm) or norm == 0.0:
+            return 0.0
+        low = low / norm
+    smallest, largest = F @ low, F @ high
+    return float(smallest @ smallest / (largest @ largest))
+
+
+@cache
+def _anywhere(size: int) -> Array:
+    """Return a direction (size,) with something of every other one, always the same."""
+    direction: Array = np.random.default_rng(0).standard_normal((size,))
+    direction.flags.writeable = False
+    return direction

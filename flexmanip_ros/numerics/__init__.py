@@ -1,0 +1,1 @@
+"""Rules for compiled functions, and square-root linear algebra."""

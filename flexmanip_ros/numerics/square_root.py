@@ -1,0 +1,113 @@
+"""Compiled square-root algebra of a Gaussian: covariance = S S', S (nx, nx) of any shape."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flexmanip_ros.numerics.compiled import inlined, kernel
+from flexmanip_ros.types import Array
+
+
+@inlined
+def project(x: Array, S: Array, H: Array, offset: int, f: Array) -> float:
+    """Return H x[offset:] and fill f (nx,) = S' H', the spread of that measurement."""
+    value = 0.0
+    for c in range(f.size):
+        f[c] = 0.0
+    for i in range(H.size):
+        if H[i] != 0.0:
+            value += H[i] * x[offset + i]
+            for c in range(f.size):
+                f[c] += H[i] * S[offset + i, c]
+    return value
+
+
+@inlined
+def absorb_measurement(x: Array, S: Array, f: Array, e: float, r: float, variance: float) -> None:
+    """Potter's update: innovation e of variance = f'f + r, r the noise variance, f = S' H'."""
+    nx = x.size
+    gamma = 1.0 / (1.0 + np.sqrt(r / variance))
+    for i in range(nx):
+        gain = 0.0
+        for c in range(nx):
+            gain += S[i, c] * f[c]
+        gain /= variance
+        x[i] += gain * e
+        gain *= gamma
+        for c in range(nx):
+            S[i, c] -= gain * f[c]
+
+
+@kernel
+def absorb_noise(S: Array, deviation: Array, W: Array) -> None:
+    """S <- lower triangular L, L L' = S S' + diag(deviation^2), by Householder; W: (nx, 2 nx) scratch."""
+    nx = S.shape[0]
+    for i in range(nx):
+        for c in range(nx):
+            W[i, c] = S[i, c]
+            W[i, nx + c] = 0.0
+        W[i, nx + i] = deviation[i]
+    width = 2 * nx
+    for i in range(nx):
+        norm = 0.0
+        for c in range(i, width):
+            norm += W[i, c] * W[i, c]
+        norm = np.sqrt(norm)
+        if norm > 0.0:
+            if W[i, i] > 0.0:
+                norm = -norm
+            head = W[i, i] - norm
+            square = -norm * head  # half the squared length of the reflection vector
+            if square > 0.0:
+                W[i, i] = head
+                for r in range(i + 1, nx):
+                    dot = 0.0
+                    for c in range(i, width):
+                        dot += W[i, c] * W[r, c]
+                    dot /= square
+                    for c in range(i, width):
+                        W[r, c] -= dot * W[i, c]
+            W[i, i] = norm
+    for i in range(nx):
+        for c in range(nx):
+            S[i, c] = W[i, c] if c <= i else 0.0
+
+
+@kernel
+def factor_information(N: Array) -> bool:
+    """Overwrite the lower triangle of N with the Cholesky factor of I + N; False when it is not finite."""
+    nx = N.shape[0]
+    for j in range(nx):
+        d = 1.0 + N[j, j]
+        for p in range(j):
+            d -= N[j, p] * N[j, p]
+        if not (d > 0.0 and d < 1e300):
+            return False
+        d = np.sqrt(d)
+        N[j, j] = d
+        for r in range(j + 1, nx):
+            value = N[r, j]
+            for p in range(j):
+                value -= N[r, p] * N[j, p]
+            N[r, j] = value / d
+    return True
+
+
+@kernel
+def forward(L: Array, b: Array) -> None:
+    """Overwrite b with L^-1 b."""
+    for r in range(b.size):
+        value = b[r]
+        for p in range(r):
+            value -= L[r, p] * b[p]
+        b[r] = value / L[r, r]
+
+
+@kernel
+def backward(L: Array, b: Array) -> None:
+    """Overwrite b with L'^-1 b."""
+    for r in range(b.size - 1, -1, -1):
+        value = b[r]
+        for p in range(r + 1, b.size):
+            value -= L[p, r] * b[p]
+        b[r] = value / L[r, r]

@@ -1,0 +1,232 @@
+"""One experiment of the paper: every method over the same samples, as rows and as tracks over time.
+
+Work that several methods share is done once: one pass of an identifier serves every method that reads it, the
+messages become samples once for the two rivals.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from flexmanip_ros import pipeline
+from flexmanip_ros.identification import rpbsid
+from flexmanip_ros.paper import experiments, single_link
+from flexmanip_ros.paper.experiments import Case, Method
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, PlantParameters, configure
+from flexmanip_ros.payload import block_extraction
+from flexmanip_ros.studies import baselines, trial
+from flexmanip_ros.studies.scenario import Run, Scenario
+from flexmanip_ros.types import Array, CaptureEvent, Estimate, JointRecord, StateSpace, Status
+
+Item = JointRecord | CaptureEvent
+
+
+class Track(NamedTuple):
+    """One method over one run: time (T,) [s], mass, lower, upper (T,) [kg], frequencies (T, 2) [Hz]."""
+
+    time: Array
+    mass: Array
+    lower: Array
+    upper: Array
+    frequencies: Array
+    model: StateSpace | None
+
+
+class Reading(NamedTuple):
+    """What a method gave: its estimates, the last one at the last sample, and what they cost [s]."""
+
+    estimates: list[Estimate]
+    wall: float
+
+
+def run(case: Case, seed: int) -> tuple[list[trial.Row], dict[str, Track]]:
+    """Simulate one experiment and put every method over the same samples; rows and tracks.
+
+    Whatever goes wrong in a method becomes the ``error`` of its row; the others go on.
+    """
+    found: dict[str, Reading] = {}
+    failed: dict[str, str] = {}
+    alone = [method for method in experiments.METHODS if method.name == experiments.ALONE]
+    others = [method for method in experiments.METHODS if method.name != experiments.ALONE]
+    rivalling = [method for method in others if method.rival]
+    items: list[Item] = []
+    with _attempt(failed, others):
+        items = _messages(case, seed)
+    for name in experiments.IDENTIFIERS if items else ():
+        readers = [method for method in others if method.identifier == name]
+        with _attempt(failed, readers):
+            found.update(_identify(case, name, readers, items))
+    if items:
+        with _attempt(failed, rivalling):
+            found.update(_compare(case, rivalling, items))
+    with _attempt(failed, alone):
+        found.update(_compare(case, alone, _own_run(case, seed)))
+    return _rows(case, seed, found, failed)
+
+
+@contextmanager
+def _attempt(failed: dict[str, str], methods: Sequence[Method]) -> Iterator[None]:
+    """Keep an error as that of some methods: a defect in one must not hide the others."""
+    try:
+        yield
+    except Exception as error:
+        failed.update({method.name: trial.describe(error) for method in methods})
+
+
+def _rows(case: Case, seed: int, found: dict[str, Reading], failed: dict[str, str]
+          ) -> tuple[list[trial.Row], dict[str, Track]]:
+    rows: list[trial.Row] = []
+    tracks: dict[str, Track] = {}
+    for method in experiments.METHODS:
+        row: trial.Row = {'case': case.name, 'method': method.name, 'seed': seed,
+                          'error': failed.get(method.name, '')}
+        if method.name in found:
+            reading = found[method.name]
+            tracks[method.name] = follow(reading.estimates)
+            row.update(_columns(reading.estimates, tracks[method.name], case))
+            row['us_per_sample'] = 1e6 * reading.wall / (experiments.WINDOW[1] * PlantParameters().rate)
+        rows.append(row)
+    return rows, tracks
+
+
+def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[Item]) -> dict[str, Reading]:
+    """Run one identifier once; each of the methods that read it costs the pass and its own reading.
+
+    A method without settings of its own takes the identifier's estimates; the others read a block payload
+    from its model, from the capture on.
+    """
+    configs = {method.name: _configured(case, method)[1].identifier for method in readers if method.settings}
+    found = {method.name: Reading([], 0.0) for method in readers}
+    walls = dict.fromkeys(found, 0.0)
+    begun = time.perf_counter()
+    for state, estimate in pipeline.replay(_identifier(case, name), items):
+        now = estimate if estimate is not None else pipeline.current(state)  # the last: at the last sample
+        if now is None:
+            continue
+        held = (now.stamp_ns - state.first_ns) * 1e-9 >= experiments.CAPTURE_TIME
+        for method in found:
+            started = time.perf_counter()
+            read = now
+            if method in configs:
+                read = (_with_block(configs[method], case, state, now) if held
+                        else now._replace(payload=None))
+            found[method].estimates.append(read)
+            walls[method] += time.perf_counter() - started
+    shared = time.perf_counter() - begun - sum(walls.values())
+    return {method: reading._replace(wall=shared + walls[method]) for method, reading in found.items()}
+
+
+def _with_block(config: IdentifierParameters, case: Case, state: pipeline.State, now: Estimate) -> Estimate:
+    """Return an estimate with the payload that the blocks of its model give at the case's working point."""
+    assert state.timeline is not None
+    core = state.timeline.core
+    try:
+        found = rpbsid.identified(config, core.rpbsid, state.sampling.dt)
+    except np.linalg.LinAlgError:  # nothing moves yet
+        found = None
+    if found is None:
+        return now._replace(payload=None, status=now.model_status)
+    payload = block_extraction.estimate(config, found, np.radians(case.angles_deg), core.swept)
+    status = payload.status if found.status is Status.TRACKING else found.status
+    return now._replace(payload=payload, status=status)
+
+
+def _compare(case: Case, methods: Sequence[Method], items: Sequence[Item]) -> dict[str, Reading]:
+    """Run methods that are no part of the identifier over the same samples."""
+    config = _configured(case, methods[0])[1].identifier
+    begun = time.perf_counter()
+    sampled = baselines.samples(config, items)
+    shared = time.perf_counter() - begun
+    found = {}
+    for method in methods:
+        begun = time.perf_counter()
+        estimates = list(baselines.run(method.rival, config, sampled))
+        found[method.name] = Reading(estimates, shared + time.perf_counter() - begun)
+    return found
+
+
+@cache
+def _identifier(case: Case, name: str) -> IdentifierParameters:
+    """Return the configuration of one of the identifiers, whoever reads it."""
+    return experiments.scenario(case, Method(name, '', name)).configuration(0, name).identifier
+
+
+@cache
+def _prepared(case: Case, name: str) -> tuple[Scenario, Run]:
+    """Return the scenario and its configurations but for the seed."""
+    made = experiments.scenario(case, next(method for method in experiments.METHODS if method.name == name))
+    return made, made.configuration(0, name)
+
+
+def _configured(case: Case, method: Method) -> tuple[Scenario, Run]:
+    return _prepared(case, method.name)
+
+
+def _messages(case: Case, seed: int) -> list[Item]:
+    made, configured = _configured(case, experiments.METHODS[0])
+    return trial.messages(made, replace(configured, plant=replace(configured.plant, seed=seed)), seed)
+
+
+def _own_run(case: Case, seed: int) -> list[Item]:
+    return single_link.messages(
+        configure(ArmParameters, experiments.ARM), math.radians(case.angles_deg[1]), case.payload, seed,
+        duration=experiments.WINDOW[1], capture_time=experiments.CAPTURE_TIME,
+        snr_db=PlantParameters().snr_db)
+
+
+@cache
+def true_frequencies(case: Case, mass: float) -> tuple[float, ...]:
+    """Return the two lowest frequencies of a case's arm with a payload [Hz]."""
+    return tuple(trial.true_frequencies(_configured(case, experiments.METHODS[0])[1], mass))
+
+
+def _columns(estimates: Sequence[Estimate], track: Track, case: Case) -> trial.Row:
+    inside = (track.time >= experiments.WINDOW[0]) & (track.time <= experiments.WINDOW[1])
+    true = np.array(true_frequencies(case, case.payload))
+    relative = 100.0 * np.abs(track.mass - case.payload) / case.payload
+    frequency = 100.0 * np.abs(track.frequencies - true) / true
+    held = (track.lower <= case.payload) & (case.payload <= track.upper)
+    row: trial.Row = {
+        'payload_true_kg': case.payload, 'payload_mass_kg': _last(track.mass),
+        'payload_lower_kg': _last(track.lower), 'payload_upper_kg': _last(track.upper),
+        'covered': bool(held[-1]) if held.size else None,
+        'error_percent': _mean(relative[inside]), 'status': estimates[-1].status.name if estimates else '',
+    }
+    for k in range(true.size):
+        row[f'true_frequency_{k + 1}'] = float(true[k])
+        row[f'frequency_error_percent_{k + 1}'] = _mean(frequency[inside, k])
+    return row
+
+
+def follow(estimates: Sequence[Estimate]) -> Track:
+    """Return estimates as arrays; what there was not is nan, and so is a mass of which nothing is known."""
+    count = len(estimates)
+    table = np.full((count, 3), np.nan)
+    frequencies = np.full((count, 2), np.nan)
+    for k, estimate in enumerate(estimates):
+        held = estimate.payload
+        if held is not None:
+            table[k] = held.mass if math.isfinite(held.std) else np.nan, held.lower, held.upper
+        found = [mode.frequency_hz for mode in estimate.modes[:2]]
+        frequencies[k, :len(found)] = found
+    start = estimates[0].stamp_ns if estimates else 0
+    stamps = np.array([(estimate.stamp_ns - start) / 1e9 for estimate in estimates], dtype=np.float64)
+    return Track(stamps, table[:, 0], table[:, 1], table[:, 2], frequencies,
+                 estimates[-1].model if estimates else None)
+
+
+def _mean(values: Array) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else None
+
+
+def _last(values: Array) -> float | None:
+    return float(values[-1]) if values.size and math.isfinite(values[-1]) else None

@@ -1,0 +1,132 @@
+"""Section 4 of the paper as cases and methods: what is simulated, and which estimators look at it.
+
+Linear plant at a fixed working point, one mode a link, the paper's torque convention (torque 2 does no work
+on bending), chord angles, rates continuous at the capture, 40 dB, 1 kHz, square waves, capture at 3 s,
+errors averaged over 4 to 6 s. Its Table 1 is lost: the arm is the reference arm of the parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from flexmanip_ros.paper import single_link
+from flexmanip_ros.payload import cramer_rao
+from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.simulation.noise import std_for_snr
+from flexmanip_ros.studies.scenario import Scenario
+from flexmanip_ros.types import CaptureEvent, EventKind
+
+ARM: Mapping[str, Any] = {
+    'modes': 1, 'torque_convention': 'paper', 'angle_convention': 'chord', 'shortening': False,
+    'slope_correction': False}
+WINDOW = (4.0, 6.0)
+CAPTURE_TIME = 3.0
+TRACK_RATE = 5.0
+"""Estimates a second: enough for the tracks, and thirty runs stay quick."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One simulation of the paper. angles_deg: chord angles; payload [kg]; model: of the plant."""
+
+    name: str
+    payload: float
+    angles_deg: tuple[float, float]
+    model: str = 'linear'
+
+    @property
+    def title(self) -> str:
+        """The case in words."""
+        plant = ', finite element plant' if self.model == 'finite_element' else ''
+        return f'{self.payload:g} kg at {self.angles_deg[0]:g}/{self.angles_deg[1]:g} deg{plant}'
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to a payload, and who proposed it."""
+
+    name: str
+    words: str
+    identifier: str = ''
+    """The one of ``IDENTIFIERS`` whose state it reads; several methods may read the same one."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Identifier parameters over those of ``identifier`` with which it is read."""
+    rival: str = ''
+    """Name in ``rivals`` of a method that is no part of the identifier."""
+
+
+PAYLOADS = (Case('payload_20', 20.0, (60.0, 45.0)), Case('payload_50', 50.0, (60.0, 45.0)),
+            Case('payload_100', 100.0, (60.0, 45.0)))
+CONFIGURATIONS = (Case('configuration_0_0', 100.0, (0.0, 0.0)),
+                  Case('configuration_45_0', 100.0, (45.0, 0.0)),
+                  Case('configuration_-45_45', 100.0, (-45.0, 45.0)))
+FINITE_ELEMENT = Case('finite_element', 20.0, (45.0, 0.0), 'finite_element')
+CASES = (*PAYLOADS, *CONFIGURATIONS, FINITE_ELEMENT)
+
+IDENTIFIERS: Mapping[str, Mapping[str, Any]] = {
+    'paper': {'payload_method': 'none', 'estimator': 'paper', 'forgetting': 'constant',
+              'restart_on_event': False},
+    'ours': {'payload_method': 'structured', 'forgetting_factor': [0.9995, 0.9995, 0.9995]},
+}
+"""What is run over the samples: identifier parameters over the defaults."""
+_BLOCK = {'payload_method': 'block'}
+_WEIGHED = {'payload.gravity': single_link.GRAVITY, 'outputs': ['joint2/position'], 'order': 1}
+METHODS = (
+    Method('paper', "the paper's settings: beta 0.99, no restart, block extraction", 'paper', _BLOCK),
+    Method('restart', 'ours: restart at the capture, beta 0.9995, maximum-likelihood refinement; block '
+           'extraction', 'ours', _BLOCK),
+    Method('known M_b', 'ours: the same model, the coupling block taken from the arm', 'ours',
+           {**_BLOCK, 'payload.known_coupling': True}),
+    Method('rigid RLS', "the paper's rival: recursive least squares on two rigid links", rival='rigid_rls'),
+    Method('algebraic', "the paper's rival on the same run: link 2, its moving base left out",
+           rival='algebraic'),
+    Method('algebraic, 1 link', 'as the paper runs it: a run of its own, link 2 alone on a fixed base under '
+           'gravity, which weighs the object', settings=_WEIGHED, rival='algebraic'),
+    Method('structured', "ours: the arm's equations of motion (the default)", 'ours'),
+)
+ALONE = 'algebraic, 1 link'
+BEST_MODEL = 'restart'
+"""The method whose state-space model is shown in the test responses and frequency tracks."""
+
+
+def bounds_of(case: Case) -> dict[str, float]:
+    """Return method -> Cramer-Rao bound of the payload [kg] at the end of a run, where a method has one.
+
+    ``structured`` knows the structure; the block extractions know nothing of (A, B), and theirs is the bound
+    of their own formula (docs of ``payload.bounds``).
+    """
+    if case.model != 'linear':
+        return {}
+    run = scenario(case, METHODS[0]).configuration(0, METHODS[0].name)
+    quiet = replace(run.plant, noise='none')
+    torque = excitation.sequence(run.excitation, round(WINDOW[1] * quiet.rate))
+    clean = simulator.simulate(quiet, torque, (CaptureEvent(round(CAPTURE_TIME * 1e9), EventKind.CAPTURE),))
+    noise = std_for_snr(clean.position, clean.velocity, run.plant.snr_db)
+    first = round(CAPTURE_TIME * quiet.rate)
+    states = np.hstack([clean.position[first:, 2:], clean.velocity[first:, 2:]])
+    given = (quiet.arm, np.radians(case.angles_deg), case.payload, states, torque[first:],
+             np.concatenate([noise[2:4], noise[6:8]]), 1.0 / quiet.rate, (len(states),))
+    structure = float(cramer_rao.structure_known(*given)[0])
+    trace, known = (float(cramer_rao.structure_unknown(*given, known_mb=known)[0]) for known in (False, True))
+    return {'paper': trace, 'restart': trace, 'known M_b': known, 'structured': structure}
+
+
+def scenario(case: Case, method: Method) -> Scenario:
+    """Return the scenario of a case for one method."""
+    modes = 1 if case.model == 'linear' else 3
+    identifier: dict[str, Any] = {f'arm.{name}': value for name, value in ARM.items()}
+    identifier |= {'arm.modes': modes}
+    identifier |= {'publish_rate': TRACK_RATE, 'model_rate': TRACK_RATE, 'payload.dynamics': 'linear',
+                   'payload.working_point': [math.radians(angle) for angle in case.angles_deg],
+                   **IDENTIFIERS.get(method.identifier, {}), **method.settings}
+    return Scenario(
+        name=case.name, capture_time=CAPTURE_TIME, window=WINDOW,
+        plant={**{f'arm.{name}': value for name, value in ARM.items()}, 'model': case.model,
+               'capture_impact': 'continuous', 'payload_mass': case.payload,
+               'initial_angles': [math.radians(angle) for angle in case.angles_deg]},
+        identifier=identifier, estimators={method.name: {}})

@@ -1,0 +1,251 @@
+"""Compiled change detection: tell that something began to push on the tip within the last samples.
+
+A capture or release acts on the arm as a force at the tip: an impulse, and the inertia of the object from
+then on. Its trace in the innovations of a filter that does not know of it is H exp(A t) of an impulse, a step
+and a ramp of force in two directions: six numbers, tested for every onset in the window (generalized
+likelihood ratio).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexmanip_ros.arm.acceleration import solve
+from flexmanip_ros.numerics.compiled import kernel
+from flexmanip_ros.numerics.square_root import factor_information, forward
+from flexmanip_ros.payload.filter_state import EFFECTIVE
+from flexmanip_ros.payload.moving_horizon import take
+from flexmanip_ros.payload.process_model import linearize, set_parameters
+from flexmanip_ros.types import Array
+
+if TYPE_CHECKING:
+    from flexmanip_ros.payload.filter_state import Memory
+    from flexmanip_ros.payload.measurement_update import Sensors
+    from flexmanip_ros.payload.process_model import Motion
+
+CAUSES = 6
+"""Impulse, step and ramp of the force at the tip, along x and y."""
+SHORTEST = 3
+"""Samples after the onset before it can be told."""
+REFRESH = 16
+"""Samples between computations of the traces."""
+CALM = 2.0
+"""The statistic must exceed this times its own recent peaks: what the model always misses is no event."""
+
+DATING = 3.0
+"""The latest onset whose statistic is that close to the largest dates the event."""
+
+# elements of ``clock``
+NEWEST, FILLED, SINCE_TRACES, QUIET, HISTORY, ALARMED = range(6)
+
+
+class Watch(NamedTuple):
+    """What the detector remembers; w onsets in the window, m sensors."""
+
+    trace: Array
+    """(w, m, 6) innovation at each lag after an onset, per unit of prior standard deviation."""
+    factors: Array
+    """(w, 6, 6) Cholesky factor of I + information at each lag."""
+    scores: Array
+    """(w, 6) gathered for each onset, a ring."""
+    past: Array
+    """(w, m) innovations over their variance, a ring."""
+    clock: NDArray[np.int64]
+    """(6,) counters."""
+    level: Array
+    """(4,) statistic, lag of its maximum, recent peak, threshold."""
+    history: Array
+    """(2 w,) statistics of the last samples: a peak counts once it is older than these."""
+    statistic: Array
+    """(w,) of each lag."""
+    flow: Array
+    """(n2, n2) scratch: state transition of a sample."""
+    state: Array
+    """(2, n2, 2) scratch."""
+
+
+@kernel
+def traces(
+    motion: Motion, sensors: Sensors, m: Memory, watch: Watch, prior: Array, effort: Array, dt: float,
+) -> None:
+    """Compute the traces of an onset for the present state; prior: (3,) deviations of the causes."""
+    n = motion.q.size
+    w, sensors_count = watch.trace.shape[0], watch.trace.shape[1]
+    set_parameters(motion, m.x, False)
+    linearize(motion, m.x[:n], m.x[n:2 * n], effort, motion.k[7], False)
+    flow, state = watch.flow, watch.state
+    for i in range(2 * n):
+        for c in range(2 * n):
+            flow[i, c] = 0.0
+        for c in range(2):
+            state[0, i, c] = 0.0
+    # one sample by Taylor's series of fourth order, column by column in state[1]
+    for column in range(2 * n):
+        for i in range(2 * n):
+            state[1, i, 0] = 1.0 if i == column else 0.0
+            flow[i, column] = state[1, i, 0]
+        weight = 1.0
+        for order in range(1, 5):
+            for i in range(n):
+                state[1, i, 1] = state[1, n + i, 0]
+                value = 0.0
+                for j in range(n):
+                    value += motion.dq[i, j] * state[1, j, 0] + motion.dqd[i, j] * state[1, n + j, 0]
+                state[1, n + i, 1] = value
+            weight *= dt / order
+            for i in range(2 * n):
+                state[1, i, 0] = state[1, i, 1]
+                flow[i, column] += weight * state[1, i, 0]
+    for c in range(2):
+        for i in range(n):
+            motion.a[i] = 0.0
+        for link in range(2):
+            angle = m.x[link]
+            motion.a[link] = motion.arm.length[link] * (np.cos(angle) if c == 1 else -np.sin(angle))
+        solve(motion.work.M, motion.a)
+        for i in range(n):
+            state[0, n + i, c] = motion.a[i]
+    for lag in range(w):
+        for i in range(sensors_count):
+            offset = n if sensors.rate[i] else 0
+            for c in range(2):
+                value = 0.0
+                for j in range(n):
+                    value += sensors.H[i, j] * state[0, offset + j, c]
+                watch.trace[lag, i, c] = value * prior[0]
+                before = watch.trace[lag - 1] if lag > 0 else watch.trace[lag]
+                step, ramp = 0.0, 0.0
+                if lag > 0:
+                    step = before[i, 2 + c] / prior[1] + dt * before[i, c] / prior[0]
+                    ramp = before[i, 4 + c] / prior[2] + dt * before[i, 2 + c] / prior[1]
+                watch.trace[lag, i, 2 + c] = step * prior[1]
+                watch.trace[lag, i, 4 + c] = ramp * prior[2]
+        for i in range(2 * n):
+            for c in range(2):
+                value = 0.0
+                for j in range(2 * n):
+                    value += flow[i, j] * state[0, j, c]
+                state[1, i, c] = value
+        for i in range(2 * n):
+            for c in range(2):
+                state[0, i, c] = state[1, i, c]
+    information(m, watch)
+    rescore(watch)
+
+
+@kernel
+def rescore(watch: Watch) -> None:
+    """Gather every onset's score anew: scores and information must come from the same traces."""
+    w = watch.trace.shape[0]
+    newest = watch.clock[NEWEST]
+    for lag in range(watch.clock[FILLED]):
+        onset = (newest - lag) % w
+        score = watch.scores[onset]
+        for a in range(CAUSES):
+            score[a] = 0.0
+        for since in range(lag + 1):
+            for i in range(watch.trace.shape[1]):
+                e = watch.past[(onset + since) % w, i]
+                for a in range(CAUSES):
+                    score[a] += watch.trace[since, i, a] * e
+
+
+@kernel
+def information(m: Memory, watch: Watch) -> None:
+    """Factor the information of every lag."""
+    for lag in range(watch.trace.shape[0]):
+        for a in range(CAUSES):
+            for b in range(a + 1):
+                value = 0.0
+                for i in range(watch.trace.shape[1]):
+                    value += watch.trace[lag, i, a] * watch.trace[lag, i, b] / m.noise[i, EFFECTIVE]
+                watch.factors[lag, a, b] = value
+    # sums over the lags, then factors: the sums would be lost if each were factored at once
+    for lag in range(1, watch.trace.shape[0]):
+        for a in range(CAUSES):
+            for b in range(a + 1):
+                watch.factors[lag, a, b] += watch.factors[lag - 1, a, b]
+    for lag in range(watch.trace.shape[0]):
+        factor_information(watch.factors[lag])
+
+
+@kernel
+def look(m: Memory, watch: Watch, scratch: Array) -> None:
+    """Take the latest innovations into the score of every onset, and find the largest statistic."""
+    w = watch.trace.shape[0]
+    clock = watch.clock
+    clock[NEWEST] = (clock[NEWEST] + 1) % w
+    clock[FILLED] = min(clock[FILLED] + 1, w)
+    for a in range(CAUSES):
+        watch.scores[clock[NEWEST], a] = 0.0
+    for i in range(watch.trace.shape[1]):
+        variance = max(m.innovation[i, 1], m.noise[i, EFFECTIVE])
+        limit = 5.0 * np.sqrt(variance)
+        watch.past[clock[NEWEST], i] = min(max(m.innovation[i, 0], -limit), limit) / variance
+    best, best_lag = 0.0, 0
+    for lag in range(clock[FILLED]):
+        onset = (clock[NEWEST] - lag) % w
+        score = watch.scores[onset]
+        for i in range(watch.trace.shape[1]):
+            e = watch.past[clock[NEWEST], i]
+            for a in range(CAUSES):
+                score[a] += watch.trace[lag, i, a] * e
+        if lag + 1 < SHORTEST:
+            continue
+        for a in range(CAUSES):
+            scratch[a] = score[a]
+        forward(watch.factors[lag], scratch)
+        statistic = 0.0
+        for a in range(CAUSES):
+            statistic += scratch[a] * scratch[a]
+        watch.statistic[lag] = statistic
+        best = max(best, statistic)
+    for lag in range(clock[FILLED] - 1, SHORTEST - 2, -1):
+        if watch.statistic[lag] > best - DATING:
+            best_lag = lag
+    watch.level[0], watch.level[1] = best, best_lag
+
+
+@kernel
+def remember(watch: Watch, fade: float) -> None:
+    """Let a statistic that is older than the window raise the recent peak."""
+    clock, history = watch.clock, watch.history
+    clock[HISTORY] = (clock[HISTORY] + 1) % history.size
+    old = history[clock[HISTORY]]
+    history[clock[HISTORY]] = watch.level[0]
+    watch.level[2] = max(watch.level[2] * fade, old)
+
+
+@kernel
+def watch_samples(
+    motion: Motion, sensors: Sensors, m: Memory, watch: Watch, prior: Array, dt: float, fade: float,
+    hold: int, confirm: int,    durations: Array, efforts: Array, Y: Array, scratch: Array,
+) -> int:
+    """Run the filter and the test; return how many samples were taken before an alarm or a failure.
+
+    A negative number -k - 1: numbers left the finite range at sample k. hold: samples to be quiet at first;
+    confirm: samples from an alarm to its return, so that it can be dated; fade: factor of the recent peak a
+    sample. Otherwise as ``structured_kernel.advance``.
+    """
+    for k in range(Y.shape[0]):
+        if not take(motion, sensors, m, durations[k], efforts[k], Y[k]):
+            return -k - 1
+        clock = watch.clock
+        if clock[SINCE_TRACES] == 0:
+            traces(motion, sensors, m, watch, prior, efforts[k], dt)
+        clock[SINCE_TRACES] = (clock[SINCE_TRACES] + 1) % REFRESH
+        look(m, watch, scratch)
+        clock[QUIET] += 1
+        if clock[ALARMED] > 0:
+            clock[ALARMED] += 1
+            if clock[ALARMED] > confirm:
+                return k + 1
+        elif clock[QUIET] > hold:
+            if watch.level[0] > max(watch.level[3], CALM * watch.level[2]):
+                clock[ALARMED] = 1
+            remember(watch, fade)
+    taken: int = Y.shape[0]
+    return taken

@@ -1,0 +1,161 @@
+"""Cramer-Rao bounds: the least standard deviation any unbiased payload estimate can have from given signals.
+
+Three kinds of knowledge. ``structure_known``: the linear vibration model at a working point but for the
+payload and the first state. ``structure_unknown``: nothing of (A, B) and the first state; the payload is read
+from them by the block extraction, so the bound belongs to that formula (name it wherever it is quoted).
+``nonlinear``: the moving arm, its stiffness, damping and rates as uncertain as the parameters say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flexmanip_ros.arm.linearization import blocks, discretize, vibration_model
+from flexmanip_ros.errors import ModelError
+from flexmanip_ros.identification.realization import to_continuous
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
+from flexmanip_ros.payload import filter_state as mem
+from flexmanip_ros.payload import structured_start as start
+from flexmanip_ros.payload.block_extraction import masses
+from flexmanip_ros.payload.process_model import PARAMETERS, predict
+from flexmanip_ros.payload.structured_model import build, sensors
+from flexmanip_ros.types import Array
+
+
+def structure_known(
+    arm: ArmParameters, theta: Array, payload: float, states: Array, efforts: Array, noise_std: Array,
+    dt: float, counts: Sequence[int],
+) -> Array:
+    """Return the bound [kg] after each of ``counts`` samples from the capture on; all outputs y = x measured.
+
+    theta: (2,) chords; states: (N, 4 kappa) true [eta; eta'], efforts: (N, 2), noise_std: (4 kappa,).
+    """
+    kappa = _kappa(states, efforts, noise_std, counts)
+    step = 1e-4 * (payload + arm.tip_mass + arm.linear_density[1] * arm.link_length[1] / 3)
+    (A_up, B_up), (A, _), (A_down, B_down) = (
+        discretize(*vibration_model(arm, theta, payload + change, kappa), dt)
+        for change in (step, 0.0, max(-step, -payload)))
+    width = step + min(step, payload)
+    driven = (states @ (A_up - A_down).T + efforts @ (B_up - B_down).T) / width
+    n = states.shape[1]
+    S = np.hstack([np.zeros((n, 1)), np.eye(n)])
+    information = np.zeros((n + 1, n + 1))
+    found = []
+    for k in range(max(counts)):
+        rows = S / noise_std[:, None]
+        information += rows.T @ rows
+        S = A @ S
+        S[:, 0] += driven[k]
+        if k + 1 in counts:
+            found.append(_deviation(information, np.eye(n + 1)[0]))
+    return np.array(found)
+
+
+def structure_unknown(
+    arm: ArmParameters, theta: Array, payload: float, states: Array, efforts: Array, noise_std: Array,
+    dt: float, counts: Sequence[int], known_mb: bool = False,
+) -> Array:
+    """Return the bound [kg] of block extraction (eqs. 48-52) when A, B and the first state are unknown.
+
+    Arguments as ``structure_known``; known_mb: the extraction takes M_b from the arm.
+    """
+    kappa = _kappa(states, efforts, noise_std, counts)
+    A, B = discretize(*vibration_model(arm, theta, payload, kappa), dt)
+    n, r = B.shape
+    size = n * (n + r)
+    S = np.hstack([np.zeros((n, size)), np.eye(n)])
+    gradient = np.append(_extraction_gradient(arm, theta, A, B, dt, kappa, known_mb), np.zeros(n))
+    information = np.zeros((size + n, size + n))
+    found = []
+    for k in range(max(counts)):
+        rows = S / noise_std[:, None]
+        information += rows.T @ rows
+        S = A @ S
+        for i in range(n):
+            S[i, i * n:(i + 1) * n] += states[k]
+            S[i, n * n + i * r:n * n + (i + 1) * r] += efforts[k]
+        if k + 1 in counts:
+            found.append(_deviation(information, gradient))
+    return np.array(found)
+
+
+def nonlinear(
+    config: IdentifierParameters, theta: Array, payload: float, efforts: Array, noise_std: Array, dt: float,
+    counts: Sequence[int], rates: Array | None = None,
+) -> Array:
+    """Return the bound [kg] for the moving arm, caught at rest (or at chord rates (2,) [rad/s]), unbent.
+
+    efforts: (N, 2) held from each sample on; noise_std: one for each output and then each angle that is not
+    among the outputs. The first state is as open as the estimator holds it, stiffness and damping as
+    ``config.payload`` says. Raises ModelError where the configured signals cannot give a payload.
+    """
+    model = build(config)
+    if model is None:
+        raise ModelError('the configured signals cannot give a payload', 'name both torques and both angles')
+    n = model.motion.q.size
+    m = mem.memory(2 * n + model.motion.G.shape[1], len(model.roles))
+    start.first(config, model, m, np.zeros(len(model.roles)))
+    m.x[:2] = theta
+    m.x[n:n + 2] = 0.0 if rates is None else rates
+    p = m.x.size - PARAMETERS
+    m.S[2 * n:p] = 0.0  # the structure is known, of every mode
+    m.x[p] = np.log(max(payload, 1e-9) / model.motion.scale)
+    m.S[p, p] = 10.0 * start.PAYLOAD_STD
+    if config.payload.rotary_inertia:
+        m.S[-1, -1] = start.PAYLOAD_STD
+    start.freeze(config, model, theta)
+    seen = sensors(config, model, dt, np.zeros(m.x.size), theta)
+    information = np.zeros((m.x.size, m.x.size))
+    found = []
+    for k in range(max(counts)):
+        for i, deviation in enumerate(noise_std):
+            f = seen.H[i] @ m.S[n:2 * n] if seen.rate[i] else seen.H[i] @ m.S[:n]
+            information += np.outer(f, f) / deviation ** 2
+        if not predict(model.motion, m.x, m.S, efforts[k], dt, True):
+            raise ModelError('the arm diverges under these torques', 'use smaller torques')
+        if k + 1 in counts:
+            spread = np.linalg.solve(np.eye(m.x.size) + information, m.S[p])
+            found.append(payload * float(np.sqrt(m.S[p] @ spread)))
+    return np.array(found)
+
+
+def _kappa(states: Array, efforts: Array, noise_std: Array, counts: Sequence[int]) -> int:
+    short = min(len(states), len(efforts)) < max(counts)
+    if states.shape[1] % 4 or states.shape[1] != noise_std.size or short:
+        raise ModelError(
+            f'states {states.shape}, efforts {efforts.shape} and noise {noise_std.shape} do not fit {counts}',
+            'give [eta; eta\'] (N, 4 kappa), torques (N, 2) and one deviation for each state')
+    return int(states.shape[1] // 4)
+
+
+def _extraction_gradient(
+    arm: ArmParameters, theta: Array, A: Array, B: Array, dt: float, kappa: int, known_mb: bool,
+) -> Array:
+    """Derivative of the extracted payload by the elements of A, then B, row-major."""
+    empty = blocks(arm, theta, kappa=kappa)
+    both = np.hstack([A.ravel(), B.ravel()])
+    steps = 1e-7 * np.repeat([1.0, float(np.abs(B).max())], [A.size, B.size])
+    gradient = np.empty(both.size)
+    for i, step in enumerate(steps):
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = both.copy()
+            moved[i] += sign * step
+            Ac, Bc = to_continuous(moved[:A.size].reshape(A.shape), moved[A.size:].reshape(B.shape), dt)
+            ends.append(float(masses(arm, empty, Ac, Bc, known_mb)))
+        gradient[i] = (ends[0] - ends[1]) / (2 * float(step))
+    return gradient
+
+
+def _deviation(information: Array, gradient: Array) -> float:
+    """Square root of g' J^-1 g, J scaled to a unit diagonal; infinite where J is singular."""
+    scale = np.sqrt(np.diag(information))
+    if np.any(scale == 0.0):
+        return float('inf')
+    scaled = information / np.outer(scale, scale)
+    if np.linalg.cond(scaled) > 1e14:
+        return float('inf')
+    g = gradient / scale
+    return float(np.sqrt(max(float(g @ np.linalg.solve(scaled, g)), 0.0)))

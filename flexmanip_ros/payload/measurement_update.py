@@ -1,0 +1,161 @@
+"""Compiled update of the structured estimator with a sample, and what its innovations say of the noise."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexmanip_ros.numerics.compiled import inlined
+from flexmanip_ros.numerics.square_root import absorb_measurement, project
+from flexmanip_ros.payload.filter_state import (
+    BATCHES,
+    BLOCK_POWER,
+    BLOCK_SUM,
+    BLOCKS,
+    DRIFT,
+    EFFECTIVE,
+    FLOOR,
+    IN_BATCH,
+    IN_BLOCK,
+    MOVE,
+    POWER,
+    SEEN,
+    SHOWN,
+    SINCE_EVENT,
+    SLOW,
+    TOLD,
+    VARIANCE,
+    WEIGHT,
+    WHITE,
+)
+from flexmanip_ros.payload.process_model import PARAMETERS
+from flexmanip_ros.payload.tail_kernel import amplitude, ringing
+from flexmanip_ros.types import Array
+
+if TYPE_CHECKING:
+    from flexmanip_ros.payload.filter_state import Memory
+    from flexmanip_ros.payload.process_model import Motion
+    from flexmanip_ros.payload.tail_kernel import Tail
+
+OUTLIER = 4.0
+"""Innovations beyond this many standard deviations count less (Huber)."""
+BLOCK_MEMORY = 120
+"""Blocks over which the noise of a sensor is averaged."""
+BATCH_MEMORY = 20
+"""Batches over which the moves of the payload are averaged."""
+
+
+class Sensors(NamedTuple):
+    """How the signals follow from the state."""
+
+    H: Array
+    """(m, n) of q or qd."""
+    rate: NDArray[np.bool_]
+    """(m,) whether H reads qd."""
+    feed: Array
+    """(m, 2) direct effect of the torque."""
+    tail: Tail
+    """What rings beyond kappa."""
+    block: int
+    """Samples in a block: a tenth of the slowest vibration."""
+    diffusion: Array
+    """(nx,) standard deviation that each state gains in the square root of a second."""
+    deviation: Array
+    """(nx,) scratch."""
+    f: Array
+    """(nx,) scratch."""
+    W: Array
+    """(nx, 2 nx) scratch."""
+
+
+@inlined
+def measure(motion: Motion, sensors: Sensors, m: Memory, effort: Array, y: Array) -> None:
+    """Update the filter with one sample and gather what its innovations say of noise and payload."""
+    payload = m.x.size - PARAMETERS
+    x, S, f = m.x, m.S, sensors.f
+    n = motion.q.size
+    share = amplitude(m.score)
+    for i in range(y.size):
+        r = m.noise[i, EFFECTIVE]
+        predicted = project(x, S, sensors.H[i], n if sensors.rate[i] else 0, f)
+        more = ringing(sensors.tail, m, i)
+        e = y[i] - predicted - sensors.feed[i, 0] * effort[0] - sensors.feed[i, 1] * effort[1] - share * more
+        spread = 0.0
+        for c in range(f.size):
+            spread += f[c] * f[c]
+        variance = spread + r
+        square = e * e / variance
+        m.innovation[i, 0], m.innovation[i, 1] = e, variance
+        m.power[i] += (min(square, 25.0) - m.power[i]) / min(m.counts[SINCE_EVENT] + 100, 1000)
+        more /= np.sqrt(variance)
+        m.score[SHOWN] += more * min(max(e / np.sqrt(variance) + share * more, -5.0), 5.0)
+        m.score[TOLD] += more * more
+        residual = min(max(e / np.sqrt(variance), -5.0), 5.0) * np.sqrt(r)
+        m.noise[i, BLOCK_SUM] += residual
+        m.noise[i, BLOCK_POWER] += residual * residual
+        if square > OUTLIER * OUTLIER:
+            r += e * e / (OUTLIER * OUTLIER) - variance
+            variance = spread + r
+        gain = 0.0
+        for c in range(f.size):
+            gain += S[payload, c] * f[c]
+        gain /= variance
+        m.score[MOVE] += gain * e
+        m.score[VARIANCE] += gain * gain * variance
+        m.noise[i, WEIGHT] += gain * gain * variance
+        absorb_measurement(x, S, f, e, r, variance)
+        white_noise(m, i, y[i])
+    m.counts[SEEN] = min(m.counts[SEEN] + 1, 2000)
+
+
+@inlined
+def white_noise(m: Memory, i: int, y: float) -> None:
+    """Variance of sensor i's white noise, from fourth differences, in which slow motion has no part."""
+    recent = m.recent[i]
+    if m.counts[SEEN] >= 4:
+        difference = y - 4.0 * recent[0] + 6.0 * recent[1] - 4.0 * recent[2] + recent[3]
+        square = difference * difference / 70.0
+        if m.counts[SEEN] > 50:
+            square = min(square, 16.0 * m.noise[i, WHITE] + 1e-300)
+        m.noise[i, WHITE] += (square - m.noise[i, WHITE]) / (m.counts[SEEN] - 3)
+    for p in range(3, 0, -1):
+        recent[p] = recent[p - 1]
+    recent[0] = y
+
+
+@inlined
+def learn_noise(sensors: Sensors, m: Memory) -> None:
+    """At the end of a block: the variance of each sensor, and its slow part when that is not white."""
+    m.counts[IN_BLOCK] += 1
+    if m.counts[IN_BLOCK] < sensors.block:
+        return
+    m.counts[IN_BLOCK] = 0
+    m.counts[BLOCKS] = min(m.counts[BLOCKS] + 1, BLOCK_MEMORY)
+    blocks = m.counts[BLOCKS]
+    doubt = 3.0 * np.sqrt(2.0 / blocks)
+    for i in range(m.noise.shape[0]):
+        row = m.noise[i]
+        row[POWER] += (row[BLOCK_POWER] / sensors.block - row[POWER]) / blocks
+        row[SLOW] += (row[BLOCK_SUM] * row[BLOCK_SUM] / sensors.block - row[SLOW]) / blocks
+        row[BLOCK_SUM] = 0.0
+        row[BLOCK_POWER] = 0.0
+        # white noise has SLOW = POWER; a slow part that is no chance makes samples worth less
+        # trust comes back slowly: the first guess, or a shock, may have been right
+        row[EFFECTIVE] = max(row[POWER], row[SLOW] - doubt * row[POWER], row[FLOOR], 0.7 * row[EFFECTIVE])
+
+
+@inlined
+def judge_payload(sensors: Sensors, m: Memory) -> None:
+    """At the end of a batch: see whether the payload moved farther than its variance allows."""
+    m.counts[IN_BATCH] += 1
+    if m.counts[IN_BATCH] < 8 * sensors.block:
+        return
+    m.counts[IN_BATCH] = 0
+    if m.score[VARIANCE] > 0.0:
+        m.counts[BATCHES] = min(m.counts[BATCHES] + 1, BATCH_MEMORY)
+        square = m.score[MOVE] * m.score[MOVE] / m.score[VARIANCE]
+        m.score[DRIFT] += (square - m.score[DRIFT]) / m.counts[BATCHES]
+    m.score[MOVE] = 0.0
+    m.score[VARIANCE] = 0.0

@@ -1,0 +1,194 @@
+"""Compiled loop of the structured estimator: filter every sample, refit behind it all since the last event.
+
+The filter alone would linearise the first samples after an event at a poor guess and never take that
+back. So the samples since the event are kept (``HORIZON``), and a Gauss-Newton pass over them runs three
+samples for each new one; when it catches up, its result replaces the filter's state, and the next pass
+starts there.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from flexmanip_ros.numerics.compiled import inlined, kernel
+from flexmanip_ros.numerics.square_root import absorb_noise, backward, factor_information, forward, project
+from flexmanip_ros.payload.filter_state import (
+    EFFECTIVE,
+    HELD,
+    HORIZON,
+    IN_BATCH,
+    MOVE,
+    NOW,
+    PASSED,
+    PASSING,
+    SINCE_EVENT,
+    SINCE_NOISE,
+    STORED,
+    VARIANCE,
+)
+from flexmanip_ros.payload.measurement_update import OUTLIER, judge_payload, learn_noise, measure
+from flexmanip_ros.payload.process_model import PARAMETERS, predict
+from flexmanip_ros.payload.tail_kernel import amplitude, believed, push, ring, ringing
+from flexmanip_ros.types import Array
+
+if TYPE_CHECKING:
+    from flexmanip_ros.payload.filter_state import Memory
+    from flexmanip_ros.payload.measurement_update import Sensors
+    from flexmanip_ros.payload.process_model import Motion
+
+NOISE_EVERY = 50
+"""Samples between additions of process noise."""
+FIRST_PASS = 8
+"""Samples after an event before the first refit."""
+
+
+@kernel
+def begin_pass(m: Memory) -> None:
+    """Start a refit at the event, from the best trajectory known."""
+    nx = m.x.size
+    for i in range(nx):
+        m.xr[i] = m.x0[i]
+        m.g[i] = 0.0
+        for c in range(nx):
+            m.xr[i] += m.S0[i, c] * m.xi[c]
+            m.Sr[i, c] = m.S0[i, c]
+            m.N[i, c] = 0.0
+    m.counts[PASSED] = 0
+    m.counts[PASSING] = 1
+
+
+@kernel
+def pass_sample(motion: Motion, sensors: Sensors, m: Memory) -> bool:
+    """Take one kept sample into the refit; False when numbers left the finite range."""
+    sample = m.samples[m.counts[PASSED]]
+    n, nx = motion.q.size, m.x.size
+    effort, f = sample[1:3], sensors.f
+    if not predict(motion, m.xr, m.Sr, effort, sample[0], m.counts[HELD] != 0):
+        return False
+    if sample[0] > 0.0:
+        before = m.torque0 if m.counts[PASSED] == 0 else m.samples[m.counts[PASSED] - 1, 1:3]
+        push(motion, sensors.tail, m.xr, before, effort, believed(m.score))
+    for i in range(m.noise.shape[0]):
+        r = m.noise[i, EFFECTIVE]
+        predicted = project(m.xr, m.Sr, sensors.H[i], n if sensors.rate[i] else 0, f)
+        e = sample[3 + i] - predicted - sensors.feed[i, 0] * effort[0] - sensors.feed[i, 1] * effort[1]
+        weight = 1.0 / r
+        if e * e * weight > OUTLIER * OUTLIER:
+            weight = OUTLIER / (abs(e) * np.sqrt(r))
+        for a in range(nx):
+            scaled = weight * f[a]
+            m.g[a] += scaled * e
+            for b in range(a + 1):
+                m.N[a, b] += scaled * f[b]
+    m.counts[PASSED] += 1
+    return True
+
+
+@kernel
+def finish_pass(m: Memory) -> bool:
+    """Step to the minimum, and hand state and spread at the last sample to the filter."""
+    nx = m.x.size
+    payload = nx - PARAMETERS
+    if not factor_information(m.N):
+        return False
+    for i in range(nx):
+        m.g[i] -= m.xi[i]
+    forward(m.N, m.g)
+    backward(m.N, m.g)
+    move = 0.0
+    for c in range(nx):
+        move += m.S0[payload, c] * m.g[c]
+    # a step in the logarithm of the payload is not trusted beyond the range of its linearisation
+    limit = 1.0 if m.counts[HELD] != 0 else 1e300
+    shorten = min(1.0, limit / max(abs(move), 1e-300))
+    for c in range(nx):
+        m.xi[c] += shorten * m.g[c]
+    for i in range(nx):
+        value = m.xr[i]
+        for c in range(nx):
+            value += m.Sr[i, c] * shorten * m.g[c]
+        m.x[i] = value
+        forward(m.N, m.Sr[i])
+        for c in range(nx):
+            m.S[i, c] = m.Sr[i, c]
+    m.counts[PASSING] = 0
+    return True
+
+
+@kernel
+def refit(motion: Motion, sensors: Sensors, m: Memory, duration: float, effort: Array, y: Array) -> bool:
+    """Keep a sample and let the refit behind the filter take up to three."""
+    stored = m.counts[STORED]
+    if stored >= HORIZON:
+        return True
+    m.samples[stored, 0] = duration
+    m.samples[stored, 1] = effort[0]
+    m.samples[stored, 2] = effort[1]
+    share = amplitude(m.score)
+    for i in range(y.size):
+        m.samples[stored, 3 + i] = y[i] - share * ringing(sensors.tail, m, i)
+    m.counts[STORED] = stored + 1
+    if m.counts[PASSING] == 0:
+        if stored + 1 < FIRST_PASS or 3 * (stored + 1) > 2 * HORIZON:
+            return True
+        begin_pass(m)
+    for _ in range(3):
+        if m.counts[PASSED] < m.counts[STORED] and not pass_sample(motion, sensors, m):
+            return False
+    if m.counts[PASSED] == m.counts[STORED]:
+        m.counts[IN_BATCH] = 0
+        m.score[MOVE] = 0.0
+        m.score[VARIANCE] = 0.0
+        return finish_pass(m)
+    return True
+
+
+@inlined
+def diffuse(sensors: Sensors, m: Memory, duration: float) -> None:
+    """Add the process noise of a while, so that the memory stays finite."""
+    m.score[NOW] += duration
+    m.counts[SINCE_NOISE] += 1
+    if m.counts[SINCE_NOISE] < NOISE_EVERY or m.counts[STORED] < HORIZON:
+        return
+    root = np.sqrt(m.score[NOW])
+    for i in range(m.x.size):
+        sensors.deviation[i] = sensors.diffusion[i] * root
+    absorb_noise(m.S, sensors.deviation, sensors.W)
+    m.counts[SINCE_NOISE] = 0
+    m.score[NOW] = 0.0
+
+
+@kernel
+def take(motion: Motion, sensors: Sensors, m: Memory, duration: float, effort: Array, y: Array) -> bool:
+    """Take one sample, ``duration`` after the one before; False when numbers left the finite range."""
+    if not predict(motion, m.x, m.S, effort, duration, m.counts[HELD] != 0):
+        return False
+    if duration > 0.0:
+        push(motion, sensors.tail, m.x, m.torque, effort, believed(m.score))
+        ring(sensors.tail, m, duration, effort)
+        m.torque[0], m.torque[1] = effort[0], effort[1]
+    measure(motion, sensors, m, effort, y)
+    if not abs(m.x[m.x.size - PARAMETERS]) < 1e9:
+        return False
+    m.counts[SINCE_EVENT] += 1
+    learn_noise(sensors, m)
+    if not refit(motion, sensors, m, duration, effort, y):
+        return False
+    judge_payload(sensors, m)
+    diffuse(sensors, m, duration)
+    return True
+
+
+@kernel
+def advance(motion: Motion, sensors: Sensors, m: Memory, table: Array) -> int:
+    """Take samples, table (N, 3 + m): duration since the one before, torques held meanwhile, measurements.
+
+    Returns how many were taken; fewer than N when numbers left the finite range.
+    """
+    for k in range(table.shape[0]):
+        if not take(motion, sensors, m, table[k, 0], table[k, 1:3], table[k, 3:]):
+            return k
+    taken: int = table.shape[0]
+    return taken

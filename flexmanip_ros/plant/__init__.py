@@ -1,1 +1,0 @@
-"""The simulated arm: dynamics, linearization, capture, sensors, torques."""

@@ -1,0 +1,1 @@
+"""The nodes: each converts, makes one call of the core and publishes."""

@@ -1,0 +1,127 @@
+"""Node ``excitation``: a torque source that makes the arm tell what it carries.
+
+subscribes  joint_states                sensor_msgs/JointState  only with `clock: joint_states`
+publishes   effort_controller/commands  std_msgs/Float64MultiArray  one torque per joint [N m], at `rate`
+            /diagnostics                diagnostic_msgs/DiagnosticArray  1 Hz
+
+Sample k of the torque belongs k / rate seconds after activation, or after the first joint state (`clock`).
+When the node is deactivated or stopped it sends zero torque once.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+from rclpy.context import Context
+from rclpy.parameter import Parameter
+from rclpy.timer import Timer
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from flexmanip_ros.messages import LabelledArray
+from flexmanip_ros.parameters import ExcitationParameters
+from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.clock import SampleGrid
+from flexmanip_ros.ros.diagnostics import WARN, Meter, Report
+from flexmanip_ros.ros.encoding import Encoder
+from flexmanip_ros.ros.node import FlexmanipNode
+from flexmanip_ros.ros.spin import run
+from flexmanip_ros.simulation import excitation, excitation_design
+from flexmanip_ros.types import Array
+
+NAME = 'excitation'
+
+
+class Excitation(FlexmanipNode[ExcitationParameters]):
+    """Publishes the torque of the present instant."""
+
+    def __init__(self, *, context: Context | None = None, overrides: list[Parameter] | None = None,
+                 namespace: str | None = None, cli_args: list[str] | None = None) -> None:
+        super().__init__(NAME, ExcitationParameters, context=context, overrides=overrides,
+                         namespace=namespace, cli_args=cli_args)
+        self._meter = Meter()
+        self._last = -1
+        self._first_ns: int | None = None
+        self.skipped = 0
+
+    def make_entities(self) -> None:
+        """Publisher, and the timer or the subscription that sets the pace."""
+        self.commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.command())
+        self._encoded = Encoder()
+        self._grid = SampleGrid(self, self.config.rate)
+        self._timer: Timer | None = None
+        if self.config.clock == 'joint_states':
+            self.subscription(JointState, 'joint_states', self._on_joint_states, qos.sensor_input(), raw=True)
+        else:
+            self._timer = self.create_timer(1.0 / self.config.rate, self._tick, clock=self._grid.clock)
+            self._timer.cancel()
+
+    def start(self) -> None:
+        """Compute one sample, so that nothing is late later; say what a designed torque will tell."""
+        excitation.torque(self.config, 0)
+        if self.config.allowed_angle or self.config.shape in ('multisine', 'prbs', 'chirp'):
+            self.get_logger().info(excitation_design.describe(self.config))
+
+    def activated(self) -> None:
+        """Sample 0 is now."""
+        self._last, self._first_ns = -1, None
+        if self._timer is not None:
+            self._grid.begin()
+            self._timer.reset()
+
+    def deactivated(self) -> None:
+        """Leave the arm without torque."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._grid.stop()
+        self._send(np.zeros(2))
+
+    def _tick(self) -> None:
+        if not self.active or not (self._grid.begun or self._grid.begin()):
+            return
+        with self._meter:
+            latest = self._grid.latest()
+            if latest < 0:  # simulated time went back
+                self._grid.begin()
+                self._last, latest = -1, 0
+            self._instant(latest)
+
+    def _on_joint_states(self, raw: bytes) -> None:
+        """Send the torque that the arm needs at the sample after this one."""
+        if not self.active:
+            return
+        with self._meter:
+            stamp = self.stamp_of(raw)
+            if stamp is None:
+                return
+            if self._first_ns is None or stamp < self._first_ns:
+                self._first_ns, self._last = stamp, -1
+            self._instant(round((stamp - self._first_ns) * 1e-9 * self.config.rate) + 1)
+
+    def _instant(self, latest: int) -> None:
+        if latest == self._last:
+            return
+        self.skipped += max(latest - self._last - 1, 0)
+        self._last = latest
+        self._send(excitation.torque(self.config, latest))
+
+    def _send(self, torque: Array) -> None:
+        self.commands.publish(self._encoded(LabelledArray((), torque)))
+
+    def report(self, report: Report) -> None:
+        """Rate and instants that passed without a command."""
+        report.values.update(self._meter.window())
+        report.values['skipped_instants'] = self.skipped
+        report.values['shape'] = self.config.shape
+        if self.active and report.values['rate_hz'] < 0.9 * self.config.rate:
+            report.worse(WARN, f'{report.values["rate_hz"]:.0f} of {self.config.rate:.0f} commands a second')
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(Excitation, NAME, __doc__, ExcitationParameters, argv)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,236 @@
+"""Node ``plant_simulator``: the flexible two-link arm, stepped in real time.
+
+subscribes  effort_controller/commands  std_msgs/Float64MultiArray  one torque per joint [N m], held
+            capture_event               std_msgs/Header  the object is taken or let go at this stamp
+publishes   joint_states                sensor_msgs/JointState  joint1, joint2, link1_bend, link2_bend
+            /diagnostics                diagnostic_msgs/DiagnosticArray  1 Hz
+services    plant_simulator/reset       std_srvs/Trigger  back to the start, at rest, empty, without torque
+
+Stamps form the uniform grid activation + k / rate: after a late timer the node catches up and none is lost.
+A command of the wrong size or with a value that is not finite is dropped whole.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any
+
+import numpy as np
+from rclpy.context import Context
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, Header
+from std_srvs.srv import Trigger
+
+from flexmanip_ros.errors import FlexmanipError, SignalError
+from flexmanip_ros.parameters import PlantParameters
+from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.clock import SampleGrid
+from flexmanip_ros.ros.conversions import capture_event, numbers
+from flexmanip_ros.ros.diagnostics import ERROR, WARN, LossCounter, Meter, Report
+from flexmanip_ros.ros.encoding import JointStateWriter
+from flexmanip_ros.ros.node import FlexmanipNode, sequence_number, with_info
+from flexmanip_ros.ros.spin import run
+from flexmanip_ros.simulation import simulator
+from flexmanip_ros.types import CaptureEvent, EventKind
+
+NAME = 'plant_simulator'
+CATCH_UP = 5
+"""Samples made in one run of the timer at most, so that commands get their turn between them."""
+MOST_EVENTS = 100
+"""Events that wait for their stamps at most."""
+
+
+class PlantSimulator(FlexmanipNode[PlantParameters]):
+    """Steps the plant along the grid of stamps and publishes every sample."""
+
+    def __init__(self, *, context: Context | None = None, overrides: list[Parameter] | None = None,
+                 namespace: str | None = None, cli_args: list[str] | None = None) -> None:
+        super().__init__(NAME, PlantParameters, context=context, overrides=overrides,
+                         namespace=namespace, cli_args=cli_args)
+        self.state: simulator.PlantState | None = None
+        self.efforts = np.zeros(2)
+        self.dropped_commands = 0
+        self.lost_commands = LossCounter()
+        self._several = False
+        self.late_events = 0
+        self.refused_events = 0
+        self.samples = 0
+        self.backlog = 0
+        self._alive_ns = 0
+        self._pending: tuple[CaptureEvent, ...] = ()
+        self._meter = Meter()
+        self._fault = ''
+
+    def make_entities(self) -> None:
+        """Publisher, subscriptions, service and timer."""
+        self.joint_states = self.publisher(JointState, 'joint_states', qos.sensor_output())
+        self._encoded = JointStateWriter()
+        self.subscription(
+            Float64MultiArray, 'effort_controller/commands', with_info(self._on_command), qos.command(),
+            raw=True, matched=self._on_publisher)
+        self.subscription(Header, 'capture_event', self._on_event, qos.latched_input())
+        self.create_service(Trigger, '~/reset', self._on_reset)
+        self._grid = SampleGrid(self, self.config.rate)
+        self._timer = self.create_timer(1.0 / self.config.rate, self._tick, clock=self._grid.clock)
+        self._timer.cancel()
+
+    def start(self) -> None:
+        """Take a step, a capture and a release, so that nothing is compiled while the clock runs."""
+        state = simulator.init(self.config)
+        self._noise_std = state.noise_std
+        state = simulator.attach(self.config, state)
+        state, _ = simulator.step(self.config, state, np.zeros(2))
+        simulator.release(self.config, state)
+
+    def activated(self) -> None:
+        """Sample 0 is now."""
+        self._begin()
+        self._timer.reset()
+
+    def deactivated(self) -> None:
+        """Stand still."""
+        self._timer.cancel()
+        self._grid.stop()
+
+    def _begin(self) -> bool:
+        """Sample 0 is now; False without a clock yet."""
+        self.samples = 0
+        if not self._grid.begin():
+            return False
+        self._revive()
+        return True
+
+    def _revive(self) -> None:
+        """Put the arm at its start from the next stamp on: stamps never go back."""
+        self._alive_ns = self._stamp(self.samples)
+        self.state = simulator.init(self.config, self._alive_ns, self._noise_std)
+        self._pending, self._fault, self.efforts = (), '', np.zeros(2)
+
+    def _stamp(self, index: int) -> int:
+        return self._grid.start_ns + round(index * 1e9 / self.config.rate)
+
+    def _tick(self) -> None:
+        if not self.active or not (self._grid.begun or self._begin()):
+            return
+        latest = self._grid.latest()
+        if latest < 0:  # simulated time went back
+            self._begin()
+            latest = 0
+        self.backlog = latest + 1 - self.samples
+        for _ in range(min(self.backlog, CATCH_UP)):
+            if self._fault:
+                return
+            with self._meter:
+                self._step()
+
+    def _step(self) -> None:
+        assert self.state is not None
+        try:
+            self._apply_events(simulator.stamp(self.config, self.state))
+            self.state, record = simulator.step(self.config, self.state, self.efforts)
+        except FlexmanipError as error:
+            self._fault = str(error)
+            self.get_logger().error(f'the simulation stopped: {error}; call {NAME}/reset to start again')
+            return
+        self.samples += 1
+        if record is not None:  # lost on its way (sensors.drop_probability)
+            self.joint_states.publish(self._encoded(record))
+
+    def _apply_events(self, stamp: int) -> None:
+        """Take or let go of the object before the first sample that is not older than the event."""
+        assert self.state is not None
+        while self._pending and self._pending[0].stamp_ns <= stamp:
+            event, self._pending = self._pending[0], self._pending[1:]
+            change = simulator.attach if event.kind is EventKind.CAPTURE else simulator.release
+            self.state = change(self.config, self.state)
+
+    def _on_command(self, raw: bytes, info: object) -> None:
+        if not self._several:
+            self.lost_commands.note(sequence_number(info))
+        try:
+            efforts = numbers(raw)
+        except SignalError as error:
+            self._drop(str(error))
+            return
+        if efforts.size != 2:
+            self._drop(f'a command has {efforts.size} values; send one torque for each of the 2 joints')
+        elif not all(map(math.isfinite, efforts.tolist())):
+            self._drop('a command has a value that is not finite; look at the controller')
+        else:
+            self.efforts = efforts
+
+    def _on_publisher(self, event: Any) -> None:
+        """Each publisher has numbers of its own: count those of one, anew once another is gone."""
+        self._several = event.current_count > 1
+        if self._several or event.current_count_change < 0:
+            self.lost_commands.restart()
+
+    def _drop(self, words: str) -> None:
+        self.dropped_commands += 1
+        self.complain('command', words)
+
+    def _on_event(self, message: Header) -> None:
+        try:
+            event = capture_event(message)
+        except FlexmanipError as error:
+            self._refuse_event(str(error))
+            return
+        if not self.active or event.stamp_ns < self._alive_ns:
+            self.get_logger().info(f'{event.kind.value} from before the start is ignored')
+            return
+        if len(self._pending) >= MOST_EVENTS:
+            self._refuse_event(f'{MOST_EVENTS} events wait for their stamps already; one more was refused')
+            return
+        if self.samples and event.stamp_ns <= self._stamp(self.samples - 1):
+            self.late_events += 1
+            late_ms = (self._stamp(self.samples) - event.stamp_ns) * 1e-6
+            self.get_logger().warning(
+                f'{event.kind.value} came {late_ms:.1f} ms late and is applied now; raise lead_time or '
+                'service_delay of capture_trigger')
+        self._pending = tuple(sorted((*self._pending, event), key=lambda item: item.stamp_ns))
+
+    def _refuse_event(self, words: str) -> None:
+        self.refused_events += 1
+        self.complain('event', words)
+
+    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if not self.active:
+            response.success, response.message = False, f'{NAME} is not active'
+            return response
+        if self._grid.begun:
+            self._revive()
+        response.success, response.message = True, 'the arm is at its start, at rest and empty'
+        return response
+
+    def report(self, report: Report) -> None:
+        """Rate, backlog, dropped commands and events that came late."""
+        values = report.values
+        values.update(self._meter.window())
+        values['samples'] = self.samples
+        values['backlog'] = self.backlog
+        values['dropped_commands'] = self.dropped_commands
+        lost = self.lost_commands.lost
+        values['lost_commands'] = f'{lost} or more (several publishers)' if self._several else lost
+        values['late_events'] = self.late_events
+        values['refused_events'] = self.refused_events
+        if self._fault:
+            report.worse(ERROR, self._fault)
+        elif self.active and values['rate_hz'] < 0.9 * self.config.rate:
+            report.worse(WARN, f'{values["rate_hz"]:.0f} of {self.config.rate:.0f} samples a second')
+        if self.dropped_commands:
+            report.worse(WARN, f'{self.dropped_commands} commands dropped')
+        if lost:
+            report.worse(WARN, f'{lost} commands lost: they came faster than they were taken')
+        if self.refused_events:
+            report.worse(WARN, f'{self.refused_events} events refused')
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(PlantSimulator, NAME, __doc__, PlantParameters, argv)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

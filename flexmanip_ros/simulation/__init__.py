@@ -1,0 +1,1 @@
+"""The simulated arm: integration, sensors, noise, excitation, injected faults."""

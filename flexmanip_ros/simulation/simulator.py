@@ -1,0 +1,234 @@
+"""The simulated arm: init, step, attach, release, and a whole trajectory at once with the same numbers.
+
+``step`` records the sample at the present stamp and then integrates one period with the torque held from
+that stamp on. An event changes the state before the sample it belongs to: the sample stamped at the
+event's instant is the first after the jump; an event between two stamps acts at the later one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from flexmanip_ros.arm.capture import Body, free_object, joined, rates_after
+from flexmanip_ros.errors import ModelError, SignalError
+from flexmanip_ros.parameters.excitation import ExcitationParameters
+from flexmanip_ros.parameters.plant import PlantParameters
+from flexmanip_ros.parameters.sensing import SensorParameters
+from flexmanip_ros.simulation import excitation, models, noise, sensors
+from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointRecord
+
+JOINT_NAMES = ('joint1', 'joint2', 'link1_bend', 'link2_bend')
+REHEARSAL_TIME = 6.0
+"""Seconds of the rehearsal that finds the signal levels, with the capture half way (the paper's run)."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlantState:
+    """The arm between two samples. Never written to; ``model`` holds constants and scratch only."""
+
+    model: models.Model
+    start_ns: int
+    index: int
+    """Number of the next sample."""
+    x: Array
+    """(2n,) coordinates and rates."""
+    payload: Array
+    """(4,) what the arm holds, see ``manipulator.payload_array``."""
+    memory: Array
+    """What the model's outputs remember beside x."""
+    noise_std: Array
+    """(8,) of the positions, then the rates."""
+    noise_block: Array
+    """(BLOCK, 10) standard normal numbers around the next sample."""
+    noise_number: int
+    """Which block that is."""
+    gauges: Array
+    """(2, 2) low-pass state of the deflections and of their rates."""
+    commands: Array
+    """(command_delay, 2) torques on their way to the drives."""
+    reported: Array
+    """(effort_delay, 2) torques that are still to be reported."""
+    taking: Body | None = None
+    """Part of an object that a soft gripper takes at each of the next samples."""
+    taking_left: int = 0
+
+
+class Trajectory(NamedTuple):
+    """A simulated run as its messages tell it, columns in the order of JOINT_NAMES (effort: the joints)."""
+
+    stamp_ns: np.ndarray[tuple[int], np.dtype[np.int64]]
+    position: Array
+    velocity: Array
+    effort: Array
+    names: tuple[str, ...] = JOINT_NAMES
+
+
+def init(config: PlantParameters, start_ns: int = 0, noise_std: Array | None = None) -> PlantState:
+    """Put the arm at rest at its initial angles, empty; sample 0 is stamped start_ns.
+
+    noise_std: (8,) overrides the parameters'. With ``noise: snr`` and none given, the levels come from a
+    noise-free rehearsal of the paper's excitation.
+    """
+    model = models.build(config)
+    return PlantState(
+        model=model, start_ns=start_ns, index=0, x=model.rest(), payload=np.zeros(4), memory=model.memory(),
+        noise_std=_levels(config) if noise_std is None else np.array(noise_std, dtype=np.float64),
+        noise_block=noise.block(config.seed, 0), noise_number=0, gauges=np.zeros((2, 2)),
+        commands=np.zeros((config.actuators.command_delay, 2)),
+        reported=np.zeros((config.arm.effort_delay, 2)))
+
+
+def stamp(config: PlantParameters, state: PlantState) -> int:
+    """Stamp [ns] of the next sample."""
+    return state.start_ns + round(state.index * 1e9 / config.rate)
+
+
+def step(
+    config: PlantParameters, state: PlantState, efforts: Array,
+) -> tuple[PlantState, JointRecord | None]:
+    """Record the present sample and integrate one period under efforts (2,) [N m].
+
+    The record is None when the sample is lost on its way (``sensors.drop_probability``).
+    Raises SignalError when efforts are not two finite numbers, ModelError when the simulation diverges.
+    """
+    efforts = _checked(np.asarray(efforts, dtype=np.float64).reshape(1, -1))
+    now = stamp(config, state)
+    number = state.index // noise.BLOCK
+    if number != state.noise_number:
+        state = replace(state, noise_block=noise.block(config.seed, number), noise_number=number)
+    drawn = state.noise_block[state.index % noise.BLOCK][None]
+    state, position, velocity, effort = _advance(config, state, efforts)
+    if not sensors.arrives(config, drawn)[0]:
+        return state, None
+    sensors.read(config, position, velocity, state.noise_std, drawn)
+    record = JointRecord(
+        now + int(sensors.jitter_ns(config, drawn)[0]), JOINT_NAMES, position[0], velocity[0],
+        np.array([*effort[0], 0.0, 0.0]))
+    return state, record
+
+
+def attach(config: PlantParameters, state: PlantState) -> PlantState:
+    """Take the object of the parameters, before the next sample; a soft gripper begins to.
+
+    What it still has to take of an object before is taken at once.
+    """
+    if state.taking is not None:
+        state = _take(config, state, state.taking.part(state.taking_left))
+        state = replace(state, taking=None, taking_left=0)
+    parts = max(round(config.gripper_ramp * config.rate), 1)
+    if parts == 1:
+        return _take(config, state, free_object(config))
+    return replace(state, taking=free_object(config).part(1.0 / parts), taking_left=parts)
+
+
+def release(config: PlantParameters, state: PlantState) -> PlantState:
+    """Let go of all that is held: the arm keeps its rates and the object those of the tip."""
+    return replace(state, payload=np.zeros(4), taking=None, taking_left=0)
+
+
+def simulate(
+    config: PlantParameters, efforts: Array, events: Sequence[CaptureEvent] = (), start_ns: int = 0,
+    noise_std: Array | None = None,
+) -> Trajectory:
+    """Run efforts.shape[0] samples under efforts (N, 2) [N m], events applied at their stamps.
+
+    The same numbers as N steps. With ``noise: snr`` and no noise_std given, the levels are those of this
+    very trajectory (a live plant cannot know them and rehearses).
+    """
+    efforts = _checked(np.asarray(efforts, dtype=np.float64))
+    count = efforts.shape[0]
+    own_levels = config.noise == 'snr' and noise_std is None
+    state = init(config, start_ns, np.zeros(8) if own_levels else noise_std)
+    stamps = start_ns + np.round(np.arange(count) * 1e9 / config.rate).astype(np.int64)
+    rows = np.empty((count, 10))
+    ordered = sorted(events, key=lambda event: event.stamp_ns)
+    places = [int(np.searchsorted(stamps, event.stamp_ns)) for event in ordered]
+    for first, last, event in zip([0, *places], [*places, count], [None, *ordered], strict=True):
+        if event is not None and first < count:
+            state = (attach if event.kind is EventKind.CAPTURE else release)(config, state)
+        while first < last:
+            end = first + 1 if state.taking_left else last
+            state, *parts = _advance(config, state, efforts[first:end])
+            rows[first:end] = np.hstack(parts)
+            first = end
+    position, velocity, effort = rows[:, :4].copy(), rows[:, 4:8].copy(), rows[:, 8:].copy()
+    levels = noise.std_for_snr(position, velocity, config.snr_db) if own_levels else state.noise_std
+    drawn = noise.normal(config.seed, 0, count)
+    sensors.read(config, position, velocity, levels, drawn)
+    kept = sensors.arrives(config, drawn)
+    stamps = stamps + sensors.jitter_ns(config, drawn)
+    return Trajectory(stamps[kept], position[kept], velocity[kept], effort[kept])
+
+
+def records(
+    trajectory: Trajectory, events: Sequence[CaptureEvent] = (),
+) -> Iterator[JointRecord | CaptureEvent]:
+    """Messages of a trajectory in time order, each event before the first sample that is not older."""
+    waiting = sorted(events, key=lambda event: event.stamp_ns, reverse=True)
+    for k, now in enumerate(trajectory.stamp_ns.tolist()):
+        while waiting and waiting[-1].stamp_ns <= now:
+            yield waiting.pop()
+        yield JointRecord(
+            now, trajectory.names, trajectory.position[k], trajectory.velocity[k],
+            np.array([*trajectory.effort[k], 0.0, 0.0]))
+
+
+def _advance(
+    config: PlantParameters, state: PlantState, efforts: Array,
+) -> tuple[PlantState, Array, Array, Array]:
+    """Run commands (N, 2); return the state after them, positions, rates (N, 4) and reported torques."""
+    if state.taking is not None:
+        state = _take(config, state, state.taking)
+        left = state.taking_left - 1
+        state = replace(state, taking_left=left, taking=state.taking if left else None)
+    count = len(efforts)
+    queue = np.concatenate([state.commands, sensors.saturated(config, efforts)])
+    applied = np.ascontiguousarray(queue[:count])
+    reported = np.concatenate([state.reported, applied])
+    x, memory, gauges = state.x.copy(), state.memory.copy(), state.gauges.copy()
+    position, velocity = np.empty((count, 4)), np.empty((count, 4))
+    good = state.model.advance(x, state.payload, memory, applied, position, velocity)
+    if good < count:
+        raise ModelError(
+            f'the simulation diverged {(state.index + good) / config.rate:.3f} s after its start',
+            'lower the torque, raise the stiffness or the rate, or reset the plant')
+    sensors.gauge(config, position, velocity, gauges)
+    after = replace(state, index=state.index + count, x=x, memory=memory, gauges=gauges,
+                    commands=queue[count:], reported=reported[count:])
+    return after, position, velocity, reported[:count]
+
+
+def _take(config: PlantParameters, state: PlantState, body: Body) -> PlantState:
+    x, memory = state.x.copy(), state.memory
+    n = x.size // 2
+    if config.capture_impact == 'momentum' and (body.mass or body.inertia):
+        M = state.model.mass_matrix(x, state.payload)
+        x[n:] = rates_after(M, state.model.body_jacobian(x, body.com), x[n:], body, state.model.held)
+        memory = state.model.struck(x, memory, x[n:] - state.x[n:])
+    return replace(state, x=x, memory=memory, payload=joined(state.payload, body))
+
+
+def _levels(config: PlantParameters) -> Array:
+    if config.noise == 'none':
+        return np.zeros(8)
+    if config.noise == 'std':
+        return np.array(config.noise_std)
+    gauges_only = SensorParameters(strain_cutoff=config.sensors.strain_cutoff)
+    quiet = replace(config, noise='none', sensors=gauges_only)
+    waves = ExcitationParameters(rate=config.rate, amplitude=config.rehearsal_torque)
+    efforts = excitation.sequence(waves, round(REHEARSAL_TIME * config.rate))
+    half = round(round(len(efforts) / 2) * 1e9 / config.rate)
+    run = simulate(quiet, efforts, (CaptureEvent(half, EventKind.CAPTURE),))
+    return noise.std_for_snr(run.position, run.velocity, config.snr_db)
+
+
+def _checked(efforts: Array) -> Array:
+    if efforts.ndim != 2 or efforts.shape[1] != 2:
+        raise SignalError(f'the efforts have shape {efforts.shape}', 'give one torque for each of 2 joints')
+    if not np.all(np.isfinite(efforts)):
+        raise SignalError('an effort is not finite', 'look at the controller that sent it')
+    return efforts

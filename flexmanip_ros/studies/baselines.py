@@ -1,0 +1,78 @@
+"""The paper's rivals over the same messages and the same publishing grid as the identifier."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.payload import algebraic, rigid_rls
+from flexmanip_ros.payload.rival import RivalState
+from flexmanip_ros.samples import sampling
+from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, Sample
+
+
+class Rival(NamedTuple):
+    """The calls of one estimator."""
+
+    init: Callable[[IdentifierParameters], RivalState]
+    advance: Callable[[IdentifierParameters, RivalState, Sequence[Sample]], RivalState]
+    event: Callable[[IdentifierParameters, RivalState, CaptureEvent], RivalState]
+    estimate: Callable[[IdentifierParameters, RivalState], Payload]
+
+
+RIVALS: Mapping[str, Rival] = {
+    'rigid_rls': Rival(rigid_rls.init, rigid_rls.advance, rigid_rls.event, rigid_rls.estimate),
+    'algebraic': Rival(algebraic.init, algebraic.advance, algebraic.event, algebraic.estimate),
+}
+
+
+def samples(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]
+            ) -> list[Sample | CaptureEvent]:
+    """Return messages as samples, each event before the first sample at or after its stamp."""
+    clock = sampling.init()
+    waiting: list[CaptureEvent] = []
+    found: list[Sample | CaptureEvent] = []
+    for item in items:
+        if isinstance(item, CaptureEvent):
+            waiting.append(item)
+            continue
+        clock, sampled = sampling.step(config, clock, item)
+        for sample in sampled.samples:
+            due = [event for event in waiting if event.stamp_ns <= sample.stamp_ns] if waiting else []
+            if due:
+                found.extend(due)
+                waiting = [event for event in waiting if event not in due]
+            found.append(sample)
+    return found
+
+
+def run(name: str, config: IdentifierParameters, sampled: Iterable[Sample | CaptureEvent]
+        ) -> Iterator[Estimate]:
+    """Yield estimates with a payload and no model: at each publishing instant and at the last sample."""
+    rival = RIVALS[name]
+    state = rival.init(config)
+    block: list[Sample] = []
+    first_ns, published, due = 0, -1, False
+    last: Sample | None = None
+    for item in sampled:
+        if isinstance(item, CaptureEvent):
+            state, block = rival.advance(config, state, block), []
+            state = rival.event(config, state, item)
+            continue
+        first_ns = item.stamp_ns if last is None else first_ns
+        last = item
+        block.append(item)
+        instant = int((item.stamp_ns - first_ns) * config.publish_rate * 1e-9 + 1e-6)
+        due = instant > published
+        if due:
+            published = instant
+            state, block = rival.advance(config, state, block), []
+            yield _estimate(rival, config, state, item)
+    if last is not None and not due:
+        yield _estimate(rival, config, rival.advance(config, state, block), last)
+
+
+def _estimate(rival: Rival, config: IdentifierParameters, state: RivalState, sample: Sample) -> Estimate:
+    payload = rival.estimate(config, state)
+    return Estimate(sample.stamp_ns, payload.status, None, (), payload)

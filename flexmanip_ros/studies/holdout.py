@@ -1,0 +1,64 @@
+"""Scores of a model on the part of a recording it was not identified on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexmanip_ros.errors import ModelError, ParameterError
+from flexmanip_ros.identification import validation
+from flexmanip_ros.samples.history import Signals
+from flexmanip_ros.types import Array, StateSpace
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Variance accounted for per output [%], and the outputs behind it: time (N,), others (N, m)."""
+
+    simulation: Array
+    prediction: Array
+    time: Array
+    measured: Array
+    simulated: Array
+    predicted: Array
+    until_gap: bool
+    """A gap ended the scored stretch before the recording did."""
+
+
+def score(model: StateSpace | None, signals: Signals, start_s: float) -> Scores:
+    """Hold a model still and score it on the samples from ``start_s`` on, up to the first gap.
+
+    The state at the start is estimated on the samples before it, by least squares over a free run of the
+    model and of its predictor; simulation then uses no measured output.
+    Raises ParameterError when nothing is left to score, ModelError when there is no model.
+    """
+    time = signals.time
+    first = int(np.searchsorted(time, start_s))
+    if first < 2 or time.size - first < 2:
+        length = f'{time[-1]:.3f} s' if time.size else 'nothing'
+        raise ParameterError(f'validation from {start_s:g} s leaves no samples to identify on or to score',
+                             f'the recording is {length} long; choose a time well inside it')
+    if model is None:
+        raise ModelError(f'there is no model yet at {start_s:g} s', 'validate from a later time')
+    gaps = np.flatnonzero(signals.gap)
+    before = int(gaps[gaps <= first][-1]) if (gaps <= first).any() else 0
+    after = int(gaps[gaps > first][0]) if (gaps > first).any() else time.size
+    u, y = signals.u[first:after], signals.y[first:after]
+    x0 = validation.state_at_end(model, signals.u[before:first], signals.y[before:first])
+    with np.errstate(over='ignore', invalid='ignore'):  # an unstable model runs away: it scores 0
+        simulated = validation.simulate(model, u, x0)
+        seen = np.hstack([signals.u[before:first], signals.y[before:first]])
+        filtered = validation.state_at_end(_predictor(model), seen, signals.y[before:first])
+        predicted = validation.predict(model, u, y, filtered)
+    return Scores(
+        validation.vaf(y, simulated), validation.vaf(y, predicted), time[first:after], y, simulated,
+        predicted, after < time.size)
+
+
+def _predictor(model: StateSpace) -> StateSpace:
+    """Return the one-step predictor as a system with the inputs [u; y]."""
+    A = model.A - model.K @ model.C
+    B = np.hstack([model.B - model.K @ model.D, model.K])
+    D = np.hstack([model.D, np.zeros((model.C.shape[0], model.C.shape[0]))])
+    return StateSpace(A, B, model.C, D, np.zeros_like(model.K), model.dt)

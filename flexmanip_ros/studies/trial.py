@@ -1,0 +1,154 @@
+"""One run of a scenario to one row an estimator. The run's number is its seed."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from flexmanip_ros import pipeline
+from flexmanip_ros.arm import linearization
+from flexmanip_ros.errors import FlexmanipError
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.samples.history import History
+from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.studies.achievable import payload_std
+from flexmanip_ros.studies.fault_injection import inject
+from flexmanip_ros.studies.metrics import relative_error_percent
+from flexmanip_ros.studies.scenario import Run, Scenario
+from flexmanip_ros.studies.summary import summarize
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord
+
+Row = dict[str, Any]
+"""Column name -> bool, int, float, str or None."""
+
+
+def trial(scenario: Scenario, seed: int) -> list[Row]:
+    """Simulate one run and put every estimator of the scenario over the same samples.
+
+    Whatever goes wrong in an estimator becomes the ``error`` of its row; the others go on.
+    """
+    rows = []
+    for name in scenario.estimators:
+        row: Row = {'scenario': scenario.name, 'seed': seed, 'estimator': name, 'error': ''}
+        try:
+            run = scenario.configuration(seed, name)
+            row.update(drawn_columns(run.drawn))
+            items = messages(scenario, run, seed)
+            row.update(measure(run.identifier, items, run.plant.payload_mass, scenario.window,
+                               bound=scenario.bound))
+            row.update(frequency_columns(run, row))
+        except Exception as error:  # a defect in one estimator must not end a study of thousands
+            row['error'] = describe(error)
+        rows.append(row)
+    return rows
+
+
+def describe(error: BaseException) -> str:
+    """Return an error as the text of a row: ours as they are, others with their type."""
+    if isinstance(error, FlexmanipError):
+        return str(error)
+    return ' '.join(f'{type(error).__name__}: {error}'.split())
+
+
+def messages(scenario: Scenario, run: Run, seed: int) -> list[JointRecord | CaptureEvent]:
+    """Return what the estimators of a run receive."""
+    count = max(round(scenario.duration * run.plant.rate), 1)
+    events = tuple(
+        CaptureEvent(round(at * 1e9), kind)
+        for at, kind in ((run.capture_time, EventKind.CAPTURE), (scenario.release_time, EventKind.RELEASE))
+        if 0.0 <= at < scenario.duration)
+    trajectory = simulator.simulate(run.plant, excitation.sequence(run.excitation, count), events)
+    rng = np.random.default_rng([seed, 1 << 20])  # a stream of its own beside those of `vary`
+    return inject(simulator.records(trajectory, events), scenario.faults, rng)
+
+
+def measure(config: IdentifierParameters, items: Sequence[JointRecord | CaptureEvent], true_kg: float | None,
+            window: tuple[float, float], *, bound: bool = False, settled: float = 0.0) -> Row:
+    """Identify and return the columns of a row.
+
+    true_kg: mass held after a capture; None when unknown. window: from and to [s] of the mean error, at the
+    earliest ``settled`` seconds after the event that made it true; bound: add the least standard deviation
+    that the samples after the capture allow.
+    """
+    started = time.perf_counter()
+    state, estimates = pipeline.init(), []
+    for now, estimate in pipeline.replay(config, items):
+        state = now
+        if estimate is not None:
+            estimates.append(estimate)
+    wall = time.perf_counter() - started
+    last = pipeline.current(state)
+    row: Row = summarize(state, last, wall).as_json()
+    interval: tuple[float | None, float | None] = row.pop('payload_ci95_kg') or (None, None)
+    low, high = interval
+    for name in ('vaf_simulation_percent', 'vaf_prediction_percent', 'wall_s'):
+        row.pop(name)
+    for kind in ('frequencies_hz', 'damping_ratios'):
+        for k, value in enumerate(row.pop(kind)):
+            row[f'{kind.split("_")[0]}_{k + 1}'] = value
+    row.update(payload_lower_kg=low, payload_upper_kg=high,
+               us_per_sample=1e6 * wall / max(state.counters.accepted, 1))
+    held = row['capture_time_s'] is not None and (
+        row['release_time_s'] is None or row['release_time_s'] < row['capture_time_s'])
+    true = None if true_kg is None else (true_kg if held else 0.0)
+    row['payload_true_kg'] = true
+    row['covered'] = None if true is None or low is None or high is None else bool(low <= true <= high)
+    changed = row['capture_time_s'] if held else row['release_time_s']
+    begin = window[0] if changed is None else max(window[0], changed + settled)
+    row['error_percent'] = None if true is None else _window_error(state, estimates, true, (begin, window[1]))
+    if bound and held and config.payload_method != 'none':
+        mass = row['payload_mass_kg'] if true is None else true
+        row['bound_std_kg'] = _bound(config, items, row['capture_time_s'], mass, state.sampling.dt)
+    return row
+
+
+def _bound(config: IdentifierParameters, items: Sequence[JointRecord | CaptureEvent], capture_time: float,
+           mass: float | None, dt: float) -> float | None:
+    history = History(config)
+    for item in items:
+        if isinstance(item, JointRecord):
+            history.add(item)
+    return None if mass is None else payload_std(config, history.signals(), capture_time, mass, dt)
+
+
+def _window_error(state: pipeline.State, estimates: Sequence[Estimate], true: float,
+                  window: tuple[float, float]) -> float | None:
+    masses = np.array([
+        estimate.payload.mass for estimate in estimates if estimate.payload is not None
+        and window[0] <= (estimate.stamp_ns - state.first_ns) * 1e-9 <= window[1]], dtype=np.float64)
+    found = relative_error_percent(masses, true)
+    return None if math.isnan(found) else found
+
+
+def frequency_columns(run: Run, row: Mapping[str, Any]) -> Row:
+    """Return the true frequencies at the working point and the largest relative error of those found [%]."""
+    mass = row.get('payload_true_kg') or 0.0
+    true = true_frequencies(run, mass)
+    found = [row[f'frequencies_{k + 1}'] for k in range(len(true)) if f'frequencies_{k + 1}' in row]
+    columns: Row = {f'true_frequency_{k + 1}': value for k, value in enumerate(true)}
+    if len(found) == len(true):
+        columns['frequency_error_percent'] = max(
+            100.0 * abs(value - known) / known for value, known in zip(found, true, strict=True))
+    return columns
+
+
+def true_frequencies(run: Run, mass: float) -> list[float]:
+    """Return the two lowest damped frequencies of the arm at its start [Hz]."""
+    Ac, _ = linearization.vibration_model(run.plant.arm, np.array(run.plant.initial_angles), mass)
+    poles = np.linalg.eigvals(Ac)
+    return sorted((poles.imag[poles.imag > 1e-9] / (2.0 * np.pi)).tolist())[:2]
+
+
+def drawn_columns(drawn: Mapping[str, Any]) -> Row:
+    """Return what was drawn for a run as plain columns."""
+    columns: Row = {}
+    for name, value in drawn.items():
+        if isinstance(value, (list, tuple)):
+            columns.update({f'{name}.{k + 1}': item for k, item in enumerate(value)})
+        else:
+            columns[name] = value
+    return columns
