@@ -1,60 +1,55 @@
-"""Samples and events in the order of their stamps, whatever the order of their arrival.
+"""Events at their own stamps, whatever the order of their arrival.
 
-An event that arrives early waits for its stamp. One that arrives late is applied at its own stamp: the last
-``rewind_time`` of samples is kept, the estimator goes back to a checkpoint before the event and runs them
-again. From its arrival on, the result depends on stamps alone. An older event is applied at once and counted.
-One from before the first sample (latched, heard only now) held all along: the payload begins anew with it.
+An event that arrives early waits for its stamp. One that arrives late is applied at its own stamp: the estimators go
+back to a snapshot before the event and take the rows of the log again. From its arrival on, the result depends on
+stamps alone. An event older than ``rewind_time`` is applied at once and counted. One from before the first sample
+(latched, received only now) was true all along: the payload begins again with it.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from flexmanip_ros import estimator
+from flexmanip_ros.numerics.background import Background
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.types import CaptureEvent, EventKind, Sample
+from flexmanip_ros.samples.sample_log import SampleLog
+from flexmanip_ros.types import CaptureEvent, EventKind
 
 BEFORE_ALL = -(1 << 63)
-"""Stamp of the sample before the first one."""
-CHECKPOINTS = 2
-"""Checkpoints within ``rewind_time``; one more is kept so that the whole of it can be run again."""
-
+"""Stamp of the row before the first one."""
+SNAPSHOTS = 2
+"""Snapshots within ``rewind_time``. One more is kept, so that the whole of it can be taken again."""
 MOST_EVENTS = 100
 """Events that wait for their stamps at most, the earliest ones."""
-LET_GO = 2
-"""Blocks no longer needed that are let go of with each new one, or more until as many samples have gone."""
-MOST_SAMPLES = 20_000
-"""Samples needed at most; at rates (or with stamps) that need more the time to go back is shorter."""
+MOST_ROWS = 20_000
+"""Rows kept for a rewind at most. At rates (or with stamps) that need more the time to go back is shorter."""
 
 
-class Checkpoint(NamedTuple):
-    """The estimator after the sample at ``after_ns``, before the one at ``stamp_ns`` and its events."""
+class Snapshot(NamedTuple):
+    """The estimators before a row at ``stamp_ns`` and its events, after the row at ``before_ns``."""
 
-    after_ns: int
+    row: int
     stamp_ns: int
-    core: estimator.Core
+    before_ns: int
+    estimators: estimator.EstimatorState
 
 
-class Timeline(NamedTuple):
-    """The estimator now, and what is needed to go back."""
+class EventReplay(NamedTuple):
+    """The estimators now, and what is needed to go back."""
 
-    core: estimator.Core
-    checkpoints: tuple[Checkpoint, ...] = ()
-    blocks: tuple[tuple[Sample, ...], ...] = ()
-    """Samples from the oldest checkpoint on, as they were run; no block reaches over a checkpoint."""
-    kept: int = 0
-    """How many samples these are."""
-    stale: int = 0
-    """Blocks in front of these, of before it: let go of a few at a time, or a sample would wait for it."""
-    applied: tuple[CaptureEvent, ...] = ()
-    """Events at or after the oldest checkpoint, in the order of their stamps."""
-    waiting: tuple[CaptureEvent, ...] = ()
+    estimators: estimator.EstimatorState
+    cursor: int = 0
+    """Row of the sample log that is taken next."""
+    last_ns: int = BEFORE_ALL
+    """Stamp of the row before it [ns]."""
+    snapshots: tuple[Snapshot, ...] = ()
+    applied: tuple[tuple[int, CaptureEvent], ...] = ()
+    """Events at or after the oldest snapshot, each with the row before which it was applied."""
+    pending: tuple[CaptureEvent, ...] = ()
     """Events whose stamp has not been reached."""
     latest: tuple[CaptureEvent, ...] = ()
     """The latest event of each kind that was taken, to recognise a repeated one."""
-    last_ns: int = BEFORE_ALL
     late_events: int = 0
     repeated_events: int = 0
     rewinds: int = 0
@@ -64,68 +59,62 @@ class Timeline(NamedTuple):
         return next((event.stamp_ns for event in self.latest if event.kind is kind), None)
 
 
-def advance(config: IdentifierParameters, line: Timeline, samples: Sequence[Sample], *, ahead: bool = False
-            ) -> Timeline:
-    """Run samples, in rising stamps, through the estimator, with the events that fall among them.
-
-    ahead: somebody waits for the payload of the last one; what can be done after it is left for later (the
-    identifier's step to ``estimator.settle``, a checkpoint to the next sample).
-    """
-    block: list[Sample] = []
-    for sample in samples:
-        due = tuple(event for event in line.waiting if event.stamp_ns <= sample.stamp_ns)
-        checkpoint_due = (is_checkpoint_due(config, line, sample.stamp_ns, ahead and sample is samples[-1])
-                          or line.kept + len(block) >= MOST_SAMPLES)
-        if block and (due or checkpoint_due):
-            line = _run(config, line, block)
-            block = []
-        if checkpoint_due:
-            line = _checkpoint(config, line, sample.stamp_ns)
-        for event in due:
-            line = line._replace(core=estimator.event(config, line.core, event),
-                                 applied=(*line.applied, event),
-                                 waiting=tuple(e for e in line.waiting if e is not event))
-        block.append(sample)
-    return _run(config, line, block, ahead=ahead) if block else line
+def first_needed(replay: EventReplay) -> int:
+    """Return the first row of the log that may be read again."""
+    return min(estimator.first_needed(replay.estimators),
+               *(min(one.row, estimator.first_needed(one.estimators)) for one in replay.snapshots),
+               replay.cursor)
 
 
-def is_checkpoint_due(config: IdentifierParameters, line: Timeline, stamp_ns: int, awaited: bool = False
-                      ) -> bool:
-    """Whether it is time for a checkpoint before a sample of this stamp [ns].
+def advance(config: IdentifierParameters, replay: EventReplay, log: SampleLog, until: int,
+            background: Background) -> EventReplay:
+    """Take the rows of the log up to ``until``, with the events that fall among them."""
+    while replay.cursor < until:
+        stop = min(until, _next_snapshot(config, replay, log))
+        if stop == replay.cursor:
+            replay = _snapshot(config, replay, log)
+            stop = min(until, _next_snapshot(config, replay, log))
+        event = replay.pending[0] if replay.pending else None
+        if event is not None:
+            row = log.row_at(event.stamp_ns, replay.cursor)
+            if row == replay.cursor:
+                replay = replay._replace(
+                    estimators=estimator.event(config, replay.estimators, event, background),
+                    applied=(*replay.applied, (row, event)), pending=replay.pending[1:])
+                continue
+            stop = min(stop, row)
+        rows = log.rows(replay.cursor, stop)
+        replay = replay._replace(
+            estimators=estimator.advance(config, replay.estimators, rows, background), cursor=stop,
+            last_ns=int(rows.stamp_ns[-1]))
+    return replay
 
-    awaited: somebody waits for it, and the checkpoint may be late, but at the same sample always.
-    """
-    if not line.checkpoints:
-        return True
-    spacing_ns = int(config.rewind_time * 1e9) // CHECKPOINTS
-    return stamp_ns - line.checkpoints[-1].stamp_ns >= spacing_ns * (3 if awaited else 2) // 2
 
-
-def event(config: IdentifierParameters, line: Timeline, event: CaptureEvent, first_ns: int = BEFORE_ALL
-          ) -> Timeline:
+def insert(config: IdentifierParameters, replay: EventReplay, log: SampleLog, event: CaptureEvent,
+           first_ns: int, background: Background) -> EventReplay:
     """Take an event: let it wait, go back for it, or (too old to go back) apply it now.
 
-    first_ns: stamp of the first sample [ns]; BEFORE_ALL when it is unknown.
+    first_ns: stamp of the first sample [ns].
     """
-    previous = line.stamp_of(event.kind)
+    previous = replay.stamp_of(event.kind)
     if previous is not None and abs(event.stamp_ns - previous) <= config.event_merge_time * 1e9:
-        return line._replace(repeated_events=line.repeated_events + 1)
-    line = line._replace(latest=(*(e for e in line.latest if e.kind is not event.kind), event))
-    if event.stamp_ns > line.last_ns:
-        return _wait(line, event)
-    if event.stamp_ns <= line.checkpoints[0].after_ns:
-        if all(taken.stamp_ns <= first_ns for taken in line.latest):
-            return _all_along(config, line)
-        now = event._replace(stamp_ns=line.last_ns + 1)
-        return _wait(line._replace(late_events=line.late_events + 1), now)
-    return _rewind(config, line, event)
+        return replay._replace(repeated_events=replay.repeated_events + 1)
+    replay = replay._replace(latest=(*(e for e in replay.latest if e.kind is not event.kind), event))
+    if event.stamp_ns > replay.last_ns:
+        return _wait(replay, event)
+    if event.stamp_ns > replay.snapshots[0].before_ns:
+        return _rewind(config, replay, log, event, background)
+    replay = replay._replace(late_events=replay.late_events + 1)
+    if all(taken.stamp_ns <= first_ns for taken in replay.latest):
+        return _restart_payload(config, replay)
+    return _wait(replay, event._replace(stamp_ns=replay.last_ns + 1))
 
 
-def _all_along(config: IdentifierParameters, line: Timeline) -> Timeline:
-    """Every sample came after the events: forget a payload that was read as if they had not happened."""
-    core = estimator.anew(config, line.core, sorted(line.latest, key=_order))
-    return line._replace(core=core, checkpoints=(Checkpoint(line.last_ns, line.last_ns + 1, core),),
-                         blocks=(), kept=0, stale=0, applied=(), late_events=line.late_events + 1)
+def _restart_payload(config: IdentifierParameters, replay: EventReplay) -> EventReplay:
+    """Every sample came after the events: forget a payload that was estimated without them."""
+    estimators = estimator.restart_payload(config, replay.estimators, sorted(replay.latest, key=_order))
+    only = Snapshot(replay.cursor, replay.last_ns + 1, replay.last_ns, estimators)
+    return replay._replace(estimators=estimators, snapshots=(only,), applied=())
 
 
 def _order(event: CaptureEvent) -> tuple[int, bool]:
@@ -133,48 +122,40 @@ def _order(event: CaptureEvent) -> tuple[int, bool]:
     return event.stamp_ns, event.kind is EventKind.CAPTURE
 
 
-def _wait(line: Timeline, event: CaptureEvent) -> Timeline:
-    waiting = sorted((*line.waiting, event), key=_order)
-    return line._replace(waiting=tuple(waiting[:MOST_EVENTS]))
+def _wait(replay: EventReplay, event: CaptureEvent) -> EventReplay:
+    pending = sorted((*replay.pending, event), key=_order)
+    return replay._replace(pending=tuple(pending[:MOST_EVENTS]))
 
 
-def _run(config: IdentifierParameters, line: Timeline, block: list[Sample], *, ahead: bool = False
-         ) -> Timeline:
-    run = estimator.payload_ahead if ahead else estimator.advance
-    gone = min(line.stale, LET_GO)
-    while gone < line.stale and sum(map(len, line.blocks[:gone])) < len(block):
-        gone += 1
-    return line._replace(core=run(config, line.core, block), blocks=(*line.blocks[gone:], tuple(block)),
-                         stale=line.stale - gone, kept=line.kept + len(block), last_ns=block[-1].stamp_ns)
+def _next_snapshot(config: IdentifierParameters, replay: EventReplay, log: SampleLog) -> int:
+    """Return the row before which the next snapshot is due: the first, then one a fraction of rewind_time."""
+    if not replay.snapshots:
+        return replay.cursor
+    spacing_ns = max(int(config.rewind_time * 1e9) // SNAPSHOTS, 1)
+    due_ns = (replay.snapshots[-1].stamp_ns // spacing_ns + 1) * spacing_ns
+    return min(log.row_at(due_ns, replay.cursor), replay.snapshots[0].row + MOST_ROWS)
 
 
-def _last_ns(block: tuple[Sample, ...]) -> int:
-    return block[-1].stamp_ns
-
-
-def _checkpoint(config: IdentifierParameters, line: Timeline, stamp_ns: int) -> Timeline:
-    """Remember the estimator as it is before the sample at ``stamp_ns``; forget what is too old."""
-    kept = (*line.checkpoints, Checkpoint(line.last_ns, stamp_ns, line.core))
+def _snapshot(config: IdentifierParameters, replay: EventReplay, log: SampleLog) -> EventReplay:
+    """Remember the estimators as they are before the next row; forget what is too old."""
+    stamp_ns = int(log.rows(replay.cursor, replay.cursor + 1).stamp_ns[0])
+    kept = (*replay.snapshots, Snapshot(replay.cursor, stamp_ns, replay.last_ns, replay.estimators))
     oldest_needed = stamp_ns - int(config.rewind_time * 1e9)
-    too_many = line.kept >= MOST_SAMPLES
+    too_many = replay.cursor - kept[0].row >= MOST_ROWS
     while len(kept) > 1 and (kept[1].stamp_ns <= oldest_needed or too_many):
         kept = kept[1:]
-    start = kept[0].after_ns
-    stale = bisect_right(line.blocks, start, key=_last_ns)
-    return line._replace(checkpoints=kept, stale=stale,
-                         kept=line.kept - sum(map(len, line.blocks[line.stale:stale])),
-                         applied=tuple(e for e in line.applied if e.stamp_ns > start))
+    return replay._replace(snapshots=kept,
+                           applied=tuple((row, e) for row, e in replay.applied if row >= kept[0].row))
 
 
-def _rewind(config: IdentifierParameters, line: Timeline, event: CaptureEvent) -> Timeline:
-    """Go back to the last checkpoint not after the event, and run samples and events again from there."""
-    kept = tuple(c for c in line.checkpoints if c.after_ns < event.stamp_ns)
-    start = kept[-1].after_ns
-    first = bisect_right(line.blocks, start, key=_last_ns)
-    again = tuple(sample for block in line.blocks[first:] for sample in block)
-    redo = sorted((*(e for e in line.applied if e.stamp_ns > start), *line.waiting, event), key=_order)
-    back = line._replace(
-        core=kept[-1].core, checkpoints=kept, blocks=line.blocks[:first], kept=line.kept - len(again),
-        applied=tuple(e for e in line.applied if e.stamp_ns <= start),
-        waiting=tuple(redo), last_ns=start, rewinds=line.rewinds + 1)
-    return advance(config, back, again)
+def _rewind(config: IdentifierParameters, replay: EventReplay, log: SampleLog, event: CaptureEvent,
+            background: Background) -> EventReplay:
+    """Go back to the last snapshot not after the event, and take rows and events again from there."""
+    kept = tuple(one for one in replay.snapshots if one.before_ns < event.stamp_ns)
+    back = kept[-1]
+    again = sorted((*(e for row, e in replay.applied if row >= back.row), *replay.pending, event), key=_order)
+    before = replay._replace(
+        estimators=back.estimators, cursor=back.row, last_ns=back.before_ns, snapshots=kept,
+        applied=tuple((row, e) for row, e in replay.applied if row < back.row), pending=tuple(again),
+        rewinds=replay.rewinds + 1)
+    return advance(config, before, log, replay.cursor, background)

@@ -1,260 +1,349 @@
 """The one way through the house: messages in, estimates out.
 
-The live node calls ``take`` and ``read`` for each message, a replay and a study call ``run``. Both take the
-same path, so the same messages give the same estimates bit for bit.
+A message becomes a row of the sample log. The estimators are cursors into that log and take its rows in groups. The
+live node calls ``step`` for each message, a replay ``run`` for a recording: the same messages give the same
+estimates bit for bit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
 
 from flexmanip_ros import estimator, event_replay
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.identification.recursive_fit import Answer, Job
+from flexmanip_ros.identification import rpbsid
+from flexmanip_ros.numerics.background import INLINE, Background
 from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.payload import model_check
+from flexmanip_ros.payload.model_comparison import Verdict
 from flexmanip_ros.samples import sampling
-from flexmanip_ros.schedule import Due as Due
-from flexmanip_ros.schedule import Reading, instant_of, is_due, is_read_anew, is_young
-from flexmanip_ros.schedule import State as State
-from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, Sample
+from flexmanip_ros.samples.sample_log import SampleLog
+from flexmanip_ros.samples.sampling import Clock, Counters
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord
 
-GROUP_S, LEAST, GROUP, BLOCK = 0.003, 2, 20, 256
-"""Samples run through the compiled kernels at once: live those of a time [s], between least and most, so that
-none of them holds up the next for long; when replaying. The numbers are the same."""
-PATIENCE = 2000
+GROUP = 16
+"""Rows that a live node leaves pending at most. A group costs less than its rows one by one, and at 1 kHz takes
+0.4 ms, which delays a sample less than the 3 ms that an estimate may take."""
+RESULT_DELAY_S = 0.005
+"""Time from the row that a model is asked for at to the row at which it is taken [s]. Reading it takes 1 to 3 ms."""
+HOPELESS = 2000
 """Messages without a single usable one after which a replay gives up."""
+ROUNDING = 1e-6
+"""Share of an instant by which a stamp may fall short of it, for stamps that are rounded to nanoseconds."""
+
+Item = JointRecord | JointBlock | CaptureEvent
 
 
-def init() -> State:
-    """Start with nothing seen."""
-    return State()
+class PendingModel(NamedTuple):
+    """A model that was asked for at a row and is taken at row ``due``, or with the next estimate."""
+
+    request: estimator.ModelRequest
+    since_ns: int
+    """Stamp of the last event before it [ns]."""
+    instant: int
+    """Number of its instant on the grid of ``model_rate``."""
+    due: int
 
 
-def step(config: IdentifierParameters, state: State, item: JointRecord | CaptureEvent
-         ) -> tuple[State, tuple[Estimate, ...]]:
-    """Take one message; return the estimates that are due with it.
+class ModelEstimate(NamedTuple):
+    """The last model: its estimate, the event it came after, and its instant on the grid of ``model_rate``."""
 
-    Raises ParameterError when the configuration does not fit the signals that the messages carry.
-    """
-    return _all_read(*take(config, state, item))
+    estimate: Estimate
+    since_ns: int
+    instant: int
 
 
-def take(config: IdentifierParameters, state: State, item: JointRecord | CaptureEvent,
-         group: int | None = None) -> tuple[State, tuple[Due, ...]]:
-    """Take one message; return what is due with it, each to be given to ``read`` before the next message.
+class State(NamedTuple):
+    """Everything that the identifier remembers."""
 
-    Samples are run ``group`` at a time, by ``GROUP_S`` where it is None. Those before one that an estimate
-    waits for are not kept until then.
+    clock: Clock = Clock()
+    log: SampleLog = sampling.EMPTY
+    events: event_replay.EventReplay | None = None
+    """The estimators and the events."""
+    config: IdentifierParameters | None = None
+    """The configuration with the outputs that the messages really carry."""
+    early: tuple[CaptureEvent, ...] = ()
+    """Events that came before the first usable message."""
+    first_ns: int = 0
+    published: int = -1
+    """Number of the last instant of ``publish_rate``, counted from the first stamp."""
+    pending: PendingModel | None = None
+    model: ModelEstimate | None = None
+    verdicts: tuple[Verdict, ...] = ()
+    """What models so far say of the payloads that follow."""
+    keep_log: bool = False
+    """Keep every row of the log, for reports and scores."""
+
+    @property
+    def counters(self) -> Counters:
+        """What became of the messages."""
+        return self.clock.counters
+
+    def stamp_of(self, kind: EventKind) -> int | None:
+        """Return the stamp of the latest event of a kind [ns], None when there was none."""
+        return self.events.stamp_of(kind) if self.events is not None else None
+
+
+def init(*, keep_log: bool = False) -> State:
+    """Start with nothing known."""
+    return State(keep_log=keep_log)
+
+
+def step(config: IdentifierParameters, state: State, item: Item, background: Background = INLINE,
+         group: int = GROUP) -> tuple[State, tuple[Estimate, ...]]:
+    """Take a message, a block of messages or an event; return the estimates that are due with it.
+
+    An estimate with a new payload comes at once (``payload_is_new``); where its model is read, the model follows
+    in an estimate of the same stamp (``model_is_new``). Rows wait until an estimate is due, or ``group`` of them.
     Raises ParameterError when the configuration does not fit the signals that the messages carry.
     """
     if isinstance(item, CaptureEvent):
-        return _event(_run_held(state), item), ()
-    state, samples = _sample(config, state, item)
-    return _hold(state, samples, group)
+        return _insert(state, item, background), ()
+    estimates: list[Estimate] = []
+    taken, count = 0, len(item.stamp_ns) if isinstance(item, JointBlock) else 1
+    while taken < count:
+        if isinstance(item, JointBlock):
+            sampled, some = sampling.push_block(config, state.clock, state.log, item, taken)
+            stamp_ns = int(item.stamp_ns[taken])
+        else:
+            sampled, some, stamp_ns = sampling.push(config, state.clock, state.log, item), 1, item.stamp_ns
+        state = _sampled(config, state, sampled, stamp_ns, background)
+        state, found = catch_up(state, background, group)
+        estimates += found
+        taken += some
+    return state, tuple(estimates)
 
 
-def read(state: State, due: Due) -> tuple[State, Estimate]:
-    """Return the estimate that is due, its model read anew when it is time for that."""
-    line, config, last = state.timeline, state.config, state.reading
-    assert line is not None
-    assert config is not None
-    if last is not None and not is_read_anew(state, due):
-        return state, estimator.follow(config, due.stamp_ns, last.estimate, due.payload)
-    core = estimator.settle(config, due.core)
-    if due.core is line.core:
-        state = state._replace(timeline=line._replace(core=core))
-    # while an event may still come late no verdict is given: it would depend on when that came
-    estimate, verdicts = estimator.estimate(config, core, due.stamp_ns, state.sampling.dt, due.payload,
-                                            state.verdicts, compare=not is_young(state, due))
-    instant = instant_of(state, due.stamp_ns, config.model_rate)
-    reading = Reading(estimate, core.since_ns, instant) if estimate.model is not None else None
-    return state._replace(reading=reading, verdicts=verdicts), estimate
+def catch_up(state: State, background: Background = INLINE, group: int = 1) -> tuple[State, list[Estimate]]:
+    """Let the estimators take the rows of the log: the pipeline's table of contents.
 
-
-def payload(state: State) -> tuple[Payload | None, int]:
-    """Return the payload as of the last sample run, where it stands by itself, and its stamp [ns]."""
-    line, config = state.timeline, state.config
-    assert line is not None
-    assert config is not None
-    return estimator.payload(config, line.core, state.verdicts), line.last_ns
-
-
-def adopted(state: State, read: State) -> State:
-    """Return the state knowing the model with which ``read`` has answered an earlier one.
-
-    So a model may be read elsewhere while samples go on, if this is done before a sample comes for which
-    ``schedule.awaits`` an estimate. No change where all was forgotten since.
+    Rows up to each instant of ``publish_rate``, then the estimate that is due there; last the rows left over, if
+    they are ``group`` or more.
     """
-    if (state.timeline is None or state.config is not read.config
-            or state.counters.resets != read.counters.resets):
-        return state
-    return state._replace(reading=read.reading, verdicts=read.verdicts)
+    estimates: list[Estimate] = []
+    if state.events is None:
+        return state, estimates
+    for row in _due_rows(state, state.events):
+        state, model = _take_model(state, background)
+        state = _advance(state, row + 1, background)
+        state, estimate = _estimate(state, background)
+        estimates += [*model, *estimate]
+    state = _advance(state, state.log.end, background, least=group)
+    if state.pending is not None and state.log.end > state.pending.due:
+        state, model = _take_model(state, background)
+        estimates += model
+    return state, estimates
 
 
-def job(state: State) -> tuple[Job, int] | None:
-    """Return long work under way, and the samples until its result is taken.
-
-    Whoever has the time may ``solve`` it on another thread and give ``answered`` the result; otherwise it is
-    done when its turn comes. The numbers are the same.
-    """
-    line, config = state.timeline, state.config
-    return estimator.job(config, line.core) if line is not None and config is not None else None
-
-
-def answered(state: State, job: Job, answer: Answer) -> State:
-    """Return the state knowing the result of long work; no change where that work is over."""
-    line = state.timeline
-    if line is None:
-        return state
-    return state._replace(timeline=line._replace(core=estimator.answered(line.core, job, answer)))
-
-
-def run(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]) -> Iterator[Estimate]:
-    """Yield the estimates of a recording. Raises SignalError when none of its messages can be used."""
+def run(config: IdentifierParameters, items: Iterable[Item]) -> Iterator[Estimate]:
+    """Yield the estimates of a recording, one a stamp. Raises SignalError when no message can be used."""
     for _, estimate in replay(config, items):
         if estimate is not None:
             yield estimate
 
 
-def replay(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]
+def replay(config: IdentifierParameters, items: Iterable[Item], state: State | None = None
            ) -> Iterator[tuple[State, Estimate | None]]:
     """Yield the state with each estimate of a recording, and at the end the last state with None.
 
-    The same numbers as ``step`` on each item, faster. Raises SignalError when no message can be used.
+    Payload and model of one stamp come in one estimate. Raises SignalError when no message can be used.
     """
-    state = init()
+    last = init() if state is None else state
+
+    def all_estimates() -> Iterator[tuple[State, Estimate]]:
+        nonlocal last
+        for now, found in _steps(config, last, items):
+            last = now
+            yield from ((now, estimate) for estimate in found)
+
+    yield from _one_a_stamp(all_estimates())
+    check_used(last)
+    yield last, None
+
+
+def one_a_stamp(estimates: Iterable[Estimate]) -> Iterator[Estimate]:
+    """Yield the estimates of ``step`` as a replay does: payload and model of one stamp in one estimate."""
+    return (estimate for _, estimate in _one_a_stamp((init(), estimate) for estimate in estimates))
+
+
+def _one_a_stamp(estimates: Iterable[tuple[State, Estimate]]) -> Iterator[tuple[State, Estimate]]:
+    waiting: tuple[State, Estimate] | None = None
+    for state, estimate in estimates:
+        if waiting is not None and waiting[1].stamp_ns != estimate.stamp_ns:
+            yield waiting
+        waiting = state, estimate._replace(payload_is_new=True)
+    if waiting is not None:
+        yield waiting
+
+
+def _steps(config: IdentifierParameters, state: State, items: Iterable[Item]
+           ) -> Iterator[tuple[State, tuple[Estimate, ...]]]:
+    """Yield state and estimates after each message of a recording, and after its end."""
     for item in items:
-        state, ready = _all_read(*take(config, state, item, BLOCK))
-        yield from ((state, estimate) for estimate in ready)
-        if state.counters.accepted == 0 and state.counters.received >= PATIENCE:
+        state, found = step(config, state, item, group=HOPELESS)
+        yield state, found
+        if state.counters.accepted == 0 and state.counters.received >= HOPELESS:
             break
-    if state.config is not None:
-        clock, late = sampling.flush(state.config, state.sampling)
-        state, ready = _all_read(*_hold(state._replace(sampling=clock), late.samples, BLOCK))
-        yield from ((state, estimate) for estimate in ready)
-    state = _run_held(state)
-    check_used(state)
-    yield state, None
+    yield finish(config, state)
+
+
+def finish(config: IdentifierParameters, state: State, background: Background = INLINE
+           ) -> tuple[State, tuple[Estimate, ...]]:
+    """No message follows: take every row, and the model under way."""
+    if state.config is None:
+        return state, ()
+    sampled = sampling.flush(config, state.clock, state.log)
+    state = _sampled(config, state, sampled, state.first_ns, background)
+    state, estimates = catch_up(state, background)
+    state, model = _take_model(state, background)
+    return state, (*estimates, *model)
 
 
 def current(state: State) -> Estimate | None:
     """Return the estimate at the latest sample, whatever the publishing grid; None before the first.
 
-    As none followed: a fit under way is awaited.
+    A fit under way is awaited, as no sample follows.
     """
-    state = _run_held(state)
-    line, config = state.timeline, state.config
-    if line is None or config is None or line.last_ns == event_replay.BEFORE_ALL:
+    if state.events is None or state.config is None:
         return None
-    core = estimator.finish(config, line.core)
-    estimate, verdicts = estimator.estimate(config, core, line.last_ns, state.sampling.dt, None,
-                                            state.verdicts, compare=True)
-    payload = estimator.payload(config, core, verdicts)
+    state, _ = _take_model(_advance(state, state.log.end, INLINE), INLINE)
+    config, events = state.config, state.events
+    assert config is not None
+    assert events is not None
+    if events.cursor == 0:
+        return None
+    estimators = events.estimators
+    estimators = estimators._replace(rpbsid=rpbsid.finish(config, estimators.rpbsid))
+    request = estimator.ModelRequest(config, estimators, events.last_ns, state.clock.dt, None, compare=True)
+    estimate, verdict = request.solve()
+    payload = estimator.payload(config, estimators, _remember(state, verdict))
     if estimate.model is None:
         return estimate._replace(payload=payload)
-    return estimator.follow(config, line.last_ns, estimate, payload)._replace(model_is_new=True)
+    return estimator.with_model_of(config, events.last_ns, estimate, payload)._replace(model_is_new=True)
 
 
 def check_used(state: State) -> None:
     """Raise SignalError when messages came and none, or just one, could be used."""
-    refusal = state.sampling.refusal
-    if state.counters.accepted <= 1 and refusal is not None:
-        raise SignalError(refusal.problem, refusal.remedy)
+    rejection = state.clock.rejection
+    if state.counters.accepted <= 1 and rejection is not None:
+        raise SignalError(rejection.problem, rejection.remedy)
 
 
-def reconfigure(config: IdentifierParameters, state: State) -> State:
+def reconfigure(config: IdentifierParameters, state: State, background: Background = INLINE) -> State:
     """Go on with parameters that were changed while running (those declared ``live``)."""
-    state = _run_held(state)
-    line, before = state.timeline, state.config
+    before = state.config
     if before is None:
         return state
-    if line is not None:  # what came before the change is of the parameters before it
-        state = state._replace(timeline=line._replace(
-            core=estimator.settle(before, line.core),
-            checkpoints=tuple(one._replace(core=estimator.settle(before, one.core))
-                              for one in line.checkpoints)))
+    if state.events is not None:  # the samples before the change are estimated with the parameters before it
+        state = _advance(state, state.log.end, background)
     state = state._replace(config=replace(config, outputs=before.outputs))
-    if state.published < 0 or state.timeline is None:
+    if state.published < 0 or state.events is None:
         return state
-    last = instant_of(state, state.timeline.last_ns, config.publish_rate)
-    again = state.reading._replace(instant=-1) if state.reading is not None else None  # to be read anew
-    return state._replace(published=last, reading=again)
+    last = _instant(state, state.events.last_ns, config.publish_rate)
+    model = state.model._replace(instant=-1) if state.model is not None else None  # to be read again
+    return state._replace(published=last, model=model)
 
 
-def _event(state: State, event: CaptureEvent) -> State:
-    if state.timeline is None or state.config is None:
-        return state._replace(early=(*state.early, event)[-event_replay.MOST_EVENTS:])
-    return state._replace(timeline=event_replay.event(
-        state.config, state.timeline, event, state.first_ns))
-
-
-def _sample(config: IdentifierParameters, state: State, record: JointRecord
-            ) -> tuple[State, tuple[Sample, ...]]:
-    clock, sampled = sampling.step(config, state.sampling, record)
-    state = state._replace(sampling=clock)
+def _sampled(config: IdentifierParameters, state: State, sampled: sampling.Sampled, stamp_ns: int,
+             background: Background) -> State:
+    """Go on with clock and log after a message; build the estimators once the signals are known."""
     if sampled.reset:
-        state = State(sampling=clock, config=state.config)
-    if state.timeline is None and clock.outputs is not None:
-        state = _begin(config, state, record.stamp_ns)
-    return state, sampled.samples
-
-
-def _begin(config: IdentifierParameters, state: State, first_ns: int) -> State:
-    """Build the estimators for the outputs that are there, and give them the events that were early."""
-    assert state.sampling.outputs is not None
-    settled = config if config.outputs == state.sampling.outputs else replace(
-        config, outputs=state.sampling.outputs)
-    state = state._replace(config=settled, timeline=event_replay.Timeline(estimator.init(settled)),
-                           first_ns=first_ns, published=-1)
+        state = State(config=state.config, keep_log=state.keep_log)
+    state = state._replace(clock=sampled.clock, log=sampled.log)
+    outputs = sampled.clock.outputs
+    if state.events is not None or outputs is None:
+        return state
+    settled = config if config.outputs == outputs else replace(config, outputs=outputs)
     early = state.early
-    state = state._replace(early=())
+    state = state._replace(
+        config=settled, events=event_replay.EventReplay(estimator.init(settled)), first_ns=stamp_ns, published=-1,
+        early=())
     for event in early:
-        state = _event(state, event)
+        state = _insert(state, event, background)
     return state
 
 
-def _hold(state: State, samples: Iterable[Sample], group: int | None) -> tuple[State, tuple[Due, ...]]:
-    """Keep samples, and run what is kept: when it is many, at each publishing instant and just before one."""
-    config = state.config
-    if config is None or state.timeline is None:
-        return state, ()
-    due: list[Due] = []
-    dt, dt_ns = state.sampling.dt, 0
-    if group is None:
-        group, dt_ns = min(max(LEAST, round(GROUP_S / max(dt, 1e-9))), GROUP), int(dt * 1e9)
-    for sample in samples:
-        line, held = state.timeline, (*state.held, sample)
-        assert line is not None
-        if is_due(state, sample.stamp_ns):
-            line = event_replay.advance(config, line, held, ahead=True)
-            state = state._replace(
-                timeline=line, held=(), published=instant_of(state, sample.stamp_ns, config.publish_rate))
-            payload = estimator.payload(config, line.core, state.verdicts)
-            due.append(Due(sample.stamp_ns, line.core, payload))
-            continue
-        state = state._replace(held=held)
-        following = sample.stamp_ns + dt_ns
-        if (len(held) >= group or is_due(state, following)
-                or event_replay.is_checkpoint_due(config, line, following)):  # a group is run in one piece
-            state = _run_held(state)
-        elif len(line.core.owed) >= estimator.BATCH:
-            state = state._replace(timeline=line._replace(core=estimator.settle(config, line.core)))
-    return state, tuple(due)
-
-
-def _run_held(state: State) -> State:
-    """Run the samples that are kept."""
-    if not state.held:
-        return state
-    assert state.timeline is not None
+def _insert(state: State, event: CaptureEvent, background: Background) -> State:
+    if state.events is None or state.config is None:
+        return state._replace(early=(*state.early, event)[-event_replay.MOST_EVENTS:])
+    state = _advance(state, state.log.end, background)
+    assert state.events is not None
     assert state.config is not None
-    return state._replace(timeline=event_replay.advance(state.config, state.timeline, state.held), held=())
+    return state._replace(events=event_replay.insert(
+        state.config, state.events, state.log, event, state.first_ns, background))
 
 
-def _all_read(state: State, due: tuple[Due, ...]) -> tuple[State, tuple[Estimate, ...]]:
-    estimates = []
-    for one in due:
-        state, estimate = read(state, one)
-        estimates.append(estimate)
-    return state, tuple(estimates)
+def _advance(state: State, until: int, background: Background, least: int = 1) -> State:
+    """Let the estimators take the rows up to ``until``, if they are so many; drop rows that nothing reads any more."""
+    assert state.events is not None
+    assert state.config is not None
+    if until - state.events.cursor < least:
+        return state
+    events = event_replay.advance(state.config, state.events, state.log, until, background)
+    log = state.log if state.keep_log else state.log.from_row(event_replay.first_needed(events))
+    return state._replace(events=events, log=log)
+
+
+def _instant(state: State, stamp_ns: int, rate: float) -> int:
+    """Return the number of the instant at or before a stamp on the grid of a rate [Hz] from the first stamp on."""
+    return int((stamp_ns - state.first_ns) * rate * 1e-9 + ROUNDING)
+
+
+def _due_rows(state: State, events: event_replay.EventReplay) -> list[int]:
+    """Return the rows not taken yet that are the first at or after an instant of ``publish_rate``."""
+    assert state.config is not None
+    cursor = events.cursor
+    stamps = state.log.rows(cursor, state.log.end).stamp_ns
+    instants = ((stamps - state.first_ns) * state.config.publish_rate * 1e-9 + ROUNDING).astype(np.int64)
+    due = np.flatnonzero(np.diff(instants, prepend=state.published) > 0) + cursor
+    return [int(row) for row in due]
+
+
+def _estimate(state: State, background: Background) -> tuple[State, list[Estimate]]:
+    """Return the estimate due at the last row taken, and ask for its model when that is due.
+
+    A model is due by ``model_rate``, and with every estimate for as long after an event as another may arrive
+    late: so any order of arrival reads models at the same stamps. Meanwhile it is not compared with the payload,
+    as the result would depend on when the event arrived.
+    """
+    config, events = state.config, state.events
+    assert config is not None
+    assert events is not None
+    stamp_ns, since_ns, last = events.last_ns, events.estimators.since_ns, state.model
+    payload = estimator.payload(config, events.estimators, state.verdicts)
+    state = state._replace(published=_instant(state, stamp_ns, config.publish_rate))
+    settling_ns = (2.0 * config.rewind_time + 1.0 / config.publish_rate) * 1e9
+    young = stamp_ns - max(state.first_ns, since_ns) <= settling_ns
+    instant = _instant(state, stamp_ns, config.model_rate)
+    if last is not None and last.since_ns == since_ns and not young and instant <= last.instant:
+        return state, [estimator.with_model_of(config, stamp_ns, last.estimate, payload)]
+    request = estimator.ModelRequest(
+        config, events.estimators, stamp_ns, state.clock.dt, payload, compare=not young)
+    background.start(request)
+    due = events.cursor - 1 + int(np.ceil(RESULT_DELAY_S / max(state.clock.dt, 1e-9)))
+    state = state._replace(pending=PendingModel(request, since_ns, instant, due))
+    if payload is None:  # it rests on the model
+        return state, []
+    if last is None:
+        return state, [estimator.without_model(config, stamp_ns, payload)]
+    return state, [estimator.with_model_of(config, stamp_ns, last.estimate, payload)]
+
+
+def _take_model(state: State, background: Background) -> tuple[State, list[Estimate]]:
+    """Take the model under way, if there is one; what it says of the payload counts from the next estimate on."""
+    pending = state.pending
+    if pending is None:
+        return state, []
+    estimate, verdict = background.result(pending.request)
+    model = None if estimate.model is None else ModelEstimate(estimate, pending.since_ns, pending.instant)
+    state = state._replace(pending=None, model=model, verdicts=_remember(state, verdict))
+    return state, [estimate._replace(payload_is_new=pending.request.payload is None)]
+
+
+def _remember(state: State, verdict: Verdict | None) -> tuple[Verdict, ...]:
+    assert state.config is not None
+    return model_check.remember(state.verdicts, verdict, int(2e9 * state.config.rewind_time))

@@ -39,6 +39,23 @@ class JointRecord(NamedTuple):
     effort: Array
 
 
+class JointBlock(NamedTuple):
+    """N consecutive JointStates that share names and layout.
+
+    stamp_ns: (N,); position: (N, j) or (N, 0) [rad or m], velocity: the same, effort: the same [N m].
+    """
+
+    names: tuple[str, ...]
+    stamp_ns: NDArray[np.int64]
+    position: Array
+    velocity: Array
+    effort: Array
+
+    def record(self, k: int) -> JointRecord:
+        """Return message number k."""
+        return JointRecord(int(self.stamp_ns[k]), self.names, self.position[k], self.velocity[k], self.effort[k])
+
+
 class Sample(NamedTuple):
     """One instant of the configured signals, in JointState units.
 
@@ -136,6 +153,8 @@ class Estimate(NamedTuple):
     """What the model is worth; ``status`` is that of the payload where one is estimated beside the model."""
     model_is_new: bool = True
     """Whether model and modes were read at this stamp, or are those of an estimate before."""
+    payload_is_new: bool = True
+    """Whether the payload has not been in an estimate of this stamp before."""
     modes_deviation: float = float('nan')
     """How far the model's modes are from those of the arm with this payload, over what is tolerated: beyond 1
     they disagree; nan where there was nothing to compare."""

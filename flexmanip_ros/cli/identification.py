@@ -17,7 +17,8 @@ from flexmanip_ros.io.outputs import Outputs, TableOutput, open_output
 from flexmanip_ros.io.table import check_place
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload.detected_events import with_detected
-from flexmanip_ros.samples.history import History, Signals
+from flexmanip_ros.samples import sampling
+from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies import holdout
 from flexmanip_ros.studies.achievable import payload_std
 from flexmanip_ros.studies.summary import Summary, summarize
@@ -90,7 +91,7 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
     last = pipeline.current(state)
     summary = summarize(state, last, time.perf_counter() - started)
     scores = None
-    signals = None if feed.history is None else feed.history.signals()
+    signals = feed.signals() if feed.is_kept else None
     if request.validate_from is not None and signals is not None:
         scores = holdout.score(None if last is None else last.model, signals, request.validate_from)
         summary = replace(summary, vaf_simulation_percent=tuple(scores.simulation.tolist()),
@@ -99,7 +100,7 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
     if request.report is not None and signals is not None:
         _report(request, summary, feed, kept, signals, last, scores, state, fault)
     return Result(
-        summary, () if last is None else last.modes, state.sampling.outputs or request.config.outputs,
+        summary, () if last is None else last.modes, state.clock.outputs or request.config.outputs,
         tuple(str(place) for place in (request.output, request.report) if place is not None), fault,
         feed.interrupted, _remark(state, feed.foreign))
 
@@ -116,8 +117,8 @@ class _Feed:
         self._joints = {name.rpartition('/')[0] for name in (*config.inputs, *config.outputs, *config.angles)}
         self.first_ns: int | None = None
         self.events: list[CaptureEvent] = []
-        wanted = request.report is not None or request.validate_from is not None
-        self.history = History(request.config) if wanted else None
+        self.is_kept = request.report is not None or request.validate_from is not None
+        self._clock, self._log = sampling.Clock(), sampling.EMPTY
         self._request = request
         self._progress = progress
 
@@ -137,8 +138,8 @@ class _Feed:
     def _pass(self, item: bag.Item) -> Iterator[bag.Item]:
         if isinstance(item, JointRecord):
             self.foreign += self._joints.isdisjoint(item.names)
-            if self.history is not None:
-                self.history.add(item)
+            if self.is_kept:
+                self._clock, self._log, _ = sampling.push(self._request.config, self._clock, self._log, item)
             if self.first_ns is None:
                 self.first_ns = item.stamp_ns
                 yield from self._known_events(item.stamp_ns)
@@ -147,6 +148,11 @@ class _Feed:
         if isinstance(item, CaptureEvent):
             self.events.append(item)
         yield item
+
+    def signals(self) -> Signals:
+        """Return the samples of the recording, held-out ones included."""
+        clock, log, _ = sampling.flush(self._request.config, self._clock, self._log)
+        return sampling.signals(self._request.config, clock, log)
 
     def _known_events(self, first_ns: int) -> Iterator[CaptureEvent]:
         for at, kind in ((self._request.capture_time, EventKind.CAPTURE),
@@ -165,7 +171,7 @@ class _Feed:
 
 def _dropped(state: pipeline.State) -> FlexmanipError | None:
     """Return what was wrong with messages that had to be left out; repeated stamps and gaps are a status."""
-    counters, refusal = state.counters, state.sampling.refusal
+    counters, refusal = state.counters, state.clock.rejection
     faulty = counters.not_finite + counters.unequal_sizes
     if not faulty or refusal is None:
         return None
@@ -179,7 +185,7 @@ def _remark(state: pipeline.State, foreign: int) -> str:
 
     foreign: messages of other publishers on the same topic, which nobody misses.
     """
-    counters, line = state.counters, state.timeline
+    counters, line = state.counters, state.events
     left_out = [f'{count} {why}' for count, why in (
         (counters.missing_signal - foreign, 'without a configured signal'),
         (counters.late_stamp, 'with a stamp older than the one before'),
@@ -190,7 +196,7 @@ def _remark(state: pipeline.State, foreign: int) -> str:
                     'the result is of what came after')
     if line is not None:
         said += [f'a {event.kind.value} is announced for after the last sample and was not applied'
-                 for event in line.waiting if event in line.latest]
+                 for event in line.pending if event in line.latest]
         if line.late_events:
             said.append(f'{line.late_events} events arrived more than rewind_time after their stamp; '
                         'they were applied on arrival')
@@ -207,7 +213,7 @@ def _report(request: Request, summary: Summary, feed: _Feed, kept: list[Estimate
     made = pictures.run(config, signals, kept, feed.events)
     bound, mass = None, summary.payload_mass_kg
     if summary.capture_time_s is not None and mass is not None:
-        bound = payload_std(config, signals, summary.capture_time_s, mass, state.sampling.dt)
+        bound = payload_std(config, signals, summary.capture_time_s, mass, state.clock.dt)
     counts: dict[str, Any] = {**state.counters._asdict(), 'dropped': state.counters.dropped}
     report.identification_report(
         request.report, Path(request.bag).name, config, summary, made,

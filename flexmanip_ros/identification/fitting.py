@@ -1,11 +1,10 @@
-"""The work that a ``recursive_fit.Job`` asks for, and its place among the samples."""
+"""The work that a ``recursive_fit.FitRequest`` asks for, and its place among the samples."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from flexmanip_ros.identification import model_output, recursive_fit
@@ -21,8 +20,10 @@ from flexmanip_ros.identification.factor import Kinds
 from flexmanip_ros.identification.moments import triangle
 from flexmanip_ros.identification.prediction_error import derivatives, moved, run
 from flexmanip_ros.identification.prediction_error_kernel import condition
-from flexmanip_ros.identification.recursive_fit import Answer, Job, Refined
+from flexmanip_ros.identification.recursive_fit import FitRequest, FitResult, Refined
+from flexmanip_ros.numerics.background import Background
 from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Array
 
 MEMORY = 1_000_000.0
@@ -39,30 +40,31 @@ LARGEST_DRIFT = 1.4
 """Logarithm of the largest factor on a variance from one block."""
 
 
-def solve(config: IdentifierParameters, job: Job) -> Answer:
+def solve(request: FitRequest) -> FitResult:
     """Make the fit."""
     try:
-        if job.R is None or job.scale is None:
-            assert job.old is not None
-            return Answer(_block(job.old, np.vstack(job.chunks)))
-        return Answer(_stretch(config, job, job.R, job.scale))
+        if request.R is None or request.scale is None:
+            assert request.old is not None
+            return FitResult(_block(request.old, request.rows.u_y))
+        return FitResult(_stretch(request, request.R, request.scale))
     except np.linalg.LinAlgError:
-        return Answer(None, failed=True)
+        return FitResult(None, failed=True)
 
 
-def _stretch(config: IdentifierParameters, job: Job, R: Array, scale: Array) -> Recursion | None:
-    """Fit the whole stretch, see ``stretch.fit_stretch``, from the subspace model of one or two windows."""
+def _stretch(request: FitRequest, R: Array, scale: Array) -> Recursion | None:
+    """Fit the whole stretch, see ``batch_fit.fit_stretch``, from the subspace model of one or two windows."""
+    config = request.config
     starts = [model_output.from_factor(config, R, scale)]
     if config.order > len(config.outputs) and config.past_window > config.future_window:
         longer = replace(config, future_window=config.past_window)
         starts.append(model_output.from_factor(longer, R, scale))
     found = fit_stretch(
-        np.vstack(job.chunks), [realized for realized, _, _ in starts if realized is not None],
-        [fit for fit in (job.old, job.older) if fit is not None],
+        request.rows.u_y, [realized for realized, _, _ in starts if realized is not None],
+        [fit for fit in (request.old, request.older) if fit is not None],
         starts[0][2], config.direct_feedthrough, 'sensor' if config.refinement == 'output_error' else 'any')
     if found is None or found.going == 0.0:
         return found
-    return found._replace(behind=job.later / BLOCK + 1.0)  # the arm goes on until it is read
+    return found._replace(behind=request.later / BLOCK + 1.0)  # the arm goes on until it is read
 
 
 def _block(old: Recursion, samples: Array) -> Recursion | None:
@@ -167,41 +169,41 @@ def going(went: Array, before: Array, after: Array) -> tuple[float, float]:
     return share, share * (AGE + lag)
 
 
-def refine(
-    config: IdentifierParameters, refined: Refined, samples: Array, stamps_ns: NDArray[np.int64], fate: Kinds,
-    R: Array, scale: Array,
-) -> Refined:
-    """Hand samples to the prediction-error fit; ask for the work that is due, take that which was.
+def refine(config: IdentifierParameters, refined: Refined, rows: Rows, outcome: Kinds, R: Array, scale: Array,
+           background: Background) -> Refined:
+    """Hand rows to the prediction-error fit; ask for the work that is due, take the result that is due.
 
-    samples: (N, r + m), N <= until_chunk(refined); stamps_ns: (N,), all 0 where unknown; R, scale: factor of
-    the moments and scale after them.
-
-    Refused samples break the stretch, and so do quiet ones: there is nothing to learn from them.
+    rows: at most until_chunk(refined); outcome: (N,) of each; R, scale: factor of the moments and scale after
+    them. Rejected samples break the stretch, and so do quiet ones: there is nothing to learn from them.
     """
-    start = 0
-    for k in np.flatnonzero(fate):
-        refined = recursive_fit.take(refined, samples[start:k], stamps_ns[start]) if k > start else refined
-        refined = broken(config, refined)
-        start = int(k) + 1
-    if start == len(samples):
+    first = rows.first
+    for k in np.flatnonzero(outcome):
+        row = rows.first + int(k)
+        refined = recursive_fit.take(refined, rows.between(first, row)) if row > first else refined
+        refined = recursive_fit.skip(broken(refined, background))
+        first = row + 1
+    if first == rows.until:
         return refined
-    refined = recursive_fit.take(refined, samples[start:], stamps_ns[start])
-    if refined.job is not None and refined.total >= refined.due:
-        refined = delivered(config, refined)
+    refined = recursive_fit.take(refined, rows.between(first, rows.until))
+    if refined.request is not None and refined.end >= refined.due:
+        refined = delivered(refined, background)
+    before = refined.request
     if recursive_fit.is_fit_due(refined):
-        refined = recursive_fit.ask_fit(refined, R, scale, int(stamps_ns[-1]))
+        refined = recursive_fit.ask_fit(config, refined, rows, R, scale)
     elif recursive_fit.is_block_due(refined):
-        refined = recursive_fit.ask_block(refined, int(stamps_ns[-1]))
+        refined = recursive_fit.ask_block(config, refined, rows)
+    if refined.request is not None and refined.request is not before:
+        background.start(refined.request)
     return refined
 
 
-def broken(config: IdentifierParameters, refined: Refined) -> Refined:
+def broken(refined: Refined, background: Background) -> Refined:
     """Samples are missing: take what is under way, and begin another stretch."""
-    return recursive_fit.break_window(delivered(config, refined)) if refined.total > 0 else refined
+    return recursive_fit.break_window(delivered(refined, background)) if refined.total > 0 else refined
 
 
-def delivered(config: IdentifierParameters, refined: Refined) -> Refined:
-    """Take the result of the fit under way, computed here and now if nobody did."""
-    if refined.job is None:
+def delivered(refined: Refined, background: Background) -> Refined:
+    """Take the result of the fit under way."""
+    if refined.request is None:
         return refined
-    return recursive_fit.deliver(refined, refined.answer or solve(config, refined.job))
+    return recursive_fit.deliver(refined, background.result(refined.request))

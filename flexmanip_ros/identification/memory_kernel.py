@@ -118,7 +118,7 @@ def memory(scalars: Array, counts: Array, beta: float, mode: int) -> float:
     if mode == CONSTANT:  # as the paper has it; only what would end in 0/0 is kept out
         quiet = 1e-12
         lively = 1e-11
-    if scalars[ENERGY] > 0.0:
+    if scalars[ENERGY] > 0.0:  # noqa: SIM108
         ratio = scalars[LATELY] / scalars[ENERGY]
     else:  # the first sample: signals that have stood still since the start say nothing
         ratio = 1.0 if scalars[LATELY] > 0.0 else 0.0

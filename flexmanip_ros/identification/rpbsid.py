@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.identification import (
@@ -27,7 +26,9 @@ from flexmanip_ros.identification.factor import Kinds
 from flexmanip_ros.identification.memory_kernel import FILLED, POWER, PRIOR, USED, WEIGHT, WEIGHT2
 from flexmanip_ros.identification.moments import solve_regressor
 from flexmanip_ros.identification.uncertainty import Identified
+from flexmanip_ros.numerics.background import INLINE, Background
 from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.samples.sample_log import Rows, SampleLog, Width
 from flexmanip_ros.types import Array, Status
 
 MODES = {
@@ -44,7 +45,8 @@ class RpbsidState(NamedTuple):
     z: (p (r + m),) past window, scaled; scale: (r + m,); mean: (2, r + m) slow means and peaks;
     variance: (m,) of the innovations, scaled; scalars, counts: see ``memory_kernel``;
     memory: the arrays of the estimator, in the order its kernel takes them; refined: the prediction-error
-    fit, None where it is off; decimator: the anti-alias filter, None where every sample is used.
+    fit, None where it is off; decimator: the anti-alias filter, None where every sample is used; decimated: the
+    log of filtered samples, where it is used; cursor: row of the sample log that is taken next.
     """
 
     z: Array
@@ -56,13 +58,15 @@ class RpbsidState(NamedTuple):
     memory: tuple[Array, ...]
     refined: recursive_fit.Refined | None
     decimator: decimation.Decimator | None
+    decimated: SampleLog | None
+    cursor: int = 0
 
     def owned(self) -> RpbsidState:
         """Return a state whose arrays may be overwritten."""
         return RpbsidState(
             self.z.copy(), self.scale.copy(), self.mean.copy(), self.variance.copy(), self.scalars.copy(),
             self.counts.copy(), tuple(array.copy() for array in self.memory), self.refined,
-            self.decimator)
+            self.decimator, self.decimated, self.cursor)
 
 
 def init(config: IdentifierParameters) -> RpbsidState:
@@ -75,8 +79,9 @@ def init(config: IdentifierParameters) -> RpbsidState:
     return RpbsidState(
         z=np.zeros(p * (r + m)), scale=np.zeros(r + m), mean=np.zeros((2, r + m)), variance=np.zeros(m),
         scalars=scalars, counts=np.zeros(memory_kernel.COUNTS, dtype=np.int64), memory=memory,
-        refined=recursive_fit.start(r + m) if _is_refined(config, r, m) else None,
-        decimator=decimation.start(config.decimation, r + m) if config.decimation > 1 else None)
+        refined=recursive_fit.start(0) if _is_refined(config, r, m) else None,
+        decimator=decimation.start(config.decimation, r + m) if config.decimation > 1 else None,
+        decimated=SampleLog(Width(r, m, 0)) if config.decimation > 1 else None)
 
 
 def _is_refined(config: IdentifierParameters, r: int, m: int) -> bool:
@@ -109,53 +114,71 @@ def _paper_memory(config: IdentifierParameters, r: int, m: int) -> tuple[Array, 
         np.eye(n, f * m), np.eye(n), np.zeros(d2 + 1))
 
 
-def step(config: IdentifierParameters, state: RpbsidState, u: Array, y: Array) -> RpbsidState:
-    """Take one sample u (r,), y (m,) in JointState units. Pure: the state given is left as it was."""
-    return advance(config, state, np.asarray(u, dtype=float)[None], np.asarray(y, dtype=float)[None])
+def advance(config: IdentifierParameters, state: RpbsidState, rows: Rows, background: Background = INLINE
+            ) -> RpbsidState:
+    """Take the next N rows of the sample log: the same bits as one by one, with one copy of the state.
 
-
-def advance(
-    config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array,
-    stamps_ns: NDArray[np.int64] | None = None,
-) -> RpbsidState:
-    """Take N samples U (N, r), Y (N, m): the same bits as N steps, one copy of the state.
-
-    stamps_ns: (N,), so that long work gets its time at any sample rate (``recursive_fit.patience``).
-    A sample that is not finite is refused and breaks the window. Raises SignalError on wrong sizes.
+    Pure: the state given is left as it was. A sample that is not finite is rejected and breaks the window.
+    Raises SignalError on wrong sizes.
     """
     r, m = len(config.inputs), len(config.outputs)
-    U = np.ascontiguousarray(U, dtype=float)
-    Y = np.ascontiguousarray(Y, dtype=float)
-    if U.ndim != 2 or Y.ndim != 2 or U.shape[1] != r or Y.shape[1] != m or len(U) != len(Y):
+    width = rows.log.width
+    if (width.inputs, width.outputs) != (r, m):
         raise SignalError(
-            f'samples of shapes {U.shape} and {Y.shape} do not fit {r} inputs and {m} outputs',
-            'give as many rows of both, one column per configured signal')
-    stamps = np.zeros(len(U), dtype=np.int64) if stamps_ns is None else stamps_ns
+            f'samples of {width.inputs} inputs and {width.outputs} outputs do not fit {r} inputs and {m} outputs',
+            'give one column per configured signal')
+    for part in rows.stretches():
+        if part.gap[0]:
+            state = window_restart(config, state, background)
+        state = _advance(config, state, part, background)
+    return state._replace(cursor=rows.until)
+
+
+def first_needed(state: RpbsidState) -> int:
+    """Return the first row of the sample log that will be read again."""
+    if state.refined is None or state.decimated is not None:
+        return state.cursor
+    return recursive_fit.first_needed(state.refined)
+
+
+def _advance(config: IdentifierParameters, state: RpbsidState, rows: Rows, background: Background
+             ) -> RpbsidState:
+    """Take rows without a gap among them."""
     new = state.owned()
-    if new.decimator is not None:
-        filtered, kept, at = decimation.decimate(new.decimator, np.hstack([U, Y]), config.decimation)
-        new, stamps = new._replace(decimator=filtered), stamps[at]
-        U, Y = np.ascontiguousarray(kept[:, :r]), np.ascontiguousarray(kept[:, r:])
-    done = 0
-    while done < len(U):
-        count = len(U) - done
+    if new.decimator is not None and new.decimated is not None:
+        new, rows = _decimate(config, new, new.decimator, new.decimated, rows)
+    done = rows.first
+    while done < rows.until:
+        until = rows.until
         if new.refined is not None:
-            count = min(count, recursive_fit.until_chunk(new.refined))
-        u, y = U[done:done + count], Y[done:done + count]
-        fate = _run(config, new, u, y)
+            until = min(until, done + recursive_fit.until_chunk(new.refined))
+        some = rows.between(done, until)
+        outcome = _run(config, new, np.ascontiguousarray(some.u), np.ascontiguousarray(some.y))
         if new.refined is not None:
             new = new._replace(refined=fitting.refine(
-                config, new.refined, np.hstack([u, y]), stamps[done:done + count], fate, new.memory[0],
-                new.scale))
-        done += count
+                config, new.refined, some, outcome, new.memory[0], new.scale, background))
+        done = until
     return new
+
+
+def _decimate(config: IdentifierParameters, state: RpbsidState, decimator: decimation.Decimator,
+              log: SampleLog, rows: Rows) -> tuple[RpbsidState, Rows]:
+    """Filter rows; return those of the decimated log that they complete."""
+    decimator, kept, at = decimation.decimate(decimator, rows.u_y, config.decimation)
+    r = log.width.inputs
+    first = log.end
+    if state.refined is not None:
+        log = log.from_row(recursive_fit.first_needed(state.refined))
+    log = log.append(rows.stamp_ns[at], kept[:, :r], kept[:, r:], np.zeros((len(at), 0)),
+                     np.zeros(len(at), dtype=np.bool_))
+    return state._replace(decimator=decimator, decimated=log), log.rows(first, log.end)
 
 
 def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array) -> Kinds:
     """Run the compiled kernel, overwriting the arrays of the state; return what became of each sample."""
     recursive = config.estimator == 'paper'  # stale states: it must forget
     mode = MODES['excitation' if recursive and config.forgetting == 'innovation' else config.forgetting]
-    fate = np.zeros(len(U), dtype=np.int8)
+    outcome = np.zeros(len(U), dtype=np.int8)
     if config.estimator == 'paper':
         common: tuple[Any, ...] = (
             state.z, state.scale, state.mean, state.variance, state.scalars, state.counts)
@@ -165,39 +188,24 @@ def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array) -
             np.array(config.regularization), np.array(config.forgetting_factor), mode)
         memory: tuple[Any, ...] = state.memory
         paper_recursion.advance_paper(U, Y, *memory, *common, *options)
-        return fate
+        return outcome
     R, row, scratch, peaks, prior = state.memory
     factor.advance_factor(
         U, Y, R, state.z, row, scratch, peaks, prior, state.scale, state.mean, state.variance, state.scalars,
         state.counts, config.past_window, int(config.direct_feedthrough), config.regularization[0],
-        config.forgetting_factor[0], mode, fate)
-    return fate
+        config.forgetting_factor[0], mode, outcome)
+    return outcome
 
 
-def job(state: RpbsidState) -> tuple[recursive_fit.Job, int] | None:
-    """Return the fit under way, its result not known, and the samples until that is taken."""
-    refined = state.refined
-    if refined is None or refined.job is None or refined.answer is not None:
-        return None
-    return refined.job, refined.due - refined.total
-
-
-def answered(state: RpbsidState, job: recursive_fit.Job, answer: recursive_fit.Answer) -> RpbsidState:
-    """Return the state knowing the result of ``job``, for when its turn comes; no change if it is over."""
-    refined = state.refined
-    if refined is None or refined.job is not job:
-        return state
-    return state._replace(refined=refined._replace(answer=answer))
-
-
-def finish(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
+def finish(config: IdentifierParameters, state: RpbsidState, background: Background = INLINE) -> RpbsidState:
     """No sample follows: take the result of the fit under way now."""
     if state.refined is None:
         return state
-    return state._replace(refined=fitting.delivered(config, state.refined))
+    return state._replace(refined=fitting.delivered(state.refined, background))
 
 
-def window_restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
+def window_restart(config: IdentifierParameters, state: RpbsidState, background: Background = INLINE
+                   ) -> RpbsidState:
     """Samples are missing: no regressor will straddle the gap; what was learnt is kept."""
     new = state.owned()
     new.counts[FILLED] = 0
@@ -206,17 +214,17 @@ def window_restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidSt
     if new.decimator is not None:
         new = new._replace(decimator=decimation.restart(new.decimator))
     if new.refined is not None:
-        new = new._replace(refined=fitting.broken(config, new.refined))
+        new = new._replace(refined=fitting.broken(new.refined, background))
     return new
 
 
-def restart(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
+def restart(config: IdentifierParameters, state: RpbsidState, background: Background = INLINE) -> RpbsidState:
     """Take note that the plant changed at this instant (capture, release).
 
     The window restarts and, if so configured, the information. Parameters stay as prior mean, worth
     ``regularization`` on signals of unit peak.
     """
-    new = window_restart(config, state)
+    new = window_restart(config, state, background)
     if new.refined is not None:
         new = new._replace(refined=recursive_fit.restart(new.refined))
     if not config.restart_on_event or not new.counts[USED]:
@@ -269,7 +277,3 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> I
         return found._replace(status=Status.WARMING_UP)  # a short past is biased, and no fit has been made
     return found
 
-
-def reset(config: IdentifierParameters, state: RpbsidState) -> RpbsidState:
-    """Forget everything (a looped bag, numbers out of range)."""
-    return init(config)

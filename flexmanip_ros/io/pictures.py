@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 
 from flexmanip_ros.io import plots
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.samples.history import History, Signals
+from flexmanip_ros.samples import sampling
+from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.holdout import Scores
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointRecord
 
@@ -55,13 +56,9 @@ class Run:
 def collect(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent],
             estimates: Sequence[Estimate], truth: Truth | None = None) -> Run:
     """Return a run from the messages that went in and the estimates that came out."""
-    history, seen = History(config), []
-    for item in items:
-        if isinstance(item, CaptureEvent):
-            seen.append(item)
-        else:
-            history.add(item)
-    return run(config, history.signals(), estimates, seen, truth)
+    items = list(items)
+    seen = [item for item in items if isinstance(item, CaptureEvent)]
+    return run(config, sampling.collect(config, items), estimates, seen, truth)
 
 
 def run(config: IdentifierParameters, signals: Signals, estimates: Sequence[Estimate],

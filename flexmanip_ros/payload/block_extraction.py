@@ -6,7 +6,7 @@ stiffness; h = 2 kappa modal coordinates; the state is [eta; eta'] with eta = [e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,8 @@ from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import block_interval, block_truncation
 from flexmanip_ros.payload.angles import chords
 from flexmanip_ros.payload.modal_basis import sensor_matrix
-from flexmanip_ros.types import Array, Payload, Sample, Status
+from flexmanip_ros.samples.sample_log import Rows
+from flexmanip_ros.types import Array, Payload, Status
 
 
 def extract(
@@ -80,16 +81,16 @@ def estimate(config: IdentifierParameters, identified: Identified, angles: Array
     return block_interval.payload(identified, *seen, mass_of, doubts_of)
 
 
-def sweep(config: IdentifierParameters, before: Array, samples: Sequence[Sample]) -> Array:
-    """Return the smallest and largest cosine between the links (2,), after more samples.
+def sweep(config: IdentifierParameters, before: Array, rows: Rows) -> Array:
+    """Return the smallest and largest cosine between the links (2,), after more rows.
 
     Kept only where it matters: M_b is taken from the arm (it varies with that cosine) and the arm moves.
     """
     payload = config.payload
     if (config.payload_method != 'block' or not payload.known_coupling or payload.dynamics == 'linear'
-            or samples[0].angles.shape != (2,)):
+            or rows.angles.shape[1] != 2):
         return before
-    theta = np.array([chords(config.arm, sample.angles) for sample in samples])
+    theta = np.array([chords(config.arm, angles) for angles in rows.angles])
     cosines = np.concatenate([before, np.cos(theta[:, 1] - theta[:, 0])])
     return np.array([cosines.min(), cosines.max()])
 

@@ -8,7 +8,6 @@ quite fit (unmodelled shortening, omitted modes) does not trip it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +18,8 @@ from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
 from flexmanip_ros.payload import capture_detection_kernel as kernel
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured
-from flexmanip_ros.types import CaptureEvent, EventKind, Sample
+from flexmanip_ros.samples.sample_log import Rows
+from flexmanip_ros.types import CaptureEvent, EventKind
 
 SETTLE = 0.5
 """Seconds after the start or an event before the next can be told."""
@@ -44,8 +44,8 @@ class DetectionState:
     """Outputs that are looked at."""
     watch: kernel.Watch | None = None
     dt: float = 0.0
-    stamps: tuple[int, ...] = ()
-    """Stamps of the last samples, to date an onset."""
+    since: int | None = None
+    """Row of the sample log with which it started, or after the last gap; an onset is not dated before it."""
 
 
 def init(config: TriggerParameters) -> DetectionState:
@@ -59,34 +59,34 @@ def init(config: TriggerParameters) -> DetectionState:
     return DetectionState(settings, structured.init(settings), kept)
 
 
-def step(
-    config: TriggerParameters, state: DetectionState, sample: Sample,
-) -> tuple[DetectionState, CaptureEvent | None]:
-    """Take one sample; return the event it reveals, dated at its onset."""
-    state, events = advance(config, state, (sample,))
-    return state, events[0] if events else None
+def first_needed(state: DetectionState) -> int:
+    """Return the first row of the sample log that will be read again."""
+    first = structured.first_needed(state.filter)
+    if state.since is None:
+        return first
+    window = state.filter.cursor if state.watch is None else state.watch.trace.shape[0]
+    return min(first, max(state.since, state.filter.cursor - window))
 
 
 def advance(
-    config: TriggerParameters, state: DetectionState, samples: Sequence[Sample],
+    config: TriggerParameters, state: DetectionState, rows: Rows,
 ) -> tuple[DetectionState, tuple[CaptureEvent, ...]]:
-    """Take samples in the order of their stamps; return the events found, the same as one by one."""
+    """Take the next rows of the sample log; return the events found, the same as one by one."""
     found: list[CaptureEvent] = []
-    left = [sample._replace(y=sample.y[list(state.kept)]) for sample in samples]
-    while left and state.filter.model is not None:
+    rows = rows.with_outputs(state.kept)
+    while len(rows) and state.filter.model is not None:
+        one = rows.between(rows.first, rows.first + 1)
         if state.watch is None or state.filter.memory is None:
-            state = _start(config, state, left[0])
-            left = left[1:]
-            continue
-        gap = next((i for i, sample in enumerate(left) if sample.gap), len(left))
-        if gap == 0:
-            state = _resume(config, state, left[0])
-            left = left[1:]
-            continue
-        state, taken, event = _watch(config, state, left[:gap])
-        left = left[taken:]
-        if event is not None:
-            found.append(event)
+            state = _start(config, state, one)
+            rows = rows.since(one.until)
+        elif rows.gap[0]:
+            state = _resume(config, state, one)
+            rows = rows.since(one.until)
+        else:
+            state, event = _watch(config, state, rows.stretches()[0])
+            rows = rows.since(state.filter.cursor)
+            if event is not None:
+                found.append(event)
     return state, tuple(found)
 
 
@@ -109,13 +109,13 @@ def threshold(config: TriggerParameters, dt: float) -> float:
     return float(chi2.isf(chance, kernel.CAUSES))
 
 
-def _start(config: TriggerParameters, state: DetectionState, sample: Sample) -> DetectionState:
+def _start(config: TriggerParameters, state: DetectionState, row: Rows) -> DetectionState:
     """Let the filter start; then allocate the watch for its sample time."""
-    stamps = (*state.stamps, sample.stamp_ns)
-    state = replace(state, filter=structured.step(state.identifier, state.filter, sample), stamps=stamps)
+    since = row.first if state.since is None else state.since
+    state = replace(state, filter=structured.advance(state.identifier, state.filter, row), since=since)
     if state.filter.memory is None or state.filter.model is None:
         return state
-    dt = float(np.median(np.diff(stamps))) * 1e-9
+    dt = float(np.median(np.diff(row.since(since).stamp_ns))) * 1e-9
     w = max(kernel.SHORTEST + 2, round(config.detection_window / dt))
     n2 = 2 * state.filter.model.motion.q.size
     m = len(state.filter.model.roles)
@@ -124,43 +124,41 @@ def _start(config: TriggerParameters, state: DetectionState, sample: Sample) -> 
         scores=np.zeros((w, kernel.CAUSES)), past=np.zeros((w, m)), clock=np.zeros(6, dtype=np.int64),
         level=np.array([0.0, 0.0, 0.0, threshold(config, dt)]), history=np.zeros(2 * w),
         statistic=np.zeros(w), flow=np.zeros((n2, n2)), state=np.zeros((2, n2, 2)))
-    return replace(state, watch=watch, dt=dt, stamps=stamps[-w:])
+    return replace(state, watch=watch, dt=dt)
 
 
 def _watch(
-    config: TriggerParameters, state: DetectionState, samples: Sequence[Sample],
-) -> tuple[DetectionState, int, CaptureEvent | None]:
-    """Run until an alarm; return how many samples were taken and the event."""
+    config: TriggerParameters, state: DetectionState, rows: Rows,
+) -> tuple[DetectionState, CaptureEvent | None]:
+    """Take rows without a gap until an alarm; return the event."""
     filtered, watch = state.filter, state.watch
     assert filtered.model is not None
     assert filtered.memory is not None
     assert filtered.sensors is not None
-    assert filtered.effort is not None
     assert watch is not None
+    assert state.since is not None
     m = mem.copy(filtered.memory)
     watch = kernel.Watch._make(part.copy() for part in watch)
-    stamps = np.array([filtered.last_ns] + [sample.stamp_ns for sample in samples])
-    efforts = np.array([filtered.effort, *(sample.u for sample in samples)], dtype=np.float64)
+    table, first = structured.input_table(filtered, rows)
     confirm = round(CONFIRM / state.dt)
     light = filtered.model.motion.scale
     taken = watch_samples(
         filtered.model.motion, filtered.sensors, m, watch, light * np.array([SPEED, ACCELERATION, JERK]),
-        state.dt, float(np.exp(-state.dt / PEAK_MEMORY)), round(SETTLE / state.dt), confirm,
-        np.diff(stamps) * 1e-9, efforts[:-1], structured.measurements(filtered.model, samples),
+        state.dt, float(np.exp(-state.dt / PEAK_MEMORY)), round(SETTLE / state.dt), confirm, table, first,
         np.zeros(kernel.CAUSES))
+    cursor = rows.first + abs(taken) - first
     if taken < 0:
-        fresh = replace(init(config), stamps=())
-        return fresh, -taken, None
-    w = watch.trace.shape[0]
-    seen = (*state.stamps, *(int(stamp) for stamp in stamps[1:taken + 1]))[-w:]
-    filtered = filtered._replace(memory=m, last_ns=int(stamps[taken]), effort=efforts[taken])
-    state = replace(state, filter=filtered, watch=watch, stamps=seen)
+        fresh = init(config)
+        return replace(fresh, filter=fresh.filter._replace(cursor=cursor)), None
+    last = rows.between(cursor - 1, cursor)
+    filtered = filtered._replace(memory=m, cursor=cursor, last_ns=int(last.stamp_ns[0]), effort=last.u[0].copy())
+    state = replace(state, filter=filtered, watch=watch)
     if watch.clock[kernel.ALARMED] <= confirm:
-        return state, taken, None
-    lag = min(int(watch.level[1]), len(seen) - 1)
+        return state, None
+    lag = min(int(watch.level[1]), cursor - 1 - state.since, watch.trace.shape[0] - 1)
     kind = EventKind.RELEASE if m.counts[mem.HELD] else EventKind.CAPTURE
-    event = CaptureEvent(seen[-1 - lag], kind)
-    return _after(state, event), taken, event
+    event = CaptureEvent(int(rows.between(cursor - 1 - lag, cursor).stamp_ns[0]), kind)
+    return _after(state, event), event
 
 
 def _after(state: DetectionState, event: CaptureEvent) -> DetectionState:
@@ -172,11 +170,11 @@ def _after(state: DetectionState, event: CaptureEvent) -> DetectionState:
     return replace(state, filter=filtered, watch=_quiet(state.watch))
 
 
-def _resume(config: TriggerParameters, state: DetectionState, sample: Sample) -> DetectionState:
+def _resume(config: TriggerParameters, state: DetectionState, row: Rows) -> DetectionState:
     """After a gap: filter anew, test anew."""
     assert state.watch is not None
-    filtered = structured.step(state.identifier, state.filter, sample)
-    return replace(state, filter=filtered, watch=_quiet(state.watch), stamps=(sample.stamp_ns,))
+    filtered = structured.advance(state.identifier, state.filter, row)
+    return replace(state, filter=filtered, watch=_quiet(state.watch), since=row.first)
 
 
 def _quiet(watch: kernel.Watch) -> kernel.Watch:

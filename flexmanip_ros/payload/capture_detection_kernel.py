@@ -222,20 +222,20 @@ def remember(watch: Watch, fade: float) -> None:
 @kernel
 def watch_samples(
     motion: Motion, sensors: Sensors, m: Memory, watch: Watch, prior: Array, dt: float, fade: float,
-    hold: int, confirm: int,    durations: Array, efforts: Array, Y: Array, scratch: Array,
+    hold: int, confirm: int, table: Array, first: int, scratch: Array,
 ) -> int:
-    """Run the filter and the test; return how many samples were taken before an alarm or a failure.
+    """Run the filter and the test; return the row of the table after the last one taken before an alarm.
 
-    A negative number -k - 1: numbers left the finite range at sample k. hold: samples to be quiet at first;
+    A negative number -k - 1: numbers left the finite range in row k. hold: samples to be quiet at first;
     confirm: samples from an alarm to its return, so that it can be dated; fade: factor of the recent peak a
     sample. Otherwise as ``structured_kernel.advance``.
     """
-    for k in range(Y.shape[0]):
-        if not take(motion, sensors, m, durations[k], efforts[k], Y[k]):
+    for k in range(first, table.shape[0]):
+        if not take(motion, sensors, m, table, k):
             return -k - 1
         clock = watch.clock
         if clock[SINCE_TRACES] == 0:
-            traces(motion, sensors, m, watch, prior, efforts[k], dt)
+            traces(motion, sensors, m, watch, prior, table[k, 1:3], dt)
         clock[SINCE_TRACES] = (clock[SINCE_TRACES] + 1) % REFRESH
         look(m, watch, scratch)
         clock[QUIET] += 1
@@ -247,5 +247,5 @@ def watch_samples(
             if watch.level[0] > max(watch.level[3], CALM * watch.level[2]):
                 clock[ALARMED] = 1
             remember(watch, fade)
-    taken: int = Y.shape[0]
+    taken: int = table.shape[0]
     return taken

@@ -24,20 +24,23 @@ def with_detected(config: IdentifierParameters, items: Iterable[Item]) -> Iterat
                              'name the joints in parameter angles, or give --capture-time')
     # The angles are needed here whether or not a payload is estimated.
     config = replace(config, payload_method='structured')
-    clock = sampling.init()
+    clock, log = sampling.Clock(), sampling.EMPTY
     state: capture_detection.DetectionState | None = None
     trigger = TriggerParameters()
+    cursor = 0
     for item in items:
         yield item
         if isinstance(item, CaptureEvent):
             continue
-        clock, sampled = sampling.step(config, clock, item)
+        clock, log, reset = sampling.push(config, clock, log, item)
         if clock.outputs is None:
             continue
-        if state is None or sampled.reset:
+        if state is None or reset:
             trigger = TriggerParameters(
                 mode='auto', inputs=config.inputs, outputs=clock.outputs, angles=config.angles,
                 arm=config.arm, payload=config.payload)
-            state = capture_detection.init(trigger)
-        state, events = capture_detection.advance(trigger, state, sampled.samples)
+            state, cursor = capture_detection.init(trigger), 0
+        state, events = capture_detection.advance(trigger, state, log.rows(cursor, log.end))
+        cursor = log.end
+        log = log.from_row(capture_detection.first_needed(state))
         yield from events

@@ -46,8 +46,8 @@ class Memory(NamedTuple):
     """(nx, nx) its square root."""
     xi: Array
     """(nx,) fitted departure from x0 in units of S0."""
-    samples: Array
-    """(HORIZON, 3 + m) duration since the sample before, torques held meanwhile, measurements."""
+    corrections: Array
+    """(HORIZON, m) what the residual modes were taken to add to the measurements since the event."""
     xr: Array
     """(nx,) reference trajectory of the running pass."""
     Sr: Array
@@ -74,7 +74,7 @@ def memory(nx: int, m: int, a: int = 0) -> Memory:
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 8)), recent=np.zeros((m, 4)),
         counts=np.zeros(11, dtype=np.int64),
         score=np.zeros(9), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx),
-        samples=np.zeros((HORIZON, 3 + m)), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
+        corrections=np.zeros((HORIZON, m)), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
         g=np.zeros(nx), tail=np.zeros((2, a)), torque=np.zeros(2), torque0=np.zeros(2),
         innovation=np.zeros((m, 2)), power=np.ones(m))
 
@@ -82,16 +82,16 @@ def memory(nx: int, m: int, a: int = 0) -> Memory:
 def copy(state: Memory, *, refit: bool = True) -> Memory:
     """Return the same values in arrays of their own.
 
-    All but the samples kept, the largest part, once they are complete: nothing writes them any more. refit
-    False: nor what belongs to the refit of them, which only an event writes then.
+    All but the corrections, the largest part, once they are complete: nothing writes them any more. refit
+    False: nor what belongs to the refit, which only an event writes then.
     """
-    (x, S, noise, recent, counts, score, x0, S0, xi, samples, xr, Sr, N, g, tail, torque, torque0, innovation,
+    (x, S, noise, recent, counts, score, x0, S0, xi, corrections, xr, Sr, N, g, tail, torque, torque0, innovation,
      power) = state
     complete = counts[STORED] >= HORIZON
     if not complete:
-        samples = samples.copy()
+        corrections = corrections.copy()
     if refit or not complete:
         x0, S0, xi, xr, Sr = x0.copy(), S0.copy(), xi.copy(), xr.copy(), Sr.copy()
         N, g, torque0 = N.copy(), g.copy(), torque0.copy()
     return Memory(x.copy(), S.copy(), noise.copy(), recent.copy(), counts.copy(), score.copy(), x0, S0, xi,
-                  samples, xr, Sr, N, g, tail.copy(), torque.copy(), torque0, innovation.copy(), power.copy())
+                  corrections, xr, Sr, N, g, tail.copy(), torque.copy(), torque0, innovation.copy(), power.copy())

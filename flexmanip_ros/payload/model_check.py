@@ -19,7 +19,8 @@ from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.interval import QUANTILE
 from flexmanip_ros.payload.model_comparison import Verdict, compare
 from flexmanip_ros.payload.structured import StructuredState
-from flexmanip_ros.types import Array, Mode, Payload, Sample, Status
+from flexmanip_ros.samples.sample_log import Rows
+from flexmanip_ros.types import Array, Mode, Payload, Status
 
 EVERY = 32
 """Of so many samples one tells where the arm is."""
@@ -28,21 +29,21 @@ LEAST = 1000.0
 BELIEVED = (Status.TRACKING, Status.POORLY_EXCITED, Status.INCONSISTENT)
 
 
-def sweep(before: Array, samples: Sequence[Sample], relative: bool) -> Array:
-    """Return where the arm was since the event, after more samples; relative: angle 2 is from link 1 on.
+def sweep(before: Array, rows: Rows, relative: bool) -> Array:
+    """Return where the arm was since the event, after more rows; relative: angle 2 is from link 1 on.
 
     (5,) smallest and largest cosine of the angle between the links, then angle of joint 1 [rad]; samples.
     """
     count = int(before[4]) if before.size else 0
     after = before.copy() if before.size else np.array([1.0, -1.0, math.inf, -math.inf, 0.0])
-    for sample in samples[-count % EVERY::EVERY]:
-        if sample.angles.shape != (2,):
-            return before
-        first, second = float(sample.angles[0]), float(sample.angles[1])
+    angles = rows.angles
+    if angles.shape[1] != 2:
+        return before
+    for first, second in angles[-count % EVERY::EVERY].tolist():
         cosine = math.cos(second if relative else second - first)
         after[0], after[1] = min(after[0], cosine), max(after[1], cosine)
         after[2], after[3] = min(after[2], first), max(after[3], first)
-    after[4] = count + len(samples)
+    after[4] = count + len(rows)
     return after
 
 

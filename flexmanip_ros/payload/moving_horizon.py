@@ -1,7 +1,7 @@
 """Compiled loop of the structured estimator: filter every sample, refit behind it all since the last event.
 
 The filter alone would linearise the first samples after an event at a poor guess and never take that
-back. So the samples since the event are kept (``HORIZON``), and a Gauss-Newton pass over them runs three
+back. So the samples since the event are read again (``HORIZON``), and a Gauss-Newton pass over them runs three
 samples for each new one; when it catches up, its result replaces the filter's state, and the next pass
 starts there.
 """
@@ -60,20 +60,25 @@ def begin_pass(m: Memory) -> None:
 
 
 @kernel
-def pass_sample(motion: Motion, sensors: Sensors, m: Memory) -> bool:
-    """Take one kept sample into the refit; False when numbers left the finite range."""
-    sample = m.samples[m.counts[PASSED]]
+def pass_sample(motion: Motion, sensors: Sensors, m: Memory, table: Array) -> bool:
+    """Take one sample since the event into the refit; False when numbers left the finite range.
+
+    table: (N, 3 + m), its first row is the first sample after the event.
+    """
+    passed = m.counts[PASSED]
+    sample = table[passed]
     n, nx = motion.q.size, m.x.size
     effort, f = sample[1:3], sensors.f
     if not predict(motion, m.xr, m.Sr, effort, sample[0], m.counts[HELD] != 0):
         return False
     if sample[0] > 0.0:
-        before = m.torque0 if m.counts[PASSED] == 0 else m.samples[m.counts[PASSED] - 1, 1:3]
+        before = m.torque0 if passed == 0 else table[passed - 1, 1:3]
         push(motion, sensors.tail, m.xr, before, effort, believed(m.score))
     for i in range(m.noise.shape[0]):
         r = m.noise[i, EFFECTIVE]
         predicted = project(m.xr, m.Sr, sensors.H[i], n if sensors.rate[i] else 0, f)
-        e = sample[3 + i] - predicted - sensors.feed[i, 0] * effort[0] - sensors.feed[i, 1] * effort[1]
+        measured = sample[3 + i] - m.corrections[passed, i]
+        e = measured - predicted - sensors.feed[i, 0] * effort[0] - sensors.feed[i, 1] * effort[1]
         weight = 1.0 / r
         if e * e * weight > OUTLIER * OUTLIER:
             weight = OUTLIER / (abs(e) * np.sqrt(r))
@@ -118,24 +123,21 @@ def finish_pass(m: Memory) -> bool:
 
 
 @kernel
-def refit(motion: Motion, sensors: Sensors, m: Memory, duration: float, effort: Array, y: Array) -> bool:
-    """Keep a sample and let the refit behind the filter take up to three."""
+def refit(motion: Motion, sensors: Sensors, m: Memory, table: Array) -> bool:
+    """Note how a sample is corrected, and let the refit behind the filter take up to three."""
     stored = m.counts[STORED]
     if stored >= HORIZON:
         return True
-    m.samples[stored, 0] = duration
-    m.samples[stored, 1] = effort[0]
-    m.samples[stored, 2] = effort[1]
     share = amplitude(m.score)
-    for i in range(y.size):
-        m.samples[stored, 3 + i] = y[i] - share * ringing(sensors.tail, m, i)
+    for i in range(m.corrections.shape[1]):
+        m.corrections[stored, i] = share * ringing(sensors.tail, m, i)
     m.counts[STORED] = stored + 1
     if m.counts[PASSING] == 0:
         if stored + 1 < FIRST_PASS or 3 * (stored + 1) > 2 * HORIZON:
             return True
         begin_pass(m)
     for _ in range(3):
-        if m.counts[PASSED] < m.counts[STORED] and not pass_sample(motion, sensors, m):
+        if m.counts[PASSED] < m.counts[STORED] and not pass_sample(motion, sensors, m, table):
             return False
     if m.counts[PASSED] == m.counts[STORED]:
         m.counts[IN_BATCH] = 0
@@ -161,8 +163,12 @@ def diffuse(sensors: Sensors, m: Memory, duration: float) -> None:
 
 
 @kernel
-def take(motion: Motion, sensors: Sensors, m: Memory, duration: float, effort: Array, y: Array) -> bool:
-    """Take one sample, ``duration`` after the one before; False when numbers left the finite range."""
+def take(motion: Motion, sensors: Sensors, m: Memory, table: Array, k: int) -> bool:
+    """Take the sample in row k of the table; False when numbers left the finite range.
+
+    table: (N, 3 + m), see ``advance``.
+    """
+    duration, effort, y = table[k, 0], table[k, 1:3], table[k, 3:]
     if not predict(motion, m.x, m.S, effort, duration, m.counts[HELD] != 0):
         return False
     if duration > 0.0:
@@ -174,7 +180,7 @@ def take(motion: Motion, sensors: Sensors, m: Memory, duration: float, effort: A
         return False
     m.counts[SINCE_EVENT] += 1
     learn_noise(sensors, m)
-    if not refit(motion, sensors, m, duration, effort, y):
+    if not refit(motion, sensors, m, table):
         return False
     judge_payload(sensors, m)
     diffuse(sensors, m, duration)
@@ -182,13 +188,15 @@ def take(motion: Motion, sensors: Sensors, m: Memory, duration: float, effort: A
 
 
 @kernel
-def advance(motion: Motion, sensors: Sensors, m: Memory, table: Array) -> int:
-    """Take samples, table (N, 3 + m): duration since the one before, torques held meanwhile, measurements.
+def advance(motion: Motion, sensors: Sensors, m: Memory, table: Array, first: int) -> int:
+    """Take the samples in the rows of the table from ``first`` on.
 
-    Returns how many were taken; fewer than N when numbers left the finite range.
+    table: (N, 3 + m) duration since the sample before, torques held meanwhile, measurements. While the horizon
+    is open (fewer than ``HORIZON`` samples since the event), the table begins with the first sample after it.
+    Returns the row after the last one taken; less than N when numbers left the finite range.
     """
-    for k in range(table.shape[0]):
-        if not take(motion, sensors, m, table[k, 0], table[k, 1:3], table[k, 3:]):
+    for k in range(first, table.shape[0]):
+        if not take(motion, sensors, m, table, k):
             return k
     taken: int = table.shape[0]
     return taken

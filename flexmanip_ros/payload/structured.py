@@ -5,7 +5,6 @@ A filter and a refit behind it (``structured_kernel``). States are never written
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +20,8 @@ from flexmanip_ros.payload.moving_horizon import advance as run_kernel
 from flexmanip_ros.payload.process_model import PARAMETERS, predict
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.payload.tail_kernel import believed, push, ring
-from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload, Sample
+from flexmanip_ros.samples.sample_log import Rows
+from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload
 
 FIRST_LOOK = 24
 """Samples looked at before the filter starts: they tell its noise."""
@@ -37,15 +37,30 @@ class StructuredState(NamedTuple):
     """None when the configured signals cannot give a payload."""
     sensors: Sensors | None = None
     memory: mem.Memory | None = None
-    waiting: tuple[Sample | CaptureEvent, ...] = ()
-    """What came before the filter started."""
+    begin: int | None = None
+    """Row of the sample log with which it starts, while there are not enough rows to start."""
+    early: tuple[tuple[int, CaptureEvent], ...] = ()
+    """Events before it started, each with the row that follows it."""
+    cursor: int = 0
+    """Row of the sample log that it takes next."""
+    horizon: Horizon | None = None
+    """Where the moving horizon begins."""
     last_ns: int = 0
     effort: Array | None = None
     """(2,) torque held since then."""
-    released: float = 0.0
-    """Payload let go at the last release [kg]."""
     restarts: int = 0
     """How often numbers left the finite range."""
+
+
+class Horizon(NamedTuple):
+    """The rows of the sample log since the last event or gap."""
+
+    row: int
+    """Its first row."""
+    before_ns: int
+    """Stamp of the state from which it starts [ns]."""
+    effort: Array
+    """(2,) torque held from there on [N m]."""
 
 
 def init(config: IdentifierParameters) -> StructuredState:
@@ -53,33 +68,32 @@ def init(config: IdentifierParameters) -> StructuredState:
     return StructuredState(build(config))
 
 
-def step(config: IdentifierParameters, state: StructuredState, sample: Sample) -> StructuredState:
-    """Take one sample."""
-    return advance(config, state, (sample,))
+def first_needed(state: StructuredState) -> int:
+    """Return the first row of the sample log that will be read again."""
+    if state.begin is not None:
+        return state.begin
+    if state.memory is None or state.horizon is None or state.memory.counts[mem.STORED] >= mem.HORIZON:
+        return state.cursor
+    return state.horizon.row
 
 
-def advance(
-    config: IdentifierParameters, state: StructuredState, samples: Sequence[Sample],
-) -> StructuredState:
-    """Take samples in the order of their stamps; the same bits as one by one."""
-    if state.model is None or not samples:
-        return state
+def advance(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
+    """Take the next rows of the sample log; the same bits as one by one."""
+    if state.model is None or not len(rows):
+        return state._replace(cursor=rows.until)
     if state.memory is None:
-        needed = FIRST_LOOK - sum(isinstance(item, Sample) for item in state.waiting)
-        state = state._replace(waiting=(*state.waiting, *samples[:needed]))
-        if len(samples) < needed:
-            return state
-        state, samples = _begin(config, state), samples[needed:]
-    begin = 0
-    for stop in [i for i, sample in enumerate(samples) if sample.gap and i > 0] + [len(samples)]:
-        part = samples[begin:stop]
-        if state.memory is None:
-            state = advance(config, state, part)  # it restarted meanwhile
-        else:
-            if part and part[0].gap:
-                state = _resume(config, state, part[0])
-            state = _run(config, state, part)
-        begin = stop
+        begin = rows.first if state.begin is None else state.begin
+        if rows.until - begin < FIRST_LOOK:
+            return state._replace(begin=begin, cursor=rows.until)
+        state = _begin(config, state, rows.since(begin).between(begin, begin + FIRST_LOOK))
+        rows = rows.since(begin + FIRST_LOOK)
+    for part in rows.stretches():
+        if state.memory is None:  # it restarted meanwhile
+            state = advance(config, state, part)
+            continue
+        if part.gap[0]:
+            state = _resume(config, state, part)
+        state = _run(config, state, part)
     return state
 
 
@@ -88,7 +102,7 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     if state.model is None:
         return state
     if state.memory is None:
-        return state._replace(waiting=(*state.waiting, event))
+        return state._replace(early=(*state.early, (state.cursor, event)))
     m = mem.copy(state.memory)
     assert state.effort is not None
     assert state.sensors is not None
@@ -98,8 +112,9 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
         push(state.model.motion, state.sensors.tail, m.x, m.torque, state.effort, believed(m.score))
         ring(state.sensors.tail, m, ahead * 1e-9, state.effort)
         m.torque[:] = state.effort
-    released = _change(config, state.model, m, event.kind)
-    return state._replace(memory=m, last_ns=state.last_ns + ahead, released=released)
+    _change(config, state.model, m, event.kind)
+    last_ns = state.last_ns + ahead
+    return state._replace(memory=m, last_ns=last_ns, horizon=Horizon(state.cursor, last_ns, state.effort))
 
 
 def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
@@ -107,8 +122,8 @@ def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
     return judge(config, state.model, state.sensors, state.memory, state.restarts)
 
 
-def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: EventKind) -> float:
-    """Reopen what an event changes: the rates, and what is held. Returns the payload let go [kg]."""
+def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: EventKind) -> None:
+    """Reopen what an event changes: the rates, and what is held."""
     payload = m.x.size - PARAMETERS
     held = bool(m.counts[mem.HELD])
     before = float(model.motion.scale * np.exp(min(m.x[payload], 12.0))) if held else 0.0
@@ -127,7 +142,6 @@ def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: Eve
     m.S[:] = start.widen(m.S, np.hstack([columns, opened]))
     start.shake(model, m)
     _anchor(m)
-    return before
 
 
 def _forget_payload(config: IdentifierParameters, model: Model, m: mem.Memory) -> None:
@@ -163,38 +177,44 @@ def _anchor(m: mem.Memory) -> None:
     m.power[:] = 1.0
 
 
-def _begin(config: IdentifierParameters, state: StructuredState) -> StructuredState:
-    """Start the filter with what waited."""
+def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
+    """Start the filter with its first rows, and take them and the events among them."""
     model = state.model
     assert model is not None
-    items = state.waiting
-    samples = [item for item in items if isinstance(item, Sample)]
-    Y = measurements(model, samples)
-    steps = np.diff([sample.stamp_ns for sample in samples]) * 1e-9
-    dt = float(np.median(steps))
+    Y = measurements(model, rows)
+    dt = float(np.median(np.diff(rows.stamp_ns) * 1e-9))
     size = 2 * model.motion.q.size + model.motion.G.shape[1]
     m = mem.memory(size, len(model.roles), 2 * residual_modes.MODES)
     m.noise[:] = start.noise(model, Y)
     start.first(config, model, m, Y[0])
-    start.freeze(config, model, np.mean([sample.angles for sample in samples], axis=0))
-    m.torque[:] = samples[0].u
+    start.freeze(config, model, np.mean(rows.angles, axis=0))
+    m.torque[:] = rows.u[0]
     _anchor(m)
     seen = sensors(config, model, dt, start.diffusion(config, model, m), m.x[:2])
     m.score[mem.ODDS] = 0.0 if seen.tail.push.any() else residual_modes.UNBENT_ODDS
+    events = state.early
+    first_ns, effort = int(rows.stamp_ns[0]), rows.u[0].copy()
     state = state._replace(
-        memory=m, sensors=seen, waiting=(), last_ns=samples[0].stamp_ns, effort=samples[0].u.copy())
-    for item in items:
-        state = event(config, state, item) if isinstance(item, CaptureEvent) else step(config, state, item)
-    return state
+        memory=m, sensors=seen, begin=None, early=(), cursor=rows.first, last_ns=first_ns, effort=effort,
+        horizon=Horizon(rows.first, first_ns, effort))
+    for row, item in events:
+        state = event(config, _part(config, state, rows, row), item)
+    return _part(config, state, rows, rows.until)
 
 
-def _resume(config: IdentifierParameters, state: StructuredState, sample: Sample) -> StructuredState:
-    """After a gap: start at the sample's measurements."""
+def _part(config: IdentifierParameters, state: StructuredState, rows: Rows, until: int) -> StructuredState:
+    """Take the rows from the cursor to ``until``."""
+    return advance(config, state, rows.between(state.cursor, until)) if until > state.cursor else state
+
+
+def _resume(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
+    """After a gap: start at the measurements of the first row."""
     assert state.model is not None
-    fresh = reopen(config, state, measurements(state.model, [sample])[0])
+    fresh = reopen(config, state, measurements(state.model, rows.between(rows.first, rows.first + 1))[0])
     assert fresh.memory is not None
-    fresh.memory.torque[:] = fresh.memory.torque0[:] = sample.u
-    return fresh._replace(last_ns=sample.stamp_ns, effort=sample.u.copy())
+    last_ns, effort = int(rows.stamp_ns[0]), rows.u[0].copy()
+    fresh.memory.torque[:] = fresh.memory.torque0[:] = effort
+    return fresh._replace(last_ns=last_ns, effort=effort, horizon=Horizon(rows.first, last_ns, effort))
 
 
 def reopen(
@@ -212,51 +232,52 @@ def reopen(
     m.S[2 * n:] = 0.0
     m.S[2 * n:, 2 * n:] = np.linalg.qr(spread.T)[1].T
     _anchor(m)
-    return state._replace(memory=m)
+    assert state.effort is not None
+    return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.effort))
 
 
-def _run(config: IdentifierParameters, state: StructuredState, samples: Sequence[Sample]) -> StructuredState:
-    """Take samples without a gap among them."""
+def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
+    """Take rows without a gap among them."""
     assert state.model is not None
     assert state.memory is not None
     assert state.sensors is not None
-    assert state.effort is not None
-    if not samples:
-        return state
     m = mem.copy(state.memory, refit=False)
-    table = _table(state.model, state.last_ns, state.effort, samples)
-    taken = run(state.model.motion, state.sensors, m, table)
-    if taken < len(samples):
-        return _restart(config, state, samples[taken:])
-    return state._replace(memory=m, last_ns=samples[-1].stamp_ns, effort=samples[-1].u)
+    table, first = input_table(state, rows)
+    taken = run(state.model.motion, state.sensors, m, table, first)
+    if taken < len(table):
+        return _restart(config, state, rows.since(rows.first + taken - first))
+    return state._replace(memory=m, cursor=rows.until, last_ns=int(rows.stamp_ns[-1]), effort=rows.u[-1].copy())
 
 
-def _table(model: Model, before: int, effort: Array, samples: Sequence[Sample]) -> Array:
-    """Return what the kernel takes, (N, 3 + m), after a sample at ``before`` [ns] with that effort (2,)."""
-    rows, held = [], effort.tolist()
-    for sample in samples:
-        rows.append([max(sample.stamp_ns - before, 0) * 1e-9, *held, *_measured(model, sample)])
-        before, held = sample.stamp_ns, sample.u.tolist()
-    return np.array(rows, dtype=np.float64)
+def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
+    """Return what the kernel reads, (N, 3 + m), and the row of it that belongs to the first of ``rows``.
+
+    Columns: duration since the sample before [s], torques held meanwhile [N m], measurements. While the
+    horizon is open the table reaches back to its first row.
+    """
+    assert state.model is not None
+    before_ns, effort, horizon = state.last_ns, state.effort, state.horizon
+    begin = first_needed(state)
+    if begin < rows.first:
+        assert horizon is not None
+        before_ns, effort = horizon.before_ns, horizon.effort
+    reach = rows.since(begin)
+    assert effort is not None
+    steps = np.maximum(np.diff(reach.stamp_ns, prepend=np.int64(before_ns)), 0) * 1e-9
+    efforts = np.vstack([effort, reach.u[:-1]])
+    return np.column_stack([steps, efforts, measurements(state.model, reach)]), rows.first - begin
 
 
-def _restart(
-    config: IdentifierParameters, state: StructuredState, samples: Sequence[Sample],
-) -> StructuredState:
-    """Numbers left the finite range: begin again, still knowing whether something is held."""
+def _restart(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
+    """Numbers left the finite range: begin again after the first of the rows, knowing whether the arm holds."""
     assert state.memory is not None
-    fresh = init(config)._replace(restarts=state.restarts + 1)
+    fresh = init(config)._replace(restarts=state.restarts + 1, cursor=rows.first + 1)
     if state.memory.counts[mem.HELD]:
-        fresh = fresh._replace(waiting=(CaptureEvent(samples[0].stamp_ns, EventKind.CAPTURE),))
-    return advance(config, fresh, samples[1:])
+        grasped = CaptureEvent(int(rows.stamp_ns[0]), EventKind.CAPTURE)
+        fresh = fresh._replace(early=((rows.first + 1, grasped),))
+    return advance(config, fresh, rows.since(rows.first + 1))
 
 
-def measurements(model: Model, samples: Sequence[Sample]) -> Array:
+def measurements(model: Model, rows: Rows) -> Array:
     """Return outputs and the angles that are not among them, (N, m)."""
-    rows = [_measured(model, sample) for sample in samples]
-    return np.array(rows, dtype=np.float64).reshape(len(samples), len(model.roles))
-
-
-def _measured(model: Model, sample: Sample) -> list[float]:
-    angles = sample.angles.tolist() if model.extra else []
-    return [*sample.y.tolist(), *(angles[i] for i in model.extra)]
+    return np.hstack([rows.y, rows.angles[:, list(model.extra)]]) if model.extra else rows.y

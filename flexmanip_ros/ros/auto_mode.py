@@ -10,7 +10,7 @@ import numpy as np
 from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
 from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.samples import sampling
-from flexmanip_ros.samples.signals import Refusal
+from flexmanip_ros.samples.signals import Rejection
 from flexmanip_ros.types import CaptureEvent, JointRecord
 
 REHEARSAL = 1500
@@ -25,18 +25,21 @@ class Watcher:
         self._sampling = IdentifierParameters(
             inputs=config.inputs, outputs=config.outputs, angles=config.angles, arm=config.arm,
             payload=config.payload)
-        self._clock = sampling.init()
+        self._clock, self._log, self._cursor = sampling.Clock(), sampling.EMPTY, 0
         self._state: capture_detection.DetectionState | None = None
 
     def take(self, record: JointRecord) -> tuple[CaptureEvent, ...]:
         """Take one message; return the events found with it, each dated at its onset."""
-        self._clock, sampled = sampling.step(self._sampling, self._clock, record)
+        self._clock, self._log, reset = sampling.push(self._sampling, self._clock, self._log, record)
         if self._clock.outputs is None:
             return ()
-        if self._state is None or sampled.reset:
+        if self._state is None or reset:
             self._settled = replace(self._config, outputs=self._clock.outputs)
-            self._state = capture_detection.init(self._settled)
-        self._state, events = capture_detection.advance(self._settled, self._state, sampled.samples)
+            self._state, self._cursor = capture_detection.init(self._settled), 0
+        rows = self._log.rows(self._cursor, self._log.end)
+        self._cursor = self._log.end
+        self._state, events = capture_detection.advance(self._settled, self._state, rows)
+        self._log = self._log.from_row(capture_detection.first_needed(self._state))
         return events
 
     @property
@@ -45,9 +48,9 @@ class Watcher:
         return self._clock.counters
 
     @property
-    def refusal(self) -> Refusal | None:
+    def rejection(self) -> Rejection | None:
         """Why the latest unusable message could not be used."""
-        return self._clock.refusal
+        return self._clock.rejection
 
     @property
     def statistic(self) -> tuple[float, float]:

@@ -1,24 +1,28 @@
-"""From messages to samples on one clock: stamps rule, not arrival.
+"""From messages to rows of the sample log, on one clock: stamps rule, not arrival.
 
-A message becomes at most one ``Sample``. Repeated and late stamps are dropped, a missing sample marks the
-next one with ``gap``, a jump back resets, and inputs are shifted by ``arm.effort_delay`` samples.
+A message becomes at most one row. Repeated and late stamps are dropped, a missing sample marks the next row with
+``gap``, a jump back resets, and inputs are shifted by ``arm.effort_delay`` samples.
 """
 
 from __future__ import annotations
 
-from itertools import pairwise
+from collections.abc import Iterable
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.samples.signals import Channels, Refusal, extract, resolve, wrong_size
-from flexmanip_ros.types import JointRecord, Sample
+from flexmanip_ros.samples.sample_log import SampleLog, Signals, Width
+from flexmanip_ros.samples.signals import Channels, Rejection, columns, extract, resolve, wrong_size
+from flexmanip_ros.types import Array, CaptureEvent, JointBlock, JointRecord, Sample
 
 LEARNING = 20
-"""Intervals looked at before the sample time is known."""
+"""Intervals whose median is the first estimate of the sample time; 20 stand a few irregular ones."""
 FAR = 100.0
-"""Sample times ahead that are taken for far where ``max_time_jump`` is shorter (a slow clock)."""
+"""A stamp this many sample times ahead is doubted where ``max_time_jump`` is shorter (a slow clock)."""
 RELEARN = 20
-"""Irregular intervals in a row after which the sample time is taken to have changed."""
+"""Irregular intervals in a row after which the sample time is learned again."""
 
 
 class Counters(NamedTuple):
@@ -41,20 +45,16 @@ class Counters(NamedTuple):
                 + self.not_finite)
 
     def plus(self, name: str) -> Counters:
-        """Return the counters with one of them raised."""
+        """Return the counters with one of them raised by one."""
         return self._replace(**{name: getattr(self, name) + 1})
 
     def received_and(self, name: str) -> Counters:
-        """Return the counters after one message with this fate."""
+        """Return the counters after one message with this outcome."""
         return self._replace(**{'received': self.received + 1, name: getattr(self, name) + 1})
 
-    def one_accepted(self) -> Counters:
-        """Return the counters after one message that became a sample."""
-        return Counters(self.received + 1, self.accepted + 1, *self[2:])
 
-
-class SamplingState(NamedTuple):
-    """Clock and queues. ``pending`` waits for its inputs, ``learning`` for the sample time."""
+class Clock(NamedTuple):
+    """The sample time as learned so far, and where the signals stand in a message."""
 
     channels: Channels | None = None
     outputs: tuple[str, ...] | None = None
@@ -62,12 +62,12 @@ class SamplingState(NamedTuple):
     interval_sum_ns: int = 0
     interval_count: int = 0
     irregular: int = 0
-    learning: tuple[Sample, ...] = ()
-    pending: tuple[Sample, ...] = ()
+    """Irregular intervals in a row."""
     counters: Counters = Counters()
-    refusal: Refusal | None = None
-    doubtful: Sample | None = None
-    """A sample from far ahead, until the next one tells whether the clock was set or one stamp was wrong."""
+    rejection: Rejection | None = None
+    """Why the latest unusable message could not be used."""
+    jump_candidate: Sample | None = None
+    """A sample with a stamp far ahead. The next one tells whether the clock was set or one stamp was wrong."""
 
     @property
     def dt(self) -> float:
@@ -76,166 +76,228 @@ class SamplingState(NamedTuple):
 
 
 class Sampled(NamedTuple):
-    """Samples that are complete now, and whether the clock was set back before them."""
+    """Clock and log after a message; reset: the stamps began again, and the log with them."""
 
-    samples: tuple[Sample, ...] = ()
+    clock: Clock
+    log: SampleLog
     reset: bool = False
 
 
-NOTHING = Sampled()
+EMPTY = SampleLog(Width(0, 0, 0))
+"""The log before the first usable message."""
 
 
-def init() -> SamplingState:
-    """Start with no clock."""
-    return SamplingState()
-
-
-def step(config: IdentifierParameters, state: SamplingState, record: JointRecord
-         ) -> tuple[SamplingState, Sampled]:
-    """Take one message; return the samples it completes, in the order of their stamps."""
-    channels = state.channels
+def push(config: IdentifierParameters, clock: Clock, log: SampleLog, record: JointRecord) -> Sampled:
+    """Take one message; return clock and log with the rows that it completes."""
+    channels = clock.channels
     if channels is None or channels.names != record.names:
-        found = resolve(config, record, state.outputs)
-        if isinstance(found, Refusal):
-            return _refuse(state, found), NOTHING
+        found = resolve(config, record, clock.outputs)
+        if isinstance(found, Rejection):
+            return Sampled(_reject(clock, found), log)
         channels = found
-        state = state._replace(channels=channels, outputs=channels.outputs)
+        clock = clock._replace(channels=channels, outputs=channels.outputs)
     fault = _fault(channels, record)
     if fault is not None:
-        return _refuse(state, fault), NOTHING
+        return Sampled(_reject(clock, fault), log)
     raw = extract(channels, record)
     if raw is None:
-        return _refuse(state, _NOT_FINITE), NOTHING
-    return _on_clock(config, state, raw)
+        return Sampled(_reject(clock, _NOT_FINITE), log)
+    if log is EMPTY:
+        log = SampleLog(Width(len(channels.u), len(channels.y), len(channels.angles)))
+    return _on_clock(config, clock, log, raw)
 
 
-def flush(config: IdentifierParameters, state: SamplingState) -> tuple[SamplingState, Sampled]:
-    """Give out what still waits: for the sample time (a recording too short to learn it), or in doubt."""
-    if state.doubtful is not None:
-        return _placed(config, state._replace(doubtful=None), state.doubtful)
-    return _learned(config, state, reset=False) if state.learning else (state, NOTHING)
+def push_block(config: IdentifierParameters, clock: Clock, log: SampleLog, block: JointBlock, first: int = 0
+               ) -> tuple[Sampled, int]:
+    """Take messages of a block from number ``first`` on; return clock and log, and how many were taken.
+
+    All those are taken at once that follow one another regularly; else one. The rows are those of ``push``.
+    """
+    regular = _regular(config, clock, block, first)
+    if regular == 0:
+        return push(config, clock, log, block.record(first)), 1
+    channels = clock.channels
+    assert channels is not None
+    taken = slice(first, first + regular)
+    stamps = block.stamp_ns[taken]
+    u, y, angles = (columns(block, places, taken) for places in (channels.u, channels.y, channels.angles))
+    finite = np.isfinite(u).all(axis=1) & np.isfinite(y).all(axis=1) & np.isfinite(angles).all(axis=1)
+    if not finite.all():
+        regular = int(np.argmin(finite))
+        if regular == 0:
+            return push(config, clock, log, block.record(first)), 1
+        stamps, u, y, angles = stamps[:regular], u[:regular], y[:regular], angles[:regular]
+    assert clock.last_ns is not None
+    last = int(stamps[-1])
+    counters = clock.counters
+    clock = clock._replace(
+        last_ns=last, interval_sum_ns=clock.interval_sum_ns + last - clock.last_ns,
+        interval_count=clock.interval_count + regular, irregular=0,
+        counters=counters._replace(received=counters.received + regular,
+                                   accepted=counters.accepted + regular))
+    log = log.append(stamps, u, y, angles, np.zeros(regular, dtype=np.bool_), config.arm.effort_delay)
+    return Sampled(clock, log), regular
 
 
-_NOT_FINITE = Refusal('not_finite', 'a configured signal is NaN or infinite',
-                      'look at the publisher of the joint states')
-_REPEATED = Refusal('repeated_stamp', 'header stamps do not advance',
-                    'use a publisher that fills header.stamp with the time of each sample')
-_LATE = Refusal('late_stamp', 'a header stamp is older than the one before',
-                'publish in the order of the stamps')
-_AHEAD = Refusal('late_stamp', 'one header stamp was far ahead of those before and after it',
-                 'look at the clock of the publisher')
+def _regular(config: IdentifierParameters, clock: Clock, block: JointBlock, first: int) -> int:
+    """Return how many messages, from ``first`` on, are regular by their stamps and layout."""
+    channels = clock.channels
+    if (channels is None or clock.interval_count == 0 or clock.jump_candidate is not None
+            or channels.names != block.names or _fault(channels, block) is not None):
+        return 0
+    assert clock.last_ns is not None
+    stamps = block.stamp_ns[first:]
+    intervals = np.diff(stamps, prepend=np.int64(clock.last_ns))
+    sums = clock.interval_sum_ns + np.concatenate([[0], np.cumsum(intervals[:-1])])
+    counts = clock.interval_count + np.arange(len(stamps))
+    # the same comparison of whole nanoseconds as ``_next``; a far jump is irregular too
+    regular = ((intervals * counts < config.gap_factor * sums)
+               & (intervals * counts > (2.0 - config.gap_factor) * sums)
+               & (intervals * 1e-9 <= config.max_time_jump))
+    return len(stamps) if regular.all() else int(np.argmin(regular))
 
 
-def _refuse(state: SamplingState, refusal: Refusal) -> SamplingState:
-    return state._replace(counters=state.counters.received_and(refusal.reason), refusal=refusal)
+def flush(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Sampled:
+    """No message follows: show the samples that wait for the sample time, or for the end of a doubt."""
+    if clock.jump_candidate is not None:
+        return _placed(config, clock._replace(jump_candidate=None), log, clock.jump_candidate)
+    return _learned(config, clock, log) if _is_learning(clock, log) else Sampled(clock, log)
 
 
-def _fault(channels: Channels, record: JointRecord) -> Refusal | None:
-    """Return what is wrong with a record that has the names of ``channels``."""
-    if record.position.size == record.velocity.size == record.effort.size == len(channels.names):
+def signals(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Signals:
+    """Return every row that the log holds, with the names of its columns."""
+    rows = log.rows(log.start, log.end)
+    return Signals(rows.stamp_ns, rows.u, rows.y, rows.angles, rows.gap, config.inputs,
+                   clock.outputs or config.outputs)
+
+
+def collect(config: IdentifierParameters, records: Iterable[JointRecord | CaptureEvent]) -> Signals:
+    """Return the signals of a whole recording."""
+    clock, log = Clock(), EMPTY
+    for item in records:
+        if isinstance(item, JointRecord):
+            clock, log, _ = push(config, clock, log, item)
+    clock, log, _ = flush(config, clock, log)
+    return signals(config, clock, log)
+
+
+_NOT_FINITE = Rejection('not_finite', 'a configured signal is NaN or infinite',
+                        'check the publisher of the joint states')
+_REPEATED = Rejection('repeated_stamp', 'header stamps do not advance',
+                      'use a publisher that fills header.stamp with the time of each sample')
+_LATE = Rejection('late_stamp', 'a header stamp is older than the one before',
+                  'publish in the order of the stamps')
+_AHEAD = Rejection('late_stamp', 'one header stamp was far ahead of those before and after it',
+                   'check the clock of the publisher')
+
+
+def _reject(clock: Clock, rejection: Rejection) -> Clock:
+    return clock._replace(counters=clock.counters.received_and(rejection.reason), rejection=rejection)
+
+
+def _fault(channels: Channels, record: JointRecord | JointBlock) -> Rejection | None:
+    """Return what is wrong with messages that have the names of ``channels``."""
+    count = len(channels.names)
+    if record.position.shape[-1] == record.velocity.shape[-1] == record.effort.shape[-1] == count:
         return None
     fault = wrong_size(record)
     if fault is not None:
         return fault
     for field, _ in channels.places:
-        if getattr(record, field).size == 0:
-            return Refusal('missing_signal', f'a message carries no {field}',
-                           'make the publisher fill it in every message')
+        if getattr(record, field).shape[-1] == 0:
+            return Rejection('missing_signal', f'a message carries no {field}',
+                             'make the publisher fill it in every message')
     return None
 
 
-def _on_clock(config: IdentifierParameters, state: SamplingState, raw: Sample
-              ) -> tuple[SamplingState, Sampled]:
-    """Place a sample; one from far ahead waits for the next, as a single wrong stamp must not cost all."""
-    held, last = state.doubtful, state.last_ns
-    if last is None or state.interval_count == 0:
-        return _placed(config, state, raw)
+def _on_clock(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sample) -> Sampled:
+    """Place a sample. One from far ahead waits for the next: a single wrong stamp must not cost all."""
+    candidate, last = clock.jump_candidate, clock.last_ns
+    if last is None or clock.interval_count == 0:
+        return _placed(config, clock, log, raw)
     ahead = (raw.stamp_ns - last) * 1e-9
-    far = max(config.max_time_jump, FAR * state.dt)
-    if held is None:
+    far = max(config.max_time_jump, FAR * clock.dt)
+    if candidate is None:
         if ahead > far:
-            return state._replace(doubtful=raw), NOTHING
-        return _placed(config, state, raw)
-    state = state._replace(doubtful=None)
+            return Sampled(clock._replace(jump_candidate=raw), log)
+        return _placed(config, clock, log, raw)
+    clock = clock._replace(jump_candidate=None)
     if abs(ahead) <= far:
-        return _placed(config, _refuse(state, _AHEAD), raw)
-    state, first = _placed(config, state, held)
-    state, second = _placed(config, state, raw)
-    if second.reset:
-        return state, second
-    return state, Sampled(first.samples + second.samples, first.reset)
+        return _placed(config, _reject(clock, _AHEAD), log, raw)
+    first = _placed(config, clock, log, candidate)
+    second = _placed(config, first.clock, first.log, raw)
+    return second._replace(reset=first.reset or second.reset)
 
 
-def _placed(config: IdentifierParameters, state: SamplingState, raw: Sample
-            ) -> tuple[SamplingState, Sampled]:
+def _placed(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sample) -> Sampled:
     """Place a sample by its stamp: repeated, late, a jump back, still learning, or the next one."""
-    interval = None if state.last_ns is None else raw.stamp_ns - state.last_ns
+    interval = None if clock.last_ns is None else raw.stamp_ns - clock.last_ns
     if interval == 0:
-        return _refuse(state, _REPEATED), NOTHING
+        return Sampled(_reject(clock, _REPEATED), log)
     if interval is not None and interval < 0:
         if -interval * 1e-9 > config.max_time_jump:
-            return _restart(config, state, raw)
-        return _refuse(state, _LATE), NOTHING
-    if state.interval_count == 0:
-        state = state._replace(learning=(*state.learning, raw), last_ns=raw.stamp_ns,
-                               counters=state.counters.one_accepted())
-        return _learned(config, state, reset=False) if len(state.learning) > LEARNING else (state, NOTHING)
-    before = state.counters
-    state, ready, gap = _next(config, state, raw, before.one_accepted())
-    if gap and state.irregular >= RELEARN:
-        return _restart(config, state._replace(counters=before.plus('gaps')), raw)
-    return state, Sampled(ready)
+            return _restart(clock, log, raw)
+        return Sampled(_reject(clock, _LATE), log)
+    if clock.interval_count == 0:
+        clock = clock._replace(last_ns=raw.stamp_ns, counters=clock.counters.received_and('accepted'))
+        log = log.wait(raw.stamp_ns, raw.u, raw.y, raw.angles)
+        return _learned(config, clock, log) if log.waiting > LEARNING else Sampled(clock, log)
+    before = clock.counters
+    clock, log, gap = _next(config, clock._replace(counters=before.received_and('accepted')), log, raw)
+    if gap and clock.irregular >= RELEARN:
+        return _restart(clock._replace(counters=before.plus('gaps')), log, raw)
+    return Sampled(clock, log)
 
 
-def _restart(config: IdentifierParameters, state: SamplingState, raw: Sample
-             ) -> tuple[SamplingState, Sampled]:
-    """Begin a new clock at ``raw``: the stamps went back, or the rate changed for good."""
-    fresh = SamplingState(channels=state.channels, outputs=state.outputs,
-                          counters=state.counters.plus('resets'))
-    fresh, _ = _on_clock(config, fresh, raw)
-    return fresh, Sampled(reset=True)
+def _restart(clock: Clock, log: SampleLog, raw: Sample) -> Sampled:
+    """Begin a new clock and a new log at ``raw``: the stamps went back, or the rate changed for good."""
+    counters = clock.counters.plus('resets').received_and('accepted')
+    fresh = Clock(channels=clock.channels, outputs=clock.outputs, counters=counters, last_ns=raw.stamp_ns)
+    return Sampled(fresh, SampleLog(log.width).wait(raw.stamp_ns, raw.u, raw.y, raw.angles), reset=True)
 
 
-def _learned(config: IdentifierParameters, state: SamplingState, *, reset: bool
-             ) -> tuple[SamplingState, Sampled]:
-    """The sample time is the median of the first intervals; place the held samples on that clock."""
-    held = state.learning
-    steps = sorted(b.stamp_ns - a.stamp_ns for a, b in pairwise(held))
-    state = state._replace(learning=(), last_ns=None, interval_count=1,
-                    interval_sum_ns=steps[len(steps) // 2] if steps else 0)
-    ready: list[Sample] = []
-    for raw in held:
-        state, complete, _ = _next(config, state, raw, state.counters)
-        ready.extend(complete)
-    return state._replace(irregular=0), Sampled(tuple(ready), reset)
+def _is_learning(clock: Clock, log: SampleLog) -> bool:
+    return clock.interval_count == 0 and log.waiting > 0
 
 
-def _next(config: IdentifierParameters, state: SamplingState, raw: Sample, counters: Counters
-          ) -> tuple[SamplingState, tuple[Sample, ...], bool]:
-    """Advance the clock by one sample; return the complete samples and whether a gap precedes ``raw``.
+def _learned(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Sampled:
+    """The sample time is the median of the first intervals; place the waiting samples on that clock."""
+    rows = log.waiting_rows()
+    stamps = rows.stamp_ns.tolist()
+    samples = [Sample(stamps[k], rows.u[k].copy(), rows.y[k].copy(), rows.angles[k].copy())
+               for k in range(len(rows))]
+    intervals = np.sort(np.diff(rows.stamp_ns)).tolist()
+    clock = clock._replace(last_ns=None, interval_count=1,
+                           interval_sum_ns=intervals[len(intervals) // 2] if intervals else 0)
+    log = log.without_waiting()
+    for raw in samples:
+        clock, log, _ = _next(config, clock, log, raw)
+    return Sampled(clock._replace(irregular=0), log)
 
-    counters: with this sample in them, but for the gap.
-    """
+
+def _next(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sample
+          ) -> tuple[Clock, SampleLog, bool]:
+    """Advance the clock by one sample; return clock, log and whether a gap precedes ``raw``."""
     gap = False
-    if state.last_ns is None:
-        state = state._replace(last_ns=raw.stamp_ns, counters=counters)
+    if clock.last_ns is None:
+        clock = clock._replace(last_ns=raw.stamp_ns)
     else:
-        interval = raw.stamp_ns - state.last_ns
-        total, count = state.interval_sum_ns, state.interval_count
-        # Compared in whole nanoseconds times count: the same stamps give the same verdict on any machine.
+        interval = raw.stamp_ns - clock.last_ns
+        total, count = clock.interval_sum_ns, clock.interval_count
+        # compared in whole nanoseconds times count: the same stamps give the same verdict on any machine
         gap = not (interval * count < config.gap_factor * total
                    and interval * count > (2.0 - config.gap_factor) * total)
         if gap:
-            raw = raw._replace(gap=True)
-            state = state._replace(irregular=state.irregular + 1, pending=(), last_ns=raw.stamp_ns,
-                                   counters=counters.plus('gaps'))
+            log = log.without_waiting()
+            clock = clock._replace(irregular=clock.irregular + 1, last_ns=raw.stamp_ns,
+                                   counters=clock.counters.plus('gaps'))
         else:
-            state = state._replace(irregular=0, interval_sum_ns=total + interval, interval_count=count + 1,
-                                   last_ns=raw.stamp_ns, counters=counters)
-    delay = config.arm.effort_delay
-    if delay == 0:
-        return state, (raw,), gap
-    queue = (*state.pending, raw)
-    if len(queue) <= delay:
-        return state._replace(pending=queue), (), gap
-    return state._replace(pending=queue[1:]), (queue[0]._replace(u=raw.u),), gap
+            clock = clock._replace(irregular=0, interval_sum_ns=total + interval, interval_count=count + 1,
+                                   last_ns=raw.stamp_ns)
+    return clock, _append(log, raw, gap, config.arm.effort_delay), gap
+
+
+def _append(log: SampleLog, raw: Sample, gap: bool, delay: int) -> SampleLog:
+    stamp: NDArray[np.int64] = np.array([raw.stamp_ns])
+    u: Array = raw.u[None]
+    return log.append(stamp, u, raw.y[None], raw.angles[None], np.array([gap]), delay)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.types import JointRecord, Sample
+from flexmanip_ros.types import Array, JointBlock, JointRecord, Sample
 
 _SHRINKABLE = IdentifierParameters().outputs
 
@@ -28,7 +28,7 @@ class Channels:
 
 
 @dataclass(frozen=True)
-class Refusal:
+class Rejection:
     """Why a message cannot be used: a counter's name, and the sentence for the user."""
 
     reason: str
@@ -38,7 +38,7 @@ class Refusal:
 
 def resolve(
     config: IdentifierParameters, record: JointRecord, outputs: tuple[str, ...] | None = None
-) -> Channels | Refusal:
+) -> Channels | Rejection:
     """Find every configured signal in a record.
 
     outputs: the signals settled on by an earlier record; None lets the default outputs shrink to what
@@ -65,17 +65,17 @@ def resolve(
     return Channels(record.names, wanted, groups[0], groups[1], groups[2], sum(groups, start=()))
 
 
-def wrong_size(record: JointRecord) -> Refusal | None:
-    """Refuse a record whose arrays have neither the length of its names nor zero."""
+def wrong_size(record: JointRecord | JointBlock) -> Rejection | None:
+    """Reject a record whose arrays have neither the length of its names nor zero."""
     count = len(record.names)
     for field in ('position', 'velocity', 'effort'):
-        size = getattr(record, field).size
+        size = getattr(record, field).shape[-1]
         if size not in (0, count):
-            return Refusal(
+            return Rejection(
                 'unequal_sizes', f"a JointState has {count} names but {size} values in '{field}'",
                 'make the publisher fill every array for every name, or leave it empty')
     if len(set(record.names)) != count:
-        return Refusal('unequal_sizes', 'a JointState names a joint twice', 'publish each joint once')
+        return Rejection('unequal_sizes', 'a JointState names a joint twice', 'publish each joint once')
     return None
 
 
@@ -91,6 +91,13 @@ def extract(channels: Channels, record: JointRecord) -> Sample | None:
     return Sample(record.stamp_ns, row[:r], row[r:r + m], row[r + m:])
 
 
+def columns(block: JointBlock, places: tuple[tuple[str, int], ...], taken: slice) -> Array:
+    """Return signals of the messages ``taken``, (N, len(places)): places as in ``Channels``."""
+    if not places:
+        return np.zeros((taken.stop - taken.start, 0))
+    return np.column_stack([getattr(block, field)[taken, index] for field, index in places])
+
+
 def _find(signal: str, record: JointRecord) -> tuple[str, int] | None:
     joint, _, field = signal.rpartition('/')
     if joint not in record.names or getattr(record, field).size == 0:
@@ -104,12 +111,12 @@ def _is_unfilled(signal: str, record: JointRecord) -> bool:
     return joint in record.names and getattr(record, field).size == 0
 
 
-def _missing(group: str, signal: str, record: JointRecord) -> Refusal:
+def _missing(group: str, signal: str, record: JointRecord) -> Rejection:
     joint, _, field = signal.rpartition('/')
     if joint not in record.names:
-        return Refusal(
+        return Rejection(
             'missing_signal', f"'{signal}' of parameter '{group}' is not in the messages",
             f'the joints there are: {", ".join(record.names) or "none"}; set {group} to match')
-    return Refusal(
+    return Rejection(
         'missing_signal', f"'{signal}' of parameter '{group}': the messages carry no {field}",
         f'set {group} to the fields that are there')

@@ -10,7 +10,7 @@ from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import cramer_rao
 from flexmanip_ros.payload.angles import chords
-from flexmanip_ros.samples.history import Signals
+from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.types import Array
 
 ORDER = 4

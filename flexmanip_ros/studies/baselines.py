@@ -30,20 +30,20 @@ RIVALS: Mapping[str, Rival] = {
 def samples(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]
             ) -> list[Sample | CaptureEvent]:
     """Return messages as samples, each event before the first sample at or after its stamp."""
-    clock = sampling.init()
-    waiting: list[CaptureEvent] = []
-    found: list[Sample | CaptureEvent] = []
+    clock, log = sampling.Clock(), sampling.EMPTY
+    events: list[CaptureEvent] = []
     for item in items:
         if isinstance(item, CaptureEvent):
-            waiting.append(item)
-            continue
-        clock, sampled = sampling.step(config, clock, item)
-        for sample in sampled.samples:
-            due = [event for event in waiting if event.stamp_ns <= sample.stamp_ns] if waiting else []
-            if due:
-                found.extend(due)
-                waiting = [event for event in waiting if event not in due]
-            found.append(sample)
+            events.append(item)
+        else:
+            clock, log, _ = sampling.push(config, clock, log, item)
+    events.sort(key=lambda event: event.stamp_ns)
+    found: list[Sample | CaptureEvent] = []
+    rows = log.rows(log.start, log.end)
+    for k, stamp_ns in enumerate(rows.stamp_ns.tolist()):
+        while events and events[0].stamp_ns <= stamp_ns:
+            found.append(events.pop(0))
+        found.append(Sample(stamp_ns, rows.u[k], rows.y[k], rows.angles[k], bool(rows.gap[k])))
     return found
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from flexmanip_ros.errors import ModelError, ParameterError
 from flexmanip_ros.identification import validation
-from flexmanip_ros.samples.history import Signals
+from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.types import Array, StateSpace
 
 

@@ -48,7 +48,7 @@ def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -
     return Summary(
         samples=state.counters.accepted,
         gaps=state.counters.gaps,
-        sample_time_s=_known(state.sampling.dt or math.nan),
+        sample_time_s=_known(state.clock.dt or math.nan),
         wall_s=wall_s,
         status='WARMING_UP' if estimate is None else estimate.status.name,
         model_status='WARMING_UP' if estimate is None else estimate.model_status.name,
@@ -67,7 +67,7 @@ def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -
 def event_time(state: pipeline.State, kind: EventKind) -> float | None:
     """Return when the latest event of a kind was, from the first sample's stamp [s]; None if not reached."""
     stamp = state.stamp_of(kind)
-    waiting = () if state.timeline is None else state.timeline.waiting
+    waiting = () if state.events is None else state.events.pending
     return None if stamp is None or CaptureEvent(stamp, kind) in waiting else (stamp - state.first_ns) / 1e9
 
 

@@ -13,7 +13,7 @@ from flexmanip_ros import pipeline
 from flexmanip_ros.arm import linearization
 from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.samples.history import History
+from flexmanip_ros.samples.sampling import collect
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.studies.achievable import payload_std
 from flexmanip_ros.studies.fault_injection import inject
@@ -102,17 +102,13 @@ def measure(config: IdentifierParameters, items: Sequence[JointRecord | CaptureE
     row['error_percent'] = None if true is None else _window_error(state, estimates, true, (begin, window[1]))
     if bound and held and config.payload_method != 'none':
         mass = row['payload_mass_kg'] if true is None else true
-        row['bound_std_kg'] = _bound(config, items, row['capture_time_s'], mass, state.sampling.dt)
+        row['bound_std_kg'] = _bound(config, items, row['capture_time_s'], mass, state.clock.dt)
     return row
 
 
 def _bound(config: IdentifierParameters, items: Sequence[JointRecord | CaptureEvent], capture_time: float,
            mass: float | None, dt: float) -> float | None:
-    history = History(config)
-    for item in items:
-        if isinstance(item, JointRecord):
-            history.add(item)
-    return None if mass is None else payload_std(config, history.signals(), capture_time, mass, dt)
+    return None if mass is None else payload_std(config, collect(config, items), capture_time, mass, dt)
 
 
 def _window_error(state: pipeline.State, estimates: Sequence[Estimate], true: float,

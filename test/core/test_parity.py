@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from flexmanip_ros import pipeline
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord
 
 Item = JointRecord | CaptureEvent
 MS = 1_000_000
@@ -67,6 +67,7 @@ def test_message_by_message_is_the_replay_bit_for_bit(bad: list[tuple[int, str]]
     for item in items:
         state, ready = pipeline.step(CONFIG, state, item)
         live.extend(ready)
+    live = list(pipeline.one_a_stamp(live))
     replayed, last = [], pipeline.init()
     for now, estimate in pipeline.replay(CONFIG, items):
         last = now
@@ -76,6 +77,40 @@ def test_message_by_message_is_the_replay_bit_for_bit(bad: list[tuple[int, str]]
     assert live[-1].payload is not None
     assert last.counters == state.counters
     assert _bits(pipeline.current(state)) == _bits(pipeline.current(last))
+
+
+def _in_blocks(items: list[Item], size: int) -> list[Item | JointBlock]:
+    """Return the same messages with consecutive records of one layout in blocks."""
+    out: list[Item | JointBlock] = []
+    run: list[JointRecord] = []
+
+    def shape(record: JointRecord) -> tuple[object, ...]:
+        return record.names, record.position.size, record.velocity.size, record.effort.size
+
+    for item in [*items, None]:
+        if run and (not isinstance(item, JointRecord) or shape(item) != shape(run[0]) or len(run) == size):
+            out.append(JointBlock(run[0].names, np.array([r.stamp_ns for r in run]),
+                                  *(np.array([getattr(r, name) for r in run])
+                                    for name in ('position', 'velocity', 'effort'))))
+            run = []
+        if isinstance(item, JointRecord):
+            run.append(item)
+        elif item is not None:
+            out.append(item)
+    return out
+
+
+@settings(max_examples=8, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(faults, announced, st.sampled_from([2, 37, 1000]), st.sampled_from([0, 2]))
+def test_blocks_of_messages_give_the_bits_of_single_messages(
+        bad: list[tuple[int, str]], events: list[tuple[int, int, EventKind]], size: int, delay: int) -> None:
+    items = _arrivals(bad, events)
+    config = configure(IdentifierParameters, {'publish_rate': 40.0, 'rewind_time': 0.1, 'arm.effort_delay': delay})
+    single = list(pipeline.replay(config, items))
+    blocks = list(pipeline.replay(config, _in_blocks(items, size)))
+    assert [_bits(e) for _, e in single] == [_bits(e) for _, e in blocks]
+    assert single[-1][0].counters == blocks[-1][0].counters
+    assert _bits(pipeline.current(single[-1][0])) == _bits(pipeline.current(blocks[-1][0]))
 
 
 def test_every_fit_after_a_capture_gives_the_same_bits_live_and_replayed() -> None:
@@ -89,6 +124,7 @@ def test_every_fit_after_a_capture_gives_the_same_bits_live_and_replayed() -> No
         for item in items:
             state, ready = pipeline.step(config, state, item)
             live += ready
+        live = list(pipeline.one_a_stamp(live))
         ballast = [np.empty(3 * k + 1) for k in range(50)]  # other places in memory, the same numbers
         replayed = list(pipeline.run(config, items))
         assert [_bits(one) for one in live] == [_bits(one) for one in replayed], len(ballast)

@@ -20,16 +20,17 @@ def record(k: float, names: tuple[str, ...] = NAMES, **arrays: object) -> JointR
 
 
 def drive(records: list[JointRecord], config: IdentifierParameters | None = None
-          ) -> tuple[sampling.SamplingState, list[Sample], int]:
+          ) -> tuple[sampling.Clock, list[Sample], int]:
     config = config or IdentifierParameters()
-    state, out, resets = sampling.init(), [], 0
+    clock, log, resets = sampling.Clock(), sampling.EMPTY, 0
     for item in records:
-        state, got = sampling.step(config, state, item)
-        if got.reset:
-            out, resets = [], resets + 1
-        out.extend(got.samples)
-    state, got = sampling.flush(config, state)
-    return state, out + list(got.samples), resets
+        clock, log, reset = sampling.push(config, clock, log, item)
+        resets += reset
+    clock, log, reset = sampling.flush(config, clock, log)
+    rows = log.rows(0, log.end)
+    samples = [Sample(int(rows.stamp_ns[k]), rows.u[k], rows.y[k], rows.angles[k], bool(rows.gap[k]))
+               for k in range(len(rows))]
+    return clock, samples, resets + reset
 
 
 def test_every_regular_message_becomes_one_sample_and_the_mean_interval_is_the_sample_time() -> None:
@@ -81,8 +82,8 @@ def test_outputs_set_by_the_user_never_shrink() -> None:
                                               'order': 2})
     state, samples, _ = drive([record(k, velocity=[]) for k in range(30)], config)
     assert samples == []
-    assert state.refusal is not None
-    assert 'link1_bend/velocity' in state.refusal.problem
+    assert state.rejection is not None
+    assert 'link1_bend/velocity' in state.rejection.problem
 
 
 @pytest.mark.parametrize(('bad', 'counter'), [
@@ -165,5 +166,5 @@ def test_a_recording_shorter_than_the_learning_is_not_lost() -> None:
 
 def test_stamps_of_zero_are_explained() -> None:
     state, _, _ = drive([record(k)._replace(stamp_ns=0) for k in range(10)])
-    assert state.refusal is not None
-    assert 'stamps do not advance' in state.refusal.problem
+    assert state.rejection is not None
+    assert 'stamps do not advance' in state.rejection.problem

@@ -123,9 +123,9 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
             self.detected_publisher.publish(header(event))
             self.detected.note(event)
             self.get_logger().info(f'{event.kind.value} detected at {event.stamp_ns * 1e-9:.6f}')
-        if watcher.counters.dropped > dropped and watcher.refusal is not None:
-            self.complain(watcher.refusal.reason,
-                          f'message dropped: {watcher.refusal.problem}; {watcher.refusal.remedy}')
+        if watcher.counters.dropped > dropped and watcher.rejection is not None:
+            self.complain(watcher.rejection.reason,
+                          f'message dropped: {watcher.rejection.problem}; {watcher.rejection.remedy}')
 
     def _begin(self, stamp: int) -> None:
         """Plan the events of mode time from the first stamp."""

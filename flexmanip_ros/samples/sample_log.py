@@ -1,0 +1,241 @@
+"""The one place where samples are kept: columns to which rows are only ever appended.
+
+A ``SampleLog`` is a value: appending returns a new one and leaves the old one as it was. Both share one buffer, so
+an append costs a copy of the new rows alone. Estimators remember row numbers, counted from the first sample of
+the run, and read slices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexmanip_ros.types import Array
+
+SMALLEST = 1024
+"""Rows of the first buffer: one second at 1 kHz."""
+
+
+class Width(NamedTuple):
+    """Number of inputs r, outputs m and angles a of a row."""
+
+    inputs: int
+    outputs: int
+    angles: int
+
+
+class _Buffer:
+    """Memory shared by logs. Rows below ``filled`` belong to some log and are never written again.
+
+    The exception are the inputs of rows that wait for them, which no log shows until they are there.
+    """
+
+    __slots__ = ('filled', 'first', 'gap', 'stamp_ns', 'values')
+
+    def __init__(self, first: int, rows: int, width: int) -> None:
+        self.first = first
+        self.filled = first
+        self.stamp_ns = np.zeros(rows, dtype=np.int64)
+        self.values = np.zeros((rows, width))
+        self.gap = np.zeros(rows, dtype=np.bool_)
+
+
+@dataclass(frozen=True, eq=False)
+class SampleLog:
+    """Samples of the configured signals, one a row.
+
+    start, end: numbers of the first row still kept, and of the row after the last; waiting: rows after these
+    whose inputs (``arm.effort_delay``) or whose sample time are not known yet.
+    """
+
+    width: Width
+    start: int = 0
+    end: int = 0
+    waiting: int = 0
+    _buffer: _Buffer | None = None
+
+    def rows(self, first: int, until: int) -> Rows:
+        """Return the rows ``first <= row < until``. Raises IndexError where they are not kept."""
+        if not self.start <= first <= until <= self.end:
+            raise IndexError(f'rows {first} to {until} of a log that holds {self.start} to {self.end}')
+        return Rows(self, first, until)
+
+    def row_at(self, stamp_ns: int, first: int) -> int:
+        """Return the first row, ``first`` or later, with this stamp [ns] or a later one; ``end`` if none has."""
+        buffer = self._buffer
+        if buffer is None or first >= self.end:
+            return self.end
+        stamps = buffer.stamp_ns[first - buffer.first:self.end - buffer.first]
+        return first + int(np.searchsorted(stamps, stamp_ns, side='left'))
+
+    def append(self, stamp_ns: NDArray[np.int64], u: Array, y: Array, angles: Array, gap: NDArray[np.bool_],
+               delay: int = 0) -> SampleLog:
+        """Return the log with N more rows.
+
+        stamp_ns: (N,); u: (N, r), of which row k belongs to the row ``delay`` before k; y: (N, m);
+        angles: (N, a); gap: (N,). A row is shown once its inputs are there.
+        """
+        buffer = self._with_room(len(stamp_ns))
+        r, m = self.width.inputs, self.width.outputs
+        at = self.end + self.waiting - buffer.first
+        stop = at + len(stamp_ns)
+        buffer.stamp_ns[at:stop] = stamp_ns
+        buffer.values[at:stop, r:r + m] = y
+        buffer.values[at:stop, r + m:] = angles
+        buffer.gap[at:stop] = gap
+        earliest = self.end - buffer.first
+        skipped = max(0, earliest - (at - delay))
+        if skipped < len(u):
+            buffer.values[at - delay + skipped:stop - delay, :r] = u[skipped:]
+        buffer.filled = stop + buffer.first
+        end = max(self.end, buffer.filled - delay)
+        return SampleLog(self.width, self.start, end, buffer.filled - end, buffer)
+
+    def wait(self, stamp_ns: int, u: Array, y: Array, angles: Array) -> SampleLog:
+        """Return the log with one more row that is not shown yet, its own inputs with it."""
+        log = self.append(np.array([stamp_ns]), u[None], y[None], angles[None], np.zeros(1, dtype=np.bool_))
+        return SampleLog(self.width, self.start, self.end, self.waiting + 1, log._buffer)
+
+    def waiting_rows(self) -> Rows:
+        """Return the rows that are not shown yet."""
+        return Rows(self, self.end, self.end + self.waiting)
+
+    def without_waiting(self) -> SampleLog:
+        """Return the log without the rows that are not shown yet."""
+        return SampleLog(self.width, self.start, self.end, 0, self._buffer) if self.waiting else self
+
+    def from_row(self, first: int) -> SampleLog:
+        """Return the log without the rows before ``first``; their memory is freed with the next buffer."""
+        if first <= self.start:
+            return self
+        return SampleLog(self.width, min(first, self.end), self.end, self.waiting, self._buffer)
+
+    def _with_room(self, count: int) -> _Buffer:
+        """Return a buffer that may be written after the last row, with room for ``count`` rows."""
+        old, last = self._buffer, self.end + self.waiting
+        if old is not None and old.filled == last and last - old.first + count <= len(old.stamp_ns):
+            return old
+        kept = last - self.start
+        new = _Buffer(self.start, max(SMALLEST, 2 * (kept + count)), sum(self.width))
+        if old is not None and kept:
+            a, b = self.start - old.first, last - old.first
+            new.stamp_ns[:kept] = old.stamp_ns[a:b]
+            new.values[:kept] = old.values[a:b]
+            new.gap[:kept] = old.gap[a:b]
+        new.filled = last
+        return new
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """The rows ``first <= row < until`` of a log; N = until - first. Its arrays are views: do not write them."""
+
+    log: SampleLog
+    first: int
+    until: int
+    chosen: tuple[int, ...] | None = None
+    """Which outputs ``y`` shows; None: all."""
+
+    def __len__(self) -> int:
+        """Return N."""
+        return self.until - self.first
+
+    def since(self, first: int) -> Rows:
+        """Return the rows from another first row on. Raises IndexError where that is not kept any more."""
+        if not self.log.start <= first <= self.until:
+            raise IndexError(f'row {first} of a log that holds {self.log.start} to {self.log.end}')
+        return Rows(self.log, first, self.until, self.chosen)
+
+    def between(self, first: int, until: int) -> Rows:
+        """Return the rows ``first <= row < until`` of the same log."""
+        return Rows(self.log, first, until, self.chosen)
+
+    def with_outputs(self, chosen: tuple[int, ...]) -> Rows:
+        """Return the same rows showing only these outputs."""
+        return Rows(self.log, self.first, self.until, chosen)
+
+    def _values(self, begin: int, end: int) -> Array:
+        buffer = self.log._buffer
+        if buffer is None:
+            return np.zeros((0, end - begin))
+        return buffer.values[self.first - buffer.first:self.until - buffer.first, begin:end]
+
+    @property
+    def stamp_ns(self) -> NDArray[np.int64]:
+        """(N,) stamps [ns]."""
+        buffer = self.log._buffer
+        if buffer is None:
+            return np.zeros(0, dtype=np.int64)
+        return buffer.stamp_ns[self.first - buffer.first:self.until - buffer.first]
+
+    @property
+    def u(self) -> Array:
+        """(N, r) inputs, each held from its stamp on [N m]."""
+        return self._values(0, self.log.width.inputs)
+
+    @property
+    def y(self) -> Array:
+        """(N, m) outputs [m, m/s, rad, ...]."""
+        y = self._values(self.log.width.inputs, self.log.width.inputs + self.log.width.outputs)
+        return y if self.chosen is None else y[:, list(self.chosen)]
+
+    @property
+    def u_y(self) -> Array:
+        """(N, r + m) inputs and outputs."""
+        return self._values(0, self.log.width.inputs + self.log.width.outputs)
+
+    @property
+    def angles(self) -> Array:
+        """(N, a) measured configuration [rad]."""
+        return self._values(self.log.width.inputs + self.log.width.outputs, sum(self.log.width))
+
+    @property
+    def gap(self) -> NDArray[np.bool_]:
+        """(N,) a sample is missing before the row: no regressor may reach back over it."""
+        buffer = self.log._buffer
+        if buffer is None:
+            return np.zeros(0, dtype=np.bool_)
+        return buffer.gap[self.first - buffer.first:self.until - buffer.first]
+
+    def stretches(self) -> list[Rows]:
+        """Return the rows in pieces, each of which has a gap at most before its first row."""
+        gaps = (np.flatnonzero(self.gap[1:]) + self.first + 1).tolist()
+        borders = [self.first, *gaps, self.until]
+        return [self.between(a, b) for a, b in pairwise(borders) if b > a]
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """The samples of a run as named columns, for pictures, tables and scores.
+
+    stamp_ns: (N,); u: (N, r); y: (N, m); angles: (N, 2) or (N, 0); gap: (N,) a sample is missing before it.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    u: Array
+    y: Array
+    angles: Array
+    gap: NDArray[np.bool_]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    @property
+    def time(self) -> Array:
+        """Seconds from the first sample: (N,)."""
+        first = self.stamp_ns[0] if self.stamp_ns.size else 0
+        return np.asarray((self.stamp_ns - first) * 1e-9, dtype=np.float64)
+
+
+def log_of(u: Array, y: Array, angles: Array | None = None, stamp_ns: NDArray[np.int64] | None = None,
+           gap: NDArray[np.bool_] | None = None) -> SampleLog:
+    """Return a log of whole arrays: u (N, r), y (N, m), angles (N, a), stamp_ns (N,), gap (N,)."""
+    u, y = np.atleast_2d(u), np.atleast_2d(y)
+    count = len(y)
+    angles = np.zeros((count, 0)) if angles is None else angles
+    log = SampleLog(Width(u.shape[1], y.shape[1], angles.shape[1]))
+    return log.append(np.zeros(count, dtype=np.int64) if stamp_ns is None else stamp_ns, u, y, angles,
+                      np.zeros(count, dtype=np.bool_) if gap is None else gap)
