@@ -1,8 +1,8 @@
-"""The state of an estimator in a file: exact to the bit, safe to read, written whole or not at all.
+"""The state of the identifier in a file: exact to the bit, safe to read, written whole or not at all.
 
-A state is a tree of NamedTuples, frozen dataclasses, enumerations, plain values and arrays. The file holds
-the tree as JSON and the arrays as bytes, under a checksum: a damaged file is refused, never half believed.
-Reading makes only classes of this package that are of those kinds, so no file can run anything.
+The file is a header, a SHA-256 checksum and an ``np.savez`` archive. The archive holds every array of the state (the
+rows of the sample log among them) and one text, ``tree``: JSON that says which array and which plain value stands
+where. Reading makes only values of this package (NamedTuples, dataclasses, enumerations), so no file can run code.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import contextlib
 import dataclasses
 import hashlib
 import importlib
+import io
 import json
-import math
 import os
-import struct
+import zipfile
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -24,12 +24,13 @@ import numpy as np
 import flexmanip_ros
 from flexmanip_ros.errors import CheckpointError
 
-MAGIC = b'flexmanip_ros checkpoint 1\n'
-LENGTH = struct.Struct('<Q')
-SEAL = 32
-"""Bytes of the checksum."""
+NAME, FORMAT = b'flexmanip_ros checkpoint ', b'2\n'
+"""Format 1 held queues of samples where format 2 holds the sample log."""
+CHECKSUM = hashlib.sha256().digest_size
 PACKAGE = 'flexmanip_ros.'
-_AGAIN = 'it starts anew'
+_NUMBERS = 'biuf'
+"""Kinds of arrays that a state holds: truth values, integers and floats."""
+_EMPTY_START = 'the identifier starts with nothing known'
 
 
 def save(path: str | Path, value: Any) -> None:
@@ -41,7 +42,7 @@ def save(path: str | Path, value: Any) -> None:
         os.replace(partial, target)
     except OSError as err:
         with contextlib.suppress(OSError):
-            partial.unlink()  # half a state helps nobody, least on a full disk
+            partial.unlink()  # on a full disk it would stay in the way
         raise CheckpointError(f"checkpoint '{path}' cannot be written: {err.strerror}",
                               'give another checkpoint_file, or free some space') from err
 
@@ -53,108 +54,92 @@ def load(path: str | Path) -> Any:
     except FileNotFoundError:
         return None
     except OSError as err:
-        raise CheckpointError(f"checkpoint '{path}' cannot be read: {err.strerror}", _AGAIN) from err
+        raise CheckpointError(f"checkpoint '{path}' cannot be read: {err.strerror}", _EMPTY_START) from err
     return decode(data)
 
 
 def encode(value: Any) -> bytes:
-    """Return a value as bytes."""
-    blob = bytearray()
-    tree = _plain(value, blob, {})
-    text = json.dumps({'version': flexmanip_ros.__version__, 'tree': tree}, allow_nan=False).encode()
-    return sealed(text, bytes(blob))
+    """Return a value as the bytes of a checkpoint."""
+    found: dict[int, tuple[int, Any]] = {}
+    tree = _plain(value, found)
+    arrays = {f'array_{k}': one for k, one in found.values() if isinstance(one, np.ndarray)}
+    return sealed(json.dumps({'version': flexmanip_ros.__version__, 'tree': tree}), arrays)
 
 
-def sealed(text: bytes, blob: bytes) -> bytes:
-    """Return tree and arrays with their checksum."""
-    body = LENGTH.pack(len(text)) + text + blob
-    return MAGIC + hashlib.sha256(body).digest() + body
+def sealed(text: str, arrays: dict[str, np.ndarray[Any, Any]]) -> bytes:
+    """Return header, checksum and archive of a tree and its arrays."""
+    archive = io.BytesIO()
+    np.savez(archive, tree=np.frombuffer(text.encode(), np.uint8), **arrays)  # type: ignore[arg-type]
+    body = archive.getvalue()
+    return NAME + FORMAT + hashlib.sha256(body).digest() + body
 
 
 def decode(data: bytes) -> Any:
     """Return the value in the bytes. Raises CheckpointError for anything else."""
-    if not data.startswith(MAGIC):
-        raise CheckpointError('the file is no checkpoint', _AGAIN)
-    seal, body = data[len(MAGIC):len(MAGIC) + SEAL], data[len(MAGIC) + SEAL:]
-    if hashlib.sha256(body).digest() != seal:
-        raise CheckpointError('the checkpoint is damaged', _AGAIN)
+    header, rest = data[:len(NAME + FORMAT)], data[len(NAME + FORMAT):]
+    if not header.startswith(NAME):
+        raise CheckpointError('the file is no checkpoint', _EMPTY_START)
+    if header != NAME + FORMAT:
+        raise CheckpointError('the checkpoint has another format than this version of the package writes', _EMPTY_START)
+    checksum, body = rest[:CHECKSUM], rest[CHECKSUM:]
+    if hashlib.sha256(body).digest() != checksum:
+        raise CheckpointError('the checkpoint is damaged: its checksum does not fit', _EMPTY_START)
     try:
-        size = LENGTH.unpack_from(body)[0]
-        document = json.loads(body[LENGTH.size:LENGTH.size + size])
-        version = document['version']
-        if version == flexmanip_ros.__version__:
-            return _value(document['tree'], body[LENGTH.size + size:], {})
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError, ImportError, struct.error,
-            RecursionError, MemoryError, OverflowError) as err:
-        raise CheckpointError('the checkpoint was not written by this package', _AGAIN) from err
-    raise CheckpointError(f'the checkpoint is of version {version}', _AGAIN)
+        with np.load(io.BytesIO(body), allow_pickle=False) as archive:
+            document = json.loads(archive['tree'].tobytes())
+            version = document['version']
+            if version == flexmanip_ros.__version__:
+                return _value(document['tree'], archive, [])
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, ImportError, RecursionError, MemoryError,
+            OverflowError, zipfile.BadZipFile) as err:
+        raise CheckpointError('the checkpoint was not written by this package', _EMPTY_START) from err
+    raise CheckpointError(f'the checkpoint is of version {version} of the package', _EMPTY_START)
 
 
-def _plain(value: Any, blob: bytearray, known: dict[int, tuple[dict[str, Any], Any]]) -> Any:
-    """Return a value as JSON has it; arrays go to the blob, each only once."""
-    if value is None or isinstance(value, (bool, str)):
-        return value
+def _plain(value: Any, found: dict[int, tuple[int, Any]]) -> Any:
+    """Return a value as JSON has it. Arrays and dataclasses that occur twice are written once: found: by ``id``."""
     if isinstance(value, Enum):
         return {'enum': _name(type(value)), 'member': value.name}
-    if isinstance(value, np.ndarray):
-        if id(value) not in known:
-            known[id(value)] = (_array(value, blob), value)
-        return known[id(value)][0]
-    if isinstance(value, (int, np.integer)):
+    if value is None or isinstance(value, (bool, str, int, float)):
+        return float(value) if isinstance(value, np.floating) else value
+    if isinstance(value, np.integer):
         return int(value)
-    if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else {'float': repr(float(value))}
     if isinstance(value, tuple):
-        items = [_plain(item, blob, known) for item in value]
-        named = hasattr(value, '_fields')
-        return {'named': _name(type(value)), 'items': items} if named else {'tuple': items}
-    if dataclasses.is_dataclass(value):
-        parts = {item.name: _plain(getattr(value, item.name), blob, known)
-                 for item in dataclasses.fields(value)}
-        return {'data': _name(type(value)), 'parts': parts}
-    raise TypeError(f'no place in a checkpoint for {type(value).__name__}')
+        items = [_plain(item, found) for item in value]
+        return {'named': _name(type(value)), 'items': items} if hasattr(value, '_fields') else {'tuple': items}
+    if id(value) in found:
+        return {'same': found[id(value)][0]}
+    if isinstance(value, np.ndarray) and value.dtype.kind in _NUMBERS:
+        parts = None
+    elif dataclasses.is_dataclass(value):
+        parts = {item.name: _plain(getattr(value, item.name), found) for item in dataclasses.fields(value)}
+    else:
+        raise TypeError(f'no place in a checkpoint for {type(value).__name__}')
+    number = len(found)
+    found[id(value)] = number, value
+    return {'array': number} if parts is None else {'data': _name(type(value)), 'parts': parts}
 
 
-def _array(value: np.ndarray[Any, Any], blob: bytearray) -> dict[str, Any]:
-    if value.dtype.kind not in 'biuf':
-        raise TypeError(f'no place in a checkpoint for an array of {value.dtype}')
-    fortran = bool(value.flags.f_contiguous and not value.flags.c_contiguous)
-    blob += b'\0' * (-len(blob) % 8)
-    at = len(blob)
-    blob += value.tobytes(order='F' if fortran else 'C')
-    return {'array': value.dtype.str, 'shape': list(value.shape), 'fortran': fortran, 'at': at}
-
-
-def _value(tree: Any, blob: bytes, arrays: dict[int, np.ndarray[Any, Any]]) -> Any:
+def _value(tree: Any, archive: Any, made: list[Any]) -> Any:
+    """Return the value of a part of the tree; made: the arrays and dataclasses so far, in the order of writing."""
     if not isinstance(tree, dict):
-        if tree is None or isinstance(tree, (bool, int, float, str)):
-            return tree
-        raise ValueError('a bare list')
-    if 'array' in tree:
-        return _read_array(tree, blob, arrays)
+        if isinstance(tree, list):
+            raise ValueError('a list without a type')
+        return tree
+    if 'same' in tree:
+        return made[tree['same']]
     if 'tuple' in tree:
-        return tuple(_value(item, blob, arrays) for item in tree['tuple'])
-    if 'float' in tree:
-        return float(tree['float'])
+        return tuple(_value(item, archive, made) for item in tree['tuple'])
     if 'enum' in tree:
         return _class(tree['enum'], Enum)[tree['member']]
     if 'named' in tree:
-        return _class(tree['named'], tuple)._make(_value(item, blob, arrays) for item in tree['items'])
-    parts = {name: _value(part, blob, arrays) for name, part in tree['parts'].items()}
-    return _class(tree['data'], None)(**parts)
-
-
-def _read_array(tree: dict[str, Any], blob: bytes, arrays: dict[int, np.ndarray[Any, Any]]) -> Any:
-    at, dtype, shape = int(tree['at']), np.dtype(tree['array']), tuple(int(n) for n in tree['shape'])
-    if dtype.kind not in 'biuf' or at < 0 or min(shape, default=0) < 0:
-        raise ValueError('not an array of numbers')
-    count = math.prod(shape)
-    if at + count * dtype.itemsize > len(blob):
-        raise ValueError('an array runs past the end')
-    if at not in arrays or arrays[at].shape != shape or arrays[at].dtype != dtype:
-        flat = np.frombuffer(blob, dtype, count, at) if count else np.empty(0, dtype)
-        arrays[at] = np.array(flat).reshape(shape, order='F' if tree['fortran'] else 'C')
-    return arrays[at]
+        return _class(tree['named'], tuple)._make(_value(item, archive, made) for item in tree['items'])
+    if 'array' in tree:
+        made.append(archive[f'array_{tree["array"]}'])
+    else:
+        parts = {name: _value(part, archive, made) for name, part in tree['parts'].items()}
+        made.append(_class(tree['data'], None)(**parts))
+    return made[-1]
 
 
 def _name(cls: type) -> str:
@@ -162,7 +147,7 @@ def _name(cls: type) -> str:
 
 
 def _class(name: str, base: type | None) -> Any:
-    """Return a class of this package by name; nothing else can be named."""
+    """Return a class of this package by name: a subclass of ``base``, or a dataclass where that is None."""
     module, _, qualified = name.partition(':')
     if not module.startswith(PACKAGE) or '.' in qualified:
         raise ValueError(f"'{name}' is not of this package")

@@ -28,20 +28,20 @@ class Width(NamedTuple):
     angles: int
 
 
+@dataclass(eq=False, slots=True)
 class _Buffer:
     """Memory shared by logs. Rows below ``filled`` belong to some log and are never written again.
 
     The exception are the inputs of rows that wait for them, which no log shows until they are there.
     """
 
-    __slots__ = ('filled', 'first', 'gap', 'stamp_ns', 'values')
-
-    def __init__(self, first: int, rows: int, width: int) -> None:
-        self.first = first
-        self.filled = first
-        self.stamp_ns = np.zeros(rows, dtype=np.int64)
-        self.values = np.zeros((rows, width))
-        self.gap = np.zeros(rows, dtype=np.bool_)
+    first: int
+    """Number of the row at index 0."""
+    filled: int
+    """Number of the row after the last one written."""
+    stamp_ns: NDArray[np.int64]
+    values: Array
+    gap: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,13 +120,14 @@ class SampleLog:
         if old is not None and old.filled == last and last - old.first + count <= len(old.stamp_ns):
             return old
         kept = last - self.start
-        new = _Buffer(self.start, max(SMALLEST, 2 * (kept + count)), sum(self.width))
+        size = max(SMALLEST, 2 * (kept + count))
+        new = _Buffer(self.start, last, np.zeros(size, dtype=np.int64), np.zeros((size, sum(self.width))),
+                      np.zeros(size, dtype=np.bool_))
         if old is not None and kept:
             a, b = self.start - old.first, last - old.first
             new.stamp_ns[:kept] = old.stamp_ns[a:b]
             new.values[:kept] = old.values[a:b]
             new.gap[:kept] = old.gap[a:b]
-        new.filled = last
         return new
 
 

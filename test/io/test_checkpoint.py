@@ -65,7 +65,7 @@ def test_no_file_is_no_state_and_a_save_leaves_no_scraps(tmp_path: Path) -> None
     assert checkpoint.load(tmp_path / 'nothing') is None
     checkpoint.save(tmp_path / 'state', pipeline.init())
     assert [path.name for path in tmp_path.iterdir()] == ['state']
-    assert checkpoint.load(tmp_path / 'state') == pipeline.init()
+    assert same(checkpoint.load(tmp_path / 'state'), pipeline.init())
 
 
 @pytest.mark.parametrize('name', [
@@ -74,16 +74,30 @@ def test_no_file_is_no_state_and_a_save_leaves_no_scraps(tmp_path: Path) -> None
 ])
 def test_a_file_can_name_nothing_but_values_of_this_package(tmp_path: Path, name: str) -> None:
     for kind, rest in (('named', {'items': ['true']}), ('data', {'parts': {}}), ('enum', {'member': 'x'})):
-        text = json.dumps({'version': flexmanip_ros.__version__, 'tree': {kind: name, **rest}}).encode()
-        (tmp_path / 'bad').write_bytes(checkpoint.sealed(text, b''))
+        text = json.dumps({'version': flexmanip_ros.__version__, 'tree': {kind: name, **rest}})
+        (tmp_path / 'bad').write_bytes(checkpoint.sealed(text, {}))
         with pytest.raises(CheckpointError, match='not written by this package'):
             checkpoint.load(tmp_path / 'bad')
 
 
 def test_a_checkpoint_of_another_version_says_so(tmp_path: Path) -> None:
-    (tmp_path / 'old').write_bytes(checkpoint.sealed(b'{"version": "9.9.9", "tree": 1}', b''))
+    (tmp_path / 'old').write_bytes(checkpoint.sealed('{"version": "9.9.9", "tree": 1}', {}))
     with pytest.raises(CheckpointError, match=r'version 9\.9\.9'):
         checkpoint.load(tmp_path / 'old')
+
+
+def test_a_checkpoint_of_the_old_format_is_refused_with_the_reason(tmp_path: Path) -> None:
+    (tmp_path / 'old').write_bytes(b'flexmanip_ros checkpoint 1\n' + bytes(100))
+    with pytest.raises(CheckpointError, match='another format'):
+        checkpoint.load(tmp_path / 'old')
+
+
+def test_arrays_and_the_sample_log_are_written_once(tmp_path: Path) -> None:
+    state, _ = stepped(pipeline.init(), items(400))
+    one, two = len(checkpoint.encode(state)), len(checkpoint.encode((state, state)))
+    assert two < 1.2 * one
+    loaded = checkpoint.decode(checkpoint.encode((state, state)))
+    assert loaded[0].log is loaded[1].log
 
 
 def test_a_save_that_fails_keeps_the_old_state_and_leaves_no_scraps(
