@@ -1,4 +1,4 @@
-"""Identifier and payload side by side, as cursors into one sample log, and what is read out of them."""
+"""The two estimators, payload and model, each a cursor into the sample log, and what is read out of them."""
 
 from __future__ import annotations
 
@@ -21,70 +21,86 @@ from flexmanip_ros.payload.model_comparison import Verdict
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, Payload, Status
 
+NO_ANGLES: Array = np.empty(0)
 
-class EstimatorState(NamedTuple):
-    """Everything the estimators remember; constant in size."""
 
-    rpbsid: rpbsid.RpbsidState
+class PayloadEstimator(NamedTuple):
+    """The payload where it does not rest on the model: ``event_replay.Estimator``; constant in size."""
+
     structured: structured.StructuredState | None
-    angles: Array
-    """The latest measured configuration: (2,) [rad], or (0,) when there is none."""
-    swept: Array
-    """What the configuration went through since the last event, see ``block_extraction.sweep``."""
-    turned: Array = NOWHERE
-    """The same for the model check, see ``model_check.sweep``."""
+    """None where the payload is read out of the model, or not at all."""
+    configuration_range: Array = NOWHERE
+    """What the configuration went through since the last event, see ``model_check.sweep``."""
     since_ns: int = 0
     """Stamp of the last event; 0 before the first."""
 
+    def first_needed(self, cursor: int) -> int:
+        """Return the first row of the sample log that will be read again."""
+        return cursor if self.structured is None else structured.first_needed(self.structured)
 
-def init(config: IdentifierParameters) -> EstimatorState:
-    """Start with nothing known. ``config.outputs`` are those the messages really carry."""
-    wanted = config.payload_method == 'structured'
-    return EstimatorState(
-        rpbsid.init(config), structured.init(config) if wanted else None, np.empty(0), np.empty(0))
-
-
-def first_needed(state: EstimatorState) -> int:
-    """Return the first row of the sample log that will be read again."""
-    first = rpbsid.first_needed(state.rpbsid)
-    return first if state.structured is None else min(first, structured.first_needed(state.structured))
-
-
-def advance(config: IdentifierParameters, state: EstimatorState, rows: Rows, background: Background
-            ) -> EstimatorState:
-    """Take the next rows of the log. One call with N rows gives the bits of N calls with one."""
-    held, turned = state.structured, state.turned
-    if held is not None:
-        held = structured.advance(config, held, rows)
+    def advance(self, config: IdentifierParameters, rows: Rows, background: Background) -> PayloadEstimator:
+        """Take the next rows of the log. One call with N rows gives the bits of N calls with one."""
+        if self.structured is None:
+            return self
+        held, turned = structured.advance(config, self.structured, rows), self.configuration_range
         if held.model is not None:
             turned = model_check.sweep(turned, rows, config.arm.angle_convention == 'encoder')
-    return EstimatorState(
-        rpbsid.advance(config, state.rpbsid, rows, background), held, rows.angles[-1].copy(),
-        block_extraction.sweep(config, state.swept, rows), turned, state.since_ns)
+        return PayloadEstimator(held, turned, self.since_ns)
+
+    def event(self, config: IdentifierParameters, event: CaptureEvent, background: Background) -> PayloadEstimator:
+        """The arm caught or let go of something before the next row."""
+        held = self.structured if self.structured is None else structured.event(config, self.structured, event)
+        return PayloadEstimator(held, NOWHERE, event.stamp_ns)
+
+    def restart(self, config: IdentifierParameters, events: Sequence[CaptureEvent]) -> PayloadEstimator:
+        """Begin again, after events from before every sample."""
+        if self.structured is None:
+            return self
+        held = structured.init(config)._replace(cursor=self.structured.cursor)
+        for event in events:
+            held = structured.event(config, held, event)
+        return self._replace(structured=held, since_ns=events[-1].stamp_ns)
 
 
-def event(config: IdentifierParameters, state: EstimatorState, event: CaptureEvent, background: Background
-          ) -> EstimatorState:
-    """Tell both estimators that the arm caught or let go of something before the next row."""
-    held = state.structured
-    if held is not None:
-        held = structured.event(config, held, event)
-    return state._replace(rpbsid=rpbsid.restart(config, state.rpbsid, background), structured=held,
-                          swept=np.empty(0), turned=NOWHERE, since_ns=event.stamp_ns)
+class ModelEstimator(NamedTuple):
+    """The identifier: ``event_replay.Estimator``; constant in size."""
+
+    rpbsid: rpbsid.RpbsidState
+    angles: Array = NO_ANGLES
+    """The latest measured configuration: (2,) [rad], or (0,) when there is none."""
+    configuration_range: Array = NO_ANGLES
+    """What the configuration went through since the last event, see ``block_extraction.sweep``."""
+
+    def first_needed(self, cursor: int) -> int:
+        """Return the first row of the sample log that will be read again."""
+        return rpbsid.first_needed(self.rpbsid)
+
+    def advance(self, config: IdentifierParameters, rows: Rows, background: Background) -> ModelEstimator:
+        """Take the next rows of the log. One call with N rows gives the bits of N calls with one."""
+        return ModelEstimator(rpbsid.advance(config, self.rpbsid, rows, background), rows.angles[-1].copy(),
+                              block_extraction.sweep(config, self.configuration_range, rows))
+
+    def event(self, config: IdentifierParameters, event: CaptureEvent, background: Background) -> ModelEstimator:
+        """The arm caught or let go of something before the next row."""
+        return self._replace(rpbsid=rpbsid.restart(config, self.rpbsid, background), configuration_range=NO_ANGLES)
+
+    def restart(self, config: IdentifierParameters, events: Sequence[CaptureEvent]) -> ModelEstimator:
+        """Go on: every sample came after these events, so the model is of what the arm holds now."""
+        return self
+
+    @property
+    def outliers(self) -> int:
+        """How many samples were rejected: values that cannot be, or far outside all before."""
+        return int(self.rpbsid.counts[REJECTED])
 
 
-def restart_payload(config: IdentifierParameters, state: EstimatorState, events: Sequence[CaptureEvent]
-                    ) -> EstimatorState:
-    """Begin the payload again, after events from before every sample; the model is of what was held anyway."""
-    if state.structured is None:
-        return state
-    held = structured.init(config)._replace(cursor=state.structured.cursor)
-    for event in events:
-        held = structured.event(config, held, event)
-    return state._replace(structured=held, since_ns=events[-1].stamp_ns)
+def init(config: IdentifierParameters) -> tuple[PayloadEstimator, ModelEstimator]:
+    """Start with nothing known. ``config.outputs`` are those the messages really carry."""
+    wanted = config.payload_method == 'structured'
+    return PayloadEstimator(structured.init(config) if wanted else None), ModelEstimator(rpbsid.init(config))
 
 
-def payload(config: IdentifierParameters, state: EstimatorState, verdicts: tuple[Verdict, ...] = ()
+def payload(config: IdentifierParameters, state: PayloadEstimator, verdicts: tuple[Verdict, ...] = ()
             ) -> Payload | None:
     """Return the payload where it does not rest on the model; else None. verdicts: of models read before."""
     if state.structured is None:
@@ -101,7 +117,8 @@ class ModelRequest:
     """
 
     config: IdentifierParameters
-    state: EstimatorState
+    identifier: ModelEstimator
+    estimator: PayloadEstimator
     stamp_ns: int
     dt: float
     payload: Payload | None
@@ -109,18 +126,19 @@ class ModelRequest:
 
     def solve(self) -> tuple[Estimate, Verdict | None]:
         """Return the estimate with model and modes, and the verdict on the payload."""
-        config, state, payload = self.config, self.state, self.payload
-        found, without = _identified(config, state.rpbsid, self.dt)
+        config, identifier, payload = self.config, self.identifier, self.payload
+        held, since_ns = self.estimator.structured, self.estimator.since_ns
+        found, without = _identified(config, identifier.rpbsid, self.dt)
         if config.payload_method == 'block' and found is not None:
-            payload = block_extraction.estimate(config, found, state.angles, state.swept)
+            payload = block_extraction.estimate(config, found, identifier.angles, identifier.configuration_range)
         if found is None:
             return Estimate(self.stamp_ns, without, None, (), payload, model_status=without), None
         oscillations = modes(found)
         verdict = None
-        if self.compare and state.structured is not None:
-            alone = structured.estimate(config, state.structured)
-            verdict = model_check.check(config, state.structured, alone, state.turned, found, oscillations,
-                                        self.stamp_ns, state.since_ns)
+        if self.compare and held is not None:
+            alone = structured.estimate(config, held)
+            verdict = model_check.check(config, held, alone, self.estimator.configuration_range, found,
+                                        oscillations, self.stamp_ns, since_ns)
         return Estimate(
             self.stamp_ns, _overall(config, found.status, payload), found.model, oscillations, payload,
             excitation=found.excitation, condition=found.condition, singular_values=found.singular_values,
@@ -141,11 +159,6 @@ def without_model(config: IdentifierParameters, stamp_ns: int, payload: Payload)
     status = Status.WARMING_UP
     return Estimate(stamp_ns, _overall(config, status, payload), None, (), payload, model_status=status,
                     model_is_new=False)
-
-
-def outliers(state: EstimatorState) -> int:
-    """Return how many samples the identifier rejected: values that cannot be, or far outside all before."""
-    return int(state.rpbsid.counts[REJECTED])
 
 
 def _overall(config: IdentifierParameters, model: Status, payload: Payload | None) -> Status:

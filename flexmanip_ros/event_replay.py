@@ -1,19 +1,19 @@
 """Events at their own stamps, whatever the order of their arrival.
 
-An event that arrives early waits for its stamp. One that arrives late is applied at its own stamp: the estimators go
-back to a snapshot before the event and take the rows of the log again. From its arrival on, the result depends on
+An event that arrives early waits for its stamp. One that arrives late is applied at its own stamp: the estimator goes
+back to a snapshot before the event and takes the rows of the log again. From its arrival on, the result depends on
 stamps alone. An event older than ``rewind_time`` is applied at once and counted. One from before the first sample
 (latched, received only now) was true all along: the payload begins again with it.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
-from flexmanip_ros import estimator
 from flexmanip_ros.numerics.background import Background
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.samples.sample_log import SampleLog
+from flexmanip_ros.samples.sample_log import Rows, SampleLog
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 BEFORE_ALL = -(1 << 63)
@@ -26,24 +26,43 @@ MOST_ROWS = 20_000
 """Rows kept for a rewind at most. At rates (or with stamps) that need more the time to go back is shorter."""
 
 
-class Snapshot(NamedTuple):
-    """The estimators before a row at ``stamp_ns`` and its events, after the row at ``before_ns``."""
+class Estimator(Protocol):
+    """A value that takes rows of the sample log, and events between them."""
+
+    def first_needed(self, cursor: int) -> int:
+        """Return the first row that will be read again; cursor: the row it takes next."""
+
+    def advance(self, config: IdentifierParameters, rows: Rows, background: Background) -> Self:
+        """Take the next rows."""
+
+    def event(self, config: IdentifierParameters, event: CaptureEvent, background: Background) -> Self:
+        """The arm caught or let go of something before the next row."""
+
+    def restart(self, config: IdentifierParameters, events: Sequence[CaptureEvent]) -> Self:
+        """Take account of events that turn out to be from before the first row."""
+
+
+E = TypeVar('E', bound=Estimator)
+
+
+class Snapshot(NamedTuple, Generic[E]):
+    """The estimator before a row at ``stamp_ns`` and its events, after the row at ``before_ns``."""
 
     row: int
     stamp_ns: int
     before_ns: int
-    estimators: estimator.EstimatorState
+    estimator: E
 
 
-class EventReplay(NamedTuple):
-    """The estimators now, and what is needed to go back."""
+class EventReplay(NamedTuple, Generic[E]):
+    """The estimator now, and what is needed to go back."""
 
-    estimators: estimator.EstimatorState
+    estimator: E
     cursor: int = 0
     """Row of the sample log that is taken next."""
     last_ns: int = BEFORE_ALL
     """Stamp of the row before it [ns]."""
-    snapshots: tuple[Snapshot, ...] = ()
+    snapshots: tuple[Snapshot[E], ...] = ()
     applied: tuple[tuple[int, CaptureEvent], ...] = ()
     """Events at or after the oldest snapshot, each with the row before which it was applied."""
     pending: tuple[CaptureEvent, ...] = ()
@@ -59,15 +78,14 @@ class EventReplay(NamedTuple):
         return next((event.stamp_ns for event in self.latest if event.kind is kind), None)
 
 
-def first_needed(replay: EventReplay) -> int:
+def first_needed(replay: EventReplay[E]) -> int:
     """Return the first row of the log that may be read again."""
-    return min(estimator.first_needed(replay.estimators),
-               *(min(one.row, estimator.first_needed(one.estimators)) for one in replay.snapshots),
-               replay.cursor)
+    return min(replay.estimator.first_needed(replay.cursor), replay.cursor,
+               *(min(one.row, one.estimator.first_needed(one.row)) for one in replay.snapshots))
 
 
-def advance(config: IdentifierParameters, replay: EventReplay, log: SampleLog, until: int,
-            background: Background) -> EventReplay:
+def advance(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog, until: int,
+            background: Background) -> EventReplay[E]:
     """Take the rows of the log up to ``until``, with the events that fall among them."""
     while replay.cursor < until:
         stop = min(until, _next_snapshot(config, replay, log))
@@ -79,19 +97,19 @@ def advance(config: IdentifierParameters, replay: EventReplay, log: SampleLog, u
             row = log.row_at(event.stamp_ns, replay.cursor)
             if row == replay.cursor:
                 replay = replay._replace(
-                    estimators=estimator.event(config, replay.estimators, event, background),
+                    estimator=replay.estimator.event(config, event, background),
                     applied=(*replay.applied, (row, event)), pending=replay.pending[1:])
                 continue
             stop = min(stop, row)
         rows = log.rows(replay.cursor, stop)
         replay = replay._replace(
-            estimators=estimator.advance(config, replay.estimators, rows, background), cursor=stop,
+            estimator=replay.estimator.advance(config, rows, background), cursor=stop,
             last_ns=int(rows.stamp_ns[-1]))
     return replay
 
 
-def insert(config: IdentifierParameters, replay: EventReplay, log: SampleLog, event: CaptureEvent,
-           first_ns: int, background: Background) -> EventReplay:
+def insert(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog, event: CaptureEvent,
+           first_ns: int, background: Background) -> EventReplay[E]:
     """Take an event: let it wait, go back for it, or (too old to go back) apply it now.
 
     first_ns: stamp of the first sample [ns].
@@ -106,15 +124,15 @@ def insert(config: IdentifierParameters, replay: EventReplay, log: SampleLog, ev
         return _rewind(config, replay, log, event, background)
     replay = replay._replace(late_events=replay.late_events + 1)
     if all(taken.stamp_ns <= first_ns for taken in replay.latest):
-        return _restart_payload(config, replay)
+        return _restart(config, replay)
     return _wait(replay, event._replace(stamp_ns=replay.last_ns + 1))
 
 
-def _restart_payload(config: IdentifierParameters, replay: EventReplay) -> EventReplay:
-    """Every sample came after the events: forget a payload that was estimated without them."""
-    estimators = estimator.restart_payload(config, replay.estimators, sorted(replay.latest, key=_order))
-    only = Snapshot(replay.cursor, replay.last_ns + 1, replay.last_ns, estimators)
-    return replay._replace(estimators=estimators, snapshots=(only,), applied=())
+def _restart(config: IdentifierParameters, replay: EventReplay[E]) -> EventReplay[E]:
+    """Every sample came after the events: forget what was estimated without them."""
+    estimator = replay.estimator.restart(config, sorted(replay.latest, key=_order))
+    only = Snapshot(replay.cursor, replay.last_ns + 1, replay.last_ns, estimator)
+    return replay._replace(estimator=estimator, snapshots=(only,), applied=())
 
 
 def _order(event: CaptureEvent) -> tuple[int, bool]:
@@ -122,12 +140,12 @@ def _order(event: CaptureEvent) -> tuple[int, bool]:
     return event.stamp_ns, event.kind is EventKind.CAPTURE
 
 
-def _wait(replay: EventReplay, event: CaptureEvent) -> EventReplay:
+def _wait(replay: EventReplay[E], event: CaptureEvent) -> EventReplay[E]:
     pending = sorted((*replay.pending, event), key=_order)
     return replay._replace(pending=tuple(pending[:MOST_EVENTS]))
 
 
-def _next_snapshot(config: IdentifierParameters, replay: EventReplay, log: SampleLog) -> int:
+def _next_snapshot(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog) -> int:
     """Return the row before which the next snapshot is due: the first, then one a fraction of rewind_time."""
     if not replay.snapshots:
         return replay.cursor
@@ -136,10 +154,10 @@ def _next_snapshot(config: IdentifierParameters, replay: EventReplay, log: Sampl
     return min(log.row_at(due_ns, replay.cursor), replay.snapshots[0].row + MOST_ROWS)
 
 
-def _snapshot(config: IdentifierParameters, replay: EventReplay, log: SampleLog) -> EventReplay:
-    """Remember the estimators as they are before the next row; forget what is too old."""
+def _snapshot(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog) -> EventReplay[E]:
+    """Remember the estimator as it is before the next row; forget what is too old."""
     stamp_ns = int(log.rows(replay.cursor, replay.cursor + 1).stamp_ns[0])
-    kept = (*replay.snapshots, Snapshot(replay.cursor, stamp_ns, replay.last_ns, replay.estimators))
+    kept = (*replay.snapshots, Snapshot(replay.cursor, stamp_ns, replay.last_ns, replay.estimator))
     oldest_needed = stamp_ns - int(config.rewind_time * 1e9)
     too_many = replay.cursor - kept[0].row >= MOST_ROWS
     while len(kept) > 1 and (kept[1].stamp_ns <= oldest_needed or too_many):
@@ -148,14 +166,14 @@ def _snapshot(config: IdentifierParameters, replay: EventReplay, log: SampleLog)
                            applied=tuple((row, e) for row, e in replay.applied if row >= kept[0].row))
 
 
-def _rewind(config: IdentifierParameters, replay: EventReplay, log: SampleLog, event: CaptureEvent,
-            background: Background) -> EventReplay:
+def _rewind(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog, event: CaptureEvent,
+            background: Background) -> EventReplay[E]:
     """Go back to the last snapshot not after the event, and take rows and events again from there."""
     kept = tuple(one for one in replay.snapshots if one.before_ns < event.stamp_ns)
     back = kept[-1]
     again = sorted((*(e for row, e in replay.applied if row >= back.row), *replay.pending, event), key=_order)
     before = replay._replace(
-        estimators=back.estimators, cursor=back.row, last_ns=back.before_ns, snapshots=kept,
+        estimator=back.estimator, cursor=back.row, last_ns=back.before_ns, snapshots=kept,
         applied=tuple((row, e) for row, e in replay.applied if row < back.row), pending=tuple(again),
         rewinds=replay.rewinds + 1)
     return advance(config, before, log, replay.cursor, background)

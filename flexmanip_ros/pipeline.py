@@ -1,8 +1,8 @@
 """The one way through the house: messages in, estimates out.
 
-A message becomes a row of the sample log. The estimators are cursors into that log and take its rows in groups. The
-live node calls ``step`` for each message, a replay ``run`` for a recording: the same messages give the same
-estimates bit for bit.
+A message becomes a row of the sample log. Two estimators, payload and identifier, are cursors into that log and take
+its rows in groups. The live node calls ``step`` for each message, a replay ``run`` for a recording: the same messages
+give the same estimates bit for bit.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ import numpy as np
 
 from flexmanip_ros import estimator, event_replay
 from flexmanip_ros.errors import SignalError
+from flexmanip_ros.estimator import ModelEstimator, PayloadEstimator
+from flexmanip_ros.event_replay import EventReplay
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.numerics.background import INLINE, Background
 from flexmanip_ros.parameters import IdentifierParameters
@@ -62,8 +64,10 @@ class State(NamedTuple):
 
     clock: Clock = Clock()
     log: SampleLog = sampling.EMPTY
-    events: event_replay.EventReplay | None = None
-    """The estimators and the events."""
+    payload: EventReplay[PayloadEstimator] | None = None
+    """The payload's estimator, with the events; None before the first usable message."""
+    identifier: EventReplay[ModelEstimator] | None = None
+    """The model's estimator, with the same events. Its cursor is never ahead of the payload's."""
     config: IdentifierParameters | None = None
     """The configuration with the outputs that the messages really carry."""
     early: tuple[CaptureEvent, ...] = ()
@@ -85,7 +89,7 @@ class State(NamedTuple):
 
     def stamp_of(self, kind: EventKind) -> int | None:
         """Return the stamp of the latest event of a kind [ns], None when there was none."""
-        return self.events.stamp_of(kind) if self.events is not None else None
+        return self.payload.stamp_of(kind) if self.payload is not None else None
 
 
 def init(*, keep_log: bool = False) -> State:
@@ -121,18 +125,20 @@ def step(config: IdentifierParameters, state: State, item: Item, background: Bac
 def catch_up(state: State, background: Background = INLINE, group: int = 1) -> tuple[State, list[Estimate]]:
     """Let the estimators take the rows of the log: the pipeline's table of contents.
 
-    Rows up to each instant of ``publish_rate``, then the estimate that is due there; last the rows left over, if
-    they are ``group`` or more.
+    The payload's takes the rows up to each instant of ``publish_rate``, and the estimate due there is made. Where that
+    needs a new model, the identifier takes the same rows. Last the rows left over, if they are ``group`` or more.
     """
     estimates: list[Estimate] = []
-    if state.events is None:
+    if state.payload is None or state.identifier is None:
         return state, estimates
-    for row in _due_rows(state, state.events):
+    for row in _due_rows(state, state.payload):
         state, model = _take_model(state, background)
-        state = _advance(state, row + 1, background)
+        state = _advance_payload(state, row + 1, background)
         state, estimate = _estimate(state, background)
         estimates += [*model, *estimate]
-    state = _advance(state, state.log.end, background, least=group)
+    assert state.identifier is not None
+    if state.log.end - state.identifier.cursor >= group:
+        state = _advance(state, state.log.end, background)
     if state.pending is not None and state.log.end > state.pending.due:
         state, model = _take_model(state, background)
         estimates += model
@@ -208,22 +214,23 @@ def current(state: State) -> Estimate | None:
 
     A fit under way is awaited, as no sample follows.
     """
-    if state.events is None or state.config is None:
+    if state.payload is None or state.config is None:
         return None
     state, _ = _take_model(_advance(state, state.log.end, INLINE), INLINE)
-    config, events = state.config, state.events
+    config, payload, identifier = state.config, state.payload, state.identifier
     assert config is not None
-    assert events is not None
-    if events.cursor == 0:
+    assert payload is not None
+    assert identifier is not None
+    if payload.cursor == 0:
         return None
-    estimators = events.estimators
-    estimators = estimators._replace(rpbsid=rpbsid.finish(config, estimators.rpbsid))
-    request = estimator.ModelRequest(config, estimators, events.last_ns, state.clock.dt, None, compare=True)
+    model = identifier.estimator._replace(rpbsid=rpbsid.finish(config, identifier.estimator.rpbsid))
+    request = estimator.ModelRequest(config, model, payload.estimator, payload.last_ns, state.clock.dt, None,
+                                     compare=True)
     estimate, verdict = request.solve()
-    payload = estimator.payload(config, estimators, _remember(state, verdict))
+    held = estimator.payload(config, payload.estimator, _remember(state, verdict))
     if estimate.model is None:
-        return estimate._replace(payload=payload)
-    return estimator.with_model_of(config, events.last_ns, estimate, payload)._replace(model_is_new=True)
+        return estimate._replace(payload=held)
+    return estimator.with_model_of(config, payload.last_ns, estimate, held)._replace(model_is_new=True)
 
 
 def check_used(state: State) -> None:
@@ -238,12 +245,12 @@ def reconfigure(config: IdentifierParameters, state: State, background: Backgrou
     before = state.config
     if before is None:
         return state
-    if state.events is not None:  # the samples before the change are estimated with the parameters before it
+    if state.payload is not None:  # the samples before the change are estimated with the parameters before it
         state = _advance(state, state.log.end, background)
     state = state._replace(config=replace(config, outputs=before.outputs))
-    if state.published < 0 or state.events is None:
+    if state.published < 0 or state.payload is None:
         return state
-    last = _instant(state, state.events.last_ns, config.publish_rate)
+    last = _instant(state, state.payload.last_ns, config.publish_rate)
     model = state.model._replace(instant=-1) if state.model is not None else None  # to be read again
     return state._replace(published=last, model=model)
 
@@ -255,37 +262,52 @@ def _sampled(config: IdentifierParameters, state: State, sampled: sampling.Sampl
         state = State(config=state.config, keep_log=state.keep_log)
     state = state._replace(clock=sampled.clock, log=sampled.log)
     outputs = sampled.clock.outputs
-    if state.events is not None or outputs is None:
+    if state.payload is not None or outputs is None:
         return state
     settled = config if config.outputs == outputs else replace(config, outputs=outputs)
     early = state.early
-    state = state._replace(
-        config=settled, events=event_replay.EventReplay(estimator.init(settled)), first_ns=stamp_ns, published=-1,
-        early=())
+    payload, identifier = estimator.init(settled)
+    state = state._replace(config=settled, payload=EventReplay(payload), identifier=EventReplay(identifier),
+                           first_ns=stamp_ns, published=-1, early=())
     for event in early:
         state = _insert(state, event, background)
     return state
 
 
 def _insert(state: State, event: CaptureEvent, background: Background) -> State:
-    if state.events is None or state.config is None:
+    if state.payload is None or state.config is None:
         return state._replace(early=(*state.early, event)[-event_replay.MOST_EVENTS:])
     state = _advance(state, state.log.end, background)
-    assert state.events is not None
+    assert state.payload is not None
+    assert state.identifier is not None
     assert state.config is not None
-    return state._replace(events=event_replay.insert(
-        state.config, state.events, state.log, event, state.first_ns, background))
+    given = state.log, event, state.first_ns, background
+    return state._replace(payload=event_replay.insert(state.config, state.payload, *given),
+                          identifier=event_replay.insert(state.config, state.identifier, *given))
 
 
-def _advance(state: State, until: int, background: Background, least: int = 1) -> State:
-    """Let the estimators take the rows up to ``until``, if they are so many; drop rows that nothing reads any more."""
-    assert state.events is not None
-    assert state.config is not None
-    if until - state.events.cursor < least:
+def _advance(state: State, until: int, background: Background) -> State:
+    """Let both estimators take the rows up to ``until``; drop rows that neither reads again."""
+    state = _advance_identifier(_advance_payload(state, until, background), until, background)
+    assert state.payload is not None
+    assert state.identifier is not None
+    if state.keep_log:
         return state
-    events = event_replay.advance(state.config, state.events, state.log, until, background)
-    log = state.log if state.keep_log else state.log.from_row(event_replay.first_needed(events))
-    return state._replace(events=events, log=log)
+    needed = min(event_replay.first_needed(state.payload), event_replay.first_needed(state.identifier))
+    return state._replace(log=state.log.from_row(needed))
+
+
+def _advance_payload(state: State, until: int, background: Background) -> State:
+    assert state.payload is not None
+    assert state.config is not None
+    return state._replace(payload=event_replay.advance(state.config, state.payload, state.log, until, background))
+
+
+def _advance_identifier(state: State, until: int, background: Background) -> State:
+    assert state.identifier is not None
+    assert state.config is not None
+    return state._replace(
+        identifier=event_replay.advance(state.config, state.identifier, state.log, until, background))
 
 
 def _instant(state: State, stamp_ns: int, rate: float) -> int:
@@ -293,10 +315,10 @@ def _instant(state: State, stamp_ns: int, rate: float) -> int:
     return int((stamp_ns - state.first_ns) * rate * 1e-9 + ROUNDING)
 
 
-def _due_rows(state: State, events: event_replay.EventReplay) -> list[int]:
+def _due_rows(state: State, payload: EventReplay[PayloadEstimator]) -> list[int]:
     """Return the rows not taken yet that are the first at or after an instant of ``publish_rate``."""
     assert state.config is not None
-    cursor = events.cursor
+    cursor = payload.cursor
     stamps = state.log.rows(cursor, state.log.end).stamp_ns
     instants = ((stamps - state.first_ns) * state.config.publish_rate * 1e-9 + ROUNDING).astype(np.int64)
     due = np.flatnonzero(np.diff(instants, prepend=state.published) > 0) + cursor
@@ -310,21 +332,23 @@ def _estimate(state: State, background: Background) -> tuple[State, list[Estimat
     late: so any order of arrival reads models at the same stamps. Meanwhile it is not compared with the payload,
     as the result would depend on when the event arrived.
     """
-    config, events = state.config, state.events
+    config, now, last = state.config, state.payload, state.model
     assert config is not None
-    assert events is not None
-    stamp_ns, since_ns, last = events.last_ns, events.estimators.since_ns, state.model
-    payload = estimator.payload(config, events.estimators, state.verdicts)
+    assert now is not None
+    stamp_ns, since_ns = now.last_ns, now.estimator.since_ns
+    payload = estimator.payload(config, now.estimator, state.verdicts)
     state = state._replace(published=_instant(state, stamp_ns, config.publish_rate))
     settling_ns = (2.0 * config.rewind_time + 1.0 / config.publish_rate) * 1e9
     young = stamp_ns - max(state.first_ns, since_ns) <= settling_ns
     instant = _instant(state, stamp_ns, config.model_rate)
     if last is not None and last.since_ns == since_ns and not young and instant <= last.instant:
         return state, [estimator.with_model_of(config, stamp_ns, last.estimate, payload)]
-    request = estimator.ModelRequest(
-        config, events.estimators, stamp_ns, state.clock.dt, payload, compare=not young)
+    state = _advance_identifier(state, now.cursor, background)
+    assert state.identifier is not None
+    request = estimator.ModelRequest(config, state.identifier.estimator, now.estimator, stamp_ns, state.clock.dt,
+                                     payload, compare=not young)
     background.start(request)
-    due = events.cursor - 1 + int(np.ceil(RESULT_DELAY_S / max(state.clock.dt, 1e-9)))
+    due = now.cursor - 1 + int(np.ceil(RESULT_DELAY_S / max(state.clock.dt, 1e-9)))
     state = state._replace(pending=PendingModel(request, since_ns, instant, due))
     if payload is None:  # it rests on the model
         return state, []

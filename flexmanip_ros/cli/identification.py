@@ -185,7 +185,7 @@ def _remark(state: pipeline.State, foreign: int) -> str:
 
     foreign: messages of other publishers on the same topic, which nobody misses.
     """
-    counters, line = state.counters, state.events
+    counters, line = state.counters, state.payload
     left_out = [f'{count} {why}' for count, why in (
         (counters.missing_signal - foreign, 'without a configured signal'),
         (counters.late_stamp, 'with a stamp older than the one before'),

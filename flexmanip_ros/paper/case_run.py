@@ -126,15 +126,15 @@ def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[
 
 def _with_block(config: IdentifierParameters, case: Case, state: pipeline.State, now: Estimate) -> Estimate:
     """Return an estimate with the payload that the blocks of its model give at the case's working point."""
-    assert state.events is not None
-    estimators = state.events.estimators
+    assert state.identifier is not None
+    identifier = state.identifier.estimator
     try:
-        found = rpbsid.identified(config, estimators.rpbsid, state.clock.dt)
+        found = rpbsid.identified(config, identifier.rpbsid, state.clock.dt)
     except np.linalg.LinAlgError:  # nothing moves yet
         found = None
     if found is None:
         return now._replace(payload=None, status=now.model_status)
-    payload = block_extraction.estimate(config, found, np.radians(case.angles_deg), estimators.swept)
+    payload = block_extraction.estimate(config, found, np.radians(case.angles_deg), identifier.configuration_range)
     status = payload.status if found.status is Status.TRACKING else found.status
     return now._replace(payload=payload, status=status)
 

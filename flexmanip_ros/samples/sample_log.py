@@ -204,7 +204,10 @@ class Rows:
 
     def stretches(self) -> list[Rows]:
         """Return the rows in pieces, each of which has a gap at most before its first row."""
-        gaps = (np.flatnonzero(self.gap[1:]) + self.first + 1).tolist()
+        later = self.gap[1:]
+        if not later.any():
+            return [self] if len(self) else []
+        gaps = (np.flatnonzero(later) + self.first + 1).tolist()
         borders = [self.first, *gaps, self.until]
         return [self.between(a, b) for a, b in pairwise(borders) if b > a]
 

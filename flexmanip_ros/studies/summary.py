@@ -67,7 +67,7 @@ def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -
 def event_time(state: pipeline.State, kind: EventKind) -> float | None:
     """Return when the latest event of a kind was, from the first sample's stamp [s]; None if not reached."""
     stamp = state.stamp_of(kind)
-    waiting = () if state.events is None else state.events.pending
+    waiting = () if state.payload is None else state.payload.pending
     return None if stamp is None or CaptureEvent(stamp, kind) in waiting else (stamp - state.first_ns) / 1e9
 
 

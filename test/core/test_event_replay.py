@@ -107,25 +107,25 @@ def test_of_two_events_of_one_stamp_the_release_comes_first() -> None:
 
 def test_an_event_too_old_to_go_back_for_is_applied_at_once_and_counted() -> None:
     state, _ = step_through(with_event(records(400), 100.0, 350))
-    assert state.events is not None
-    assert state.events.late_events == 1
-    assert state.events.rewinds == 0
+    assert state.payload is not None
+    assert state.payload.late_events == 1
+    assert state.payload.rewinds == 0
 
 
 def test_an_event_announced_twice_counts_once() -> None:
     items = with_event(with_event(records(300), 200.0, 150), 200.0, 150)
     state, twice = step_through(items)
     _, once = step_through(with_event(records(300), 200.0, 150))
-    assert state.events is not None
-    assert state.events.repeated_events == 1
+    assert state.payload is not None
+    assert state.payload.repeated_events == 1
     assert same(once, twice)
 
 
 def test_memory_stays_constant() -> None:
     state, _ = step_through(records(6000))
-    assert state.events is not None
+    assert state.payload is not None
     assert state.log.end - state.log.start <= 3000  # a fit sees 2048 rows, and the rewind 50
-    assert len(state.events.snapshots) <= 4
+    assert len(state.payload.snapshots) <= 4
 
 
 def test_a_looped_recording_gives_the_same_estimates_again() -> None:
@@ -147,9 +147,9 @@ def test_a_capture_from_before_the_first_sample_counts_all_along_however_late_it
     late: list[JointRecord | CaptureEvent] = [*items[:600], capture, *items[600:]]
     state, live = step_through(late, config)
     payload = live[-1].payload
-    assert state.events is not None
+    assert state.payload is not None
     assert payload is not None
-    assert state.events.late_events == 1
+    assert state.payload.late_events == 1
     assert live[-1].status is Status.TRACKING
     assert payload.lower < plant.payload_mass < payload.upper
     assert same(live, list(pipeline.run(config, late)))
