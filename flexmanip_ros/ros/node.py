@@ -59,7 +59,7 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
         self.active = False
         self._entities_made = False
         self.events: dict[str, int] = {}
-        self._complained: dict[str, float] = {}
+        self._logged_at: dict[str, float] = {}
         try:
             self.autostarts = bool(self.declare_parameter(
                 'autostart', True, ParameterDescriptor(
@@ -210,11 +210,11 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
 
     # Words.
 
-    def complain(self, reason: str, words: str) -> None:
+    def log_throttled(self, reason: str, words: str) -> None:
         """Log an error, at most every few seconds for one reason."""
         now = time.monotonic()
-        if now - self._complained.get(reason, -math.inf) >= THROTTLE_S:
-            self._complained[reason] = now
+        if now - self._logged_at.get(reason, -math.inf) >= THROTTLE_S:
+            self._logged_at[reason] = now
             self.get_logger().error(textwrap.shorten(words, LONGEST_WORDS, placeholder=' ...'))
 
     def stamp_of(self, raw: bytes) -> int | None:
@@ -222,7 +222,7 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
         try:
             return cdr.stamp_ns(raw)
         except cdr.CdrError:
-            self.complain('encoding', 'a JointState of another encoding than CDR was dropped')
+            self.log_throttled('encoding', 'a JointState of another encoding than CDR was dropped')
             return None
 
     def diagnose(self) -> None:

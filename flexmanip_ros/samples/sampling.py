@@ -102,7 +102,7 @@ def push(config: IdentifierParameters, clock: Clock, log: SampleLog, record: Joi
     raw = extract(channels, record)
     if raw is None:
         return Sampled(_reject(clock, _NOT_FINITE), log)
-    if log.width == EMPTY.width:
+    if log.width == EMPTY.width:  # also in a state that was saved before the first usable message
         log = SampleLog(Width(len(channels.u), len(channels.y), len(channels.angles)))
     return _on_clock(config, clock, log, raw)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import math
 from collections.abc import Iterator
-from itertools import chain
 from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -117,17 +116,19 @@ class Bench:
             for message in heard:
                 assert all(map(fine, numbers(message))), message
             heard.clear()
-        assert len(self.node._complained) < 20
+        assert len(self.node._logged_at) < 20
         assert len(self.node.events) < 20
 
     def remembered(self) -> int:
-        """Return how many events and samples the node keeps."""
+        """Return how many events, and samples to go back to, the node keeps."""
         if isinstance(self.node, PlantSimulator):
             return len(self.node._pending)
         state = self.node.state
-        line = state.timeline
-        kept = () if line is None else (*chain(*line.blocks), *line.applied, *line.waiting, *line.checkpoints)
-        return len(state.early) + len(kept)
+        events = state.events
+        if events is None:
+            return len(state.early)
+        rows = events.cursor - events.snapshots[0].row if events.snapshots else 0
+        return len(state.early) + len(events.applied) + len(events.pending) + len(events.snapshots) + rows
 
     def alive(self) -> None:
         """The node answers: its diagnostics come."""

@@ -7,6 +7,8 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import InertiaStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
@@ -62,6 +64,12 @@ class Live:
                 self.joint_states.publish(conversions.joint_state(record))
             self.ros.wait(lambda before=before, part=part:
                           self.node.state.counters.received >= before + len(part), what='samples to be taken')
+
+    def finish(self) -> None:
+        """Deactivate the node: it publishes the model under way."""
+        request = ChangeState.Request()
+        request.transition.id = Transition.TRANSITION_DEACTIVATE
+        assert self.ros.call(ChangeState, 'rpbsid_identifier/change_state', request).success
 
     def values(self) -> dict[str, str]:
         """Return the latest diagnostic values."""

@@ -17,13 +17,14 @@ def test_an_identifier_that_is_restarted_goes_on_as_if_it_had_only_missed_sample
     first = Live(ros, checkpoint_file=file)
     first.send(*samples[:300])
     first.events.publish(conversions.header(CAPTURE))
-    ros.wait(lambda: first.node.state.timeline.waiting)
+    ros.wait(lambda: first.node.state.events.pending)
     first.send(*samples[300:500])
     ros.remove(first.node)
     second = Live(ros, checkpoint_file=file)
     assert second.node.estimate is not None  # the last one, of before
     assert second.node.estimate.model is not None
     second.send(*samples[550:])
+    second.finish()
     straight = replayed(second, [*samples[:300], CAPTURE, *samples[300:500], *samples[550:]])
     count = {name: len(values) for name, values in second.said.items()}
     ros.wait(lambda: len(second.said[messages.PAYLOAD_MASS]) >= 17)
@@ -38,11 +39,11 @@ def test_an_identifier_that_is_restarted_goes_on_as_if_it_had_only_missed_sample
 def test_states_are_saved_while_it_runs(ros: Ros, tmp_path: Path) -> None:
     live = Live(ros, checkpoint_file=str(tmp_path / 'state'), checkpoint_period=0.1, payload_method='none')
     live.send(*recording(200))
-    ros.wait(lambda: live.node._keeper.due(), what='the period')
+    ros.wait(lambda: live.node.meter.idle_s() > 0.15, what='the period')
     live.send(*recording(400)[200:])
-    ros.wait(lambda: live.node._keeper.saves >= 1, what='a saved state')
+    ros.wait(lambda: live.node._checkpoints.saves >= 1, what='a saved state')
     assert (tmp_path / 'state').stat().st_size > 1000
-    live.node._keeper.finish()
+    live.node._checkpoints.join()
 
 
 def test_a_state_of_other_parameters_or_damaged_or_old_is_not_used_and_the_node_starts_anew(

@@ -34,7 +34,7 @@ def honest(payload: Payload, truth: float) -> bool:
 
 def announce(ros: Ros, live: Live) -> None:
     live.events.publish(conversions.header(CAPTURE))
-    ros.wait(lambda: live.node.state.timeline is None or live.node.state.timeline.latest)
+    ros.wait(lambda: live.node.state.events is None or live.node.state.events.latest)
 
 
 def test_a_publisher_that_dies_and_returns_is_a_gap_and_no_loss(ros: Ros) -> None:
@@ -56,6 +56,7 @@ def test_every_sample_twice_gives_the_numbers_of_every_sample_once(ros: Ros) -> 
     live = Live(ros, payload_method='none')
     samples = recording(400)
     live.send(*(sample for sample in samples for _ in range(2)))
+    live.finish()
     once = replayed(live, list(samples))
     assert live.node.state.counters.repeated_stamp == 400
     ros.wait(lambda: len(live.said[messages.MODEL]) >= len(once[messages.MODEL]))
@@ -72,7 +73,7 @@ def test_samples_out_of_order_never_move_the_clock_back(ros: Ros) -> None:
     counters = live.node.state.counters
     assert counters.late_stamp == 12
     assert counters.accepted == 688
-    assert live.node.state.timeline.last_ns == samples[-1].stamp_ns
+    assert live.node.state.clock.last_ns == samples[-1].stamp_ns
     assert honest(believed(live), TRUTH)
 
 
@@ -122,6 +123,7 @@ def test_bursts_with_pauses_between_change_nothing(ros: Ros) -> None:
     for first in range(0, 600, 150):
         live.send(*samples[first:first + 150])
         time.sleep(0.05)  # a pause of the sender is what is tested
+    live.finish()
     plain = replayed(live, list(samples))
     ros.wait(lambda: len(live.said[messages.PAYLOAD_MASS]) >= len(plain[messages.PAYLOAD_MASS]))
     assert compare({name: values for name, values in live.said.items() if values}, plain) == ''
@@ -132,7 +134,7 @@ def test_a_flood_is_taken_or_counted_as_lost_to_the_last_message(ros: Ros) -> No
     samples = recording(4000)
     for sample in samples:  # as fast as the publisher can: several times the usual rate
         live.joint_states.publish(conversions.joint_state(sample))
-    ros.wait(lambda: live.node.state.timeline and live.node.meter.idle_s() > 0.5, timeout=60.0)
+    ros.wait(lambda: live.node.state.events and live.node.meter.idle_s() > 0.5, timeout=60.0)
     last = samples[-1]
     live.send(last._replace(stamp_ns=last.stamp_ns + 1_000_000))
     node = live.node
@@ -146,7 +148,7 @@ def test_joints_that_get_other_names_in_mid_run_are_named_and_the_old_ones_taken
     live.send(*samples[:100])
     names = ('shoulder', 'elbow', 'link1_bend', 'link2_bend')
     live.send(*(JointRecord(s.stamp_ns, names, s.position, s.velocity, s.effort) for s in samples[100:150]))
-    assert 'joint1/effort' in live.node.state.sampling.refusal.problem
+    assert 'joint1/effort' in live.node.state.clock.rejection.problem
     live.send(*samples[150:])
     counters = live.node.state.counters
     assert (counters.missing_signal, counters.accepted, counters.gaps) == (50, 250, 1)
@@ -158,9 +160,9 @@ def test_a_release_without_a_capture_and_two_captures_claim_nothing_wrong(ros: R
     live.send(*samples[:200])
     release = CaptureEvent(START_NS + 210_000_000, EventKind.RELEASE)
     live.events.publish(conversions.header(release))
-    ros.wait(lambda: live.node.state.timeline.latest)
+    ros.wait(lambda: live.node.state.events.latest)
     for stamp in (CAPTURE.stamp_ns, CAPTURE.stamp_ns + 1_000_000):
         live.events.publish(conversions.header(CAPTURE._replace(stamp_ns=stamp)))
-    ros.wait(lambda: live.node.state.timeline.repeated_events == 1)
+    ros.wait(lambda: live.node.state.events.repeated_events == 1)
     live.send(*samples[200:])
     assert honest(believed(live), TRUTH)

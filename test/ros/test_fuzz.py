@@ -66,7 +66,7 @@ def test_events_without_end_do_not_fill_the_memory(ros: Ros, name: str) -> None:
 
 def test_samples_whose_stamps_hardly_advance_do_not_fill_the_memory(
         ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(event_replay, 'MOST_SAMPLES', 1000)
+    monkeypatch.setattr(event_replay, 'MOST_ROWS', 1000)
     bench = Bench(ros, 'rpbsid_identifier')
     for first in range(0, 4000, 100):
         message = [joint_state(k) for k in range(first, first + 100)]

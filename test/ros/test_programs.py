@@ -22,10 +22,14 @@ from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 NODES = ('plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier')
 
 
+def module(name: str) -> str:
+    return 'flexmanip_ros.ros.demo.program' if name == 'demo' else f'flexmanip_ros.ros.nodes.{name}'
+
+
 def start(name: str, *arguments: str) -> subprocess.Popen[str]:
     environment = {**os.environ, 'ROS_DOMAIN_ID': str(1 + (os.getpid() + 50) % 100), 'MPLBACKEND': 'Agg'}
     return subprocess.Popen(
-        [sys.executable, '-m', f'flexmanip_ros.ros.{name}', *arguments], env=environment, text=True,
+        [sys.executable, '-m', module(name), *arguments], env=environment, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
@@ -46,7 +50,7 @@ def signals() -> Iterator[None]:
 
 def call(name: str, *arguments: str) -> int:
     """Run the main function of a program in this process."""
-    main = importlib.import_module(f'flexmanip_ros.ros.{name}').main
+    main = importlib.import_module(module(name)).main
     try:
         return int(main([name, *arguments]))
     except SystemExit as left:

@@ -104,7 +104,6 @@ class Composition:
 
     def start(self) -> None:
         """Begin: who listens first, the plant's clock last."""
-        self.identifier.real_time.take()
         gc.collect()
         self._started = time.monotonic()
         gc.freeze()  # what lives from here on is not looked through again while the clock runs
@@ -126,16 +125,16 @@ class Composition:
         """Stop the plant and let everybody take what is still on the way."""
         self.plant.trigger_deactivate()
         self.excitation.trigger_deactivate()
-        limit = time.monotonic() + DRAIN_TIMEOUT
-        while time.monotonic() < limit and not self._drained():
-            self.executor.spin_once(timeout_sec=0.02)
-
-    def _drained(self) -> bool:
         sent, recorder, identifier = self.plant.samples, self.recorder, self.identifier
-        return bool(recorder.joint_states + recorder.losses.lost >= sent
-                    and identifier.state.counters.received + identifier.losses.lost >= sent
-                    and not identifier.is_reading
-                    and sum(map(len, recorder.said.values())) >= identifier.published)
+        self._spin_until(lambda: recorder.joint_states + recorder.losses.lost >= sent
+                         and identifier.state.counters.received + identifier.losses.lost >= sent)
+        identifier.trigger_deactivate()  # publishes the last model
+        self._spin_until(lambda: sum(map(len, recorder.said.values())) >= identifier.published)
+
+    def _spin_until(self, condition: Callable[[], bool]) -> None:
+        limit = time.monotonic() + DRAIN_TIMEOUT
+        while time.monotonic() < limit and not condition():
+            self.executor.spin_once(timeout_sec=0.02)
 
     def facts(self) -> Facts:
         """Return what the run came to."""

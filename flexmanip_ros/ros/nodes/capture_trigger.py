@@ -117,14 +117,14 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         try:
             record = self._reader(raw)
         except SignalError as error:
-            self.complain('encoding', f'message dropped: {error}')
+            self.log_throttled('encoding', f'message dropped: {error}')
             return
         for event in watcher.take(record):
             self.detected_publisher.publish(header(event))
             self.detected.note(event)
             self.get_logger().info(f'{event.kind.value} detected at {event.stamp_ns * 1e-9:.6f}')
         if watcher.counters.dropped > dropped and watcher.rejection is not None:
-            self.complain(watcher.rejection.reason,
+            self.log_throttled(watcher.rejection.reason,
                           f'message dropped: {watcher.rejection.problem}; {watcher.rejection.remedy}')
 
     def _begin(self, stamp: int) -> None:

@@ -82,13 +82,13 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         self.state, due = handover.step(self.config, self.state, found, now)
         if self._asked is not None and now - self._asked[1] >= ANSWER_S:
             self.problem = f"service '{self._client.srv_name}' has not answered within {ANSWER_S:g} s"
-            self.complain('silence', f'{self.problem}; it is asked again')
+            self.log_throttled('silence', f'{self.problem}; it is asked again')
             self._forget_request()
         if not due or self._asked is not None:
             return
         if not fits(self._inertia, found):
             self.doubtful += 1
-            self.complain('payload', 'a payload was not told: its mass is not that of the estimate, or it '
+            self.log_throttled('payload', 'a payload was not told: its mass is not that of the estimate, or it '
                           'has a value that is not finite')
             return
         self._tell(self._inertia, now)
@@ -96,7 +96,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
     def _tell(self, inertia: Inertia, now: float) -> None:
         if not self._client.service_is_ready():
             self.problem = f"service '{self._client.srv_name}' is not there"
-            self.complain('service', f'{self.problem}; start the driver, or correct the parameters')
+            self.log_throttled('service', f'{self.problem}; start the driver, or correct the parameters')
             self.state = handover.refused(self.state, now)
             return
         future = self._client.call_async(self._request(inertia))
@@ -122,7 +122,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         reason = refusal(future.result())
         if reason:
             self.problem = f'{mass:.3f} kg was refused: {reason}'
-            self.complain('refused', self.problem)
+            self.log_throttled('refused', self.problem)
             self.state = handover.refused(self.state, time.monotonic())
             return
         self.problem = ''

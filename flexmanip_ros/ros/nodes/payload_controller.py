@@ -129,7 +129,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
 
     def _drop(self, reason: str, words: str) -> None:
         self.dropped += 1
-        self.complain(reason, words)
+        self.log_throttled(reason, words)
 
     def _measured(self, record: JointRecord) -> controller.Measured | None:
         """Pick the four signals by name; None when one is missing or not finite."""
@@ -176,7 +176,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         if self.state is not None:
             self.state = self.state._replace(x=None)
         self._send(np.zeros(2))
-        self.complain('silence', f'no joint_states for {self.config.stale_after:g} s: zero torque')
+        self.log_throttled('silence', f'no joint_states for {self.config.stale_after:g} s: zero torque')
 
     def _send(self, torque: Array) -> None:
         self._message.data = doubles(torque)

@@ -169,7 +169,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
 
     def _drop(self, words: str) -> None:
         self.dropped_commands += 1
-        self.complain('command', words)
+        self.log_throttled('command', words)
 
     def _on_event(self, message: Header) -> None:
         try:
@@ -193,7 +193,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
 
     def _refuse_event(self, words: str) -> None:
         self.refused_events += 1
-        self.complain('event', words)
+        self.log_throttled('event', words)
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if not self.active:

@@ -1,0 +1,138 @@
+"""Fits and models solved on threads beside the samples give the estimates of a replay to the bit."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterable
+from dataclasses import replace
+
+import pytest
+
+from flexmanip_ros import pipeline
+from flexmanip_ros.identification.recursive_fit import FitRequest
+from flexmanip_ros.numerics.background import Request
+from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
+from flexmanip_ros.ros.background import KEPT, Background
+from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord
+
+CONFIG = IdentifierParameters()
+CAPTURE = CaptureEvent(400_000_000, EventKind.CAPTURE)
+
+
+class Sum:
+    """A request that counts how often it was solved; it may be held up."""
+
+    def __init__(self, *terms: int, gate: threading.Event | None = None) -> None:
+        self.terms, self.gate, self.solved = terms, gate, 0
+
+    def solve(self) -> int:
+        if self.gate is not None:
+            assert self.gate.wait(20.0)
+        self.solved += 1
+        return sum(self.terms)
+
+
+class Recorded(Background):
+    """Notes what was asked for, and what had to be solved in front of a sample."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked: list[Request] = []
+
+    def start(self, request: Request) -> None:
+        self.asked.append(request)
+        super().start(request)
+
+
+def recording(count: int = 900) -> list[JointRecord | CaptureEvent]:
+    efforts = excitation.sequence(ExcitationParameters(), count)
+    made = simulator.simulate(PlantParameters(), efforts, (CAPTURE,))
+    return list(simulator.records(made, (CAPTURE,)))
+
+
+def live(items: Iterable[JointRecord | CaptureEvent], pause: float,
+         config: IdentifierParameters = CONFIG) -> list[Estimate]:
+    """Go on with the samples while threads compute, as the node does; some samples come slowly, some at once."""
+    background, state, estimates = Recorded(), pipeline.init(), []
+    try:
+        for k, item in enumerate(items):
+            if k % 3 == 0:
+                time.sleep(pause)
+            state, found = pipeline.step(config, state, item, background)
+            estimates += found
+        state, found = pipeline.finish(config, state, background)
+        estimates += found
+    finally:
+        background.close()
+    assert len(background.asked) > 20
+    assert any(isinstance(request, FitRequest) for request in background.asked)
+    return list(pipeline.one_a_stamp(estimates))
+
+
+def said(estimate: Estimate) -> tuple[str, bytes]:
+    """Everything an estimate says, to the bit."""
+    model = b'' if estimate.model is None else estimate.model.A.tobytes() + estimate.model.K.tobytes()
+    return repr((estimate.stamp_ns, estimate.status, estimate.modes, estimate.payload)), model
+
+
+@pytest.mark.parametrize('pause', [0.0, 0.0005])
+def test_estimates_beside_threads_are_those_of_the_replay_bit_for_bit(pause: float) -> None:
+    items = recording()
+    late = [*items[:540], CaptureEvent(CAPTURE.stamp_ns + 50_000_000, CAPTURE.kind), *items[540:]]
+    for run in (items, late):
+        replayed = list(pipeline.run(CONFIG, run))
+        assert [said(estimate) for estimate in live(run, pause)] == [said(one) for one in replayed]
+
+
+@pytest.mark.parametrize('rate', [1000.0, 500.0])
+def test_an_estimate_with_every_sample_is_that_of_the_replay(rate: float) -> None:
+    config = replace(CONFIG, publish_rate=rate)
+    items = recording(700)
+    replayed = pipeline.run(config, items)
+    assert [said(one) for one in live(items, 0.0, config)] == [said(one) for one in replayed]
+
+
+def test_a_parameter_changed_meanwhile_counts_from_then_on_wherever_fits_are_solved() -> None:
+    config = replace(CONFIG, forgetting='constant')
+    factors = []
+    for background in (Background(), None):
+        arguments = () if background is None else (background,)
+        state = pipeline.init()
+        for item in recording()[:702]:
+            state, _ = pipeline.step(config, state, item, *arguments)
+        state = pipeline.reconfigure(replace(config, forgetting_factor=(0.9, 0.9, 0.9)), state, *arguments)
+        assert state.events is not None
+        factors.append(state.events.estimators.rpbsid.memory[0].tobytes())
+        if background is not None:
+            background.close()
+    assert factors[0] == factors[1]
+
+
+def test_a_result_is_solved_once_and_is_there_again_after_a_rewind() -> None:
+    background, request = Background(), Sum(1, 2)
+    background.start(request)
+    assert [background.result(request) for _ in range(3)] == [3, 3, 3]
+    assert request.solved == 1
+    background.close()
+
+
+def test_a_request_that_no_thread_has_begun_is_solved_in_place() -> None:
+    background, gate = Background(), threading.Event()
+    busy, waiting, unknown = [Sum(k, gate=gate) for k in range(4)], Sum(5), Sum(6)
+    for request in (*busy, waiting):
+        background.start(request)
+    assert (background.result(waiting), background.result(unknown)) == (5, 6)
+    gate.set()
+    background.close()
+    assert (waiting.solved, unknown.solved) == (1, 1)
+
+
+def test_requests_whose_result_nobody_takes_do_not_pile_up() -> None:
+    background = Background()
+    for k in range(5 * KEPT):
+        background.start(Sum(k))
+    assert len(background._solved) == KEPT
+    background.close()
+    assert not background._solved
