@@ -154,17 +154,14 @@ class _Feed:
             item.names, np.array([item.stamp_ns]), item.position[None], item.velocity[None], item.effort[None])
         self.foreign += len(block.stamp_ns) * self._joints.isdisjoint(block.names)
         if self.is_kept:
-            taken = 0
-            while taken < len(block.stamp_ns):
-                (self._clock, self._log, _), some = sampling.push_block(
-                    self._request.config, self._clock, self._log, block, taken)
-                taken += some
+            self._clock, self._log, _ = sampling.push_whole(self._request.config, self._clock, self._log, block)
         if self.first_ns is None:
             self.first_ns = int(block.stamp_ns[0])
             yield from self._known_events(self.first_ns)
         used = block.stamp_ns < self._limit_ns()
         if used.any():
-            yield block if used.all() else JointBlock(block.names, *(column[used] for column in block[1:]))
+            yield block if used.all() else JointBlock(
+                block.names, block.stamp_ns[used], block.position[used], block.velocity[used], block.effort[used])
 
     def signals(self) -> Signals:
         """Return the samples of the recording, held-out ones included."""
