@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from flexmanip_ros.cli import console
-from flexmanip_ros.cli.identification import Request, Result, identify
+from flexmanip_ros.cli.replay import Request, Result, identify
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import help_text

@@ -12,6 +12,7 @@ from flexmanip_ros.io import bag
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.studies import trial
 from flexmanip_ros.studies.scenario import Scenario
+from flexmanip_ros.types import CaptureEvent, JointBlock
 
 KEY = 'run'
 """Column that names a run; a study continues with the runs whose name it has not."""
@@ -62,10 +63,10 @@ def failed(task: Task, error: BaseException) -> list[trial.Row]:
 
 def _recorded(task: Recorded) -> trial.Row:
     truth = true_payload(Path(task.path))
-    items: list[bag.Item] = []
+    items: list[JointBlock | CaptureEvent] = []
     fault = ''
     try:
-        items.extend(bag.read(task.path))
+        items.extend(bag.read_blocks(task.path))
     except BagError as error:  # what came before the fault is identified
         if not items:
             raise

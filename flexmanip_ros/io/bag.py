@@ -1,25 +1,23 @@
-"""Recordings (rosbag2, sqlite3 or mcap) -> the messages the identifier takes, in recorded order."""
+"""Recordings (rosbag2, sqlite3 or mcap) -> the messages that the identifier takes, in recorded order."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rosbags.rosbag2 import Reader
 
 from flexmanip_ros.errors import BagError
 from flexmanip_ros.io import cdr, salvage
-from flexmanip_ros.types import CaptureEvent, JointRecord
+from flexmanip_ros.types import CaptureEvent, JointBlock, JointRecord
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 HEADER = 'std_msgs/msg/Header'
-REPORT_EVERY = 256
-"""Messages between two calls of the progress hook."""
+BLOCK = 2048
+"""Messages decoded at once at most: 2 s at 1 kHz, half a megabyte. Larger ones are no faster."""
 
-Item = JointRecord | CaptureEvent
 Progress = Callable[[int, int | None], None]
 """Called with messages read and messages there (None when the recording does not say)."""
 
@@ -33,38 +31,66 @@ class Topics:
     events_required: bool = False
 
 
-def read(path: str | Path, topics: Topics | None = None, progress: Progress | None = None) -> Iterator[Item]:
+def read(path: str | Path, topics: Topics | None = None, progress: Progress | None = None
+         ) -> Iterator[JointRecord | CaptureEvent]:
+    """Yield the messages of ``read_blocks`` one by one."""
+    for item in read_blocks(path, topics, progress):
+        if isinstance(item, JointBlock):
+            yield from (item.record(k) for k in range(len(item.stamp_ns)))
+        else:
+            yield item
+
+
+def read_blocks(path: str | Path, topics: Topics | None = None, progress: Progress | None = None
+                ) -> Iterator[JointBlock | CaptureEvent]:
     """Yield the joint states and events of a bag (its directory, or the .mcap or .db3 file itself).
 
-    Of a damaged recording everything before the fault is yielded, then BagError says what is wrong, so that
-    nothing recorded is lost and no damage goes unseen.
+    Joint states come in blocks of up to ``BLOCK`` messages; a block ends before an event and where names or array
+    lengths change. Of a damaged recording everything before the fault is yielded, then BagError says what is
+    wrong, so that nothing recorded is lost and no damage goes unseen.
     """
-    decode = _Decoder(Path(path), topics or Topics(), progress)
+    recording = _Recording(Path(path), topics or Topics())
+    waiting: list[bytes] = []
+    first = 0
     try:
-        yield from decode.healthy()
-    except _GaveUpError as broken:
-        yield from decode.salvaged(broken)
-    decode.finish()
+        for topic, raw in recording.messages():
+            if topic == recording.joint_topic:
+                first = first if waiting else recording.taken
+                waiting.append(raw)
+                if len(waiting) < BLOCK:
+                    continue
+            yield from recording.joint_states(waiting, first)
+            waiting = []
+            if topic != recording.joint_topic:
+                yield from recording.event(topic, raw)
+            if progress is not None:
+                progress(recording.taken, recording.total)
+    except BagError:
+        yield from recording.joint_states(waiting, first)
+        raise
+    yield from recording.joint_states(waiting, first)
+    if progress is not None:
+        progress(recording.taken, recording.taken)
+    recording.check()
 
 
-class _GaveUpError(Exception):
-    """The library gave up; what came out before stays."""
+class _Recording:
+    """One pass over one bag, and what was wrong on the way."""
 
-
-class _Decoder:
-    """One pass over one bag."""
-
-    def __init__(self, path: Path, topics: Topics, progress: Progress | None) -> None:
+    def __init__(self, path: Path, topics: Topics) -> None:
         self.path = path
         self.topics = topics
-        self.progress = progress
         self.joint_topic = ''
-        self.joint_states = 0
         self.taken = 0
+        """Messages on the chosen topics."""
         self.total: int | None = None
-        self.kinds: dict[str, str] = {}
-        self.faults: list[str] = []
+        self._kinds: dict[str, str] = {}
+        self._damage = ''
+        self._faults: list[str] = []
+        self._joint_states = 0
         self._layout: cdr.Layout | None = None
+        self._run = BLOCK
+        """Messages that are tried to be decoded at once: few where the names change often."""
         try:
             self._look()
         except OSError as err:
@@ -90,80 +116,83 @@ class _Decoder:
             return [self.path]
         return sorted(file for file in self.path.iterdir() if file.suffix in ('.mcap', '.db3'))
 
-    def healthy(self) -> Iterator[Item]:
-        """Read with the library; whatever it trips over becomes _GaveUpError."""
+    def messages(self) -> Iterator[tuple[str, bytes]]:
+        """Yield topic and bytes of the messages on the chosen topics: what the library reads, then what is left."""
         try:
             reader = Reader(self.path)
             reader.open()
-        except Exception as err:  # broken bytes lead it to errors of many kinds
-            raise _GaveUpError(_reason(err)) from err
-        with closing(reader):
-            self._choose({connection.topic: connection.msgtype for connection in reader.connections})
-            chosen = [item for item in reader.connections if item.topic in self.kinds]
-            self.total = sum(connection.msgcount for connection in chosen)
-            stream = reader.messages(connections=chosen)
-            while True:
-                try:
-                    connection, _, data = next(stream)
-                except StopIteration:
-                    return
-                except Exception as err:
-                    raise _GaveUpError(_reason(err)) from err
-                yield from self._decoded(connection.topic, bytes(data))
+            with closing(reader):
+                self._choose({connection.topic: connection.msgtype for connection in reader.connections})
+                chosen = [item for item in reader.connections if item.topic in self._kinds]
+                self.total = sum(connection.msgcount for connection in chosen)
+                for connection, _, data in reader.messages(connections=chosen):
+                    self.taken += 1
+                    yield connection.topic, data
+        except BagError:
+            raise
+        except Exception as err:  # broken bytes lead the library to errors of many kinds
+            self._damage = ' '.join(str(err).split()).rstrip('.') or type(err).__name__
+            yield from self._salvaged()
 
-    def salvaged(self, broken: _GaveUpError) -> Iterator[Item]:
-        """Read on, message by message, from where the library gave up; always ends with BagError."""
+    def _salvaged(self) -> Iterator[tuple[str, bytes]]:
+        """Read on from where the library gave up."""
         skip = self.taken
         self.total = None
-        fault = str(broken)
-        for file in self._files():
-            try:
+        try:
+            for file in self._files():
                 for raw in salvage.messages(file):
                     if not self._choose({raw.topic: raw.msgtype}, complete=False):
                         continue
                     if skip:
                         skip -= 1
                         continue
-                    yield from self._decoded(raw.topic, raw.data)
-            except salvage.DamagedError as err:
-                fault = str(err)
-                break
-        if self.joint_states == 0:
-            raise BagError(f"bag '{self.path}' cannot be read: {fault}",
-                           'check that it is a rosbag2 recording and copied whole')
-        raise BagError(f"bag '{self.path}' is damaged: {fault}; {self._read_so_far()}",
-                       "repair it with 'ros2 bag reindex' or 'mcap recover', or record again")
+                    self.taken += 1
+                    yield raw.topic, raw.data
+        except salvage.DamagedError as err:
+            self._damage = str(err)
 
-    def finish(self) -> None:
-        """Report the end, and what was wrong on the way."""
-        if self.progress is not None:
-            self.progress(self.taken, self.taken)
-        if self.joint_states == 0 and not self.faults:
+    def joint_states(self, raws: list[bytes], first: int) -> Iterator[JointBlock]:
+        """Decode joint states that follow one another, the first of which is message number ``first``."""
+        done = 0
+        while done < len(raws):
+            tried = raws[done:done + self._run]
+            try:
+                block, self._layout = cdr.joint_block(tried, self._layout)
+            except (cdr.CdrError, UnicodeDecodeError) as err:
+                self._faults.append(f"message {first + done} (on '{self.joint_topic}') is garbled: {err}")
+                done += 1
+                continue
+            count = len(block.stamp_ns)
+            self._run = min(8 * self._run, BLOCK) if count == len(tried) else max(count, 1)
+            self._joint_states += count
+            done += count
+            yield block
+
+    def event(self, topic: str, raw: bytes) -> Iterator[CaptureEvent]:
+        """Decode an event; note one that is none."""
+        try:
+            yield cdr.capture_event(raw)
+        except (cdr.CdrError, UnicodeDecodeError) as err:
+            self._faults.append(f"message {self.taken} (on '{topic}') is garbled: {err}")
+        except ValueError as err:
+            self._faults.append(f"an event on '{topic}' is neither capture nor release: {err}")
+
+    def check(self) -> None:
+        """Raise BagError with what was wrong."""
+        count = f"{self._joint_states} messages on '{self.joint_topic}' were read"
+        if self._damage and self._joint_states == 0:
+            raise BagError(f"bag '{self.path}' cannot be read: {self._damage}",
+                           'check that it is a rosbag2 recording and copied whole')
+        if self._damage:
+            raise BagError(f"bag '{self.path}' is damaged: {self._damage}; {count}",
+                           "repair it with 'ros2 bag reindex' or 'mcap recover', or record again")
+        if self._faults:
+            more = f' (and {len(self._faults) - 1} more)' if len(self._faults) > 1 else ''
+            raise BagError(f"bag '{self.path}': {self._faults[0]}{more}; {count}",
+                           'correct the publisher and record again')
+        if self._joint_states == 0:
             raise BagError(f"bag '{self.path}' has no message on '{self.joint_topic}'",
                            'record while the joint states are published')
-        if self.faults:
-            more = f' (and {len(self.faults) - 1} more)' if len(self.faults) > 1 else ''
-            raise BagError(f"bag '{self.path}': {self.faults[0]}{more}; {self._read_so_far()}",
-                           'correct the publisher and record again')
-
-    def _read_so_far(self) -> str:
-        return f"{self.joint_states} messages on '{self.joint_topic}' were read"
-
-    def _decoded(self, topic: str, data: bytes) -> Iterator[Item]:
-        self.taken += 1
-        if self.progress is not None and self.taken % REPORT_EVERY == 0:
-            self.progress(self.taken, self.total)
-        try:
-            if topic == self.joint_topic:
-                record, self._layout = cdr.joint_record(data, self._layout)
-                self.joint_states += 1
-                yield record
-            else:
-                yield cdr.capture_event(data)
-        except (cdr.CdrError, UnicodeDecodeError) as err:
-            self.faults.append(f"message {self.taken} (on '{topic}') is garbled: {err}")
-        except ValueError as err:
-            self.faults.append(f"an event on '{topic}' is neither capture nor release: {err}")
 
     def _choose(self, there: dict[str, str], *, complete: bool = True) -> bool:
         """Settle which topics are read; tell whether one of ``there`` is."""
@@ -175,25 +204,25 @@ class _Decoder:
                                f'the topics there are: {listed}')
             if found is not None:
                 self.joint_topic = found
-                self.kinds[found] = JOINT_STATE
+                self._kinds[found] = JOINT_STATE
         spaces = (self.joint_topic.rpartition('/')[0], '')
         for name in self.topics.events:
             near = there if name.startswith('/') else {
                 topic: kind for topic, kind in there.items() if topic.rpartition('/')[0] in spaces}
             event = _resolve(name, near, HEADER, self.path)
             if event is not None:
-                self.kinds[event] = HEADER
+                self._kinds[event] = HEADER
             elif complete and self.topics.events_required:
                 listed = ', '.join(sorted(topic for topic, kind in there.items() if kind == HEADER)) or 'none'
                 raise BagError(f"bag '{self.path}' has no topic '{name}'",
                                f'the event topics there are: {listed}')
-        return any(topic in self.kinds for topic in there)
+        return any(topic in self._kinds for topic in there)
 
 
 def _resolve(wanted: str, there: dict[str, str], kind: str, path: Path) -> str | None:
     """Find a topic by its name, in any namespace when that is unambiguous."""
     exact = wanted if wanted.startswith('/') else '/' + wanted
-    names: Sequence[str] = [name for name in there if name in (wanted, exact)]
+    names = [name for name in there if name in (wanted, exact)]
     if not names and not wanted.startswith('/'):
         names = [name for name in there if name.endswith(exact)]
     if not names:
@@ -205,8 +234,3 @@ def _resolve(wanted: str, there: dict[str, str], kind: str, path: Path) -> str |
         raise BagError(f"topic '{names[0]}' in bag '{path}' is {there[names[0]]}, not {kind}",
                        'name another topic, or record the right type')
     return names[0]
-
-
-def _reason(err: Any) -> str:
-    text = ' '.join(str(err).split()) or type(err).__name__
-    return text.rstrip('.')

@@ -154,7 +154,7 @@ class _Conversion:
 
     def __call__(self, value: Value) -> Any:
         if isinstance(value, JointRecord):
-            arrays = (np.asarray(part, dtype=np.float64)
+            arrays = (np.ascontiguousarray(part, dtype=np.float64)
                       for part in (value.position, value.velocity, value.effort))
             header = self._header(value.stamp_ns, '')
             return self._new('sensor_msgs/msg/JointState', header, list(value.names), *arrays)

@@ -171,11 +171,22 @@ def signals(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Signa
                    clock.outputs or config.outputs)
 
 
-def collect(config: IdentifierParameters, records: Iterable[JointRecord | CaptureEvent]) -> Signals:
+def push_whole(config: IdentifierParameters, clock: Clock, log: SampleLog, block: JointBlock) -> Sampled:
+    """Take every message of a block."""
+    taken, reset = 0, False
+    while taken < len(block.stamp_ns):
+        (clock, log, again), some = push_block(config, clock, log, block, taken)
+        taken, reset = taken + some, reset or again
+    return Sampled(clock, log, reset)
+
+
+def collect(config: IdentifierParameters, items: Iterable[JointRecord | JointBlock | CaptureEvent]) -> Signals:
     """Return the signals of a whole recording."""
     clock, log = Clock(), EMPTY
-    for item in records:
-        if isinstance(item, JointRecord):
+    for item in items:
+        if isinstance(item, JointBlock):
+            clock, log, _ = push_whole(config, clock, log, item)
+        elif isinstance(item, JointRecord):
             clock, log, _ = push(config, clock, log, item)
     clock, log, _ = flush(config, clock, log)
     return signals(config, clock, log)

@@ -66,7 +66,7 @@ def messages(scenario: Scenario, run: Run, seed: int) -> list[JointRecord | Capt
     return inject(simulator.records(trajectory, events), scenario.faults, rng)
 
 
-def measure(config: IdentifierParameters, items: Sequence[JointRecord | CaptureEvent], true_kg: float | None,
+def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_kg: float | None,
             window: tuple[float, float], *, bound: bool = False, settled: float = 0.0) -> Row:
     """Identify and return the columns of a row.
 
@@ -106,7 +106,7 @@ def measure(config: IdentifierParameters, items: Sequence[JointRecord | CaptureE
     return row
 
 
-def _bound(config: IdentifierParameters, items: Sequence[JointRecord | CaptureEvent], capture_time: float,
+def _bound(config: IdentifierParameters, items: Sequence[pipeline.Item], capture_time: float,
            mass: float | None, dt: float) -> float | None:
     return None if mass is None else payload_std(config, collect(config, items), capture_time, mass, dt)
 

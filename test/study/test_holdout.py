@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flexmanip_ros.errors import ModelError, ParameterError
-from flexmanip_ros.samples.history import Signals
+from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.holdout import score
 from flexmanip_ros.types import StateSpace
 

@@ -1,13 +1,15 @@
-"""A recording through the pipeline to its outputs; identify_bag and studies over bags call it."""
+"""The replay of a recording: its messages through the pipeline to a result, a table or recording, and a report."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.cli.console import require_pictures
@@ -22,7 +24,10 @@ from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies import holdout
 from flexmanip_ros.studies.achievable import payload_std
 from flexmanip_ros.studies.summary import Summary, summarize
-from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Mode
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Mode
+
+NEVER = (1 << 63) - 1
+"""A stamp after all others [ns]."""
 
 
 @dataclass(frozen=True)
@@ -113,41 +118,50 @@ class _Feed:
         self.interrupted = False
         self.foreign = 0
         """Messages that hold none of the configured joints."""
-        config = request.config
-        self._joints = {name.rpartition('/')[0] for name in (*config.inputs, *config.outputs, *config.angles)}
         self.first_ns: int | None = None
         self.events: list[CaptureEvent] = []
         self.is_kept = request.report is not None or request.validate_from is not None
         self._clock, self._log = sampling.Clock(), sampling.EMPTY
         self._request = request
         self._progress = progress
+        config = request.config
+        self._joints = {name.rpartition('/')[0] for name in (*config.inputs, *config.outputs, *config.angles)}
 
-    def __iter__(self) -> Iterator[bag.Item]:
+    def __iter__(self) -> Iterator[pipeline.Item]:
         request = self._request
+        topics = bag.Topics(request.joint_states, request.events, request.events_required)
         try:
-            topics = bag.Topics(request.joint_states, request.events, request.events_required)
-            items = bag.read(request.bag, topics, self._progress)
-            for item in with_detected(request.config, items) if request.detect else items:
-                yield from self._pass(item)
+            if request.detect:
+                items: Iterable[pipeline.Item] = with_detected(
+                    request.config, bag.read(request.bag, topics, self._progress))
+            else:
+                items = bag.read_blocks(request.bag, topics, self._progress)
+            for item in items:
+                yield from self._event(item) if isinstance(item, CaptureEvent) else self._joint_states(item)
         except BagError as error:
             self.fault = error
         except KeyboardInterrupt:
             self.fault = BagError('interrupted', 'what was read until then is reported')
             self.interrupted = True
 
-    def _pass(self, item: bag.Item) -> Iterator[bag.Item]:
-        if isinstance(item, JointRecord):
-            self.foreign += self._joints.isdisjoint(item.names)
-            if self.is_kept:
-                self._clock, self._log, _ = sampling.push(self._request.config, self._clock, self._log, item)
-            if self.first_ns is None:
-                self.first_ns = item.stamp_ns
-                yield from self._known_events(item.stamp_ns)
-        if self._held_out(item.stamp_ns):
-            return
-        if isinstance(item, CaptureEvent):
-            self.events.append(item)
-        yield item
+    def _event(self, event: CaptureEvent) -> Iterator[CaptureEvent]:
+        if event.stamp_ns < self._limit_ns():
+            self.events.append(event)
+            yield event
+
+    def _joint_states(self, item: JointBlock | JointRecord) -> Iterator[pipeline.Item]:
+        block = item if isinstance(item, JointBlock) else JointBlock(
+            item.names, np.array([item.stamp_ns]), item.position[None], item.velocity[None], item.effort[None])
+        self.foreign += len(block.stamp_ns) * self._joints.isdisjoint(block.names)
+        if self.is_kept:
+            self._clock, self._log, _ = sampling.push_whole(self._request.config, self._clock, self._log, block)
+        if self.first_ns is None:
+            self.first_ns = int(block.stamp_ns[0])
+            yield from self._known_events(self.first_ns)
+        used = block.stamp_ns < self._limit_ns()
+        if used.any():
+            yield block if used.all() else JointBlock(
+                block.names, block.stamp_ns[used], block.position[used], block.velocity[used], block.effort[used])
 
     def signals(self) -> Signals:
         """Return the samples of the recording, held-out ones included."""
@@ -162,11 +176,12 @@ class _Feed:
                 self.events.append(event)
                 yield event
 
-    def _held_out(self, stamp_ns: int) -> bool:
+    def _limit_ns(self) -> int:
+        """Return the stamp from which on messages are held out of the identification [ns]."""
         limit = self._request.validate_from
         if limit is None or self.first_ns is None:
-            return False
-        return stamp_ns >= self.first_ns + round(limit * 1e9)
+            return NEVER
+        return self.first_ns + round(limit * 1e9)
 
 
 def _dropped(state: pipeline.State) -> FlexmanipError | None:
