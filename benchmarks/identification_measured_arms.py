@@ -14,11 +14,11 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from flexmanip_ros.samples.history import Signals
 
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.io.bag import read
 from flexmanip_ros.parameters import IdentifierParameters, configure
-from flexmanip_ros.samples.history import Signals
 from flexmanip_ros.studies import holdout
 from flexmanip_ros.types import JointRecord
 

@@ -153,8 +153,11 @@ def test_every_program_imports_and_is_callable(distribution: Distribution) -> No
 
 
 def test_every_module_with_a_main_is_a_program(distribution: Distribution) -> None:
-    modules = [*(ROOT / 'flexmanip_ros/ros').glob('*.py'), *(ROOT / 'flexmanip_ros/cli').glob('*.py')]
-    mains = {path.stem for path in modules if '\ndef main(' in path.read_text(encoding='utf-8')}
+    modules = [path for door in ('ros', 'cli') for path in (ROOT / 'flexmanip_ros' / door).rglob('*.py')]
+    mains = {
+        'demo' if path.parent.name == 'demo' else path.stem
+        for path in modules if '\ndef main(' in path.read_text(encoding='utf-8')
+    }
     assert mains - {'warm_up', 'write_parameters'} == set(programs(distribution))
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from flexmanip_ros.samples.history import Signals
 
 from flexmanip_ros.errors import ModelError, ParameterError
-from flexmanip_ros.samples.history import Signals
 from flexmanip_ros.studies.holdout import score
 from flexmanip_ros.types import StateSpace
 
