@@ -86,7 +86,7 @@ setup(
     maintainer_email='maintainers@flexmanip-ros.example',
     python_requires='>=3.11',
     extras_require={
-        'test': ['pytest', 'hypothesis'],
+        'test': ['pytest', 'pytest-timeout', 'hypothesis'],
         'finite_element': ['scikit-fem'],
         'cluster': ['dask', 'distributed'],
         'parquet': ['pyarrow'],

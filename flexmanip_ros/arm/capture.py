@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, null_space
 
 from flexmanip_ros.arm.manipulator import Manipulator
-from flexmanip_ros.parameters.plant import PlantParameters
+from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.types import Array
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.parameters.arm import ArmParameters
+from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
 

@@ -31,7 +31,7 @@ from flexmanip_ros.arm.equations_of_motion import assemble, elastic
 from flexmanip_ros.arm.jacobian import acceleration_jacobian, bias_jacobian
 from flexmanip_ros.arm.shape_functions import link_tables, output_matrix, quartic, rotary
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.parameters.arm import ArmParameters
+from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
 

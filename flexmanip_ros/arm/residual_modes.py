@@ -15,7 +15,7 @@ from flexmanip_ros.arm import linearization
 from flexmanip_ros.arm.outputs import Slopes
 from flexmanip_ros.arm.shape_functions import output_matrix
 from flexmanip_ros.arm.slope_correction import flexibility, load_weights, slopes
-from flexmanip_ros.parameters.arm import ArmParameters
+from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
 

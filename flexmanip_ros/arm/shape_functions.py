@@ -6,7 +6,7 @@ from itertools import permutations
 
 import numpy as np
 
-from flexmanip_ros.parameters.arm import ArmParameters
+from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from flexmanip_ros.arm import linearization
 from flexmanip_ros.arm.outputs import Slopes
 from flexmanip_ros.arm.shape_functions import output_matrix
-from flexmanip_ros.parameters.arm import ArmParameters
+from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
 TERMS = 4000

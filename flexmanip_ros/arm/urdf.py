@@ -12,7 +12,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.parameters.arm import ArmParameters
+from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
 COLOURS = ('0.20 0.45 0.70 1', '0.85 0.50 0.15 1')

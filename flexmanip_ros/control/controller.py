@@ -14,7 +14,7 @@ from flexmanip_ros.control.feedback import Design, design, observation, referenc
 from flexmanip_ros.control.gate import PayloadEstimate, Verdict, judge
 from flexmanip_ros.control.path import Path
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.parameters.controller import ControllerParameters
+from flexmanip_ros.parameters import ControllerParameters
 from flexmanip_ros.types import Array
 
 

@@ -14,7 +14,7 @@ from scipy.linalg import cho_factor, cho_solve, solve, solve_discrete_are
 
 from flexmanip_ros.arm.linearization import blocks, damping, discretize, root_slopes, tip_slopes
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.parameters.controller import ControllerParameters
+from flexmanip_ros.parameters import ControllerParameters
 from flexmanip_ros.types import Array
 
 RATE_SCALE = 8.0

@@ -6,7 +6,7 @@ import math
 from enum import Enum
 from typing import NamedTuple
 
-from flexmanip_ros.parameters.controller import ControllerParameters
+from flexmanip_ros.parameters import ControllerParameters
 
 
 class PayloadEstimate(NamedTuple):

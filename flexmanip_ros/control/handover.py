@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 from flexmanip_ros.control.gate import PayloadEstimate
-from flexmanip_ros.parameters.adapter import AdapterParameters
+from flexmanip_ros.parameters import AdapterParameters
 
 
 class HandoverState(NamedTuple):

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import yaml
 
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.parameters.field import configure
+from flexmanip_ros.parameters import configure
 
 Config = TypeVar('Config')
 STANDARD = re.compile(r'^(use_sim_time|start_type_description_service|qos_overrides\..*)$')

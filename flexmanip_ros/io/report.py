@@ -8,9 +8,8 @@ from pathlib import Path
 
 from flexmanip_ros.io import pictures
 from flexmanip_ros.io.html import Section, matrix, number, page, picture, table, write
-from flexmanip_ros.parameters import IdentifierParameters, flatten
+from flexmanip_ros.parameters import IdentifierParameters, flatten, leaves
 from flexmanip_ros.parameters.document import written
-from flexmanip_ros.parameters.field import leaves
 from flexmanip_ros.studies.holdout import Scores
 from flexmanip_ros.studies.summary import Summary
 from flexmanip_ros.types import StateSpace, Status

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import yaml
 
-from flexmanip_ros.parameters.adapter import AdapterParameters
-from flexmanip_ros.parameters.controller import ControllerParameters
-from flexmanip_ros.parameters.excitation import ExcitationParameters
+from flexmanip_ros.parameters.control import AdapterParameters, ControllerParameters
 from flexmanip_ros.parameters.field import Leaf, leaves
 from flexmanip_ros.parameters.identifier import IdentifierParameters
-from flexmanip_ros.parameters.plant import PlantParameters
+from flexmanip_ros.parameters.simulation import ExcitationParameters, PlantParameters
 from flexmanip_ros.parameters.trigger import TriggerParameters
 
 NODES: Mapping[str, type] = {
@@ -27,6 +25,7 @@ NODES: Mapping[str, type] = {
 }
 """Each node and the class that declares its parameters."""
 WIDTH = 100
+"""Characters in a line of a comment or of --help."""
 
 
 def number(value: float) -> str:
@@ -59,16 +58,12 @@ def written(leaf: Leaf, value: Any) -> str:
 
 
 def limits(leaf: Leaf) -> str:
-    """Return the range or the choices in words, empty when anything goes."""
+    """Return the range or the choices in words; empty when there is neither."""
     if leaf.choices:
         return ' | '.join(leaf.choices)
-    if leaf.low is None and leaf.high is None:
-        return ''
-    if leaf.high is None:
-        return f'>= {leaf.low:g}'
-    if leaf.low is None:
-        return f'<= {leaf.high:g}'
-    return f'{leaf.low:g} .. {leaf.high:g}'
+    if leaf.low is not None and leaf.high is not None:
+        return f'{leaf.low:g} .. {leaf.high:g}'
+    return f'>= {leaf.low:g}' if leaf.low is not None else '' if leaf.high is None else f'<= {leaf.high:g}'
 
 
 def kind(leaf: Leaf) -> str:
@@ -109,27 +104,23 @@ def yaml_text(node: str, values: Mapping[str, Any] | None = None, heading: str =
     return '\n'.join(lines) + '\n'
 
 
-def _cell(text: str) -> str:
-    return text.replace('|', '\\|')
-
-
 def table(cls: type) -> str:
     """Return the parameters of a class as a Markdown table."""
     rows = ['| parameter | type | default | unit | range | live | meaning |', '|---|---|---|---|---|---|---|']
     for leaf in leaves(cls):
         cells = (f'`{leaf.name}`', kind(leaf), f'`{written(leaf, leaf.default)}`', leaf.unit, limits(leaf),
                  'yes' if leaf.live else '', leaf.words)
-        rows.append('| ' + ' | '.join(_cell(cell) for cell in cells) + ' |')
+        rows.append('| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |')
     return '\n'.join(rows) + '\n'
 
 
-def markdown(nodes: Iterable[str] = tuple(NODES)) -> str:
+def markdown() -> str:
     """Return the reference page of all parameters."""
     parts = ['# Parameters', '',
-             'Written by `python -m flexmanip_ros.cli.write_parameters` from the declarations in '
-             '`flexmanip_ros/parameters/`; a test fails when this page is stale.', '',
-             '`live`: may be changed while the node runs.', '']
-    for node in nodes:
+             'This page is written by `python -m flexmanip_ros.cli.write_parameters` from the declarations in '
+             '`flexmanip_ros/parameters/`. A test fails when it is out of date.', '',
+             'A parameter marked `live` may be changed while the node runs.', '']
+    for node in NODES:
         parts += [f'## {node}', '', table(NODES[node])]
     return '\n'.join(parts)
 

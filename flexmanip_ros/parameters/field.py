@@ -13,6 +13,12 @@ from flexmanip_ros.errors import ParameterError
 
 Config = TypeVar('Config')
 
+WANTED = {
+    bool: ('true or false', 'true/false values'), int: ('a whole number', 'whole numbers'),
+    float: ('a number', 'numbers'), str: ('a text', 'texts'),
+}
+"""What to ask for, by type: one value, several."""
+
 
 @dataclass(frozen=True)
 class Leaf:
@@ -30,30 +36,23 @@ class Leaf:
     size: int | None
     live: bool
 
+    @property
+    def range_words(self) -> str:
+        """The inclusive range with its unit, as a sentence asks for it."""
+        low = '-inf' if self.low is None else f'{self.low:g}'
+        high = 'inf' if self.high is None else f'{self.high:g}'
+        return f'a value from {low} to {high} {self.unit}'.rstrip()
 
-def parameter(
-    default: Any,
-    words: str,
-    *,
-    unit: str = '',
-    low: float | None = None,
-    high: float | None = None,
-    choices: tuple[str, ...] = (),
-    size: int | None = None,
-    live: bool = False,
-) -> Any:
+
+def parameter(default: Any, words: str, *, unit: str = '', low: float | None = None, high: float | None = None,
+              choices: tuple[str, ...] = (), size: int | None = None, live: bool = False) -> Any:
     """Declare a parameter on a frozen dataclass.
 
     low, high: inclusive bounds (of every element of an array); size: fixed length of an array;
     live: may be changed while the node runs.
     """
-    return field(
-        default=default,
-        metadata={
-            'words': words, 'unit': unit, 'low': low, 'high': high,
-            'choices': choices, 'size': size, 'live': live,
-        },
-    )
+    return field(default=default, metadata={
+        'words': words, 'unit': unit, 'low': low, 'high': high, 'choices': choices, 'size': size, 'live': live})
 
 
 def leaves(cls: type, prefix: str = '') -> tuple[Leaf, ...]:
@@ -68,9 +67,7 @@ def leaves(cls: type, prefix: str = '') -> tuple[Leaf, ...]:
             continue
         is_array = get_origin(hint) is tuple
         kind = get_args(hint)[0] if is_array else hint
-        found.append(Leaf(
-            name=prefix + item.name, kind=kind, is_array=is_array, default=item.default, **item.metadata,
-        ))
+        found.append(Leaf(prefix + item.name, kind, is_array, item.default, **item.metadata))
     return tuple(found)
 
 
@@ -121,40 +118,38 @@ def check_all(config: Any) -> None:
 
 
 def check(leaf: Leaf, value: Any) -> Any:
-    """Return the value in the declared type, or raise ParameterError naming the parameter."""
+    """Return the value in the declared type. Raises ParameterError naming the parameter."""
     if not leaf.is_array:
         return _check_one(leaf, value)
+    wanted = WANTED[leaf.kind][1]
     if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
-        raise ParameterError(f"parameter '{leaf.name}' is {value!r}", f'give a list of {_plural(leaf)}')
+        raise ParameterError(f"parameter '{leaf.name}' is {value!r}", f'give a list of {wanted}')
     items = tuple(_check_one(leaf, item) for item in value)
     if leaf.kind is str and items == ('',):
         items = ()  # ROS cannot write an empty list of a known type; [''] stands for it
     if leaf.size is not None and len(items) != leaf.size:
-        raise ParameterError(
-            f"parameter '{leaf.name}' has {len(items)} elements", f'give {leaf.size} {_plural(leaf)}')
+        raise ParameterError(f"parameter '{leaf.name}' has {len(items)} elements", f'give {leaf.size} {wanted}')
     return items
 
 
 def _check_one(leaf: Leaf, value: Any) -> Any:
     converted = _convert(leaf.kind, value)
     if converted is None:
-        wanted = _plural(leaf) if leaf.is_array else _singular(leaf)
-        raise ParameterError(f"parameter '{leaf.name}' is {value!r}", f'give {wanted}')
+        raise ParameterError(f"parameter '{leaf.name}' is {value!r}", f'give {WANTED[leaf.kind][leaf.is_array]}')
     if isinstance(converted, float) and not math.isfinite(converted):
         what = 'not a number' if math.isnan(converted) else 'infinite'
-        raise ParameterError(f"parameter '{leaf.name}' is {what}", f'give {_range_words(leaf)}, finite')
+        raise ParameterError(f"parameter '{leaf.name}' is {what}", f'give {leaf.range_words}, finite')
     if leaf.choices and converted not in leaf.choices:
-        raise ParameterError(
-            f"parameter '{leaf.name}' is {converted!r}", f'choose one of {", ".join(leaf.choices)}')
+        raise ParameterError(f"parameter '{leaf.name}' is {converted!r}", f'choose one of {", ".join(leaf.choices)}')
     below = leaf.low is not None and converted < leaf.low
-    above = leaf.high is not None and converted > leaf.high
-    if below or above:
-        raise ParameterError(
-            f"parameter '{leaf.name}' is {converted!r}{_unit(leaf)}", f'give {_range_words(leaf)}')
+    if below or (leaf.high is not None and converted > leaf.high):
+        is_what = f'{converted!r} {leaf.unit}'.rstrip()
+        raise ParameterError(f"parameter '{leaf.name}' is {is_what}", f'give {leaf.range_words}')
     return converted
 
 
 def _convert(kind: type, value: Any) -> Any:
+    """Return the value as the declared type, None where it is of another one."""
     if kind is bool or isinstance(value, bool):
         return value if kind is bool and isinstance(value, bool) else None
     if kind is float and isinstance(value, (int, float)):
@@ -166,23 +161,3 @@ def _convert(kind: type, value: Any) -> Any:
     if hasattr(value, 'item'):  # a numpy scalar
         return _convert(kind, value.item())
     return None
-
-
-def _unit(leaf: Leaf) -> str:
-    return f' {leaf.unit}' if leaf.unit else ''
-
-
-def _singular(leaf: Leaf) -> str:
-    names = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'a text'}
-    return names[leaf.kind]
-
-
-def _plural(leaf: Leaf) -> str:
-    names = {bool: 'true/false values', int: 'whole numbers', float: 'numbers', str: 'texts'}
-    return names[leaf.kind]
-
-
-def _range_words(leaf: Leaf) -> str:
-    low = '-inf' if leaf.low is None else f'{leaf.low:g}'
-    high = 'inf' if leaf.high is None else f'{leaf.high:g}'
-    return f'a value from {low} to {high}{_unit(leaf)}'

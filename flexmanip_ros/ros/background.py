@@ -129,7 +129,7 @@ def changed(before: IdentifierParameters, now: IdentifierParameters) -> list[str
 
 def too_old(config: IdentifierParameters, state: pipeline.State, stamp_ns: int) -> bool:
     """Whether a sample is further than ``checkpoint_max_age`` from the last sample of a saved state."""
-    return state.events is not None and abs(stamp_ns - state.events.last_ns) > config.checkpoint_max_age * 1e9
+    return state.payload is not None and abs(stamp_ns - state.payload.last_ns) > config.checkpoint_max_age * 1e9
 
 
 WARM_UP_EVENT = 40

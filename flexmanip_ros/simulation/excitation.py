@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from flexmanip_ros.parameters.excitation import ExcitationParameters
+from flexmanip_ros.parameters import ExcitationParameters
 from flexmanip_ros.types import Array
 
 CREST_PASSES = 200

@@ -11,8 +11,7 @@ from scipy.optimize import brentq
 
 from flexmanip_ros.arm.manipulator import manipulator
 from flexmanip_ros.errors import ModelError, ParameterError
-from flexmanip_ros.parameters.excitation import ExcitationParameters
-from flexmanip_ros.parameters.plant import PlantParameters
+from flexmanip_ros.parameters import ExcitationParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, models, noise, simulator
 from flexmanip_ros.types import Array
 

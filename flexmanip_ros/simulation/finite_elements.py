@@ -13,8 +13,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.parameters.arm import ArmParameters
-from flexmanip_ros.parameters.plant import PlantParameters
+from flexmanip_ros.parameters import ArmParameters, PlantParameters
 from flexmanip_ros.simulation.linear_model import LinearModel
 from flexmanip_ros.types import Array
 

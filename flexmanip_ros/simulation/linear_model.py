@@ -10,7 +10,7 @@ from scipy.linalg import cho_factor, cho_solve, null_space
 from flexmanip_ros.arm import manipulator as arm_dynamics
 from flexmanip_ros.arm.capture import body_jacobian
 from flexmanip_ros.arm.linearization import discretize
-from flexmanip_ros.parameters.plant import PlantParameters
+from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.simulation.integration import run_linear, scratch
 from flexmanip_ros.types import Array
 

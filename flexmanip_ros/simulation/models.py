@@ -19,7 +19,7 @@ from flexmanip_ros.arm.outputs import end_loads
 from flexmanip_ros.arm.residual_modes import slopes_with_tail
 from flexmanip_ros.arm.slope_correction import slopes
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.parameters.plant import PlantParameters
+from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.simulation.finite_elements import finite_element_model
 from flexmanip_ros.simulation.integration import run_nonlinear, scratch
 from flexmanip_ros.simulation.linear_model import linear_model

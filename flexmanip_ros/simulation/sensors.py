@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from flexmanip_ros.numerics.compiled import kernel
-from flexmanip_ros.parameters.plant import PlantParameters
+from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.types import Array
 
 

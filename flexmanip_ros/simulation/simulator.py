@@ -15,9 +15,7 @@ import numpy as np
 
 from flexmanip_ros.arm.capture import Body, free_object, joined, rates_after
 from flexmanip_ros.errors import ModelError, SignalError
-from flexmanip_ros.parameters.excitation import ExcitationParameters
-from flexmanip_ros.parameters.plant import PlantParameters
-from flexmanip_ros.parameters.sensing import SensorParameters
+from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, SensorParameters
 from flexmanip_ros.simulation import excitation, models, noise, sensors
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointRecord
 

@@ -9,8 +9,7 @@ import pytest
 from flexmanip_ros.control import controller
 from flexmanip_ros.control.gate import PayloadEstimate, Verdict, judge
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.parameters import ArmParameters, PlantParameters, configure
-from flexmanip_ros.parameters.controller import ControllerParameters
+from flexmanip_ros.parameters import ArmParameters, ControllerParameters, PlantParameters, configure
 from flexmanip_ros.simulation import simulator
 
 GOOD = PayloadEstimate(20.0, 0.1, 19.8, 20.2, 1.0)

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from flexmanip_ros.arm.linearization import frequencies, vibration_model
 from flexmanip_ros.control.feedback import design, model, observation, reference
-from flexmanip_ros.parameters import ArmParameters
-from flexmanip_ros.parameters.controller import ControllerParameters
+from flexmanip_ros.parameters import ArmParameters, ControllerParameters
 
 BETWEEN = st.floats(-3.0, 3.0)
 PAYLOAD = st.floats(0.0, 200.0)

@@ -7,7 +7,7 @@ import pytest
 from flexmanip_ros.control import handover
 from flexmanip_ros.control.gate import PayloadEstimate
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.parameters.adapter import AdapterParameters
+from flexmanip_ros.parameters import AdapterParameters
 
 CONFIG = AdapterParameters(target_node='driver', settle_time=0.5, min_period=1.0)
 GOOD = PayloadEstimate(20.0, 0.1, 19.8, 20.2, 1.0)

@@ -8,6 +8,7 @@ import json
 import re
 import subprocess
 import sys
+import warnings
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import NamedTuple
@@ -114,8 +115,24 @@ def test_every_launched_package_is_a_dependency() -> None:
 
 def test_every_rosdep_key_is_for_something_imported() -> None:
     used = {LIBRARIES.get(name, (name, ''))[0] for name in third_party()}
-    tools = {'python3-pytest', 'python3-hypothesis'}
+    tools = {'python3-pytest', 'python3-pytest-timeout', 'python3-hypothesis'}
     assert declared() - used - tools - launched() == set()
+
+
+def test_what_pytest_is_configured_for_is_a_test_dependency() -> None:
+    """``timeout`` in pyproject.toml is an option of pytest-timeout: without it pytest ends in an error."""
+    settings = (ROOT / 'pyproject.toml').read_text(encoding='utf-8')
+    assert re.search(r'^timeout = \d+$', settings, re.MULTILINE)
+    needed = {element.text for element in PACKAGE.iter('test_depend')}
+    assert {'python3-pytest', 'python3-pytest-timeout', 'python3-hypothesis'} <= needed
+
+
+def test_a_deprecated_call_of_an_old_dateutil_is_no_error() -> None:
+    """Python 3.12 warns of a call in dateutil 2.8.2 when matplotlib imports it."""
+    with pytest.warns(DeprecationWarning, match='another'):  # other warnings remain errors
+        warnings.warn_explicit('another', DeprecationWarning, 'tz.py', 1, module='dateutil.tz.tz')
+    said = 'datetime.datetime.utcfromtimestamp() is deprecated and scheduled for removal in a future version.'
+    warnings.warn_explicit(said, DeprecationWarning, 'tz.py', 37, module='dateutil.tz.tz')
 
 
 def test_every_import_is_locked() -> None:
@@ -153,8 +170,11 @@ def test_every_program_imports_and_is_callable(distribution: Distribution) -> No
 
 
 def test_every_module_with_a_main_is_a_program(distribution: Distribution) -> None:
-    modules = [*(ROOT / 'flexmanip_ros/ros').glob('*.py'), *(ROOT / 'flexmanip_ros/cli').glob('*.py')]
-    mains = {path.stem for path in modules if '\ndef main(' in path.read_text(encoding='utf-8')}
+    modules = [path for door in ('ros', 'cli') for path in (ROOT / 'flexmanip_ros' / door).rglob('*.py')]
+    mains = {
+        'demo' if path.parent.name == 'demo' else path.stem
+        for path in modules if '\ndef main(' in path.read_text(encoding='utf-8')
+    }
     assert mains - {'warm_up', 'write_parameters'} == set(programs(distribution))
 
 

@@ -7,12 +7,13 @@ come from automatic differentiation.
 
 from __future__ import annotations
 
-import casadi as ca
 import numpy as np
+import pytest
 
 from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
+ca = pytest.importorskip('casadi')
 POINTS = 30
 
 

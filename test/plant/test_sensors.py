@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
-from flexmanip_ros.parameters.sensing import ActuatorParameters, SensorParameters
+from flexmanip_ros.parameters import (
+    ActuatorParameters,
+    ArmParameters,
+    ExcitationParameters,
+    PlantParameters,
+    SensorParameters,
+)
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import JointRecord
 

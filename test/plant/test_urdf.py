@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from urdf_parser_py.urdf import URDF
 
 from flexmanip_ros.arm import manipulator
 from flexmanip_ros.arm.urdf import urdf
@@ -16,7 +15,7 @@ from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
 ARM = ArmParameters(modes=1, sensor_position=(0.5, 0.4), shortening=False, slope_correction=False)
-ROBOT = URDF.from_xml_string(urdf(ARM).encode())
+ROBOT = pytest.importorskip('urdf_parser_py.urdf').URDF.from_xml_string(urdf(ARM).encode())
 JOINTS = {joint.name: joint for joint in ROBOT.joints}
 NAMED = {'joint1', 'joint2', 'link1_bend', 'link2_bend'}
 

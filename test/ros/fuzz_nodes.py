@@ -124,7 +124,7 @@ class Bench:
         if isinstance(self.node, PlantSimulator):
             return len(self.node._pending)
         state = self.node.state
-        events = state.events
+        events = state.payload
         if events is None:
             return len(state.early)
         rows = events.cursor - events.snapshots[0].row if events.snapshots else 0

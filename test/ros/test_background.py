@@ -103,8 +103,8 @@ def test_a_parameter_changed_meanwhile_counts_from_then_on_wherever_fits_are_sol
         for item in recording()[:702]:
             state, _ = pipeline.step(config, state, item, *arguments)
         state = pipeline.reconfigure(replace(config, forgetting_factor=(0.9, 0.9, 0.9)), state, *arguments)
-        assert state.events is not None
-        factors.append(state.events.estimators.rpbsid.memory[0].tobytes())
+        assert state.payload is not None
+        factors.append(state.identifier.estimator.rpbsid.memory[0].tobytes())
         if background is not None:
             background.close()
     assert factors[0] == factors[1]

@@ -17,7 +17,7 @@ def test_an_identifier_that_is_restarted_goes_on_as_if_it_had_only_missed_sample
     first = Live(ros, checkpoint_file=file)
     first.send(*samples[:300])
     first.events.publish(conversions.header(CAPTURE))
-    ros.wait(lambda: first.node.state.events.pending)
+    ros.wait(lambda: first.node.state.payload.pending)
     first.send(*samples[300:500])
     ros.remove(first.node)
     second = Live(ros, checkpoint_file=file)

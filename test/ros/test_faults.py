@@ -34,7 +34,7 @@ def honest(payload: Payload, truth: float) -> bool:
 
 def announce(ros: Ros, live: Live) -> None:
     live.events.publish(conversions.header(CAPTURE))
-    ros.wait(lambda: live.node.state.events is None or live.node.state.events.latest)
+    ros.wait(lambda: live.node.state.payload is None or live.node.state.payload.latest)
 
 
 def test_a_publisher_that_dies_and_returns_is_a_gap_and_no_loss(ros: Ros) -> None:
@@ -134,7 +134,7 @@ def test_a_flood_is_taken_or_counted_as_lost_to_the_last_message(ros: Ros) -> No
     samples = recording(4000)
     for sample in samples:  # as fast as the publisher can: several times the usual rate
         live.joint_states.publish(conversions.joint_state(sample))
-    ros.wait(lambda: live.node.state.events and live.node.meter.idle_s() > 0.5, timeout=60.0)
+    ros.wait(lambda: live.node.state.payload and live.node.meter.idle_s() > 0.5, timeout=60.0)
     last = samples[-1]
     live.send(last._replace(stamp_ns=last.stamp_ns + 1_000_000))
     node = live.node
@@ -160,9 +160,9 @@ def test_a_release_without_a_capture_and_two_captures_claim_nothing_wrong(ros: R
     live.send(*samples[:200])
     release = CaptureEvent(START_NS + 210_000_000, EventKind.RELEASE)
     live.events.publish(conversions.header(release))
-    ros.wait(lambda: live.node.state.events.latest)
+    ros.wait(lambda: live.node.state.payload.latest)
     for stamp in (CAPTURE.stamp_ns, CAPTURE.stamp_ns + 1_000_000):
         live.events.publish(conversions.header(CAPTURE._replace(stamp_ns=stamp)))
-    ros.wait(lambda: live.node.state.events.repeated_events == 1)
+    ros.wait(lambda: live.node.state.payload.repeated_events == 1)
     live.send(*samples[200:])
     assert honest(believed(live), TRUTH)

@@ -32,7 +32,7 @@ def test_live_and_replay_give_the_same_bits(ros: Ros) -> None:
     samples = recording()
     live.send(*samples[:300])
     live.events.publish(conversions.header(CAPTURE))
-    ros.wait(lambda: live.node.state.events.pending, what='the event')
+    ros.wait(lambda: live.node.state.payload.pending, what='the event')
     live.send(*samples[300:])
     live.finish()
     expected = replayed(live, [*samples[:300], CAPTURE, *samples[300:]])
@@ -46,7 +46,7 @@ def test_an_event_that_comes_late_is_applied_at_its_own_stamp(ros: Ros) -> None:
     samples = recording()
     live.send(*samples[:500])
     live.events.publish(conversions.header(CAPTURE))
-    ros.wait(lambda: live.node.state.events.rewinds == 1)
+    ros.wait(lambda: live.node.state.payload.rewinds == 1)
     live.send(*samples[500:])
     in_time = list(pipeline.run(live.node.config, [CAPTURE, *samples]))[-1].payload
     late = live.node.estimate.payload

@@ -15,8 +15,8 @@ from rclpy.node import Node
 
 from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import leaves
-from flexmanip_ros.parameters.demo import DemoParameters, settings
 from flexmanip_ros.parameters.document import NODES, written
+from flexmanip_ros.parameters.simulation import DemoParameters, settings
 from flexmanip_ros.ros.demo.recorder import Recorder
 from flexmanip_ros.ros.demo.result import Facts
 from flexmanip_ros.ros.node import FlexmanipNode

@@ -22,8 +22,7 @@ from rclpy.utilities import remove_ros_args
 from rich.console import Console
 
 from flexmanip_ros.errors import FlexmanipError, ParameterError
-from flexmanip_ros.parameters import configure, leaves
-from flexmanip_ros.parameters.demo import DemoParameters
+from flexmanip_ros.parameters import DemoParameters, configure, leaves
 from flexmanip_ros.ros.demo.composition import Composition, foreign_arm
 from flexmanip_ros.ros.demo.composition import arguments as composition_arguments
 from flexmanip_ros.ros.demo.progress import Progress

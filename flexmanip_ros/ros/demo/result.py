@@ -17,8 +17,7 @@ from flexmanip_ros.arm.linearization import frequencies, vibration_model
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.pictures import Truth, collect, overview_figure
 from flexmanip_ros.messages import Inertia, LabelledArray, Value
-from flexmanip_ros.parameters import IdentifierParameters, PlantParameters, flatten
-from flexmanip_ros.parameters.demo import DemoParameters
+from flexmanip_ros.parameters import DemoParameters, IdentifierParameters, PlantParameters, flatten
 from flexmanip_ros.parameters.document import yaml_text
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord
 

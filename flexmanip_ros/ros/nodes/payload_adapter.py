@@ -27,7 +27,7 @@ from std_msgs.msg import Float64MultiArray
 from flexmanip_ros.control import handover
 from flexmanip_ros.control.gate import PayloadEstimate
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.parameters.adapter import AdapterParameters
+from flexmanip_ros.parameters import AdapterParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.diagnostics import ERROR, WARN, Report
 from flexmanip_ros.ros.node import FlexmanipNode

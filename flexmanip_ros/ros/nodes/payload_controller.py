@@ -26,7 +26,7 @@ from std_msgs.msg import Float64MultiArray
 from flexmanip_ros.control import controller
 from flexmanip_ros.control.gate import PayloadEstimate, Verdict
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.parameters.controller import ControllerParameters
+from flexmanip_ros.parameters import ControllerParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, doubles
 from flexmanip_ros.ros.diagnostics import ERROR, STALE, WARN, Meter, Report

@@ -24,7 +24,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
 from std_srvs.srv import Trigger
 
-from flexmanip_ros import estimator, messages, pipeline
+from flexmanip_ros import messages, pipeline
 from flexmanip_ros.errors import CheckpointError, FlexmanipError, SignalError
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.ros import qos
@@ -192,10 +192,10 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             values['checkpoints'] = self._checkpoints.saves
             if self._checkpoints.problem:
                 report.worse(ERROR, self._checkpoints.problem)
-        events = self.state.events
-        if events is not None:
+        events, identifier = self.state.payload, self.state.identifier
+        if events is not None and identifier is not None:
             values.update(late_events=events.late_events, repeated_events=events.repeated_events,
-                          rewinds=events.rewinds, outliers=estimator.outliers(events.estimators))
+                          rewinds=events.rewinds, outliers=identifier.estimator.outliers)
         if self.active and values['rate_hz'] == 0.0:
             report.worse(STALE, 'no joint_states')
         if self.rejected:

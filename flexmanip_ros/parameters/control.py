@@ -1,0 +1,117 @@
+"""Parameters of the consumers of the payload: the example controller and the bridge to a robot driver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.parameters.arm import ArmParameters
+from flexmanip_ros.parameters.field import check_all, parameter
+
+
+@dataclass(frozen=True)
+class ControllerParameters:
+    """Joint hold and vibration damping, scheduled on payload and configuration (node ``payload_controller``)."""
+
+    joints: tuple[str, ...] = parameter(('joint1', 'joint2'), 'names of the two joints', size=2)
+    bends: tuple[str, ...] = parameter(
+        ('link1_bend', 'link2_bend'), 'names of the two bend sensors (deflection and rate)', size=2)
+    hold_present: bool = parameter(
+        True, 'true: hold the angles of the first sample after activation; false: move to setpoint')
+    setpoint: tuple[float, ...] = parameter(
+        (0.0, 0.0), 'encoder angles to hold; setting them ends hold_present', unit='rad', size=2, live=True)
+    setpoint_rate: float = parameter(
+        0.2, 'largest rate of the held angles while they move to a new setpoint', unit='rad/s', low=1e-3, high=100.0,
+        live=True)
+    move_bend: float = parameter(
+        0.01, 'largest bend at the sensors that a move to a new setpoint may need; a heavier arm moves more slowly',
+        unit='m', low=1e-6, high=10.0, live=True)
+    move_effort: float = parameter(
+        0.5, 'fraction of effort_limit that a move to a new setpoint may need', low=0.01, high=1.0, live=True)
+    angle_scale: float = parameter(
+        0.01, 'angle error that costs as much as a torque of effort_scale (larger: softer)', unit='rad', low=1e-6)
+    bend_scale: float = parameter(
+        0.02, 'bend that costs as much as a torque of effort_scale (larger: less damping of vibration)', unit='m',
+        low=1e-7)
+    effort_scale: tuple[float, ...] = parameter(
+        (100.0, 50.0), 'torque that costs one unit in the regulator', unit='N m', low=1e-6, size=2)
+    effort_limit: tuple[float, ...] = parameter(
+        (300.0, 150.0), 'largest torque of each joint; a larger command is cut to it', unit='N m', low=0.0, size=2,
+        live=True)
+    noise_std: tuple[float, ...] = parameter(
+        (3e-3, 3e-3, 3e-4, 3e-4, 0.2, 0.2, 0.02, 0.02),
+        'measurement noise that the filter assumes for the angles, the bends, then their rates (larger: slower filter, '
+        'less disturbed by modes beyond kappa)', unit='rad, m, rad/s, m/s', low=1e-12, size=8)
+    disturbance_std: tuple[float, ...] = parameter(
+        (1.0, 1.0), 'white torque disturbance that the filter assumes beside the command', unit='N m', low=1e-9, size=2)
+    rate: float = parameter(1000.0, 'joint states a second', unit='Hz', low=10.0, high=100000.0)
+    use_estimate: bool = parameter(True, 'schedule the gains on the estimated payload', live=True)
+    initial_payload: float = parameter(0.0, 'payload before the first trusted estimate', unit='kg', low=0.0)
+    max_payload: float = parameter(200.0, 'largest trusted payload estimate', unit='kg', low=0.0, live=True)
+    max_interval: float = parameter(
+        0.2, 'largest trusted half width of the 95 % interval, as a fraction of tip mass plus payload', low=0.0,
+        high=10.0, live=True)
+    max_consistency: float = parameter(
+        4.0, 'largest trusted residual power of an estimate (1: noise alone)', low=0.0, live=True)
+    payload_rate: float = parameter(
+        100.0, 'largest rate at which the scheduled payload follows a trusted estimate', unit='kg/s', low=0.01,
+        high=1e6, live=True)
+    reschedule_mass: float = parameter(
+        0.02, 'change of the payload that asks for new gains, as a fraction of tip mass plus payload', low=1e-4,
+        high=1.0)
+    reschedule_angle: float = parameter(
+        0.05, 'change of the angle between the links that asks for new gains', unit='rad', low=1e-3, high=3.0)
+    blend_time: float = parameter(0.1, 'time over which new gains replace the old ones', unit='s', low=0.0, high=10.0)
+    stale_after: float = parameter(
+        0.1, 'time without joint states (or added efforts) after which the torque (or the added torque) is zero',
+        unit='s', low=0.005, high=10.0)
+    arm: ArmParameters = field(default_factory=ArmParameters)
+
+    def __post_init__(self) -> None:
+        check_all(self)
+        if len({*self.joints, *self.bends}) != 4:
+            raise ParameterError("parameters 'joints' and 'bends' name a signal twice", 'name each once')
+        for fraction in self.arm.sensor_position:
+            if not 0.05 <= fraction <= 0.95:
+                raise ParameterError(
+                    f"parameter 'arm.sensor_position' is {fraction:g}",
+                    'bend sensors so near an end of their link cannot be used; choose 0.05 to 0.95')
+
+
+@dataclass(frozen=True)
+class AdapterParameters:
+    """Which driver gets the payload, and which payload is trusted (node ``payload_adapter``)."""
+
+    service: str = parameter('io_and_status_controller/set_payload', 'service of the driver that takes a payload')
+    service_type: str = parameter(
+        'ur_msgs/srv/SetPayload', 'type of that service; its request holds a geometry_msgs/Inertia, or mass and '
+        'center_of_gravity')
+    target_node: str = parameter(
+        '', 'node whose parameter is set to the payload instead of calling the service; empty: none')
+    mass_parameter: str = parameter('payload_mass', 'name of that parameter (a double)', unit='kg')
+    max_relative_std: float = parameter(
+        0.05, 'a payload is sent when its standard deviation is below this fraction of it, or below max_std',
+        low=1e-6, high=1.0, live=True)
+    max_std: float = parameter(
+        0.2, 'standard deviation below which every payload is sent', unit='kg', low=1e-6, high=1e3, live=True)
+    max_consistency: float = parameter(
+        4.0, 'largest trusted residual power of an estimate (1: noise alone)', low=0.0, live=True)
+    max_payload: float = parameter(100.0, 'largest payload that is sent', unit='kg', low=0.0, live=True)
+    settle_time: float = parameter(
+        0.3, 'time for which a payload must have been trusted before it is sent', unit='s', low=0.0, high=60.0,
+        live=True)
+    min_change: float = parameter(
+        0.05, 'a payload is sent again when it changed by this fraction of it, or by max_std', low=0.0, high=10.0,
+        live=True)
+    min_period: float = parameter(
+        1.0, 'shortest time between two requests to the driver', unit='s', low=0.01, high=3600.0)
+
+    def __post_init__(self) -> None:
+        check_all(self)
+        if not self.service and not self.target_node:
+            raise ParameterError("parameters 'service' and 'target_node' are both empty",
+                                 'name the driver service or the node that takes the payload')
+        parts = self.service_type.split('/')
+        if len(parts) != 3 or parts[1] != 'srv' or not all(part.isidentifier() for part in parts):
+            raise ParameterError(f"parameter 'service_type' is '{self.service_type}'",
+                                 'write PACKAGE/srv/TYPE')
