@@ -22,6 +22,7 @@ from flexmanip_ros.identification.modes import modes
 from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
 from flexmanip_ros.payload.block_extraction import estimate, extract
+from flexmanip_ros.samples.sample_log import log_of
 
 DT, COUNT, MASS = 1e-3, 3000, 20.0
 THETA = np.radians([60.0, 45.0])
@@ -96,7 +97,7 @@ def study(runs: int, snr_db: float, damping: float) -> dict[str, object]:
         noise = np.random.default_rng(seed).standard_normal(clean.shape)
         exact.append(np.abs(weights @ noise[:SEEN].ravel()) < 1.96 * bound)
         y = clean + spread * noise
-        found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), u, y), DT)
+        found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), log_of(u, y).rows(0, len(u))), DT)
         if found is None or len(modes(found)) != 2:
             inside.append([False] * 5)
             continue

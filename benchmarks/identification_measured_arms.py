@@ -14,11 +14,11 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from flexmanip_ros.samples.history import Signals
 
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.io.bag import read
 from flexmanip_ros.parameters import IdentifierParameters, configure
+from flexmanip_ros.samples.sample_log import Signals, log_of
 from flexmanip_ros.studies import holdout
 from flexmanip_ros.types import JointRecord
 
@@ -43,9 +43,7 @@ def ours(u: np.ndarray, y: np.ndarray, half: int, values: dict[str, object]) -> 
         'inputs': [f'in{i}/effort' for i in range(u.shape[1])],
         'outputs': [f'out{i}/position' for i in range(y.shape[1])], 'angles': [''], 'payload_method': 'none',
         **values})
-    state = rpbsid.init(config)
-    for k in range(half):
-        state = rpbsid.step(config, state, u[k], y[k])
+    state = rpbsid.advance(config, rpbsid.init(config), log_of(u, y).rows(0, half))
     found = rpbsid.identified(config, rpbsid.finish(config, state), DT)
     assert found is not None
     stamps = (np.arange(len(u)) * round(DT * 1e9)).astype(np.int64)

@@ -19,6 +19,7 @@ from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
 from flexmanip_ros.payload.block_extraction import extract
+from flexmanip_ros.samples.sample_log import log_of
 
 DT = 1e-3
 SETTINGS = {
@@ -63,12 +64,13 @@ def payload_errors(
     config = configure(IdentifierParameters, {
         'outputs': [f'link{i}_bend/{field}' for field in what for i in (1, 2)],
         'arm.torque_convention': convention, **settings})
-    state = rpbsid.advance(config, rpbsid.init(config), u[:capture], y[:capture])
+    log = log_of(u, y)
+    state = rpbsid.advance(config, rpbsid.init(config), log.rows(0, capture))
     state = rpbsid.restart(config, state) if config.restart_on_event else state
-    state = rpbsid.advance(config, state, u[capture:begin], y[capture:begin])
+    state = rpbsid.advance(config, state, log.rows(capture, begin))
     errors = []
     for k in range(begin, len(u), every):
-        state = rpbsid.advance(config, state, u[k:k + every], y[k:k + every])
+        state = rpbsid.advance(config, state, log.rows(k, min(k + every, len(u))))
         found = rpbsid.identified(config, state, DT)
         try:
             assert found is not None

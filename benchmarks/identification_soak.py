@@ -18,6 +18,7 @@ import numpy as np
 from flexmanip_ros.arm.linearization import discretize, vibration_model
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
+from flexmanip_ros.samples.sample_log import SampleLog, Width
 
 DT = 1e-3
 LONG = {'forgetting_factor': [0.9995] * 3}
@@ -48,6 +49,15 @@ def soak(settings: dict[str, object], samples: int) -> dict[str, object]:
     config = configure(IdentifierParameters, {'arm.torque_convention': 'paper', **settings})
     hush = 1e-4 * np.abs(y).max(axis=0)
     state, done, errors, lost = rpbsid.init(config), 0, [], 0
+    log = SampleLog(Width(2, 4, 0))
+
+    def take(state: rpbsid.RpbsidState, torque: np.ndarray, output: np.ndarray) -> rpbsid.RpbsidState:
+        nonlocal log
+        count = len(torque)
+        log = log.from_row(rpbsid.first_needed(state)).append(
+            np.zeros(count, dtype=np.int64), torque, output, np.zeros((count, 0)), np.zeros(count, dtype=bool))
+        return rpbsid.advance(config, state, log.rows(log.end - count, log.end))
+
     begin = time.perf_counter()
     while done < samples:
         for torque, output in (
@@ -56,10 +66,10 @@ def soak(settings: dict[str, object], samples: int) -> dict[str, object]:
             (np.zeros((20_000, 2)), hush * rng.standard_normal((20_000, 4))),
             (np.full((20, 2), np.nan), np.full((20, 4), np.inf)),
         ):
-            state = rpbsid.window_restart(config, rpbsid.advance(config, state, torque, output))
+            state = rpbsid.window_restart(config, take(state, torque, output))
             done += len(torque)
             lost += not all(np.all(np.isfinite(array)) for array in state.memory)
-        state = rpbsid.advance(config, state, u[:100], y[:100])
+        state = take(state, u[:100], y[:100])
         found = rpbsid.identified(config, state, DT)
         assert found is not None
         errors.append(float(np.abs(np.sort_complex(np.linalg.eigvals(found.model.A)) - true).max()))

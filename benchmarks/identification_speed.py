@@ -17,6 +17,7 @@ from numba import njit
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.factor import rotate
 from flexmanip_ros.parameters import IdentifierParameters, configure
+from flexmanip_ros.samples.sample_log import log_of
 
 
 @njit(cache=True)
@@ -83,13 +84,13 @@ def identifier(p: int, r: int, m: int, count: int, publish: int = 0, **values: o
         'inputs': [f'in{i}/effort' for i in range(r)], 'outputs': [f'out{i}/position' for i in range(m)],
         'order': 4, 'past_window': p, 'future_window': 5, **values})
     u, y = motion(r, m, count + WARM_UP)
-    start = rpbsid.advance(config, rpbsid.init(config), u[:WARM_UP], y[:WARM_UP])
-    u, y = u[WARM_UP:], y[WARM_UP:]
+    log = log_of(u, y)
+    start = rpbsid.advance(config, rpbsid.init(config), log.rows(0, WARM_UP))
 
     def work() -> None:
         state = start
-        for k in range(0, count, publish or count):
-            state = rpbsid.advance(config, state, u[k:k + (publish or count)], y[k:k + (publish or count)])
+        for k in range(WARM_UP, log.end, publish or count):
+            state = rpbsid.advance(config, state, log.rows(k, min(k + (publish or count), log.end)))
             if publish:
                 rpbsid.identified(config, state, 1e-3)
     work()

@@ -24,6 +24,7 @@ from flexmanip_ros.parameters import (
     PayloadParameters,
 )
 from flexmanip_ros.payload import block_extraction, cramer_rao
+from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.simulation import excitation
 
 ARM = ArmParameters(torque_convention='paper', angle_convention='chord', modes=1)
@@ -57,11 +58,12 @@ def main() -> None:
         done: dict[bool, list[trials.Trial]] = {False: [], True: []}
         for seed in range(runs):
             Y = X + noise * np.random.default_rng(seed).normal(size=X.shape)
-            state = rpbsid.restart(paper, rpbsid.advance(paper, rpbsid.init(paper), efforts[:3000], Y[:3000]))
+            log = log_of(efforts, Y)
+            state = rpbsid.restart(paper, rpbsid.advance(paper, rpbsid.init(paper), log.rows(0, 3000)))
             found: dict[bool, list[object]] = {False: [], True: []}
             start = 3000
             for mark in MARKS:
-                state = rpbsid.advance(paper, state, efforts[start:3000 + mark], Y[start:3000 + mark])
+                state = rpbsid.advance(paper, state, log.rows(start, 3000 + mark))
                 start = 3000 + mark
                 model = rpbsid.identified(paper, state, 1e-3)
                 assert model is not None

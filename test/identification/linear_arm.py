@@ -5,12 +5,16 @@ import os
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
+from flexmanip_ros.identification import rpbsid
+from flexmanip_ros.numerics.background import INLINE, Background
 from flexmanip_ros.parameters import IdentifierParameters, configure
+from flexmanip_ros.samples.sample_log import SampleLog, Width
 from flexmanip_ros.types import StateSpace
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -41,6 +45,31 @@ def configuration(r: int, m: int, **values: object) -> IdentifierParameters:
     return configure(IdentifierParameters, {
         'inputs': [f'in{i}/effort' for i in range(r)], 'outputs': [f'out{i}/position' for i in range(m)],
         'angles': [''], 'payload_method': 'none', **values})
+
+
+class Run(NamedTuple):
+    """An identifier with the sample log that it reads. Feeding it leaves the run it was as it was."""
+
+    config: IdentifierParameters
+    log: SampleLog
+    state: rpbsid.RpbsidState
+
+    def feed(self, u: np.ndarray, y: np.ndarray, stamp_ns: np.ndarray | None = None,
+             background: Background = INLINE) -> Run:
+        """Append samples u (N, r), y (N, m) to the log and take them."""
+        stamps = np.zeros(len(y), dtype=np.int64) if stamp_ns is None else stamp_ns
+        log = self.log.append(stamps, u, y, np.zeros((len(y), 0)), np.zeros(len(y), dtype=np.bool_))
+        rows = log.rows(self.log.end, log.end)
+        return Run(self.config, log, rpbsid.advance(self.config, self.state, rows, background))
+
+
+def start(config: IdentifierParameters) -> Run:
+    return Run(config, SampleLog(Width(len(config.inputs), len(config.outputs), 0)), rpbsid.init(config))
+
+
+def run(config: IdentifierParameters, u: np.ndarray, y: np.ndarray, stamp_ns: np.ndarray | None = None) -> Run:
+    """The identifier after a whole record."""
+    return start(config).feed(u, y, stamp_ns)
 
 
 def observer(A: np.ndarray, C: np.ndarray) -> np.ndarray:

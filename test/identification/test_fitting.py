@@ -7,10 +7,11 @@ from functools import cache
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from linear_arm import configuration, random_system, record
+from linear_arm import Run, configuration, random_system, record, start
 from test_rpbsid import same
 
-from flexmanip_ros.identification import fitting, rpbsid
+from flexmanip_ros.identification import rpbsid
+from flexmanip_ros.numerics.background import Request
 from flexmanip_ros.types import Array
 
 COUNT = 1500
@@ -32,54 +33,70 @@ def signals() -> tuple[Array, Array]:
 @cache
 def stepped() -> rpbsid.RpbsidState:
     u, y = signals()
-    state = rpbsid.init(CONFIG)
+    run = start(CONFIG)
     for k in range(COUNT):
-        state = rpbsid.step(CONFIG, state, u[k], y[k])
-    return rpbsid.finish(CONFIG, state)
+        run = run.feed(u[k:k + 1], y[k:k + 1])
+    return rpbsid.finish(CONFIG, run.state)
 
 
 @given(st.lists(st.integers(1, 200), min_size=1, max_size=12))
 @settings(max_examples=15, deadline=None)
 def test_silence_and_refused_samples_in_any_grouping_give_the_same_bits(sizes: list[int]):
     u, y = signals()
-    state, at, turn = rpbsid.init(CONFIG), 0, 0
+    run, at, turn = start(CONFIG), 0, 0
     while at < COUNT:
         size = sizes[turn % len(sizes)]
-        state = rpbsid.advance(CONFIG, state, u[at:at + size], y[at:at + size])
+        run = run.feed(u[at:at + size], y[at:at + size])
         at, turn = at + size, turn + 1
-    assert same(rpbsid.finish(CONFIG, state), stepped())
+    assert same(rpbsid.finish(CONFIG, run.state), stepped())
+
+
+class Choosing:
+    """Solves some requests when they are started, the others when their result is wanted."""
+
+    def __init__(self, at_once: list[bool]) -> None:
+        self.at_once, self.started, self.taken = at_once, 0, 0
+        self.results: dict[Request, object] = {}
+
+    def start(self, request: Request) -> None:
+        if self.at_once[self.started % len(self.at_once)]:
+            self.results[request] = request.solve()
+        self.started += 1
+
+    def result(self, request: Request) -> object:
+        self.taken += 1
+        return self.results.pop(request) if request in self.results else request.solve()
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=20))
 @settings(max_examples=10, deadline=None)
-def test_a_fit_made_elsewhere_or_when_its_turn_comes_gives_the_same_bits(helped: list[bool]):
+def test_a_fit_made_at_once_or_when_its_turn_comes_gives_the_same_bits(at_once: list[bool]):
     u, y = signals()
-    state, made = rpbsid.init(CONFIG), 0
+    run, background = start(CONFIG), Choosing(at_once)
     for k in range(0, COUNT, 10):
-        state = rpbsid.advance(CONFIG, state, u[k:k + 10], y[k:k + 10])
-        pending = rpbsid.job(state)
-        if pending is not None and helped[made % len(helped)]:
-            state = rpbsid.answered(state, pending[0], fitting.solve(CONFIG, pending[0]))
-            assert rpbsid.job(state) is None
-            made += 1
-    assert same(rpbsid.finish(CONFIG, state), stepped())
+        run = run.feed(u[k:k + 10], y[k:k + 10], background=background)
+    assert same(rpbsid.finish(CONFIG, run.state, background), stepped())
+    assert background.started == background.taken > 3
 
 
 def test_no_step_does_the_work_it_asks_for():
-    u, y = signals()
-    state = rpbsid.advance(CONFIG, rpbsid.init(CONFIG), u[:256], y[:256])
-    pending = rpbsid.job(state)
-    assert pending is not None
-    assert pending[1] == 128, 'half of the samples of the first fit'
-    assert state.refined is not None
-    assert state.refined.recursion is None
+    run = fed(256)
+    refined = run.state.refined
+    assert refined is not None
+    assert refined.request is not None
+    assert refined.due - 256 == 128, 'half of the samples of the first fit'
+    assert refined.recursion is None
 
 
-def test_an_answer_that_comes_after_an_event_is_ignored():
+def test_a_restart_drops_the_fit_under_way():
+    run = fed(260)
+    assert run.state.refined is not None
+    assert run.state.refined.request is not None
+    restarted = rpbsid.restart(CONFIG, run.state)
+    assert restarted.refined is not None
+    assert restarted.refined.request is None
+
+
+def fed(count: int) -> Run:
     u, y = signals()
-    state = rpbsid.advance(CONFIG, rpbsid.init(CONFIG), u[:260], y[:260])
-    pending = rpbsid.job(state)
-    assert pending is not None
-    restarted = rpbsid.restart(CONFIG, state)
-    assert rpbsid.job(restarted) is None
-    assert same(rpbsid.answered(restarted, pending[0], fitting.solve(CONFIG, pending[0])), restarted)
+    return start(CONFIG).feed(u[:count], y[:count])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from linear_arm import configuration, random_system, record, sorted_poles
+from linear_arm import configuration, random_system, record, run, sorted_poles
 
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.memory_kernel import REJECTED, USED
@@ -28,19 +28,20 @@ def test_a_minute_without_excitation_costs_nothing(mode, quiet):
     system = random_system(3, 2, 3, rng)
     u, y = record(system, 3000, 1e-2, rng)
     config = configuration(2, 3, order=3, past_window=5, future_window=3, **mode)
-    before = rpbsid.advance(config, rpbsid.init(config), u, y)
+    before = run(config, u, y)
     count = 60_000
     gain = system.C @ np.linalg.solve(np.eye(3) - system.A, system.B)
     level = {'silence': 0.0, 'constant': 1.0, 'noise': 0.0}[quiet] * np.array([0.5, -0.3])
     hush = 1e-3 * rng.standard_normal((count, 3)) if quiet == 'noise' else 0.0
     rest = np.tile(level, (count, 1)), np.tile(gain @ level, (count, 1)) + hush
-    state = rpbsid.advance(config, before, *rest)
+    after = before.feed(*rest)
+    state = after.state
     assert all(np.all(np.isfinite(array)) for array in state.memory)
     if quiet == 'silence' or mode.get('forgetting') != 'constant':
         found = identified(config, state)
         assert np.abs(sorted_poles(found.model.A) - sorted_poles(system.A)).max() < 0.05
     u, y = record(system, 500, 1e-2, rng)
-    found = identified(config, rpbsid.advance(config, rpbsid.window_restart(config, state), u, y))
+    found = identified(config, after._replace(state=rpbsid.window_restart(config, state)).feed(u, y).state)
     assert np.abs(sorted_poles(found.model.A) - sorted_poles(system.A)).max() < 0.05
 
 
@@ -52,8 +53,8 @@ def test_units_of_the_signals_do_not_matter(a, b, c):
     u, y = record(system, 600, 1e-2, rng)
     su, sy = 10.0 ** a, 10.0 ** np.array([b, c])
     config = configuration(1, 2, order=2, past_window=4, future_window=2)
-    plain = identified(config, rpbsid.advance(config, rpbsid.init(config), u, y))
-    scaled = identified(config, rpbsid.advance(config, rpbsid.init(config), u * su, y * sy))
+    plain = identified(config, run(config, u, y).state)
+    scaled = identified(config, run(config, u * su, y * sy).state)
     assert np.abs(sorted_poles(plain.model.A) - sorted_poles(scaled.model.A)).max() < 1e-6
     assert np.allclose(plain.model.B, scaled.model.B * su / sy[:, None], rtol=1e-5, atol=1e-8)
 
@@ -63,7 +64,7 @@ def test_units_of_the_signals_do_not_matter(a, b, c):
 def test_huge_and_tiny_signals_stay_finite(size, estimator):
     rng = np.random.default_rng(7)
     config = configuration(1, 1, order=2, past_window=4, future_window=3, estimator=estimator)
-    state = rpbsid.advance(config, rpbsid.init(config), *(size * rng.standard_normal((2, 300, 1))))
+    state = run(config, *(size * rng.standard_normal((2, 300, 1)))).state
     assert state.counts[USED] == 296
     assert all(np.all(np.isfinite(array)) for array in state.memory)
 
@@ -72,15 +73,14 @@ def test_a_signal_that_explodes_is_refused_not_believed():
     rng = np.random.default_rng(8)
     config = configuration(1, 1, order=1, past_window=3, future_window=2)
     u, y = rng.standard_normal((2, 100, 1))
-    state = rpbsid.advance(config, rpbsid.init(config), u, y)
-    wild = rpbsid.advance(config, state, u * 1e200, y * 1e200)
-    assert np.array_equal(wild.memory[0], state.memory[0])
+    whole = run(config, u, y)
+    assert np.array_equal(whole.feed(u * 1e200, y * 1e200).state.memory[0], whole.state.memory[0])
 
 
 def test_factor_stays_triangular_with_a_positive_information_matrix():
     rng = np.random.default_rng(9)
     config = configuration(2, 2, order=2, past_window=5, future_window=2, forgetting='constant')
-    state = rpbsid.advance(config, rpbsid.init(config), *rng.standard_normal((2, 5000, 2)))
+    state = run(config, *rng.standard_normal((2, 5000, 2))).state
     R = state.memory[0]
     assert np.array_equal(R, np.triu(R))
     assert np.all(np.diag(R)[:-2] > 0)
@@ -94,7 +94,7 @@ def test_a_sensor_that_is_mad_for_a_moment_changes_nothing_that_was_learnt(choic
     config = configuration(1, 2, order=2, past_window=4, future_window=2, **choice)
     wild = y.copy()
     wild[700:700 + count, 1] = 1e4 * np.abs(y[:, 1]).max()
-    good, bad = (identified(config, rpbsid.advance(config, rpbsid.init(config), u, data))
+    good, bad = (identified(config, run(config, u, data).state)
                  for data in (y, wild))
     near = np.abs(sorted_poles(good.model.A) - sorted_poles(bad.model.A)).max()
     assert near < 0.02
@@ -104,7 +104,7 @@ def test_signals_that_grow_for_good_are_followed_after_two_samples():
     rng = np.random.default_rng(4)
     u, y = record(random_system(2, 1, 2, rng), 1200, 0.01, rng)
     config = configuration(1, 2, order=2, past_window=4, future_window=2)
-    state = rpbsid.advance(config, rpbsid.init(config), u[:600], y[:600])
-    grown = rpbsid.advance(config, state, 1e3 * u[600:], 1e3 * y[600:])
+    half = run(config, u[:600], y[:600])
+    grown = half.feed(1e3 * u[600:], 1e3 * y[600:]).state
     assert grown.counts[REJECTED] == 2
-    assert grown.counts[USED] > state.counts[USED] + 580
+    assert grown.counts[USED] > half.state.counts[USED] + 580

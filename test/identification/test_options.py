@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from linear_arm import benchmark, configuration, random_system, record, shared_data, sorted_poles
+from linear_arm import benchmark, configuration, random_system, record, run, shared_data, sorted_poles, start
 
 from flexmanip_ros.identification import rpbsid, validation
 from flexmanip_ros.identification.realization import stabilized, suggested_order, to_continuous, to_discrete
@@ -28,7 +28,7 @@ def test_stable_model_is_published_when_asked_for():
         config = configuration(
             1, 1, order=2, past_window=6, future_window=4, stable_model=stable, refinement='none',
             regularization=[1e-9] * 3)
-        found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), u, y), 0.01)
+        found = rpbsid.identified(config, run(config, u, y).state, 0.01)
         assert found is not None
         assert (np.abs(np.linalg.eigvals(found.model.A)).max() <= 1.0) == stable
 
@@ -38,7 +38,7 @@ def test_suggested_order_is_the_order_of_the_plant():
     for n in (2, 4):
         u, y = record(random_system(n, 2, 2, rng), 4000, 1e-3, rng)
         config = configuration(2, 2, order=3, past_window=8, future_window=6, refinement='none')
-        found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), u, y), 0.01)
+        found = rpbsid.identified(config, run(config, u, y).state, 0.01)
         assert found is not None
         assert suggested_order(found.singular_values) == n
 
@@ -47,17 +47,16 @@ def test_decimated_identification_finds_the_slow_poles():
     study = benchmark('identification_paper_settings')
     u, y = study.response(20.0, (60.0, 45.0), 'paper', 40.0, 0, capture=0, samples=3000)
     config = configuration(2, 4, order=4, decimation=8, direct_feedthrough=True, regularization=[1e-6] * 3)
-    state = rpbsid.advance(config, rpbsid.init(config), u, y)
+    state = run(config, u, y).state
     found = rpbsid.identified(config, state, 1e-3)
     assert found is not None
     assert found.model.dt == pytest.approx(8e-3)
     hertz = np.sort(np.abs(np.angle(np.linalg.eigvals(found.model.A)))[::2]) / (2 * np.pi * 8e-3)
     assert np.allclose(hertz, [5.63428, 6.55037], rtol=2e-3)
-    stepped = rpbsid.init(config)
+    stepped = start(config)
     for k in range(400):
-        stepped = rpbsid.step(config, stepped, u[k], y[k])
-    at_once = rpbsid.advance(config, rpbsid.init(config), u[:400], y[:400])
-    assert np.array_equal(stepped.memory[0], at_once.memory[0])
+        stepped = stepped.feed(u[k:k + 1], y[k:k + 1])
+    assert np.array_equal(stepped.state.memory[0], run(config, u[:400], y[:400]).state.memory[0])
 
 
 def test_continuous_and_discrete_are_inverse():
@@ -94,7 +93,8 @@ def test_long_fit_recursion_tracks_and_an_event_starts_it_anew():
     u, y = record(system, 3500, 0.0, rng)
     y = y + 0.1 * np.std(y, axis=0) * rng.standard_normal(y.shape)
     config = configuration(1, 2, order=2, past_window=4, future_window=2)
-    state = rpbsid.advance(config, rpbsid.init(config), u, y)
+    whole = run(config, u, y)
+    state = whole.state
     assert state.refined is not None
     assert not state.refined.batch
     assert state.refined.recursion is not None
@@ -102,7 +102,7 @@ def test_long_fit_recursion_tracks_and_an_event_starts_it_anew():
     found = rpbsid.identified(config, state, 0.01)
     assert found is not None
     assert np.abs(sorted_poles(found.model.A) - sorted_poles(system.A)).max() < 0.01
-    gap = rpbsid.advance(config, rpbsid.window_restart(config, state), u[:600], y[:600])
+    gap = whole._replace(state=rpbsid.window_restart(config, state)).feed(u[:600], y[:600]).state
     assert gap.refined is not None
     assert gap.refined.recursion is not None
     found = rpbsid.identified(config, gap, 0.01)

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from linear_arm import configuration, random_system, record
+from linear_arm import configuration, random_system, record, run, start
 from test_rpbsid import same
 
 from flexmanip_ros.identification import batch_fit, recursive_fit, rpbsid
+from flexmanip_ros.samples.sample_log import log_of
 
 COUNT = 1300
 CONFIG = configuration(1, 2, order=2, past_window=4, future_window=2)
 
 
 def due(rate: float, count: int) -> int:
-    """Samples from the question after ``count`` of them to its answer."""
-    refined = recursive_fit.start(3)._replace(total=count)
-    return recursive_fit.patience(refined, round((count - 1) * 1e9 / rate))
+    """Samples from the request of a fit after ``count`` of them to its result."""
+    refined = recursive_fit.start(0)._replace(end=count)
+    return recursive_fit.result_delay(refined, round((count - 1) * 1e9 / rate))
 
 
 @pytest.mark.parametrize('count', [256, 512, 1024, 2048])
@@ -42,10 +43,10 @@ def test_stamps_in_any_grouping_give_the_same_bits(decimation: int) -> None:
     config = configuration(1, 2, order=2, past_window=4, future_window=2, decimation=decimation)
     states = []
     for size in (1, 7, len(u)):
-        state = rpbsid.init(config)
+        parts = start(config)
         for k in range(0, len(u), size):
-            state = rpbsid.advance(config, state, u[k:k + size], y[k:k + size], stamps[k:k + size])
-        states.append(rpbsid.finish(config, state))
+            parts = parts.feed(u[k:k + size], y[k:k + size], stamps[k:k + size])
+        states.append(rpbsid.finish(config, parts.state))
     assert same(states[0], states[2])
     assert same(states[1], states[2])
 
@@ -53,16 +54,18 @@ def test_stamps_in_any_grouping_give_the_same_bits(decimation: int) -> None:
 def test_a_fit_at_4_khz_is_awaited_for_a_tenth_of_a_second() -> None:
     rng = np.random.default_rng(3)
     u, y = record(random_system(2, 1, 2, rng), 300, 0.0, rng)
-    state = rpbsid.advance(CONFIG, rpbsid.init(CONFIG), u, y, 250_000 * np.arange(300))
-    pending = rpbsid.job(state)
-    assert pending is not None
-    assert 256 + 400 <= pending[1] + 300 <= 256 + 464
+    refined = run(CONFIG, u, y, 250_000 * np.arange(300)).state.refined
+    assert refined is not None
+    assert refined.request is not None
+    assert 256 + 400 <= refined.due <= 256 + 464
 
 
 @pytest.mark.parametrize(('rate', 'samples'), [
     (100.0, 64), (1000.0, 64), (2000.0, 128), (4000.0, 192), (10000.0, 192)])
 def test_a_block_has_a_twentieth_of_a_second_and_is_over_before_the_next(
         rate: float, samples: int) -> None:
-    refined = recursive_fit.start(3)._replace(total=1024, chunks=(np.zeros((recursive_fit.CHUNK, 3)),) * 4)
-    asked = recursive_fit.ask_block(refined, round(1023 * 1e9 / rate))
-    assert asked.due - asked.total == samples < batch_fit.BLOCK
+    stamps = np.round(np.arange(1024) * 1e9 / rate).astype(np.int64)
+    rows = log_of(np.zeros((1024, 1)), np.zeros((1024, 2)), stamp_ns=stamps).rows(0, 1024)
+    refined = recursive_fit.start(0)._replace(end=1024, seen=768)
+    asked = recursive_fit.ask_block(CONFIG, refined, rows)
+    assert asked.due - asked.end == samples < batch_fit.BLOCK

@@ -4,9 +4,8 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from linear_arm import configuration, shared_data
+from linear_arm import configuration, run, shared_data
 
-from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.model_output import from_factor
 
 SETTINGS = {'order': 3, 'past_window': 5, 'future_window': 3, 'forgetting_factor': [0.98] * 3,
@@ -20,10 +19,11 @@ def pole_error(found: np.ndarray, true: np.ndarray) -> float:
 def trajectory(reference, **choice):
     """State matrices after each sample from 400 to 1400, and the last."""
     config = configuration(2, 2, **SETTINGS, **choice)
-    state = rpbsid.advance(config, rpbsid.init(config), reference['u'][:400], reference['y'][:400])
+    now = run(config, reference['u'][:400], reference['y'][:400])
     found = {}
     for k in range(400, len(reference['u'])):
-        state = rpbsid.step(config, state, reference['u'][k], reference['y'][k])
+        now = now.feed(reference['u'][k:k + 1], reference['y'][k:k + 1])
+        state = now.state
         if config.estimator == 'paper':
             found[k] = state.memory[5][:, :3]
         elif k <= 1400 and k % 4 == 0:

@@ -5,13 +5,14 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from linear_arm import configuration, random_system, record, sorted_poles
+from linear_arm import configuration, random_system, record, run, sorted_poles, start
 
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.memory_kernel import FILLED, REJECTED, USED
 from flexmanip_ros.identification.pbsid import pbsid
 from flexmanip_ros.identification.realization import markov
+from flexmanip_ros.samples.sample_log import SampleLog, log_of
 from flexmanip_ros.types import Status
 
 ESTIMATORS = [
@@ -28,6 +29,8 @@ def flat(item: object) -> Iterator[np.ndarray]:
     if isinstance(item, (tuple, list)):
         for part in item:
             yield from flat(part)
+    elif isinstance(item, SampleLog):
+        yield item.rows(item.start, item.end).u_y
     elif item is not None:
         yield np.asarray(item)
 
@@ -42,13 +45,14 @@ def test_steps_and_one_advance_give_the_same_bits(choice):
     rng = np.random.default_rng(1)
     config = configuration(2, 3, order=3, past_window=4, future_window=3, **choice)
     u, y = record(random_system(3, 2, 3, rng), count, 0.1, rng)
-    stepped = rpbsid.init(config)
+    stepped = start(config)
     for k in range(count):
-        before = rpbsid.advance(config, stepped, u[:0], y[:0])
-        after = rpbsid.step(config, stepped, u[k], y[k])
-        assert same(before, stepped), 'a step leaves the state it was given as it was'
+        before = stepped.state.owned()
+        after = stepped.feed(u[k:k + 1], y[k:k + 1])
+        assert same(before, stepped.state), 'a step leaves the state it was given as it was'
         stepped = after
-    assert same(stepped, rpbsid.advance(config, rpbsid.init(config), u, y))
+    finished = (rpbsid.finish(config, one.state) for one in (stepped, run(config, u, y)))
+    assert same(*finished)
 
 
 @pytest.mark.parametrize(('n', 'r', 'm'), [(3, 2, 2), (4, 1, 3), (2, 2, 1), (5, 3, 5)])
@@ -59,7 +63,7 @@ def test_recursion_equals_batch(n, r, m, beta):
     config = configuration(
         r, m, order=n, past_window=7, future_window=5, forgetting_factor=[beta] * 3, forgetting='constant',
         regularization=[1e-12] * 3, state_basis='fixed', kalman_gain='regression')
-    found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), u, y), 0.01)
+    found = rpbsid.identified(config, run(config, u, y).state, 0.01)
     assert found is not None
     batch, _ = pbsid(u, y, n=n, p=7, f=5, dt=0.01, weighted=True, fixed=True, forgetting=beta)
     assert np.abs(sorted_poles(found.model.A) - sorted_poles(batch.A)).max() < 1e-5
@@ -74,7 +78,7 @@ def test_estimators_agree_on_long_clean_records():
     for choice in ESTIMATORS:
         config = configuration(
             2, 3, order=3, past_window=8, future_window=4, forgetting_factor=[0.999] * 3, **choice)
-        found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), u, y), 0.01)
+        found = rpbsid.identified(config, run(config, u, y).state, 0.01)
         assert found is not None
         assert np.abs(sorted_poles(found.model.A) - sorted_poles(system.A)).max() < 5e-3, choice
 
@@ -83,14 +87,13 @@ def test_estimators_agree_on_long_clean_records():
 def test_no_regressor_straddles_a_gap(choice):
     rng = np.random.default_rng(2)
     config = configuration(1, 1, order=1, past_window=3, future_window=2, **choice)
-    state = rpbsid.advance(config, rpbsid.init(config), *rng.standard_normal((2, 20, 1)))
-    gap = rpbsid.window_restart(config, state)
-    used = gap.counts[USED]
+    whole = run(config, *rng.standard_normal((2, 20, 1)))
+    gap = whole._replace(state=rpbsid.window_restart(config, whole.state))
+    used = gap.state.counts[USED]
     for k in range(3):
-        gap = rpbsid.step(config, gap, rng.standard_normal(1), rng.standard_normal(1))
-        assert gap.counts[USED] == used, k
-    gap = rpbsid.step(config, gap, rng.standard_normal(1), rng.standard_normal(1))
-    assert gap.counts[USED] == used + 1
+        gap = gap.feed(*rng.standard_normal((2, 1, 1)))
+        assert gap.state.counts[USED] == used, k
+    assert gap.feed(*rng.standard_normal((2, 1, 1))).state.counts[USED] == used + 1
 
 
 @pytest.mark.parametrize('choice', ESTIMATORS)
@@ -100,13 +103,14 @@ def test_restart_keeps_the_parameters_and_drops_the_confidence(choice):
     u, y = record(system, 2000, 0.05, rng)
     config = configuration(2, 3, order=3, past_window=6, future_window=3, forgetting_factor=[1.0] * 3,
                            regularization=[1e-2] * 3, **choice)
-    state = rpbsid.advance(config, rpbsid.init(config), u, y)
+    whole = run(config, u, y)
+    state = whole.state
     before = rpbsid.identified(config, state, 0.01)
     restarted = rpbsid.restart(config, state)
     assert restarted.counts[USED] == 0
     assert restarted.counts[FILLED] == 0
     assert rpbsid.identified(config, restarted, 0.01) is None
-    after = rpbsid.identified(config, rpbsid.advance(config, restarted, u[:40], y[:40]), 0.01)
+    after = rpbsid.identified(config, whole._replace(state=restarted).feed(u[:40], y[:40]).state, 0.01)
     assert before is not None
     assert after is not None
     assert np.linalg.norm(after.spread) > 1.3 * np.linalg.norm(before.spread)
@@ -116,8 +120,8 @@ def test_restart_keeps_the_parameters_and_drops_the_confidence(choice):
 
 def test_sample_that_is_not_finite_is_refused_and_breaks_the_window():
     config = configuration(1, 1, order=1, past_window=3, future_window=1)
-    state = rpbsid.advance(config, rpbsid.init(config), *np.random.default_rng(0).standard_normal((2, 20, 1)))
-    bad = rpbsid.step(config, state, np.array([np.nan]), np.array([1.0]))
+    whole = run(config, *np.random.default_rng(0).standard_normal((2, 20, 1)))
+    state, bad = whole.state, whole.feed(np.array([[np.nan]]), np.array([[1.0]])).state
     assert bad.counts[REJECTED] == 1
     assert bad.counts[FILLED] == 0
     assert np.array_equal(bad.memory[0], state.memory[0])
@@ -126,7 +130,7 @@ def test_sample_that_is_not_finite_is_refused_and_breaks_the_window():
 def test_samples_of_the_wrong_size_are_an_error():
     config = configuration(2, 1, order=1, past_window=3, future_window=1)
     with pytest.raises(SignalError, match='2 inputs and 1 outputs'):
-        rpbsid.step(config, rpbsid.init(config), np.zeros(1), np.zeros(1))
+        rpbsid.advance(config, rpbsid.init(config), log_of(np.zeros((1, 1)), np.zeros((1, 1))).rows(0, 1))
 
 
 @pytest.mark.parametrize(('order', 'status'), [(2, Status.ORDER_TOO_LOW), (4, Status.TRACKING)])
@@ -134,6 +138,6 @@ def test_a_model_that_leaves_dynamics_out_says_so(order, status):
     rng = np.random.default_rng(5)
     u, y = record(random_system(4, 2, 2, rng), 3000, 0.1, rng)
     config = configuration(2, 2, order=order, refinement='none')
-    found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), u, y), 0.01)
+    found = rpbsid.identified(config, run(config, u, y).state, 0.01)
     assert found is not None
     assert found.status is status

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from linear_arm import benchmark, configuration, random_system, record
+from linear_arm import benchmark, configuration, random_system, record, run
 
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.model_output import based, from_factor
@@ -21,7 +21,7 @@ def test_tangent_is_the_derivative_with_respect_to_the_regression(n, m, feedthro
     u, y = record(random_system(n, 2, m, rng), 4000, 1e-6, rng)
     config = configuration(2, m, order=n, past_window=20, future_window=5, direct_feedthrough=feedthrough,
                            refinement='none', regularization=[1e-8] * 3)
-    state = rpbsid.advance(config, rpbsid.init(config), u, y)
+    state = run(config, u, y).state
     realized, R, _ = from_factor(config, state.memory[0], state.scale)
     assert realized is not None
     along = tangent(R, realized, 2, np.eye(m))
@@ -74,7 +74,7 @@ def test_variance_of_a_matrix_entry_is_the_diagonal_of_the_covariance():
     rng = np.random.default_rng(12)
     u, y = record(random_system(2, 1, 2, rng), 1000, 0.05, rng)
     config = configuration(1, 2, order=2, past_window=4, future_window=2)
-    found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), u, y), 0.01)
+    found = rpbsid.identified(config, run(config, u, y).state, 0.01)
     assert found is not None
     covariance = found.spread @ found.spread.T
     gradient = np.zeros((2, 1))
@@ -99,7 +99,7 @@ def test_modes_of_a_known_model():
     rng = np.random.default_rng(0)
     u, y = record(random_system(2, 1, 2, rng), 500, 0.05, rng)
     config = configuration(1, 2, order=2, past_window=4, future_window=2)
-    found = rpbsid.identified(config, rpbsid.advance(config, rpbsid.init(config), u, y), dt)
+    found = rpbsid.identified(config, run(config, u, y).state, dt)
     assert found is not None
     (mode,) = modes(found._replace(model=dataclasses.replace(found.model, A=A)))
     assert mode.frequency_hz == pytest.approx(6.0 * np.sqrt(1 - zeta ** 2))
