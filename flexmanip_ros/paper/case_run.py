@@ -1,7 +1,7 @@
 """One experiment of the paper: every method over the same samples, as rows and as tracks over time.
 
 Work that several methods share is done once: one pass of an identifier serves every method that reads it, the
-messages become samples once for the two rivals.
+messages become samples once for the two baselines.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def run(case: Case, seed: int) -> tuple[list[trial.Row], dict[str, Track]]:
     failed: dict[str, str] = {}
     alone = [method for method in experiments.METHODS if method.name == experiments.ALONE]
     others = [method for method in experiments.METHODS if method.name != experiments.ALONE]
-    rivalling = [method for method in others if method.rival]
+    compared = [method for method in others if method.baseline]
     items: list[Item] = []
     with _attempt(failed, others):
         items = _messages(case, seed)
@@ -65,8 +65,8 @@ def run(case: Case, seed: int) -> tuple[list[trial.Row], dict[str, Track]]:
         with _attempt(failed, readers):
             found.update(_identify(case, name, readers, items))
     if items:
-        with _attempt(failed, rivalling):
-            found.update(_compare(case, rivalling, items))
+        with _attempt(failed, compared):
+            found.update(_compare(case, compared, items))
     with _attempt(failed, alone):
         found.update(_compare(case, alone, _own_run(case, seed)))
     return _rows(case, seed, found, failed)
@@ -143,12 +143,12 @@ def _compare(case: Case, methods: Sequence[Method], items: Sequence[Item]) -> di
     """Run methods that are no part of the identifier over the same samples."""
     config = _configured(case, methods[0])[1].identifier
     begun = time.perf_counter()
-    sampled = baselines.samples(config, items)
+    recorded = baselines.recorded(config, items)
     shared = time.perf_counter() - begun
     found = {}
     for method in methods:
         begun = time.perf_counter()
-        estimates = list(baselines.run(method.rival, config, sampled))
+        estimates = list(baselines.run(method.baseline, config, recorded))
         found[method.name] = Reading(estimates, shared + time.perf_counter() - begun)
     return found
 

@@ -56,8 +56,8 @@ class Method:
     """The one of ``IDENTIFIERS`` whose state it reads; several methods may read the same one."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Identifier parameters over those of ``identifier`` with which it is read."""
-    rival: str = ''
-    """Name in ``rivals`` of a method that is no part of the identifier."""
+    baseline: str = ''
+    """Name in ``studies.baselines`` of a method that is no part of the identifier."""
 
 
 PAYLOADS = (Case('payload_20', 20.0, (60.0, 45.0)), Case('payload_50', 50.0, (60.0, 45.0)),
@@ -82,11 +82,11 @@ METHODS = (
            'extraction', 'ours', _BLOCK),
     Method('known M_b', 'ours: the same model, the coupling block taken from the arm', 'ours',
            {**_BLOCK, 'payload.known_coupling': True}),
-    Method('rigid RLS', "the paper's rival: recursive least squares on two rigid links", rival='rigid_rls'),
-    Method('algebraic', "the paper's rival on the same run: link 2, its moving base left out",
-           rival='algebraic'),
+    Method('rigid RLS', "the paper's baseline: recursive least squares on two rigid links", baseline='rigid_rls'),
+    Method('algebraic', "the paper's baseline on the same run: link 2, its moving base left out",
+           baseline='algebraic'),
     Method('algebraic, 1 link', 'as the paper runs it: a run of its own, link 2 alone on a fixed base under '
-           'gravity, which weighs the object', settings=_WEIGHED, rival='algebraic'),
+           'gravity, which weighs the object', settings=_WEIGHED, baseline='algebraic'),
     Method('structured', "ours: the arm's equations of motion (the default)", 'ours'),
 )
 ALONE = 'algebraic, 1 link'

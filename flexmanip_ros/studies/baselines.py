@@ -1,35 +1,30 @@
-"""The paper's rivals over the same messages and the same publishing grid as the identifier."""
+"""The paper's baselines over the same messages and the same publishing grid as the identifier."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
+import numpy as np
+
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload import algebraic, rigid_rls
-from flexmanip_ros.payload.rival import RivalState
+from flexmanip_ros.payload.baselines import ALGEBRAIC, RIGID_RLS, Baseline, BaselineState
 from flexmanip_ros.samples import sampling
-from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, Sample
+from flexmanip_ros.samples.sample_log import Rows
+from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord
+
+BASELINES: Mapping[str, Baseline] = {'rigid_rls': RIGID_RLS, 'algebraic': ALGEBRAIC}
 
 
-class Rival(NamedTuple):
-    """The calls of one estimator."""
+class Recorded(NamedTuple):
+    """The rows of a recording, and its events by stamp."""
 
-    init: Callable[[IdentifierParameters], RivalState]
-    advance: Callable[[IdentifierParameters, RivalState, Sequence[Sample]], RivalState]
-    event: Callable[[IdentifierParameters, RivalState, CaptureEvent], RivalState]
-    estimate: Callable[[IdentifierParameters, RivalState], Payload]
+    rows: Rows
+    events: tuple[CaptureEvent, ...]
 
 
-RIVALS: Mapping[str, Rival] = {
-    'rigid_rls': Rival(rigid_rls.init, rigid_rls.advance, rigid_rls.event, rigid_rls.estimate),
-    'algebraic': Rival(algebraic.init, algebraic.advance, algebraic.event, algebraic.estimate),
-}
-
-
-def samples(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]
-            ) -> list[Sample | CaptureEvent]:
-    """Return messages as samples, each event before the first sample at or after its stamp."""
+def recorded(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]) -> Recorded:
+    """Return the samples and events of messages."""
     clock, log = sampling.Clock(), sampling.EMPTY
     events: list[CaptureEvent] = []
     for item in items:
@@ -38,41 +33,27 @@ def samples(config: IdentifierParameters, items: Iterable[JointRecord | CaptureE
         else:
             clock, log, _ = sampling.push(config, clock, log, item)
     events.sort(key=lambda event: event.stamp_ns)
-    found: list[Sample | CaptureEvent] = []
-    rows = log.rows(log.start, log.end)
-    for k, stamp_ns in enumerate(rows.stamp_ns.tolist()):
-        while events and events[0].stamp_ns <= stamp_ns:
-            found.append(events.pop(0))
-        found.append(Sample(stamp_ns, rows.u[k], rows.y[k], rows.angles[k], bool(rows.gap[k])))
-    return found
+    return Recorded(log.rows(log.start, log.end), tuple(events))
 
 
-def run(name: str, config: IdentifierParameters, sampled: Iterable[Sample | CaptureEvent]
-        ) -> Iterator[Estimate]:
+def run(name: str, config: IdentifierParameters, recorded: Recorded) -> Iterator[Estimate]:
     """Yield estimates with a payload and no model: at each publishing instant and at the last sample."""
-    rival = RIVALS[name]
-    state = rival.init(config)
-    block: list[Sample] = []
-    first_ns, published, due = 0, -1, False
-    last: Sample | None = None
-    for item in sampled:
-        if isinstance(item, CaptureEvent):
-            state, block = rival.advance(config, state, block), []
-            state = rival.event(config, state, item)
-            continue
-        first_ns = item.stamp_ns if last is None else first_ns
-        last = item
-        block.append(item)
-        instant = int((item.stamp_ns - first_ns) * config.publish_rate * 1e-9 + 1e-6)
-        due = instant > published
-        if due:
-            published = instant
-            state, block = rival.advance(config, state, block), []
-            yield _estimate(rival, config, state, item)
-    if last is not None and not due:
-        yield _estimate(rival, config, rival.advance(config, state, block), last)
+    baseline, rows = BASELINES[name], recorded.rows
+    if not len(rows):
+        return
+    stamps = rows.stamp_ns
+    instants = ((stamps - stamps[0]) * config.publish_rate * 1e-9 + 1e-6).astype(np.int64)
+    due = set((np.flatnonzero(np.diff(instants, prepend=-1) > 0) + rows.first + 1).tolist()) | {rows.until}
+    events = [(rows.log.row_at(event.stamp_ns, rows.first), event) for event in recorded.events]
+    state, cursor = baseline.init(config), rows.first
+    for until in sorted(due | {row for row, _ in events if row > cursor}):
+        while events and events[0][0] == cursor:
+            state = baseline.event(config, state, events.pop(0)[1])
+        state, cursor = baseline.advance(config, state, rows.between(cursor, until)), until
+        if until in due:
+            yield _estimate(baseline, config, state, int(stamps[until - 1 - rows.first]))
 
 
-def _estimate(rival: Rival, config: IdentifierParameters, state: RivalState, sample: Sample) -> Estimate:
-    payload = rival.estimate(config, state)
-    return Estimate(sample.stamp_ns, payload.status, None, (), payload)
+def _estimate(baseline: Baseline, config: IdentifierParameters, state: BaselineState, stamp_ns: int) -> Estimate:
+    payload = baseline.estimate(config, state)
+    return Estimate(stamp_ns, payload.status, None, (), payload)

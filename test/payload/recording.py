@@ -10,8 +10,9 @@ from flexmanip_ros.parameters import (
     IdentifierParameters,
     PlantParameters,
 )
+from flexmanip_ros.samples.sample_log import Rows, log_of
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import CaptureEvent, EventKind, Sample
+from flexmanip_ros.types import CaptureEvent, EventKind
 
 BENDS = ('link1_bend/position', 'link2_bend/position')
 RATES = ('link1_bend/velocity', 'link2_bend/velocity')
@@ -32,7 +33,7 @@ def record(
         seconds: float, events: tuple[CaptureEvent, ...] = (), degrees=(60.0, 45.0), payload: float = 20.0,
         outputs: tuple[str, ...] = BENDS + RATES, seed: int = 1, arm: ArmParameters = ARM, scale: float = 1.0,
         **plant,
-) -> list[Sample]:
+) -> Rows:
     """Samples at 1 kHz under the paper's square waves, 40 dB."""
     parameters = PlantParameters(
         initial_angles=tuple(np.radians(degrees)), payload_mass=payload, seed=seed, arm=arm, **plant)
@@ -41,5 +42,25 @@ def record(
     columns = {'position': trajectory.position, 'velocity': trajectory.velocity}
     parts = [name.split('/') for name in outputs]
     Y = np.column_stack([columns[field][:, simulator.JOINT_NAMES.index(joint)] for joint, field in parts])
-    return [Sample(int(stamp), effort, y, angles) for stamp, effort, y, angles in zip(
-        trajectory.stamp_ns, trajectory.effort[:, :2], Y, trajectory.position[:, :2], strict=True)]
+    return rows_of(trajectory.effort[:, :2], Y, trajectory.position[:, :2], trajectory.stamp_ns)
+
+
+def rows_of(u: np.ndarray, y: np.ndarray, angles: np.ndarray, stamp_ns: np.ndarray,
+            gap: np.ndarray | None = None) -> Rows:
+    """All rows of a log of whole arrays."""
+    return log_of(u, y, angles, stamp_ns, gap).rows(0, len(y))
+
+
+def joined(*parts: Rows, gap: bool = False) -> Rows:
+    """One log of parts; gap: a sample is missing between them."""
+    gaps = [part.gap.copy() for part in parts]
+    for one in gaps[1:]:
+        one[0] = gap
+    return rows_of(*(np.concatenate([getattr(part, name) for part in parts])
+                     for name in ('u', 'y', 'angles', 'stamp_ns')), np.concatenate(gaps))
+
+
+def altered(rows: Rows, **columns: np.ndarray) -> Rows:
+    """The same rows with other columns."""
+    whole = {name: getattr(rows, name) for name in ('u', 'y', 'angles', 'stamp_ns', 'gap')}
+    return rows_of(**{**whole, **columns})

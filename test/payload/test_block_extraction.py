@@ -18,7 +18,8 @@ from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, config
 from flexmanip_ros.payload import block_truncation
 from flexmanip_ros.payload.block_extraction import estimate, extract, sweep
 from flexmanip_ros.payload.modal_basis import to_modal
-from flexmanip_ros.types import Sample, StateSpace, Status
+from flexmanip_ros.samples.sample_log import log_of
+from flexmanip_ros.types import StateSpace, Status
 
 CONFIGURATIONS = [(60.0, 45.0), (0.0, 0.0), (45.0, 0.0), (-45.0, 45.0)]
 
@@ -138,10 +139,10 @@ def test_known_coupling_doubts_as_far_as_the_arm_moved():
     path = np.radians([[60.0, 45.0], [61.5, 43.5], [63.0, 42.0]])
     config = _config(payload__known_coupling=True)
     model = _sharp(vibration_model(config.arm, path[0], 20.0, 1))
-    samples = [Sample(k, np.zeros(2), np.zeros(4), angles) for k, angles in enumerate(path)]
-    swept = sweep(config, np.empty(0), samples)
+    rows = log_of(np.zeros((3, 2)), np.zeros((3, 4)), path).rows(0, 3)
+    swept = sweep(config, np.empty(0), rows)
     np.testing.assert_allclose(swept, [np.cos(np.radians(21.0)), np.cos(np.radians(15.0))])
-    np.testing.assert_array_equal(swept, sweep(config, sweep(config, np.empty(0), samples[:1]), samples[1:]))
+    np.testing.assert_array_equal(swept, sweep(config, sweep(config, np.empty(0), rows.between(0, 1)), rows.since(1)))
     found = estimate(config, model, path[-1], swept)
     assert found.lower <= 20.0 + 1e-6
     assert found.upper >= 20.0 - 1e-6

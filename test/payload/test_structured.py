@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recording import ARM, BENDS, RATES, config, event, record
+from recording import ARM, BENDS, RATES, altered, config, event, joined, record
 
 from flexmanip_ros.parameters import ArmParameters, PayloadParameters
 from flexmanip_ros.payload import structured
@@ -17,10 +17,10 @@ def run(settings, samples, events=()):
     state = structured.init(settings)
     start = 0
     for one in events:
-        stop = next((i for i, sample in enumerate(samples) if sample.stamp_ns >= one.stamp_ns), len(samples))
-        state = structured.event(settings, structured.advance(settings, state, samples[start:stop]), one)
+        stop = samples.log.row_at(one.stamp_ns, start)
+        state = structured.event(settings, structured.advance(settings, state, samples.between(start, stop)), one)
         start = stop
-    return structured.advance(settings, state, samples[start:])
+    return structured.advance(settings, state, samples.since(start))
 
 
 @pytest.fixture(scope='module')
@@ -50,12 +50,12 @@ def test_displacements_alone_are_enough():
 
 def test_a_block_of_samples_gives_the_bits_of_single_ones(caught):
     settings = config()
-    whole = run(settings, caught[:1700], (event(1.5),))
+    whole = run(settings, caught.between(0, 1700), (event(1.5),))
     single = structured.init(settings)
-    for sample in caught[:1700]:
-        if sample.stamp_ns == event(1.5).stamp_ns:
+    for row in range(1700):
+        if caught.stamp_ns[row] == event(1.5).stamp_ns:
             single = structured.event(settings, single, event(1.5))
-        single = structured.step(settings, single, sample)
+        single = structured.advance(settings, single, caught.between(row, row + 1))
     assert all(np.array_equal(a, b) for a, b in zip(whole.memory, single.memory, strict=True))
     assert structured.estimate(settings, whole) == structured.estimate(settings, single)
 
@@ -63,18 +63,18 @@ def test_a_block_of_samples_gives_the_bits_of_single_ones(caught):
 @pytest.mark.parametrize('begin', [200, 500, 700])  # before, across and beyond the samples that are kept
 def test_a_state_is_never_written_to(caught, begin):
     settings = config()
-    state = structured.advance(settings, structured.init(settings), caught[:begin])
-    later = structured.advance(settings, state, caught[begin:begin + 200])
+    state = structured.advance(settings, structured.init(settings), caught.between(0, begin))
+    later = structured.advance(settings, state, caught.between(begin, begin + 200))
     before = [[part.copy() for part in one.memory] for one in (state, later)]
     changed = structured.event(settings, later, event(0.001 * (begin + 200)))
-    structured.advance(settings, changed, caught[begin + 200:begin + 250])
+    structured.advance(settings, changed, caught.between(begin + 200, begin + 250))
     structured.reopen(settings, later)
     for values, one in zip(before, (state, later), strict=True):
         assert all(np.array_equal(a, b) for a, b in zip(values, one.memory, strict=True))
 
 
 def test_an_empty_arm_holds_nothing(caught):
-    found = structured.estimate(config(), run(config(), caught[:1500]))
+    found = structured.estimate(config(), run(config(), caught.between(0, 1500)))
     assert found.mass == 0.0
     assert found.lower == 0.0
     assert 0.0 < found.upper < 1.0
@@ -187,27 +187,27 @@ def test_events_in_any_order_give_a_status_never_a_nan(events, caught):
     start = 0
     for one in events:
         state = structured.event(settings, state, one)
-        state = structured.advance(settings, state, caught[start:start + 7])
+        state = structured.advance(settings, state, caught.between(start, start + 7))
         start += 7
         assert finite(structured.estimate(settings, state))
-    state = structured.advance(settings, state, caught[start:600])
+    state = structured.advance(settings, state, caught.between(start, 600))
     assert finite(structured.estimate(settings, state))
 
 
 def test_an_event_years_after_the_last_sample_is_taken_at_once(caught):
     settings, years = config(), 10 ** 18
-    state = structured.advance(settings, structured.init(settings), caught[:700])
+    state = structured.advance(settings, structured.init(settings), caught.between(0, 700))
     changed = structured.event(settings, state, event(0.7)._replace(stamp_ns=years))
-    then = [sample._replace(stamp_ns=years + sample.stamp_ns) for sample in caught[700:]]
-    then[0] = then[0]._replace(gap=True)
+    then = caught.since(700)
+    then = joined(caught.between(0, 700), altered(then, stamp_ns=years + then.stamp_ns), gap=True).since(700)
     assert finite(structured.estimate(settings, structured.advance(settings, changed, then)))
 
 
 def test_a_gap_keeps_what_is_known_of_the_payload(caught):
     settings = config()
-    state = run(settings, caught[:2500], (event(1.5),))
-    later = [caught[2700]._replace(gap=True), *caught[2701:]]
-    found = structured.estimate(settings, structured.advance(settings, state, later))
+    samples = joined(caught.between(0, 2500), caught.since(2700), gap=True)
+    state = run(settings, samples.between(0, 2500), (event(1.5),))
+    found = structured.estimate(settings, structured.advance(settings, state, samples.since(2500)))
     assert found.mass == pytest.approx(20.0, rel=0.01)
     assert found.lower < 20.0 < found.upper
 
@@ -215,16 +215,17 @@ def test_a_gap_keeps_what_is_known_of_the_payload(caught):
 def test_names_of_the_signals_do_not_matter(caught):
     named = config(inputs=('a/effort', 'b/effort'), angles=('a/position', 'b/position'),
                    outputs=('x/position', 'y/position', 'x/velocity', 'y/velocity'))
-    same = run(named, caught[:1800], (event(1.5),))
-    usual = run(config(), caught[:1800], (event(1.5),))
+    same = run(named, caught.between(0, 1800), (event(1.5),))
+    usual = run(config(), caught.between(0, 1800), (event(1.5),))
     assert structured.estimate(named, same) == structured.estimate(config(), usual)
 
 
 def test_absurd_numbers_restart_the_filter_and_say_so(caught):
     settings = config()
-    state = structured.advance(settings, structured.init(settings), caught[:300])
-    broken = [sample._replace(u=np.array([1e12, -1e12])) for sample in caught[300:310]]
-    state = structured.advance(settings, state, [*broken, *caught[310:800]])
+    state = structured.advance(settings, structured.init(settings), caught.between(0, 300))
+    u = caught.u.copy()
+    u[300:310] = 1e12, -1e12
+    state = structured.advance(settings, state, altered(caught, u=u).between(300, 800))
     found = structured.estimate(settings, state)
     assert finite(found)
     assert found.status in (Status.DIVERGED, Status.INCONSISTENT, Status.WARMING_UP)
@@ -232,14 +233,14 @@ def test_absurd_numbers_restart_the_filter_and_say_so(caught):
 
 @pytest.mark.parametrize('scale', [1e3, 1e6, 1e12])
 def test_signals_in_other_units_are_told_from_a_start(caught, scale):
-    wrong = [sample._replace(y=scale * sample.y, angles=scale * sample.angles) for sample in caught]
+    wrong = altered(caught, y=scale * caught.y, angles=scale * caught.angles)
     found = structured.estimate(config(), run(config(), wrong, (event(1.5),)))
     assert finite(found)
     assert found.status in (Status.DIVERGED, Status.INCONSISTENT)
 
 
 def test_rates_alone_are_enough_with_the_angles(caught):
-    samples = [sample.__class__(sample.stamp_ns, sample.u, sample.y[2:], sample.angles) for sample in caught]
+    samples = altered(caught, y=caught.y[:, 2:])
     found = structured.estimate(config(outputs=RATES), run(config(outputs=RATES), samples, (event(1.5),)))
     assert abs(found.mass - 20.0) < 4 * found.std
     assert found.mass == pytest.approx(20.0, rel=0.02)

@@ -121,10 +121,10 @@ def test_an_arm_of_more_modes_than_the_estimator_is_weighed_within_the_interval(
     capture = event(1.0)
     samples = record(2.0, (capture,), arm=replace(ARM, modes=6), snr_db=30.0, seed=seed)
     settings = config(replace(ARM, modes=3))
-    state = structured.advance(settings, structured.init(settings), samples[:1000])
+    state = structured.advance(settings, structured.init(settings), samples.between(0, 1000))
     state = structured.event(settings, state, capture)
     for begin, stop in ((1000, 1060), (1060, 1250), (1250, 2000)):
-        state = structured.advance(settings, state, samples[begin:stop])
+        state = structured.advance(settings, state, samples.between(begin, stop))
         found = structured.estimate(settings, state)
         assert found.lower < 20.0 < found.upper
     assert found.status is Status.TRACKING

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from flexmanip_ros.numerics.compiled import Prepared
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import structured
+from flexmanip_ros.samples.sample_log import log_of
 
 
 class Table(NamedTuple):
@@ -46,4 +47,5 @@ def test_an_error_of_types_is_told_as_ever() -> None:
 def test_no_samples_are_a_table_without_rows() -> None:
     model = structured.init(IdentifierParameters()).model
     assert model is not None
-    assert structured.measurements(model, []).shape == (0, len(model.roles))
+    rows = log_of(np.zeros((0, 2)), np.zeros((0, 4)), np.zeros((0, 2))).rows(0, 0)
+    assert structured.measurements(model, rows).shape == (0, len(model.roles))

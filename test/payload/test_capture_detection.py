@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from recording import ARM, BENDS, RATES, event, record
+from recording import ARM, BENDS, RATES, event, record, rows_of
 
 from flexmanip_ros.parameters import PlantParameters, TriggerParameters
 from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.simulation import simulator
-from flexmanip_ros.types import EventKind, Sample
+from flexmanip_ros.types import EventKind
 
 
 def settings(outputs=BENDS + RATES, **parameters):
@@ -20,9 +20,9 @@ def detect(config, samples, block=5):
     """Events found, with the stamp at which each was told."""
     state, found = capture_detection.init(config), []
     for start in range(0, len(samples), block):
-        part = samples[start:start + block]
+        part = samples.between(start, min(start + block, len(samples)))
         state, events = capture_detection.advance(config, state, part)
-        found.extend((one, part[-1].stamp_ns) for one in events)
+        found.extend((one, part.stamp_ns[-1]) for one in events)
     return found
 
 
@@ -56,8 +56,7 @@ def test_a_capture_at_rest_is_told_when_the_torque_resumes():
     parameters = PlantParameters(arm=ARM, payload_mass=20.0, noise='std', noise_std=noise)
     trajectory = simulator.simulate(parameters, efforts, (event(1.0),))
     Y = np.hstack([trajectory.position[:, 2:], trajectory.velocity[:, 2:]])
-    samples = [Sample(int(stamp), effort, y, angles) for stamp, effort, y, angles in zip(
-        trajectory.stamp_ns, trajectory.effort[:, :2], Y, trajectory.position[:, :2], strict=True)]
+    samples = rows_of(trajectory.effort[:, :2], Y, trajectory.position[:, :2], trajectory.stamp_ns)
     ((found, told),) = detect(settings(), samples)
     assert found.kind is EventKind.CAPTURE
     assert 2.0e9 < told <= 2.1e9
@@ -67,9 +66,9 @@ def test_single_samples_give_the_events_of_a_block():
     samples = record(1.6, (event(1.3),))
     config = settings()
     state, single = capture_detection.init(config), []
-    for sample in samples:
-        state, one = capture_detection.step(config, state, sample)
-        single.extend([one] if one is not None else [])
+    for row in range(len(samples)):
+        state, events = capture_detection.advance(config, state, samples.between(row, row + 1))
+        single.extend(events)
     assert single == list(capture_detection.advance(config, capture_detection.init(config), samples)[1])
 
 

@@ -1,0 +1,336 @@
+"""The two estimators that the paper compares with: rigid least squares, and the algebraic method.
+
+Rigid least squares (paper eqs. 45-46) takes both links as rigid and differentiates the angles by a filter. It knows
+nothing of bending, hence its bias. The algebraic method (Fliess; Becedas; Cambera) looks at link 2 alone, its base at
+rest: with the known link subtracted, torque - J a'' - moment g L cos a = dm (L^2 a'' + g L cos a) + nu a'. Multiplied
+by t^2, t from the capture on, and integrated twice, nothing is differentiated; least squares give (dm, nu). On a
+two-link arm it leaves the moving base out, as the paper does: that is its bias.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from flexmanip_ros.numerics.compiled import kernel
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.payload.angles import chords
+from flexmanip_ros.payload.structured_model import pinned_frequencies
+from flexmanip_ros.samples.sample_log import Rows
+from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload, Status
+
+QUANTILE = 1.959963984540054
+"""Of the normal distribution, for 95 %."""
+FEWEST = 200
+"""Samples since the event before anything is claimed."""
+
+
+@dataclass(frozen=True, eq=False)
+class BaselineState:
+    """Everything remembered; constant in size."""
+
+    x: Array
+    """States of filters or integrals."""
+    sums: Array
+    """Sums of the least squares."""
+    held: bool = False
+    dt: float = 0.0
+    last_ns: int | None = None
+    effort: Array | None = None
+    """(2,) torque held since the last sample."""
+
+
+def _series(config: IdentifierParameters, state: BaselineState, rows: Rows) -> tuple[Array, Array, float]:
+    """Return efforts held before each sample (N, 2), chord angles (N, 2), and the sample time [s]."""
+    first = rows.u[0] if state.effort is None else state.effort
+    efforts = np.vstack([first, rows.u[:-1]])
+    angles = np.array([chords(config.arm, measured) for measured in rows.angles])
+    dt = state.dt
+    if dt == 0.0:
+        stamps = [*(() if state.last_ns is None else (state.last_ns,)), *rows.stamp_ns.tolist()]
+        dt = float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.0
+    return efforts, angles, dt
+
+
+def _usable(config: IdentifierParameters) -> bool:
+    """Whether both torques and both angles are configured."""
+    return len(config.inputs) == 2 and len(config.angles) == 2
+
+
+def _unknown(status: Status) -> Payload:
+    """Return the payload of which nothing is known."""
+    return Payload(0.0, math.inf, 0.0, math.inf, 1.0, status)
+
+
+def _nothing_held() -> Payload:
+    """Return the payload of an arm that is empty because nothing was caught; these methods do not test it."""
+    return Payload(0.0, 0.0, 0.0, 0.0, 1.0, Status.TRACKING)
+
+
+def _interval(mass: float, std: float, misfit: float) -> Payload:
+    """Return mass and interval; misfit: share of the regression's power that is left, 0 where it fits.
+
+    Neither method knows its noise: the deviation is that of the residuals, and a fit that leaves most of the
+    power is called inconsistent.
+    """
+    if not (math.isfinite(mass) and math.isfinite(std)):
+        return _unknown(Status.POORLY_EXCITED)
+    status = Status.TRACKING
+    if std > max(abs(mass), 1e-9):
+        status = Status.POORLY_EXCITED
+    elif misfit > 0.1 or mass < 0.0:
+        status = Status.INCONSISTENT
+    # a negative mass says how wrong the method is here: the interval reaches as far to the other side
+    lower, upper = max(0.0, mass - QUANTILE * std), abs(mass) + QUANTILE * std
+    return Payload(max(mass, 0.0), std, lower, upper, 1.0 + float(misfit), status)
+
+
+CUTOFF = 0.2
+"""Of the differentiating filters, over the lowest pinned frequency: it must not see the vibration."""
+MEMORY_S = 10.0
+"""Seconds after which a sample counts 1/e."""
+
+
+def _rigid_init(config: IdentifierParameters) -> BaselineState:
+    """Start with an empty arm."""
+    return BaselineState(np.zeros((4, 4)), np.zeros(5))
+
+
+def _rigid_advance(config: IdentifierParameters, state: BaselineState, rows: Rows) -> BaselineState:
+    """Take the next rows of the sample log."""
+    if not len(rows) or not _usable(config):
+        return state
+    efforts, angles, dt = _series(config, state, rows)
+    x, sums = state.x.copy(), state.sums.copy()
+    if state.last_ns is None or rows.gap[0]:
+        x[:2], sums[4] = angles[0][:, None] * (1.0, 0.0, 1.0, 0.0), 0.0
+    _rigid_kernel(_arm(config, dt), x, sums, dt, efforts, angles)
+    return replace(state, x=x, sums=sums, dt=dt, last_ns=int(rows.stamp_ns[-1]), effort=rows.u[-1].copy())
+
+
+def _rigid_event(config: IdentifierParameters, state: BaselineState, event: CaptureEvent) -> BaselineState:
+    """Begin the least squares, and the filters, anew."""
+    held = event.kind is EventKind.CAPTURE
+    return replace(state, sums=np.zeros(5), held=held)
+
+
+def _rigid_estimate(config: IdentifierParameters, state: BaselineState) -> Payload:
+    """Return the payload; the interval takes the residuals as correlated over the filter's memory."""
+    if not _usable(config):
+        return _unknown(Status.UNOBSERVABLE)
+    if not state.held:
+        return _nothing_held()
+    information, score, residual, count, _ = state.sums
+    if count < 2 * FEWEST or information <= 0.0:
+        return _unknown(Status.WARMING_UP)
+    correlated = max(1.0, 4.0 / (_cutoff(config) * state.dt))
+    variance = residual / count * correlated / information
+    total = residual + score ** 2 / information
+    return _interval(score / information, float(np.sqrt(variance)), residual / max(total, 1e-300))
+
+
+def _cutoff(config: IdentifierParameters) -> float:
+    """Of the filters [rad/s]."""
+    return CUTOFF * 2 * np.pi * min(pinned_frequencies(config.arm))
+
+
+def _arm(config: IdentifierParameters, dt: float) -> RigidArm:
+    arm = config.arm
+    (L1, L2), (rho1, rho2) = arm.link_length, arm.linear_density
+    return RigidArm(
+        Ma11=rho1 * L1 ** 3 / 3 + (arm.joint_mass + rho2 * L2 + arm.tip_mass) * L1 ** 2,
+        Ma22=rho2 * L2 ** 3 / 3 + arm.tip_mass * L2 ** 2, coupling=(rho2 * L2 / 2 + arm.tip_mass) * L1 * L2,
+        L1=L1, L2=L2, reaction=1.0 if arm.torque_convention == 'joint' else 0.0, cutoff=_cutoff(config),
+        fade=float(np.exp(-dt / MEMORY_S)), frozen_turn=_frozen_turn(config))
+
+
+def _frozen_turn(config: IdentifierParameters) -> float:
+    """Where a linear plant stays, as far as it is given [rad]."""
+    point = config.payload.working_point
+    frozen = config.payload.dynamics == 'linear' and len(point) == 2
+    return point[1] - point[0] if frozen else float('nan')
+
+
+STILL = 1e-6
+"""Motion [rad] below which a link tells nothing."""
+
+
+def _algebraic_init(config: IdentifierParameters) -> BaselineState:
+    """Start with an empty arm."""
+    return BaselineState(np.zeros(11), np.zeros(7))
+
+
+def _algebraic_advance(config: IdentifierParameters, state: BaselineState, rows: Rows) -> BaselineState:
+    """Take the next rows of the sample log."""
+    if not len(rows) or not _usable(config):
+        return state
+    efforts, angles, dt = _series(config, state, rows)
+    x, normal = state.x.copy(), state.sums.copy()
+    if rows.gap[0]:
+        x, normal = np.zeros(11), np.zeros(7)
+    arm = config.arm
+    L, rho = arm.link_length[1], arm.linear_density[1]
+    _algebraic_kernel(rho * L ** 3 / 3 + arm.tip_mass * L ** 2, rho * L / 2 + arm.tip_mass, L, config.payload.gravity,
+                      x, normal, dt, np.ascontiguousarray(angles[:, 1]), np.ascontiguousarray(efforts[:, 1]))
+    return replace(state, x=x, sums=normal, dt=dt, last_ns=int(rows.stamp_ns[-1]), effort=rows.u[-1].copy())
+
+
+def _algebraic_event(config: IdentifierParameters, state: BaselineState, event: CaptureEvent) -> BaselineState:
+    """Time begins anew."""
+    return replace(state, x=np.zeros(11), sums=np.zeros(7), held=event.kind is EventKind.CAPTURE)
+
+
+def _algebraic_estimate(config: IdentifierParameters, state: BaselineState) -> Payload:
+    """Return the payload; the twice integrated residuals count as one a tenth of the record."""
+    if not _usable(config):
+        return _unknown(Status.UNOBSERVABLE)
+    if not state.held:
+        return _nothing_held()
+    if state.sums[6] < FEWEST:
+        return _unknown(Status.WARMING_UP)
+    A = np.array([[state.sums[0], state.sums[1]], [state.sums[1], state.sums[2]]])
+    b, square = state.sums[3:5], float(state.sums[5])
+    scale = np.sqrt(np.diag(A))
+    still = STILL * config.arm.link_length[1] ** 2 * state.x[0] ** 2 * np.sqrt(state.sums[6])
+    if scale[0] <= still or scale[1] == 0.0 or np.linalg.cond(A / np.outer(scale, scale)) > 1e12:
+        return _unknown(Status.POORLY_EXCITED)
+    solved = np.linalg.solve(A / np.outer(scale, scale), np.column_stack([b / scale, [1.0 / scale[0], 0.0]]))
+    mass = float(solved[0, 0] / scale[0])
+    residual = max(square - float(b @ (solved[:, 0] / scale)), 0.0)
+    spread = float(solved[0, 1] / scale[0])
+    return _interval(mass, float(np.sqrt(residual / 10.0 * spread)), residual / max(square, 1e-300))
+
+
+class RigidArm(NamedTuple):
+    """Two rigid links: M11 = a + ..., constants of Ma and of the payload's part."""
+
+    Ma11: float
+    Ma22: float
+    coupling: float
+    """Ma12 at cos = 1 [kg m^2]."""
+    L1: float
+    L2: float
+    reaction: float
+    """1: torque 2 reacts on link 1; 0: it acts on link 2 alone."""
+    cutoff: float
+    """Of the differentiating filter [rad/s]."""
+    fade: float
+    """Forgetting factor a sample."""
+    frozen_turn: float
+    """Angle between the links at which a linear plant stays [rad]; nan: measured, with centripetal terms."""
+
+
+@kernel
+def _rigid_kernel(arm: RigidArm, x: Array, sums: Array, dt: float, efforts: Array, chords: Array) -> None:
+    """Take samples into the scalar least squares; efforts (N, 2) held before each sample, chords (N, 2).
+
+    x: (4, 4) states of the filters, two for angles, two for torques; sums: (5,) information,
+    score, residual power, samples, samples since the start of the filters.
+    """
+    w = arm.cutoff
+    for k in range(chords.shape[0]):
+        rate0 = rate1 = acc0 = acc1 = torque0 = torque1 = 0.0
+        for i in range(2):
+            for part in range(2):
+                target = chords[k, i] if part == 0 else efforts[k, i]
+                # twice w^2 / (s + w)^2, critically damped, exact for an input held over the sample
+                acceleration = 0.0
+                for stage in (2, 0):
+                    row = x[i + 2 * part]
+                    level, slope = row[stage] - target, row[stage + 1]
+                    decay = np.exp(-w * dt)
+                    drive = slope + w * level
+                    row[stage] = target + (level + drive * dt) * decay
+                    row[stage + 1] = (slope - w * drive * dt) * decay
+                    # the mean over the sample: its end would show the staircase of the held input
+                    acceleration = (row[stage + 1] - slope) / dt if dt > 0.0 else 0.0
+                    target = row[stage]
+                if part == 1:
+                    if i == 0:
+                        torque0 = x[2, 0]
+                    else:
+                        torque1 = x[3, 0]
+                elif i == 0:
+                    rate0, acc0 = x[0, 1], acceleration
+                else:
+                    rate1, acc1 = x[1, 1], acceleration
+        sums[4] += 1.0
+        if sums[4] * dt * w < 12.0:
+            continue  # the filters still carry their start
+        turn = x[1, 0] - x[0, 0]
+        c, s = np.cos(turn), np.sin(turn)
+        if not np.isnan(arm.frozen_turn):
+            c, s = np.cos(arm.frozen_turn), 0.0
+        known0 = arm.Ma11 * acc0 + arm.coupling * (c * acc1 - s * rate1 * rate1)
+        known1 = arm.Ma22 * acc1 + arm.coupling * (c * acc0 + s * rate0 * rate0)
+        cross = arm.L1 * arm.L2
+        row0 = arm.L1 * arm.L1 * acc0 + cross * (c * acc1 - s * rate1 * rate1)
+        row1 = arm.L2 * arm.L2 * acc1 + cross * (c * acc0 + s * rate0 * rate0)
+        left0 = torque0 - arm.reaction * torque1 - known0
+        left1 = torque1 - known1
+        mass = sums[1] / sums[0] if sums[0] > 0.0 else 0.0
+        e0, e1 = left0 - mass * row0, left1 - mass * row1
+        sums[0] = arm.fade * sums[0] + row0 * row0 + row1 * row1
+        sums[1] = arm.fade * sums[1] + row0 * left0 + row1 * left1
+        sums[2] = arm.fade * sums[2] + e0 * e0 + e1 * e1
+        sums[3] = arm.fade * sums[3] + 2.0
+
+
+@kernel
+def _algebraic_kernel(
+    inertia: float, moment: float, L: float, gravity: float, x: Array, normal: Array, dt: float,
+    angles: Array, torques: Array,
+) -> None:
+    """Take samples of one link into the algebraic estimator's normal equations.
+
+    inertia: rho L^3 / 3 + m_o L^2; moment: rho L / 2 + m_o; angles: (N,); torques: (N,) held before each.
+    x: (11,) time, last angle, then int(t a), its integral, int(t^2 a), int(a), its integral, int(t^2 cos a),
+    its integral, int(t^2 torque), its integral; normal: (7,) A11, A12, A22, B1, B2, square of q, samples.
+    """
+    for k in range(angles.shape[0]):
+        t0, t1, a0, a1 = x[0], x[0] + dt, x[1], angles[k]
+        if normal[6] == 0.0:
+            t1 = t0
+        h = t1 - t0
+        # trapezoids; the torque is held, so its integrals are exact
+        moments0 = (t0 * a0, t0 * t0 * a0, a0, t0 * t0 * np.cos(a0))
+        moments1 = (t1 * a1, t1 * t1 * a1, a1, t1 * t1 * np.cos(a1))
+        ta, taa, tc = x[2], x[5], x[7]
+        x[2] += 0.5 * h * (moments0[0] + moments1[0])
+        x[4] += 0.5 * h * (moments0[1] + moments1[1])
+        x[5] += 0.5 * h * (moments0[2] + moments1[2])
+        x[7] += 0.5 * h * (moments0[3] + moments1[3])
+        x[3] += 0.5 * h * (ta + x[2])
+        x[6] += 0.5 * h * (taa + x[5])
+        x[8] += 0.5 * h * (tc + x[7])
+        x[10] += h * x[9] + torques[k] * ((t1 ** 4 - t0 ** 4) / 12.0 - t0 ** 3 * h / 3.0)
+        x[9] += torques[k] * (t1 ** 3 - t0 ** 3) / 3.0
+        x[0], x[1] = t1, a1
+        normal[6] += 1.0
+        beta = t1 * t1 * a1 - 4.0 * x[2] + 2.0 * x[6]
+        eta = x[4] - 2.0 * x[3]
+        q = x[10] - inertia * beta - moment * gravity * L * x[8]
+        row0, row1 = L * L * beta + gravity * L * x[8], eta
+        normal[0] += row0 * row0
+        normal[1] += row0 * row1
+        normal[2] += row1 * row1
+        normal[3] += row0 * q
+        normal[4] += row1 * q
+        normal[5] += q * q
+
+
+class Baseline(NamedTuple):
+    """The calls of one estimator; those of ``payload.structured``."""
+
+    init: Callable[[IdentifierParameters], BaselineState]
+    advance: Callable[[IdentifierParameters, BaselineState, Rows], BaselineState]
+    event: Callable[[IdentifierParameters, BaselineState, CaptureEvent], BaselineState]
+    estimate: Callable[[IdentifierParameters, BaselineState], Payload]
+
+
+RIGID_RLS = Baseline(_rigid_init, _rigid_advance, _rigid_event, _rigid_estimate)
+ALGEBRAIC = Baseline(_algebraic_init, _algebraic_advance, _algebraic_event, _algebraic_estimate)
