@@ -1,8 +1,13 @@
-"""What every program shares: progress on a terminal, one line for an error, exit codes."""
+"""What every program shares: progress on a terminal, one line for an error, exit codes.
+
+The programs import numpy, scipy, numba, rosbags and matplotlib only after their arguments are parsed, so that
+``--help`` and a mistake in the arguments are answered at once.
+"""
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import math
 import os
 import signal
@@ -12,9 +17,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from flexmanip_ros.errors import FlexmanipError
 
@@ -62,29 +64,29 @@ def parser(prog: str, words: str, epilog: str) -> Parser:
 @contextmanager
 def progress(words: str, unit: str) -> Iterator[Report]:
     """Show a bar on stderr when that is a terminal; otherwise nothing."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
+    if not sys.stderr.isatty():
         yield lambda done, total: None
         return
-    bar = Progress(TextColumn(words), BarColumn(), MofNCompleteColumn(), TextColumn(unit),
-                   TimeRemainingColumn(), console=console, transient=True)
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    bar = Progress(TextColumn(words), BarColumn(), MofNCompleteColumn(), TextColumn(unit), TimeRemainingColumn(),
+                   console=Console(stderr=True), transient=True)
     with bar:
         task = bar.add_task(words, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def complain(prog: str, error: BaseException | str) -> None:
+def print_error(prog: str, error: BaseException | str) -> None:
     """Write one line on stderr."""
     print(f'{prog}: {" ".join(str(error).split())}', file=sys.stderr)
 
 
-def require_pictures() -> None:
-    """Raise now, not after the work, when pictures are asked for and cannot be drawn."""
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as err:
+def require_matplotlib() -> None:
+    """Raise FlexmanipError before the work when a report is asked for and its figures cannot be drawn."""
+    if importlib.util.find_spec('matplotlib') is None:
         raise FlexmanipError('a report needs matplotlib, which is not installed',
-                             "run 'pip install matplotlib', or leave --report away") from err
+                             "run 'pip install matplotlib', or leave --report away")
 
 
 def run(prog: str, body: Callable[[], int]) -> int:
@@ -94,10 +96,10 @@ def run(prog: str, body: Callable[[], int]) -> int:
         try:
             return body()
         except FlexmanipError as error:
-            complain(prog, error)
+            print_error(prog, error)
             return BAD_INPUT
         except KeyboardInterrupt:
-            complain(prog, 'interrupted')
+            print_error(prog, 'interrupted')
             return INTERRUPTED
         except BrokenPipeError:
             sys.stderr.close()  # the reader of our output is gone; nothing is left to say
@@ -105,7 +107,7 @@ def run(prog: str, body: Callable[[], int]) -> int:
         except Exception as error:
             if os.environ.get(TRACEBACK):
                 raise
-            complain(prog, f'a defect of this program: {type(error).__name__}: {error}; '
+            print_error(prog, f'a defect of this program: {type(error).__name__}: {error}; '
                      f'please report it with the recording ({TRACEBACK}=1 shows where)')
             return DEFECT
 

@@ -6,13 +6,15 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from flexmanip_ros.cli import console
-from flexmanip_ros.cli.replay import Request, Result, identify
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import help_text
-from flexmanip_ros.types import Status
+
+if TYPE_CHECKING:
+    from flexmanip_ros.cli.replay import Result
 
 PROG = 'identify_bag'
 NODE = 'rpbsid_identifier'
@@ -63,6 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(given: argparse.Namespace) -> int:
+    from flexmanip_ros.cli.replay import Request, identify
+
     config = load(IdentifierParameters, NODE, given.params, given.set)
     request = Request(
         given.bag, config, joint_states=given.joint_states,
@@ -79,15 +83,17 @@ def _main(given: argparse.Namespace) -> int:
         print(json.dumps(result.summary.as_json(), allow_nan=False))
     if result.fault is not None:
         kept = ''.join(f"; what was identified is in '{place}'" for place in result.written)
-        console.complain(PROG, f'{result.fault}{kept}')
+        console.print_error(PROG, f'{result.fault}{kept}')
         return console.INTERRUPTED if result.interrupted else console.BAD_INPUT
     if result.remark:
-        console.complain(PROG, result.remark)
+        console.print_error(PROG, result.remark)
     return console.SUCCESS
 
 
 def describe(result: Result) -> list[str]:
     """Return the result as lines for people."""
+    from flexmanip_ros.types import Status
+
     summary = result.summary
     lines = [f'samples      {summary.samples}, {summary.gaps} gaps, '
              f'sample time {_text(summary.sample_time_s)} s, identified in {summary.wall_s:.2f} s']
@@ -101,13 +107,12 @@ def describe(result: Result) -> list[str]:
         lines.append(f'mode {k + 1}       {mode.frequency_hz:.4f}{spread} Hz, '
                      f'damping ratio {mode.damping_ratio:.4f}')
     if summary.modes_deviation > 1.0:
-        lines.append('             they are not those of the arm with this payload: '
-                     f'off by {summary.modes_deviation:.1f} times what is tolerated')
+        lines.append('             these modes are not those of the arm with this payload: they deviate '
+                     f'{summary.modes_deviation:.1f} times as much as is tolerated; check the parameters arm.*')
     if summary.payload_ci95_kg is not None:
-        low, high = summary.payload_ci95_kg
-        lines.append(f'payload      {_text(summary.payload_mass_kg)} kg, '
-                     f'95 % interval {_text(low)} .. {_text(high)} kg, '
-                     f'residual power {_text(summary.consistency)}')
+        lines.append(f'payload      {summary.payload_text()}')
+        if summary.consistency is not None and summary.payload_std_kg is not None:
+            lines.append(f'residuals    power {summary.consistency:.6g} times that of the noise (1: noise only)')
     for words, values in (('simulation', summary.vaf_simulation_percent),
                           ('prediction', summary.vaf_prediction_percent)):
         if values is not None:

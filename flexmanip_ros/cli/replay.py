@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from flexmanip_ros import pipeline
-from flexmanip_ros.cli.console import require_pictures
+from flexmanip_ros.cli.console import require_matplotlib
 from flexmanip_ros.errors import BagError, FlexmanipError, ParameterError
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.outputs import Outputs, TableOutput, open_output
@@ -71,7 +71,7 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
     started = time.perf_counter()
     if request.report is not None:
         check_place(request.report)
-        require_pictures()
+        require_matplotlib()
         if request.output is not None and Path(request.output).resolve() == Path(request.report).resolve():
             raise ParameterError(f"--output and --report are both '{request.report}'", 'give two names')
     feed = _Feed(request, progress)

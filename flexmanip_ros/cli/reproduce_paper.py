@@ -14,14 +14,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from flexmanip_ros.cli import console, workers
+from flexmanip_ros.cli import console
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.io.table import OutputError, check_place, write_file
-from flexmanip_ros.paper import case_run, experiments, summary
-from flexmanip_ros.studies import trial
+from flexmanip_ros.paper import experiments
 
 if TYPE_CHECKING:
-    from flexmanip_ros.paper.sections import Planned
+    from flexmanip_ros.cli import workers
+    from flexmanip_ros.paper.case_run import Track
+    from flexmanip_ros.paper.report import Planned
+    from flexmanip_ros.studies.trial import Row
 
 PROG = 'reproduce_paper'
 EXAMPLES = """examples:
@@ -79,20 +80,20 @@ class Collected:
     def __init__(self, cases: Sequence[experiments.Case], seeds: Sequence[int]) -> None:
         self.groups = {name: [case for case in group if case in cases] for name, group in GROUPS.items()}
         self.seeds = seeds
-        self.runs: dict[tuple[str, int], tuple[list[trial.Row], dict[str, case_run.Track]]] = {}
+        self.runs: dict[tuple[str, int], tuple[list[Row], dict[str, Track]]] = {}
         self.bounds: dict[tuple[str, str], float] = {}
         self.planned: dict[str, Sequence[Planned]] = {}
         self.drawn: dict[tuple[str, int], bytes] = {}
 
     def first(self) -> list[Job]:
         """Return what can be done at once; the runs of one group after the other."""
+        from flexmanip_ros.paper import case_run, report
+
         cases = [case for group in self.groups.values() for case in group]
-        bounds = [Job('bounds', (case.name,), partial(experiments.bounds_of, case)) for case in cases]
+        bounds = [Job('bounds', (case.name,), partial(case_run.bounds, case)) for case in cases]
         runs = [Job('run', (case, seed), partial(case_run.run, case, seed))
                 for group in self.groups.values() for seed in self.seeds for case in group]
-        from flexmanip_ros.paper import sections
-
-        return [*bounds, *self._drawings('signals', sections.without_results()), *runs]
+        return [*bounds, *self._drawings('signals', report.without_results()), *runs]
 
     def take(self, outcome: workers.Outcome) -> list[Job]:
         """Keep an outcome; return what can be drawn now."""
@@ -110,7 +111,7 @@ class Collected:
                 return self._figures(group)
         return []
 
-    def rows(self) -> list[trial.Row]:
+    def rows(self) -> list[Row]:
         """Return every row there is, in the order of cases and seeds."""
         return [row for group in self.groups.values() for case in group for seed in self.seeds
                 for row in self.runs.get((case.name, seed), ([], {}))[0]]
@@ -121,34 +122,37 @@ class Collected:
                 for group, planned in self.planned.items()}
 
     def _figures(self, group: str) -> list[Job]:
-        from flexmanip_ros.paper import sections
+        from flexmanip_ros.paper import report
 
-        plan = {'payloads': sections.payload_example,
-                'configurations': sections.configuration_example,
-                'finite_element': sections.finite_element_example}[group]
+        plan = {'payloads': report.payload_example,
+                'configurations': report.configuration_example,
+                'finite_element': report.finite_element_example}[group]
         return self._drawings(group, plan(self._tracks(), self.rows()))
 
-    def _tracks(self) -> dict[str, dict[str, list[case_run.Track]]]:
+    def _tracks(self) -> dict[str, dict[str, list[Track]]]:
         return {case.name: {
             method.name: [self.runs[case.name, seed][1][method.name] for seed in self.seeds
                           if method.name in self.runs.get((case.name, seed), ([], {}))[1]]
             for method in experiments.METHODS} for case in experiments.CASES}
 
     def _drawings(self, group: str, planned: Sequence[Planned]) -> list[Job]:
-        from flexmanip_ros.paper import sections
+        from flexmanip_ros.paper import report
 
         self.planned[group] = planned
-        return [Job('figure', (group, k), partial(sections.drawing, one))
+        return [Job('figure', (group, k), partial(report.drawing, one))
                 for k, one in enumerate(planned)]
 
 
 def _main(given: argparse.Namespace) -> int:
+    from flexmanip_ros.cli import workers
+    from flexmanip_ros.io.table import OutputError, check_place
+
     if given.runs < 1:
         raise ParameterError(f'--runs is {given.runs}', 'give at least 1')
     if given.workers is not None and given.workers < 0:
         raise ParameterError(f'--workers is {given.workers}', 'give 0 or more')
-    console.require_pictures()
-    from flexmanip_ros.paper import report
+    console.require_matplotlib()
+    from flexmanip_ros.paper import report, summary
 
     folder = Path(given.output)
     try:
@@ -179,11 +183,15 @@ def _main(given: argparse.Namespace) -> int:
 
 
 def _compute(count: int | None, jobs: Iterable[Job]) -> Iterator[workers.Outcome]:
+    from flexmanip_ros.cli import workers
+
     cores = len(os.sched_getaffinity(0)) if count is None else count
     return workers.processes(work, jobs, cores) if cores > 0 else workers.serial(work, jobs)
 
 
-def _failed(case: experiments.Case, seed: int, error: BaseException) -> list[trial.Row]:
+def _failed(case: experiments.Case, seed: int, error: BaseException) -> list[Row]:
+    from flexmanip_ros.studies import trial
+
     return [{'case': case.name, 'method': method.name, 'seed': seed, 'error': trial.describe(error)}
             for method in experiments.METHODS]
 
@@ -205,6 +213,8 @@ def _short(value: float | None) -> str:
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write rows as a table; a missing value is an empty cell."""
+    from flexmanip_ros.io.table import write_file
+
     names = list(dict.fromkeys(name for row in rows for name in row))
     text = io.StringIO()
     writer = csv.DictWriter(text, names, restval='', lineterminator='\n')

@@ -8,21 +8,16 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from flexmanip_ros.arm import linearization
 from flexmanip_ros.cli import console
 from flexmanip_ros.errors import BagError, ParameterError
-from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.io.parameter_file import load
-from flexmanip_ros.io.table import check_place, write_file
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, flatten
 from flexmanip_ros.parameters.document import help_text
-from flexmanip_ros.simulation import excitation, excitation_design, simulator
-from flexmanip_ros.studies.scenario import for_plant
-from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+
+if TYPE_CHECKING:
+    from flexmanip_ros.types import CaptureEvent
 
 PROG = 'simulate_bag'
 START_NS = 1_700_000_000_000_000_000
@@ -70,6 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def configurations(given: argparse.Namespace) -> tuple[PlantParameters, ExcitationParameters]:
     """Return what the arguments ask for; named arguments win over --set, --set over the file."""
+    from flexmanip_ros.studies.scenario import for_plant
+
     plant_items = [item for item in given.set if not item.startswith(PREFIX)]
     plant_items += [f'{name}={value!r}' for name, value in (
         ('seed', given.seed), ('payload_mass', given.payload)) if value is not None]
@@ -81,6 +78,11 @@ def configurations(given: argparse.Namespace) -> tuple[PlantParameters, Excitati
 
 
 def _main(given: argparse.Namespace) -> int:
+    from flexmanip_ros.io.bag_writer import BagWriter
+    from flexmanip_ros.io.table import check_place, write_file
+    from flexmanip_ros.simulation import excitation, excitation_design, simulator
+    from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+
     plant, torque = configurations(given)
     if not 0.0 < given.duration <= 1e6:
         raise ParameterError(f'--duration is {given.duration:g}', 'give seconds above 0, up to 1e6')
@@ -116,23 +118,19 @@ def _main(given: argparse.Namespace) -> int:
 def truth(plant: PlantParameters, torque: ExcitationParameters, events: Sequence[CaptureEvent]
           ) -> dict[str, Any]:
     """Return what an estimator of this run should find."""
+    from flexmanip_ros.studies.trial import true_frequencies
+    from flexmanip_ros.types import EventKind
+
     at = {event.kind: (event.stamp_ns - START_NS) * 1e-9 for event in events}
     return {
         'payload_mass_kg': plant.payload_mass if EventKind.CAPTURE in at else 0.0,
         'capture_time_s': at.get(EventKind.CAPTURE), 'release_time_s': at.get(EventKind.RELEASE),
         'working_point_deg': [math.degrees(angle) for angle in plant.initial_angles],
         'sample_time_s': 1.0 / plant.rate,
-        'frequencies_before_hz': frequencies(plant, 0.0),
-        'frequencies_after_hz': frequencies(plant, plant.payload_mass),
+        'frequencies_before_hz': true_frequencies(plant, 0.0),
+        'frequencies_after_hz': true_frequencies(plant, plant.payload_mass),
         'plant': flatten(plant), 'excitation': flatten(torque),
     }
-
-
-def frequencies(plant: PlantParameters, payload: float) -> list[float]:
-    """Return the damped frequencies of the arm linearized at its start, the lowest two [Hz]."""
-    Ac, _ = linearization.vibration_model(plant.arm, np.array(plant.initial_angles), payload)
-    found = np.sort(np.abs(np.linalg.eigvals(Ac).imag))[::-1] / (2.0 * np.pi)
-    return sorted(float(value) for value in found[found > 1e-9])[:4:2]
 
 
 if __name__ == '__main__':

@@ -1,7 +1,7 @@
 """One experiment of the paper: every method over the same samples, as rows and as tracks over time.
 
 Work that several methods share is done once: one pass of an identifier serves every method that reads it, the
-messages become samples once for the two rivals.
+messages become samples once for the two baselines.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.paper import experiments, single_link
 from flexmanip_ros.paper.experiments import Case, Method
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, PlantParameters, configure
-from flexmanip_ros.payload import block_extraction
+from flexmanip_ros.payload import block_extraction, cramer_rao
+from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.simulation.noise import std_for_snr
 from flexmanip_ros.studies import baselines, trial
 from flexmanip_ros.studies.scenario import Run, Scenario
-from flexmanip_ros.types import Array, CaptureEvent, Estimate, JointRecord, StateSpace, Status
+from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointRecord, StateSpace, Status
 
 Item = JointRecord | CaptureEvent
 
@@ -56,7 +58,7 @@ def run(case: Case, seed: int) -> tuple[list[trial.Row], dict[str, Track]]:
     failed: dict[str, str] = {}
     alone = [method for method in experiments.METHODS if method.name == experiments.ALONE]
     others = [method for method in experiments.METHODS if method.name != experiments.ALONE]
-    rivalling = [method for method in others if method.rival]
+    baselined = [method for method in others if method.baseline]
     items: list[Item] = []
     with _attempt(failed, others):
         items = _messages(case, seed)
@@ -65,8 +67,8 @@ def run(case: Case, seed: int) -> tuple[list[trial.Row], dict[str, Track]]:
         with _attempt(failed, readers):
             found.update(_identify(case, name, readers, items))
     if items:
-        with _attempt(failed, rivalling):
-            found.update(_compare(case, rivalling, items))
+        with _attempt(failed, baselined):
+            found.update(_compare(case, baselined, items))
     with _attempt(failed, alone):
         found.update(_compare(case, alone, _own_run(case, seed)))
     return _rows(case, seed, found, failed)
@@ -148,7 +150,7 @@ def _compare(case: Case, methods: Sequence[Method], items: Sequence[Item]) -> di
     found = {}
     for method in methods:
         begun = time.perf_counter()
-        estimates = list(baselines.run(method.rival, config, sampled))
+        estimates = list(baselines.run(method.baseline, config, sampled))
         found[method.name] = Reading(estimates, shared + time.perf_counter() - begun)
     return found
 
@@ -185,7 +187,7 @@ def _own_run(case: Case, seed: int) -> list[Item]:
 @cache
 def true_frequencies(case: Case, mass: float) -> tuple[float, ...]:
     """Return the two lowest frequencies of a case's arm with a payload [Hz]."""
-    return tuple(trial.true_frequencies(_configured(case, experiments.METHODS[0])[1], mass))
+    return tuple(trial.true_frequencies(_configured(case, experiments.METHODS[0])[1].plant, mass))
 
 
 def _columns(estimates: Sequence[Estimate], track: Track, case: Case) -> trial.Row:
@@ -221,6 +223,28 @@ def follow(estimates: Sequence[Estimate]) -> Track:
     stamps = np.array([(estimate.stamp_ns - start) / 1e9 for estimate in estimates], dtype=np.float64)
     return Track(stamps, table[:, 0], table[:, 1], table[:, 2], frequencies,
                  estimates[-1].model if estimates else None)
+
+
+def bounds(case: Case) -> dict[str, float]:
+    """Return method -> Cramer-Rao bound of the payload [kg] at the end of a run, where a method has one.
+
+    ``structured`` knows the structure of the equations of motion. The block extractions know nothing of (A, B);
+    theirs is the bound of their own formula (``payload.cramer_rao.structure_unknown``).
+    """
+    if case.model != 'linear':
+        return {}
+    run = experiments.scenario(case, experiments.METHODS[0]).configuration(0, experiments.METHODS[0].name)
+    quiet = replace(run.plant, noise='none')
+    torque = excitation.sequence(run.excitation, round(experiments.WINDOW[1] * quiet.rate))
+    clean = simulator.simulate(quiet, torque, (CaptureEvent(round(experiments.CAPTURE_TIME * 1e9), EventKind.CAPTURE),))
+    noise = std_for_snr(clean.position, clean.velocity, run.plant.snr_db)
+    first = round(experiments.CAPTURE_TIME * quiet.rate)
+    states = np.hstack([clean.position[first:, 2:], clean.velocity[first:, 2:]])
+    given = (quiet.arm, np.radians(case.angles_deg), case.payload, states, torque[first:],
+             np.concatenate([noise[2:4], noise[6:8]]), 1.0 / quiet.rate, (len(states),))
+    structure = float(cramer_rao.structure_known(*given)[0])
+    trace, known = (float(cramer_rao.structure_unknown(*given, known_mb=known)[0]) for known in (False, True))
+    return {'paper': trace, 'restart': trace, 'known M_b': known, 'structured': structure}
 
 
 def _mean(values: Array) -> float | None:

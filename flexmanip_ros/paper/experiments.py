@@ -9,23 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
-from flexmanip_ros.paper import single_link
-from flexmanip_ros.payload import cramer_rao
-from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.simulation.noise import std_for_snr
 from flexmanip_ros.studies.scenario import Scenario
-from flexmanip_ros.types import CaptureEvent, EventKind
 
 ARM: Mapping[str, Any] = {
     'modes': 1, 'torque_convention': 'paper', 'angle_convention': 'chord', 'shortening': False,
     'slope_correction': False}
 WINDOW = (4.0, 6.0)
+"""From and to [s] of the mean errors."""
 CAPTURE_TIME = 3.0
+GRAVITY = 9.81
+"""In the run of link 2 alone [m/s^2]; the arm itself moves in a horizontal plane."""
 TRACK_RATE = 5.0
 """Estimates a second: enough for the tracks, and thirty runs stay quick."""
 
@@ -56,8 +52,8 @@ class Method:
     """The one of ``IDENTIFIERS`` whose state it reads; several methods may read the same one."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Identifier parameters over those of ``identifier`` with which it is read."""
-    rival: str = ''
-    """Name in ``rivals`` of a method that is no part of the identifier."""
+    baseline: str = ''
+    """Name in ``studies.baselines`` of a method that is no part of the identifier."""
 
 
 PAYLOADS = (Case('payload_20', 20.0, (60.0, 45.0)), Case('payload_50', 50.0, (60.0, 45.0)),
@@ -75,45 +71,23 @@ IDENTIFIERS: Mapping[str, Mapping[str, Any]] = {
 }
 """What is run over the samples: identifier parameters over the defaults."""
 _BLOCK = {'payload_method': 'block'}
-_WEIGHED = {'payload.gravity': single_link.GRAVITY, 'outputs': ['joint2/position'], 'order': 1}
+_WEIGHED = {'payload.gravity': GRAVITY, 'outputs': ['joint2/position'], 'order': 1}
 METHODS = (
     Method('paper', "the paper's settings: beta 0.99, no restart, block extraction", 'paper', _BLOCK),
     Method('restart', 'ours: restart at the capture, beta 0.9995, maximum-likelihood refinement; block '
            'extraction', 'ours', _BLOCK),
     Method('known M_b', 'ours: the same model, the coupling block taken from the arm', 'ours',
            {**_BLOCK, 'payload.known_coupling': True}),
-    Method('rigid RLS', "the paper's rival: recursive least squares on two rigid links", rival='rigid_rls'),
-    Method('algebraic', "the paper's rival on the same run: link 2, its moving base left out",
-           rival='algebraic'),
+    Method('rigid RLS', "the paper's baseline: recursive least squares on two rigid links", baseline='rigid_rls'),
+    Method('algebraic', "the paper's baseline on the same run: link 2, its moving base left out",
+           baseline='algebraic'),
     Method('algebraic, 1 link', 'as the paper runs it: a run of its own, link 2 alone on a fixed base under '
-           'gravity, which weighs the object', settings=_WEIGHED, rival='algebraic'),
+           'gravity, which weighs the object', settings=_WEIGHED, baseline='algebraic'),
     Method('structured', "ours: the arm's equations of motion (the default)", 'ours'),
 )
 ALONE = 'algebraic, 1 link'
 BEST_MODEL = 'restart'
 """The method whose state-space model is shown in the test responses and frequency tracks."""
-
-
-def bounds_of(case: Case) -> dict[str, float]:
-    """Return method -> Cramer-Rao bound of the payload [kg] at the end of a run, where a method has one.
-
-    ``structured`` knows the structure; the block extractions know nothing of (A, B), and theirs is the bound
-    of their own formula (docs of ``payload.bounds``).
-    """
-    if case.model != 'linear':
-        return {}
-    run = scenario(case, METHODS[0]).configuration(0, METHODS[0].name)
-    quiet = replace(run.plant, noise='none')
-    torque = excitation.sequence(run.excitation, round(WINDOW[1] * quiet.rate))
-    clean = simulator.simulate(quiet, torque, (CaptureEvent(round(CAPTURE_TIME * 1e9), EventKind.CAPTURE),))
-    noise = std_for_snr(clean.position, clean.velocity, run.plant.snr_db)
-    first = round(CAPTURE_TIME * quiet.rate)
-    states = np.hstack([clean.position[first:, 2:], clean.velocity[first:, 2:]])
-    given = (quiet.arm, np.radians(case.angles_deg), case.payload, states, torque[first:],
-             np.concatenate([noise[2:4], noise[6:8]]), 1.0 / quiet.rate, (len(states),))
-    structure = float(cramer_rao.structure_known(*given)[0])
-    trace, known = (float(cramer_rao.structure_unknown(*given, known_mb=known)[0]) for known in (False, True))
-    return {'paper': trace, 'restart': trace, 'known M_b': known, 'structured': structure}
 
 
 def scenario(case: Case, method: Method) -> Scenario:

@@ -12,11 +12,11 @@ from functools import cache
 
 import numpy as np
 
+from flexmanip_ros.paper.experiments import GRAVITY
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters
 from flexmanip_ros.simulation import excitation
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointRecord
 
-GRAVITY = 9.81
 RATE = 1000.0
 STIFFNESS, DAMPING = 20000.0, 4000.0
 """Of the joint that holds the link [N m/rad, N m s/rad]."""

@@ -1,4 +1,4 @@
-"""The paper's rivals over the same messages and the same publishing grid as the identifier."""
+"""The paper's baselines over the same messages and the same publishing grid as the identifier."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flexmanip_ros.samples import sampling
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, Sample
 
 
-class Rival(NamedTuple):
+class Baseline(NamedTuple):
     """The calls of one estimator."""
 
     init: Callable[[IdentifierParameters], RivalState]
@@ -21,9 +21,9 @@ class Rival(NamedTuple):
     estimate: Callable[[IdentifierParameters, RivalState], Payload]
 
 
-RIVALS: Mapping[str, Rival] = {
-    'rigid_rls': Rival(rigid_rls.init, rigid_rls.advance, rigid_rls.event, rigid_rls.estimate),
-    'algebraic': Rival(algebraic.init, algebraic.advance, algebraic.event, algebraic.estimate),
+BASELINES: Mapping[str, Baseline] = {
+    'rigid_rls': Baseline(rigid_rls.init, rigid_rls.advance, rigid_rls.event, rigid_rls.estimate),
+    'algebraic': Baseline(algebraic.init, algebraic.advance, algebraic.event, algebraic.estimate),
 }
 
 
@@ -50,15 +50,15 @@ def samples(config: IdentifierParameters, items: Iterable[JointRecord | CaptureE
 def run(name: str, config: IdentifierParameters, sampled: Iterable[Sample | CaptureEvent]
         ) -> Iterator[Estimate]:
     """Yield estimates with a payload and no model: at each publishing instant and at the last sample."""
-    rival = RIVALS[name]
-    state = rival.init(config)
+    baseline = BASELINES[name]
+    state = baseline.init(config)
     block: list[Sample] = []
     first_ns, published, due = 0, -1, False
     last: Sample | None = None
     for item in sampled:
         if isinstance(item, CaptureEvent):
-            state, block = rival.advance(config, state, block), []
-            state = rival.event(config, state, item)
+            state, block = baseline.advance(config, state, block), []
+            state = baseline.event(config, state, item)
             continue
         first_ns = item.stamp_ns if last is None else first_ns
         last = item
@@ -67,12 +67,12 @@ def run(name: str, config: IdentifierParameters, sampled: Iterable[Sample | Capt
         due = instant > published
         if due:
             published = instant
-            state, block = rival.advance(config, state, block), []
-            yield _estimate(rival, config, state, item)
+            state, block = baseline.advance(config, state, block), []
+            yield _estimate(baseline, config, state, item)
     if last is not None and not due:
-        yield _estimate(rival, config, rival.advance(config, state, block), last)
+        yield _estimate(baseline, config, baseline.advance(config, state, block), last)
 
 
-def _estimate(rival: Rival, config: IdentifierParameters, state: RivalState, sample: Sample) -> Estimate:
-    payload = rival.estimate(config, state)
+def _estimate(baseline: Baseline, config: IdentifierParameters, state: RivalState, sample: Sample) -> Estimate:
+    payload = baseline.estimate(config, state)
     return Estimate(sample.stamp_ns, payload.status, None, (), payload)

@@ -12,7 +12,7 @@ import numpy as np
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm import linearization
 from flexmanip_ros.errors import FlexmanipError
-from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.parameters import IdentifierParameters, PlantParameters
 from flexmanip_ros.samples.sampling import collect
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.studies.achievable import payload_std
@@ -123,7 +123,7 @@ def _window_error(state: pipeline.State, estimates: Sequence[Estimate], true: fl
 def frequency_columns(run: Run, row: Mapping[str, Any]) -> Row:
     """Return the true frequencies at the working point and the largest relative error of those found [%]."""
     mass = row.get('payload_true_kg') or 0.0
-    true = true_frequencies(run, mass)
+    true = true_frequencies(run.plant, mass)
     found = [row[f'frequencies_{k + 1}'] for k in range(len(true)) if f'frequencies_{k + 1}' in row]
     columns: Row = {f'true_frequency_{k + 1}': value for k, value in enumerate(true)}
     if len(found) == len(true):
@@ -132,9 +132,9 @@ def frequency_columns(run: Run, row: Mapping[str, Any]) -> Row:
     return columns
 
 
-def true_frequencies(run: Run, mass: float) -> list[float]:
-    """Return the two lowest damped frequencies of the arm at its start [Hz]."""
-    Ac, _ = linearization.vibration_model(run.plant.arm, np.array(run.plant.initial_angles), mass)
+def true_frequencies(plant: PlantParameters, mass: float) -> list[float]:
+    """Return the two lowest damped frequencies of the arm, linearized at its start, with a payload [kg]: [Hz]."""
+    Ac, _ = linearization.vibration_model(plant.arm, np.array(plant.initial_angles), mass)
     poles = np.linalg.eigvals(Ac)
     return sorted((poles.imag[poles.imag > 1e-9] / (2.0 * np.pi)).tolist())[:2]
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from quick_study import SCENARIO, rows_of, run, without_cost
 
-from flexmanip_ros.cli import tasks, workers
+from flexmanip_ros.cli import workers
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.types import JointRecord
 
@@ -77,7 +77,7 @@ def test_a_folder_of_recordings_is_a_study_and_a_broken_one_a_row(tmp_path):
     assert set(rows) == {'one', 'two', 'three.mcap'}
     assert 'cannot be read' in rows['three.mcap']['error']
     assert rows['one']['samples'] == '300'
-    assert tasks.true_payload(folder / 'one') == 20.0
+    assert workers.true_payload(folder / 'one') == 20.0
 
 
 FRAGILE = '''
