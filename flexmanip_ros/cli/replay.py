@@ -18,7 +18,6 @@ from flexmanip_ros.io import bag
 from flexmanip_ros.io.outputs import Outputs, TableOutput, open_output
 from flexmanip_ros.io.table import check_place
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload.detected_events import with_detected
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies import holdout
@@ -132,6 +131,8 @@ class _Feed:
         topics = bag.Topics(request.joint_states, request.events, request.events_required)
         try:
             if request.detect:
+                from flexmanip_ros.payload.detected_events import with_detected
+
                 items: Iterable[pipeline.Item] = with_detected(
                     request.config, bag.read(request.bag, topics, self._progress))
             else:

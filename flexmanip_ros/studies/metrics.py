@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta
+from scipy.special import betaincinv
 
 from flexmanip_ros.types import Array
 
@@ -49,8 +49,8 @@ def coverage(hits: int, runs: int, confidence: float = 0.95) -> tuple[float, flo
     if runs == 0:
         return math.nan, math.nan, math.nan
     tail = (1.0 - confidence) / 2.0
-    low = 0.0 if hits == 0 else float(beta.ppf(tail, hits, runs - hits + 1))
-    high = 1.0 if hits == runs else float(beta.ppf(1.0 - tail, hits + 1, runs - hits))
+    low = 0.0 if hits == 0 else float(betaincinv(hits, runs - hits + 1, tail))
+    high = 1.0 if hits == runs else float(betaincinv(hits + 1, runs - hits, 1.0 - tail))
     return 100.0 * hits / runs, 100.0 * low, 100.0 * high
 
 
