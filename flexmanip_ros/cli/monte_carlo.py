@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.cli import workers
     from flexmanip_ros.io.journal import Journal
-    from flexmanip_ros.io.table import check_place
+    from flexmanip_ros.io.outputs import check_place
 
     todo, identity = _plan(given)
     if given.report is not None:
@@ -84,9 +84,9 @@ def _main(given: argparse.Namespace) -> int:
             interrupted = True
         journal.finish(('estimator', 'seed', workers.KEY))
     if given.report is not None:
-        from flexmanip_ros.io import study_report
+        from flexmanip_ros.io.report import study_report
 
-        study_report.report(given.report, Path(given.source).stem, journal.rows)
+        study_report(given.report, Path(given.source).stem, journal.rows)
     for line in describe(journal.rows):
         print(line)
     print(f"wrote '{given.output}' ({len(journal.rows)} rows)")

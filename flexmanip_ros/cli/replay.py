@@ -15,13 +15,11 @@ from flexmanip_ros import pipeline
 from flexmanip_ros.cli.console import require_matplotlib
 from flexmanip_ros.errors import BagError, FlexmanipError, ParameterError
 from flexmanip_ros.io import bag
-from flexmanip_ros.io.outputs import Outputs, TableOutput, open_output
-from flexmanip_ros.io.table import check_place
+from flexmanip_ros.io.outputs import Outputs, TableOutput, check_place, open_output
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies import holdout
-from flexmanip_ros.studies.achievable import payload_std
 from flexmanip_ros.studies.summary import Summary, summarize
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Mode
 
@@ -222,14 +220,15 @@ def _remark(state: pipeline.State, foreign: int) -> str:
 def _report(request: Request, summary: Summary, feed: _Feed, kept: list[Estimate], signals: Signals,
             last: Estimate | None, scores: holdout.Scores | None, state: pipeline.State,
             fault: FlexmanipError | None) -> None:
-    from flexmanip_ros.io import pictures, report
+    from flexmanip_ros.io import plots, report
+    from flexmanip_ros.studies.metrics import payload_bound
 
     assert request.report is not None
     config = state.config or request.config
-    made = pictures.run(config, signals, kept, feed.events)
+    made = plots.run(config, signals, kept, feed.events)
     bound, mass = None, summary.payload_mass_kg
     if summary.capture_time_s is not None and mass is not None:
-        bound = payload_std(config, signals, summary.capture_time_s, mass, state.clock.dt)
+        bound = payload_bound(config, signals, summary.capture_time_s, mass, state.clock.dt)
     counts: dict[str, Any] = {**state.counters._asdict(), 'dropped': state.counters.dropped}
     report.identification_report(
         request.report, Path(request.bag).name, config, summary, made,

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import math
 import os
 import sys
@@ -145,7 +143,7 @@ class Collected:
 
 def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.cli import workers
-    from flexmanip_ros.io.table import OutputError, check_place
+    from flexmanip_ros.io.outputs import OutputError, check_place, write_rows
 
     if given.runs < 1:
         raise ParameterError(f'--runs is {given.runs}', 'give at least 1')
@@ -173,8 +171,8 @@ def _main(given: argparse.Namespace) -> int:
     wall = time.perf_counter() - started
     rows = collected.rows()
     lines = summary.summary(rows, collected.bounds)
-    write_csv(folder / ROWS, rows)
-    write_csv(folder / SUMMARY, lines)
+    write_rows(folder / ROWS, rows)
+    write_rows(folder / SUMMARY, lines)
     report.report(folder / PAGE, report.Study(
         rows, collected.bounds, collected.pictures(), given.runs, wall))
     print('\n'.join(describe(lines)))
@@ -209,18 +207,6 @@ def describe(lines: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _short(value: float | None) -> str:
     return '-' if value is None or math.isnan(value) else f'{value:.3g}'
-
-
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows as a table; a missing value is an empty cell."""
-    from flexmanip_ros.io.table import write_file
-
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, restval='', lineterminator='\n')
-    writer.writeheader()
-    writer.writerows({name: '' if row[name] is None else row[name] for name in row} for row in rows)
-    write_file(path, lambda file: file.write(text.getvalue().encode('utf-8')))
 
 
 if __name__ == '__main__':

@@ -79,7 +79,7 @@ def configurations(given: argparse.Namespace) -> tuple[PlantParameters, Excitati
 
 def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.io.bag_writer import BagWriter
-    from flexmanip_ros.io.table import check_place, write_file
+    from flexmanip_ros.io.outputs import check_place, write_file
     from flexmanip_ros.simulation import excitation, excitation_design, simulator
     from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 

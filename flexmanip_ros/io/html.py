@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from flexmanip_ros.io.table import write_file
+from flexmanip_ros.io.outputs import write_file
 from flexmanip_ros.types import Array
 
 STYLE = """

@@ -6,10 +6,8 @@ from it at the end and on an interrupt.
 
 from __future__ import annotations
 
-import csv
 import fcntl
 import importlib
-import io
 import json
 import os
 from collections.abc import Iterable, Mapping
@@ -18,7 +16,7 @@ from types import TracebackType
 from typing import Any
 
 from flexmanip_ros.errors import FlexmanipError
-from flexmanip_ros.io.table import OutputError, check_place, write_file
+from flexmanip_ros.io.outputs import OutputError, check_place, write_file, write_rows
 
 Row = dict[str, Any]
 SUFFIXES = ('.csv', '.parquet')
@@ -108,15 +106,11 @@ class Journal:
         """Write the table, sorted by the columns in ``order``."""
         names = list(order)
         rows = sorted(self.rows, key=lambda row: tuple(_sortable(row.get(name)) for name in names))
-        columns = list(dict.fromkeys(name for row in rows for name in row))
         if self.path.suffix == '.csv':
-            text = io.StringIO()
-            writer = csv.DictWriter(text, columns, restval='', lineterminator='\n')
-            writer.writeheader()
-            writer.writerows({name: '' if row[name] is None else row[name] for name in row} for row in rows)
-            write_file(self.path, lambda file: file.write(text.getvalue().encode('utf-8')))
+            write_rows(self.path, rows)
         else:
             arrow, parquet = _parquet()
+            columns = dict.fromkeys(name for row in rows for name in row)
             made = arrow.table({name: [row.get(name) for row in rows] for name in columns})
             write_file(self.path, lambda file: parquet.write_table(made, file))
 

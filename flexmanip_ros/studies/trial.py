@@ -15,9 +15,8 @@ from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import IdentifierParameters, PlantParameters
 from flexmanip_ros.samples.sampling import collect
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.studies.achievable import payload_std
 from flexmanip_ros.studies.fault_injection import inject
-from flexmanip_ros.studies.metrics import relative_error_percent
+from flexmanip_ros.studies.metrics import payload_bound, relative_error_percent
 from flexmanip_ros.studies.scenario import Run, Scenario
 from flexmanip_ros.studies.summary import summarize
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord
@@ -108,7 +107,7 @@ def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_k
 
 def _bound(config: IdentifierParameters, items: Sequence[pipeline.Item], capture_time: float,
            mass: float | None, dt: float) -> float | None:
-    return None if mass is None else payload_std(config, collect(config, items), capture_time, mass, dt)
+    return None if mass is None else payload_bound(config, collect(config, items), capture_time, mass, dt)
 
 
 def _window_error(state: pipeline.State, estimates: Sequence[Estimate], true: float,

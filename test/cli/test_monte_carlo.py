@@ -34,7 +34,7 @@ def test_a_failed_run_is_a_row_with_its_error(scenario_file, tmp_path, capsys):
 
 
 def test_the_report_shows_scores_runs_and_failures(tmp_path):
-    from flexmanip_ros.io.study_report import report
+    from flexmanip_ros.io.report import study_report as report
 
     rows = [{'run': str(k), 'estimator': 'a', 'error': '', 'status': 'TRACKING', 'payload_true_kg': 20.0 + k,
              'payload_mass_kg': 20.1 + k, 'payload_lower_kg': 19.9 + k, 'payload_upper_kg': 20.2 + k,
