@@ -40,15 +40,13 @@ def _parser() -> console.Parser:
     add = made.add_argument
     add('bag', metavar='BAG', help='rosbag2 directory, or the .mcap or .db3 file itself')
     add('--params', metavar='FILE.yaml', help='ROS parameter file for rpbsid_identifier')
-    add('--set', metavar='name=value', action='append', default=[],
-        help='override one parameter (YAML value)')
+    add('--set', metavar='name=value', action='append', default=[], help='override one parameter (YAML value)')
     add('--validate-from', metavar='SECONDS', type=console.seconds,
         help='identify before this time from the first stamp, score the model on the rest')
     add('--output', metavar='OUT', help='estimates: .csv or .npz a table, anything else a rosbag2 recording')
     add('--report', metavar='REPORT.html', help='one page with pictures and tables')
     add('--json', action='store_true', help='print the result as JSON, the last line of stdout')
-    add('--joint-states', metavar='TOPIC', default='joint_states',
-        help='default: joint_states, in any namespace')
+    add('--joint-states', metavar='TOPIC', default='joint_states', help='default: joint_states, in any namespace')
     add('--capture-event', metavar='TOPIC', action='append',
         help='default: capture_event and capture_detected beside the joint states')
     add('--detect', action='store_true', help='find captures and releases in the signals')
@@ -104,8 +102,7 @@ def describe(result: Result) -> list[str]:
         lines.append(f'model        {summary.model_status}: {Status[summary.model_status].value}')
     for k, mode in enumerate(result.modes):
         spread = f' +- {1.96 * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else ''
-        lines.append(f'mode {k + 1}       {mode.frequency_hz:.4f}{spread} Hz, '
-                     f'damping ratio {mode.damping_ratio:.4f}')
+        lines.append(f'mode {k + 1}       {mode.frequency_hz:.4f}{spread} Hz, damping ratio {mode.damping_ratio:.4f}')
     if summary.modes_deviation > 1.0:
         lines.append('             these modes are not those of the arm with this payload: they deviate '
                      f'{summary.modes_deviation:.1f} times as much as is tolerated; check the parameters arm.*')

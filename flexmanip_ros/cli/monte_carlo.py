@@ -40,8 +40,7 @@ def _parser() -> console.Parser:
         PROG, 'Run a scenario with many seeds, or identify every recording in a folder; one row per run.', EXAMPLES)
     add = made.add_argument
     add('source', metavar='SCENARIO.yaml|FOLDER', help='what to repeat, or where the recordings are')
-    add('--runs', type=int, default=100, metavar='N',
-        help='seeds FIRST .. FIRST+N-1 of the scenario (default 100)')
+    add('--runs', type=int, default=100, metavar='N', help='seeds FIRST .. FIRST+N-1 of the scenario (default 100)')
     add('--first-seed', type=console.whole, default=0, metavar='FIRST', help='default: 0')
     add('--output', default='study.csv', metavar='TABLE', help='.csv or .parquet (default study.csv)')
     add('--report', metavar='REPORT.html', help='one page with scores and pictures')
@@ -105,8 +104,7 @@ def _plan(given: argparse.Namespace) -> tuple[Sequence[workers.Task], dict[str, 
         config = load(IdentifierParameters, 'rpbsid_identifier', given.params, given.set)
         found = workers.recordings(source)
         if not found:
-            raise ParameterError(f"folder '{given.source}' holds no recording",
-                                 'give a folder of rosbag2 recordings')
+            raise ParameterError(f"folder '{given.source}' holds no recording", 'give a folder of rosbag2 recordings')
         return ([workers.Recorded(str(path), config, (0.0, float('inf'))) for path in found],
                 {'recordings': str(source), 'parameters': _digest(flatten(config))})
     if given.runs < 1:
@@ -131,8 +129,7 @@ def read_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
         made = scenario(parse(text, 'the file'))
         if overrides:
             values = parse_overrides(overrides)
-            made = replace(made, estimators={
-                name: {**given, **values} for name, given in made.estimators.items()})
+            made = replace(made, estimators={name: {**given, **values} for name, given in made.estimators.items()})
     except ParameterError as err:
         raise ParameterError(f"scenario '{path}': {err.problem}", err.remedy) from err
     return made

@@ -102,8 +102,7 @@ class Collected:
             self.drawn[job.key] = found or b''
         else:
             case, seed = job.key
-            self.runs[case.name, seed] = (
-                found if outcome.error is None else (_failed(case, seed, outcome.error), {}))
+            self.runs[case.name, seed] = (found if outcome.error is None else (_failed(case, seed, outcome.error), {}))
             group = next(name for name, cases in self.groups.items() if case in cases)
             if all((known.name, seed) in self.runs for known in self.groups[group] for seed in self.seeds):
                 return self._figures(group)
@@ -137,8 +136,7 @@ class Collected:
         from flexmanip_ros.paper import report
 
         self.planned[group] = planned
-        return [Job('figure', (group, k), partial(report.drawing, one))
-                for k, one in enumerate(planned)]
+        return [Job('figure', (group, k), partial(report.drawing, one)) for k, one in enumerate(planned)]
 
 
 def _main(given: argparse.Namespace) -> int:
@@ -156,8 +154,7 @@ def _main(given: argparse.Namespace) -> int:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as err:
-        raise OutputError(f"folder '{folder}' cannot be made: {err.strerror}",
-                          'give another --output') from err
+        raise OutputError(f"folder '{folder}' cannot be made: {err.strerror}", 'give another --output') from err
     for name in (PAGE, ROWS, SUMMARY):
         check_place(folder / name)
     started = time.perf_counter()
@@ -173,8 +170,7 @@ def _main(given: argparse.Namespace) -> int:
     lines = summary.summary(rows, collected.bounds)
     write_rows(folder / ROWS, rows)
     write_rows(folder / SUMMARY, lines)
-    report.report(folder / PAGE, report.Study(
-        rows, collected.bounds, collected.pictures(), given.runs, wall))
+    report.report(folder / PAGE, report.Study(rows, collected.bounds, collected.pictures(), given.runs, wall))
     print('\n'.join(describe(lines)))
     print(f"{len(collected.runs)} runs in {wall:.1f} s; wrote '{folder / PAGE}', {ROWS} and {SUMMARY}")
     return console.SUCCESS

@@ -46,8 +46,7 @@ def _parser() -> console.Parser:
     add('--duration', metavar='SECONDS', type=console.seconds, default=6.0, help='default: 6')
     add('--seed', metavar='N', type=int, help='seed of the noise (parameter seed)')
     add('--payload', metavar='KG', type=float, help='mass of the object (parameter payload_mass)')
-    add('--capture-time', metavar='SECONDS', type=console.seconds, default=3.0,
-        help='default: 3; negative: never')
+    add('--capture-time', metavar='SECONDS', type=console.seconds, default=3.0, help='default: 3; negative: never')
     add('--release-time', metavar='SECONDS', type=console.seconds, default=-1.0, help='default: never')
     add('--expected', action='store_true',
         help='say how accurate a payload estimate from this torque can be (takes some seconds)')
@@ -99,8 +98,7 @@ def _main(given: argparse.Namespace) -> int:
         raise BagError(f"'{target}' exists already", 'remove it or give another name')
     check_place(truth_path)
     trajectory = simulator.simulate(plant, excitation.sequence(torque, count), events, START_NS)
-    with (console.progress('simulating', 'samples') as progress,
-          BagWriter(target, flush_period=None) as writer):
+    with (console.progress('simulating', 'samples') as progress, BagWriter(target, flush_period=None) as writer):
         for k, item in enumerate(simulator.records(trajectory, events)):
             topic = '/joint_states' if isinstance(item, JointRecord) else '/capture_event'
             writer.write(topic, item.stamp_ns, item, latched=isinstance(item, CaptureEvent))
@@ -115,8 +113,7 @@ def _main(given: argparse.Namespace) -> int:
     return console.SUCCESS
 
 
-def truth(plant: PlantParameters, torque: ExcitationParameters, events: Sequence[CaptureEvent]
-          ) -> dict[str, Any]:
+def truth(plant: PlantParameters, torque: ExcitationParameters, events: Sequence[CaptureEvent]) -> dict[str, Any]:
     """Return what an estimator of this run should find."""
     from flexmanip_ros.studies.trial import true_frequencies
     from flexmanip_ros.types import EventKind

@@ -115,8 +115,7 @@ def true_payload(path: Path) -> float | None:
 def recordings(folder: Path) -> list[Path]:
     """Return every recording at or below a folder, in order."""
     found = {path.parent for path in folder.rglob('metadata.yaml')}
-    loose = {path for suffix in ('*.mcap', '*.db3') for path in folder.rglob(suffix)
-             if path.parent not in found}
+    loose = {path for suffix in ('*.mcap', '*.db3') for path in folder.rglob(suffix) if path.parent not in found}
     return sorted(found | loose)
 
 
@@ -164,8 +163,7 @@ def serial(work: Work, tasks: Iterable[Task]) -> Iterator[Outcome]:
 def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome]:
     """Compute in ``count`` processes of this machine. Outcomes come as they are ready.
 
-    tasks may be a ``Feed``. A worker that dies (killed, out of memory) costs at most the run that
-    killed it.
+    tasks may be a ``Feed``. A worker that dies (killed, out of memory) costs at most the run that killed it.
     """
     for name in THREADS:
         os.environ.setdefault(name, '1')  # one run a core; more threads would only get in each other's way

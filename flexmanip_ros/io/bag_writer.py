@@ -169,8 +169,7 @@ class _Conversion:
             com = self._new('geometry_msgs/msg/Vector3', *(float(part) for part in value.com))
             inner = self._new('geometry_msgs/msg/Inertia', float(value.mass), com,
                               *(float(part) for part in value.inertia))
-            return self._new('geometry_msgs/msg/InertiaStamped',
-                             self._header(value.stamp_ns, value.frame_id), inner)
+            return self._new('geometry_msgs/msg/InertiaStamped', self._header(value.stamp_ns, value.frame_id), inner)
         if isinstance(value, Diagnostics):
             return self._diagnostics(value)
         return self._new('std_msgs/msg/Float64', float(value))

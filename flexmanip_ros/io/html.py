@@ -36,8 +36,7 @@ class Section(NamedTuple):
 def page(title: str, lead: str, sections: Sequence[Section]) -> str:
     """Return a whole page with a contents list. ``title`` and ``lead`` are plain text."""
     links = ''.join(f'<a href="#s{k}">{escape(section.title)}</a>' for k, section in enumerate(sections))
-    parts = ''.join(f'<h2 id="s{k}">{escape(section.title)}</h2>{section.body}'
-                    for k, section in enumerate(sections))
+    parts = ''.join(f'<h2 id="s{k}">{escape(section.title)}</h2>{section.body}' for k, section in enumerate(sections))
     return (f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
             f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head><body>'
             f'<h1>{escape(title)}</h1><p class="note">{escape(lead)}</p><nav>{links}</nav>{parts}'

@@ -46,8 +46,7 @@ class Journal:
         try:
             self._file = self.journal.open('a', encoding='utf-8')
         except OSError as err:
-            raise OutputError(f"'{self.journal}' cannot be written: {err.strerror}",
-                              'give another place') from err
+            raise OutputError(f"'{self.journal}' cannot be written: {err.strerror}", 'give another place') from err
         try:
             self._lock()
             if is_new or not self._resume(head):
@@ -70,8 +69,7 @@ class Journal:
         content = self.journal.read_bytes()
         whole = content[:content.rfind(b'\n') + 1]
         if not whole and not f'{head}\n'.encode().startswith(content):
-            raise OutputError(f"'{self.journal}' is no journal of a study",
-                              'remove it, or give another --output')
+            raise OutputError(f"'{self.journal}' is no journal of a study", 'remove it, or give another --output')
         lines = whole.decode('utf-8', errors='replace').splitlines()
         if lines and lines[0] != head:
             raise OutputError(f"'{self.journal}' belongs to another study",

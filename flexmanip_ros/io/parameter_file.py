@@ -80,8 +80,7 @@ def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, An
         return {}
     sections = dict(_sections(document, '', where))
     if not sections:
-        raise ParameterError(f"{where} has no 'ros__parameters'",
-                             f"write '{node}: {{ros__parameters: {{...}}}}'")
+        raise ParameterError(f"{where} has no 'ros__parameters'", f"write '{node}: {{ros__parameters: {{...}}}}'")
     chosen = [name for name in sections if _applies(name, node)]
     if not chosen and not optional:
         near = difflib.get_close_matches(node, [name.rpartition('/')[2] for name in sections], n=1)
@@ -97,8 +96,7 @@ def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, An
 
 def _sections(tree: Any, prefix: str, where: str) -> Iterable[tuple[str, Any]]:
     if not isinstance(tree, Mapping):
-        raise ParameterError(f'{where} has {tree!r:.60} in place of a node',
-                             "write 'NODE: {ros__parameters: {...}}'")
+        raise ParameterError(f'{where} has {tree!r:.60} in place of a node', "write 'NODE: {ros__parameters: {...}}'")
     for key, value in tree.items():
         name = f'{prefix}/{key}'.replace('//', '/') if prefix else str(key)
         if isinstance(value, Mapping) and 'ros__parameters' in value:

@@ -132,8 +132,7 @@ def times(estimates: Sequence[Estimate], start_ns: int) -> Array:
     return np.array([(estimate.stamp_ns - start_ns) * 1e-9 for estimate in estimates], dtype=np.float64)
 
 
-def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int,
-                truth: Sequence[Known] = ()) -> None:
+def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int, truth: Sequence[Known] = ()) -> None:
     """Draw the identified frequencies with their 95 % bands."""
     time = times(estimates, start_ns)
     count = max((len(estimate.modes) for estimate in estimates), default=0)

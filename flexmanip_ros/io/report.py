@@ -44,8 +44,7 @@ def identification_report(
     if scores is not None:
         note = '' if not scores.until_gap else '<p class="note">Scored up to the first gap.</p>'
         drawn = plots.validation_figure(scores, made.signals.outputs, has_arm=made.has_arm)
-        sections.append(Section(
-            'Validation', note + picture(drawn, 'measured, simulated and predicted outputs')))
+        sections.append(Section('Validation', note + picture(drawn, 'measured, simulated and predicted outputs')))
     if model is not None:
         sections.append(Section('Model', _model(model, made.signals.inputs, made.signals.outputs)))
     counts = [(name.replace('_', ' '), count) for name, count in messages.items()]

@@ -72,8 +72,7 @@ def _mcap(file: BinaryIO) -> Iterator[Raw]:
         elif opcode == SCHEMA:
             schemas[U16.unpack_from(content)[0]] = _text(content, 2)
         elif opcode == CHANNEL:
-            channels[U16.unpack_from(content)[0]] = (
-                _text(content, 4), schemas.get(U16.unpack_from(content, 2)[0], ''))
+            channels[U16.unpack_from(content)[0]] = (_text(content, 4), schemas.get(U16.unpack_from(content, 2)[0], ''))
         elif opcode == DATA_END:
             return
     raise DamagedError('its end is missing')

@@ -88,8 +88,7 @@ def _rows(case: Case, seed: int, found: dict[str, Reading], failed: dict[str, st
     rows: list[trial.Row] = []
     tracks: dict[str, Track] = {}
     for method in experiments.METHODS:
-        row: trial.Row = {'case': case.name, 'method': method.name, 'seed': seed,
-                          'error': failed.get(method.name, '')}
+        row: trial.Row = {'case': case.name, 'method': method.name, 'seed': seed, 'error': failed.get(method.name, '')}
         if method.name in found:
             reading = found[method.name]
             tracks[method.name] = follow(reading.estimates)
@@ -118,8 +117,7 @@ def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[
             started = time.perf_counter()
             read = now
             if method in configs:
-                read = (_with_block(configs[method], case, state, now) if held
-                        else now._replace(payload=None))
+                read = (_with_block(configs[method], case, state, now) if held else now._replace(payload=None))
             found[method].estimates.append(read)
             walls[method] += time.perf_counter() - started
     shared = time.perf_counter() - begun - sum(walls.values())
@@ -221,8 +219,7 @@ def follow(estimates: Sequence[Estimate]) -> Track:
         frequencies[k, :len(found)] = found
     start = estimates[0].stamp_ns if estimates else 0
     stamps = np.array([(estimate.stamp_ns - start) / 1e9 for estimate in estimates], dtype=np.float64)
-    return Track(stamps, table[:, 0], table[:, 1], table[:, 2], frequencies,
-                 estimates[-1].model if estimates else None)
+    return Track(stamps, table[:, 0], table[:, 1], table[:, 2], frequencies, estimates[-1].model if estimates else None)
 
 
 def bounds(case: Case) -> dict[str, float]:

@@ -40,8 +40,7 @@ LEAST_KG = 1e-5
 """Bottom of the logarithmic axes over the payload."""
 RATE = 1000.0
 DURATION = 3.0
-TEST_INPUT = {
-    'shape': 'multisine', 'band': [0.5, 10.0], 'repeat_time': 3.0, 'amplitude': [10.0, 5.0], 'seed': 4}
+TEST_INPUT = {'shape': 'multisine', 'band': [0.5, 10.0], 'repeat_time': 3.0, 'amplitude': [10.0, 5.0], 'seed': 4}
 """A signal the model was not identified on."""
 
 
@@ -119,8 +118,7 @@ def finite_element(run: Trajectory) -> Figure:
     for row, (values, what, unit) in enumerate(zip(
             mid_span(run), ('displacement', 'velocity'), ('mm', 'mm/s'), strict=True)):
         for k, axis in enumerate('XY'):
-            plots.lines(axes[2 * row + k], _time(run), 1e3 * values[k], ['link 1', 'link 2'],
-                        f'{axis} {what}', unit)
+            plots.lines(axes[2 * row + k], _time(run), 1e3 * values[k], ['link 1', 'link 2'], f'{axis} {what}', unit)
         top = 1.1e3 * float(np.abs(values).max())
         for ax in axes[2 * row:2 * row + 2]:
             ax.set_ylim(-top, top)
@@ -188,8 +186,7 @@ def frequency_tracks(tracks: Tracks, before: Sequence[float], after: Sequence[fl
                 axes[2].semilogy(time, off, linewidth=1.4, label=f'{method}, frequency {k + 1}', **style)
             for begin, end, values in ((0.0, experiments.CAPTURE_TIME, before),
                                        (experiments.CAPTURE_TIME, experiments.WINDOW[1], after)):
-                ax.plot([begin, end], [values[k]] * 2, **TRUE,
-                        label='true' if k == 0 and begin == 0.0 else None)
+                ax.plot([begin, end], [values[k]] * 2, **TRUE, label='true' if k == 0 and begin == 0.0 else None)
         low, high = min(*before, *after), max(*before, *after)
         ax.set_ylim(low - 0.7 * (high - low), high + 0.7 * (high - low))
         ax.set_ylabel(f'frequency [Hz],\n{method}')

@@ -136,8 +136,7 @@ def _worst(found: Array, true: Array) -> str:
 def _frequency_figure(case: experiments.Case, numbers: str, tracks: Mapping[str, figures.Tracks],
                  rows: Sequence[trial.Row]) -> Planned:
     before, after = (case_run.true_frequencies(case, mass) for mass in (0.0, case.payload))
-    said = [f'{line[1]}: {plain(line[2])} and {plain(line[3])} %'
-            for line in summary.frequency_lines(rows, (case,))]
+    said = [f'{line[1]}: {plain(line[2])} and {plain(line[3])} %' for line in summary.frequency_lines(rows, (case,))]
     return Planned(numbers, f'frequencies, {case.title}', 'the frequencies drop at the capture and are '
                    'tracked.', f'mean error of the two, 4 to 6 s: {"; ".join(said)}.{RUNS}',
                    figures.frequency_tracks, (tracks[case.name], before, after))

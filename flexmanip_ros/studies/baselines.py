@@ -27,8 +27,7 @@ BASELINES: Mapping[str, Baseline] = {
 }
 
 
-def samples(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]
-            ) -> list[Sample | CaptureEvent]:
+def samples(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]) -> list[Sample | CaptureEvent]:
     """Return messages as samples, each event before the first sample at or after its stamp."""
     clock, log = sampling.Clock(), sampling.EMPTY
     events: list[CaptureEvent] = []
@@ -47,8 +46,7 @@ def samples(config: IdentifierParameters, items: Iterable[JointRecord | CaptureE
     return found
 
 
-def run(name: str, config: IdentifierParameters, sampled: Iterable[Sample | CaptureEvent]
-        ) -> Iterator[Estimate]:
+def run(name: str, config: IdentifierParameters, sampled: Iterable[Sample | CaptureEvent]) -> Iterator[Estimate]:
     """Yield estimates with a payload and no model: at each publishing instant and at the last sample."""
     baseline = BASELINES[name]
     state = baseline.init(config)

@@ -131,8 +131,7 @@ def payload_bound(config: IdentifierParameters, signals: Signals, capture_time: 
     later = chords(config.arm, signals.angles[first + RATE_WINDOW - 1])
     rates = (later - theta) / ((RATE_WINDOW - 1) * dt)
     try:
-        found = float(cramer_rao.nonlinear(
-            config, theta, mass, signals.u[first:], noise, dt, (count,), rates)[0])
+        found = float(cramer_rao.nonlinear(config, theta, mass, signals.u[first:], noise, dt, (count,), rates)[0])
     except ModelError:
         return None
     return found if np.isfinite(found) else None

@@ -69,8 +69,7 @@ class Summary:
 
 def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -> Summary:
     """Return the numbers of the last estimate of a run. ``estimate`` is None when there never was one."""
-    modes = () if estimate is None else tuple(
-        mode for mode in estimate.modes if math.isfinite(mode.frequency_hz))
+    modes = () if estimate is None else tuple(mode for mode in estimate.modes if math.isfinite(mode.frequency_hz))
     payload = None if estimate is None else estimate.payload
     return Summary(
         samples=state.counters.accepted,

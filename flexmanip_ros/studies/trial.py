@@ -37,8 +37,7 @@ def trial(scenario: Scenario, seed: int) -> list[Row]:
             run = scenario.configuration(seed, name)
             row.update(drawn_columns(run.drawn))
             items = messages(scenario, run, seed)
-            row.update(measure(run.identifier, items, run.plant.payload_mass, scenario.window,
-                               bound=scenario.bound))
+            row.update(measure(run.identifier, items, run.plant.payload_mass, scenario.window, bound=scenario.bound))
             row.update(frequency_columns(run, row))
         except Exception as error:  # a defect in one estimator must not end a study of thousands
             row['error'] = describe(error)
@@ -89,8 +88,7 @@ def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_k
     for kind in ('frequencies_hz', 'damping_ratios'):
         for k, value in enumerate(row.pop(kind)):
             row[f'{kind.split("_")[0]}_{k + 1}'] = value
-    row.update(payload_lower_kg=low, payload_upper_kg=high,
-               us_per_sample=1e6 * wall / max(state.counters.accepted, 1))
+    row.update(payload_lower_kg=low, payload_upper_kg=high, us_per_sample=1e6 * wall / max(state.counters.accepted, 1))
     held = row['capture_time_s'] is not None and (
         row['release_time_s'] is None or row['release_time_s'] < row['capture_time_s'])
     true = None if true_kg is None else (true_kg if held else 0.0)
