@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from flexmanip_ros import pipeline
 from flexmanip_ros.cli.console import require_matplotlib
 from flexmanip_ros.errors import BagError, FlexmanipError, ParameterError
 from flexmanip_ros.io import bag
-from flexmanip_ros.io.outputs import Outputs, TableOutput, check_place, open_output
+from flexmanip_ros.io.outputs import TableOutput, check_place, open_output
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
@@ -74,20 +74,18 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
     feed = _Feed(request, progress)
     kept: list[Estimate] = []
     state = pipeline.init()
-    with ExitStack() as stack:
-        frame = request.config.payload_frame
-        outputs = [] if request.output is None else [open_output(request.output, frame)]
-        sink = stack.enter_context(Outputs(*outputs))
+    output = None if request.output is None else open_output(request.output, request.config.payload_frame)
+    with output or nullcontext():
         for now, estimate in pipeline.replay(request.config, feed):
             state = now
             if estimate is None:
                 continue
-            sink.write(estimate)
+            if output is not None:
+                output.write(estimate)
             if request.report is not None:
                 kept.append(estimate)
-        for output in outputs:
-            if isinstance(output, TableOutput):
-                output.start_ns = feed.first_ns
+        if isinstance(output, TableOutput):
+            output.start_ns = feed.first_ns
     if feed.fault is not None and state.counters.accepted == 0:
         raise feed.fault
     last = pipeline.current(state)

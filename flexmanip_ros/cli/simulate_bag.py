@@ -78,7 +78,7 @@ def configurations(given: argparse.Namespace) -> tuple[PlantParameters, Excitati
 
 def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.io.bag_writer import BagWriter
-    from flexmanip_ros.io.outputs import check_place, write_file
+    from flexmanip_ros.io.outputs import check_place, write_text
     from flexmanip_ros.simulation import excitation, excitation_design, simulator
     from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
@@ -104,9 +104,7 @@ def _main(given: argparse.Namespace) -> int:
             writer.write(topic, item.stamp_ns, item, latched=isinstance(item, CaptureEvent))
             if k % 1000 == 0:
                 progress(k, count)
-    known = truth(plant, torque, events)
-    text = json.dumps(known, indent=1) + '\n'
-    write_file(truth_path, lambda file: file.write(text.encode('utf-8')))
+    write_text(truth_path, json.dumps(truth(plant, torque, events), indent=1) + '\n')
     if given.expected:
         print(excitation_design.describe(torque))
     print(f"wrote '{target}' ({count} samples, {given.duration:g} s) and '{truth_path}'")

@@ -6,13 +6,11 @@ import base64
 import io
 from collections.abc import Iterable, Sequence
 from html import escape
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from flexmanip_ros.io.outputs import write_file
 from flexmanip_ros.types import Array
 
 STYLE = """
@@ -94,8 +92,3 @@ def matrix(name: str, values: Array, rows: Sequence[str] = (), columns: Sequence
     header = ['', *(columns or [f'x{k + 1}' for k in range(values.shape[1])])]
     labels = rows or [f'x{k + 1}' for k in range(values.shape[0])]
     return table(header, [[label, *row] for label, row in zip(labels, values.tolist(), strict=True)], name)
-
-
-def write(path: str | Path, text: str) -> None:
-    """Write a page, whole or not at all."""
-    write_file(path, lambda file: file.write(text.encode('utf-8')))

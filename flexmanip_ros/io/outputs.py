@@ -10,10 +10,11 @@ import csv
 import io
 import os
 import stat
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -61,6 +62,11 @@ def check_place(path: str | Path) -> None:
         raise OutputError(f"directory '{folder}' cannot be written", 'give another place')
 
 
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file as UTF-8, whole or not at all."""
+    write_file(path, lambda file: file.write(text.encode('utf-8')))
+
+
 def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write rows of named values as .csv; a value that is None or not there is an empty cell."""
     text = io.StringIO()
@@ -68,7 +74,7 @@ def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
                             lineterminator='\n')
     writer.writeheader()
     writer.writerows({name: '' if value is None else value for name, value in row.items()} for row in rows)
-    write_file(path, lambda file: file.write(text.getvalue().encode('utf-8')))
+    write_text(path, text.getvalue())
 
 
 def columns(estimates: Sequence[Estimate], start_ns: int | None = None) -> dict[str, Any]:
@@ -125,16 +131,11 @@ def write_csv(path: str | Path, estimates: Sequence[Estimate], start_ns: int | N
     for name, values in columns(estimates, start_ns).items():
         if values.ndim == 2:
             stem, _, unit = name.partition('_')
-            for k in range(values.shape[1]):
-                flat[f'{stem}{k + 1}_{unit}'] = values[:, k]
+            flat |= {f'{stem}{k + 1}_{unit}': values[:, k] for k in range(values.shape[1])}
         else:
             flat[name] = values
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator='\n')
-    writer.writerow(flat)
-    for row in range(len(estimates)):
-        writer.writerow([_cell(values[row]) for values in flat.values()])
-    write_file(path, lambda file: file.write(text.getvalue().encode('utf-8')))
+    lines = [[_cell(values[row]) for values in flat.values()] for row in range(len(estimates))]
+    write_text(path, ''.join(','.join(line) + '\n' for line in [list(flat), *lines]))
 
 
 def write_npz(path: str | Path, estimates: Sequence[Estimate], start_ns: int | None = None) -> None:
@@ -149,27 +150,44 @@ def _cell(value: Any) -> str:
     return '' if np.isnan(value) else repr(float(value))
 
 
-class Output(Protocol):
-    """Takes estimates one by one; ``close`` makes them permanent, after an exception too."""
+class Output(ABC):
+    """Takes estimates one by one. Leaving its ``with`` finishes it, after an exception too if it holds any."""
 
+    def __init__(self) -> None:
+        self.is_empty = True
+
+    @abstractmethod
     def write(self, estimate: Estimate) -> None:
         """Take one estimate."""
+        self.is_empty = False
 
+    @abstractmethod
     def close(self) -> None:
         """Finish."""
 
+    def __enter__(self) -> Output:
+        return self
 
-class TableOutput:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        if kind is None or not self.is_empty:
+            self.close()
+
+
+class TableOutput(Output):
     """A .csv or .npz file, written when closed."""
 
     def __init__(self, path: Path) -> None:
+        super().__init__()
         check_place(path)
         self.path = path
         self.estimates: list[Estimate] = []
         self.start_ns: int | None = None
+        """Stamp at which the time of the table is 0; None: the first estimate."""
 
     def write(self, estimate: Estimate) -> None:
         """Keep one row."""
+        super().write(estimate)
         self.estimates.append(estimate)
 
     def close(self) -> None:
@@ -178,24 +196,24 @@ class TableOutput:
         writer(self.path, self.estimates, self.start_ns)
 
 
-class BagOutput:
-    """A recording with the identifier's topics, stamped as the input; made with the first estimate."""
+class BagOutput(Output):
+    """A recording with the identifier's topics, stamped as the input. It is made with the first estimate."""
 
-    def __init__(self, path: Path, frame_id: str, node: str = NODE) -> None:
-        if os.path.exists(path):  # a name too long is for check_place to say
+    def __init__(self, path: Path, frame_id: str) -> None:
+        super().__init__()
+        if os.path.exists(path):  # check_place names what is wrong with a name that is too long
             raise BagError(f"'{path}' exists already", 'remove it or give another name')
         check_place(path)
         self._path = path
         self._frame_id = frame_id
-        self._node = node
         self._writer: BagWriter | None = None
 
     def write(self, estimate: Estimate) -> None:
-        """Append what the node would have published."""
-        writer = self._opened()
+        """Append the messages that the node would have published."""
+        super().write(estimate)
         for name, value in outgoing(estimate, self._frame_id):
             latched = name not in (MODES, PAYLOAD_MASS)
-            writer.write(f'/{self._node}/{name}', estimate.stamp_ns, value, latched=latched)
+            self._opened().write(f'/{NODE}/{name}', estimate.stamp_ns, value, latched=latched)
 
     def close(self) -> None:
         """Finish the recording."""
@@ -207,30 +225,7 @@ class BagOutput:
         return self._writer
 
 
-class Outputs:
-    """Several outputs as one; closes all of them, whatever happens. Nothing is left of a run of nothing."""
-
-    def __init__(self, *outputs: Output) -> None:
-        self._outputs = outputs
-        self._written = False
-
-    def write(self, estimate: Estimate) -> None:
-        """Hand one estimate to each."""
-        self._written = True
-        for output in self._outputs:
-            output.write(estimate)
-
-    def __enter__(self) -> Outputs:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
-        if kind is None or self._written:
-            for output in self._outputs:
-                output.close()
-
-
 def open_output(path: str | Path, frame_id: str) -> Output:
-    """Return the output a name asks for: .csv or .npz a table, anything else a recording."""
+    """Return the output for a name: a table where it ends in .csv or .npz, else a recording."""
     path = Path(path)
     return TableOutput(path) if path.suffix in ('.csv', '.npz') else BagOutput(path, frame_id)

@@ -12,7 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from flexmanip_ros.io import plots
-from flexmanip_ros.io.html import Section, matrix, number, page, picture, table, write
+from flexmanip_ros.io.html import Section, matrix, number, page, picture, table
+from flexmanip_ros.io.outputs import write_text
 from flexmanip_ros.parameters import IdentifierParameters, flatten
 from flexmanip_ros.parameters.document import written
 from flexmanip_ros.parameters.field import leaves
@@ -51,7 +52,7 @@ def identification_report(
     sections += [Section('Parameters', _parameters(config)),
                  Section('Messages', table(['what became of the messages', 'count'], counts))]
     lead = f'{summary.samples} samples, {made.end:.3f} s, identified in {summary.wall_s:.2f} s'
-    write(path, page(f'Identification of {source}', lead, sections))
+    write_text(path, page(f'Identification of {source}', lead, sections))
 
 
 def _result(summary: Summary, outputs: Sequence[str], bound: float | None, fault: str) -> str:
@@ -125,7 +126,7 @@ def study_report(path: str | Path, name: str, rows: Sequence[Row]) -> None:
         columns = ('run', 'estimator', 'error')
         shown = table(columns, [[str(row.get(k, '')) for k in columns] for row in failed[:SHOWN_FAILURES]])
         sections.append(Section(f'Failed: {len(failed)}', shown))
-    write(path, page(f'Study: {name}', f'{len(rows)} rows', sections))
+    write_text(path, page(f'Study: {name}', f'{len(rows)} rows', sections))
 
 
 def errors(rows: Sequence[Row]) -> Figure | None:

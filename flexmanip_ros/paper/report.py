@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from flexmanip_ros.io.html import Section, image, number, page, plain, png, table, write
+from flexmanip_ros.io.html import Section, image, number, page, plain, png, table
+from flexmanip_ros.io.outputs import write_text
 from flexmanip_ros.paper import case_run, experiments, figures, summary
 from flexmanip_ros.parameters import leaves
 from flexmanip_ros.simulation import excitation, simulator
@@ -225,7 +226,7 @@ def report(path: str | Path, done: Study) -> None:
     lead = (f'{done.runs} runs a case, {len(done.rows)} rows, computed in {done.wall_s:.0f} s. Mean relative '
             f'error over {experiments.WINDOW[0]:g} to {experiments.WINDOW[1]:g} s; '
             'the interval is judged at the end.')
-    write(path, page("The paper's section 4, its method and ours", lead, sections))
+    write_text(path, page("The paper's section 4, its method and ours", lead, sections))
 
 
 def _result(done: Study) -> str:
