@@ -30,18 +30,13 @@ LINES: tuple[Any, ...] = ('-', (0, (4, 1.2)), (0, (1.2, 1)), (0, (6, 1.2, 1.2, 1
 PAYLOAD_COLOUR = '#009E73'
 TRUTH_COLOUR = '#000000'
 EVENT_COLOUR = '#AA0000'
-STATUS_COLOURS = {
-    Status.WARMING_UP: '#C8C8C8', Status.TRACKING: '#009E73', Status.POORLY_EXCITED: '#E69F00',
-    Status.ILL_CONDITIONED: '#CC79A7', Status.SAMPLE_GAP: '#56B4E9', Status.INCONSISTENT: '#D55E00',
-    Status.NO_PAYLOAD_METHOD: '#56B4E9', Status.UNOBSERVABLE: '#7F7F7F', Status.DIVERGED: '#000000',
-    Status.ORDER_TOO_LOW: '#F0E442',
+STATUS_LOOKS: dict[Status, tuple[str, str]] = {
+    Status.WARMING_UP: ('#C8C8C8', '..'), Status.TRACKING: ('#009E73', ''), Status.POORLY_EXCITED: ('#E69F00', '//'),
+    Status.ILL_CONDITIONED: ('#CC79A7', 'xx'), Status.SAMPLE_GAP: ('#56B4E9', '||'),
+    Status.INCONSISTENT: ('#D55E00', '\\\\'), Status.NO_PAYLOAD_METHOD: ('#56B4E9', '--'),
+    Status.UNOBSERVABLE: ('#7F7F7F', '++'), Status.DIVERGED: ('#000000', 'OO'), Status.ORDER_TOO_LOW: ('#F0E442', '**'),
 }
-STATUS_HATCHES = {
-    Status.TRACKING: '', Status.WARMING_UP: '..', Status.POORLY_EXCITED: '//', Status.ILL_CONDITIONED: 'xx',
-    Status.SAMPLE_GAP: '||', Status.INCONSISTENT: '\\\\', Status.NO_PAYLOAD_METHOD: '--',
-    Status.UNOBSERVABLE: '++', Status.DIVERGED: 'OO', Status.ORDER_TOO_LOW: '**',
-}
-"""A status differs by more than its colour."""
+"""Colour and hatch of each status, which so differs by more than its colour."""
 WIDTH = 10.0
 """Inches; about the width of a page."""
 DPI = 120
@@ -56,37 +51,21 @@ Known = tuple[float, float, Sequence[float]]
 """From and to [s], and the frequencies [Hz] that are true between."""
 
 
-def figure(rows: int, heights: Sequence[float], *, share_time: bool = True) -> tuple[Figure, list[Any]]:
-    """Return a figure of the page's width and its axes, one below the other with one time axis."""
+def figure(heights: Sequence[float], *, columns: int = 1, share_time: bool = True) -> tuple[Figure, list[Any]]:
+    """Return a figure of the page's width and its axes, row by row. heights: of the rows [inches].
+
+    share_time: the axes have one time axis, labelled at the bottom.
+    """
     made = Figure(figsize=(WIDTH, float(sum(heights)) + 0.6), dpi=DPI, layout='constrained')
     FigureCanvasAgg(made)
-    axes = made.subplots(rows, 1, sharex=share_time, squeeze=False, height_ratios=list(heights))[:, 0]
-    _plain(axes)
-    if share_time:
-        axes[-1].set_xlabel('time since the first sample [s]')
-    return made, list(axes)
-
-
-def row(columns: int, height: float) -> tuple[Figure, list[Any]]:
-    """Return a figure of the page's width and its axes side by side."""
-    made = Figure(figsize=(WIDTH, height + 0.6), dpi=DPI, layout='constrained')
-    FigureCanvasAgg(made)
-    axes = made.subplots(1, columns, squeeze=False)[0]
-    _plain(axes)
-    return made, list(axes)
-
-
-def _plain(axes: Iterable[Any]) -> None:
+    axes = made.subplots(len(heights), columns, sharex=share_time, squeeze=False, height_ratios=list(heights)).ravel()
     for ax in axes:
         ax.grid(True, color='#E4E4E4', linewidth=0.7)
         ax.set_axisbelow(True)
-        for side in ('top', 'right'):
-            ax.spines[side].set_visible(False)
-
-
-def save(made: Figure, path: str | Path) -> None:
-    """Write a figure as PNG."""
-    made.savefig(str(path), format='png')
+        ax.spines[['top', 'right']].set_visible(False)
+    if share_time:
+        axes[-1].set_xlabel('time since the first sample [s]')
+    return made, list(axes)
 
 
 def envelope(time: Array, values: Array) -> tuple[Array, Array]:
@@ -248,8 +227,8 @@ def statuses(ax: Any, estimates: Sequence[Estimate], start_ns: int) -> None:
 
 
 def _status_look(status: Status) -> dict[str, Any]:
-    return {'facecolor': STATUS_COLOURS[status], 'hatch': STATUS_HATCHES[status], 'edgecolor': '#FFFFFF',
-            'linewidth': 0}
+    colour, hatch = STATUS_LOOKS[status]
+    return {'facecolor': colour, 'hatch': hatch, 'edgecolor': '#FFFFFF', 'linewidth': 0}
 
 
 @dataclass(frozen=True)
@@ -311,14 +290,14 @@ def overview_figure(made: Run, path: str | Path, title: str = '') -> None:
     groups = signal_groups(made)
     with_payload = any(estimate.payload is not None for estimate in made.estimates)
     heights = [1.5] * len(groups) + [2.2] + [2.2] * with_payload + [0.35]
-    drawn, axes = figure(len(heights), heights)
+    drawn, axes = figure(heights)
     for ax, group in zip(axes, groups, strict=False):
         lines(ax, made.signals.time, *group)
     _estimates(axes[len(groups):], made, with_payload)
     events(axes, made.events)
     if title:
         drawn.suptitle(title, x=0.02, ha='left', fontsize=13, fontweight='bold')
-    save(drawn, path)
+    drawn.savefig(str(path), format='png')
 
 
 def _estimates(axes: Sequence[Any], made: Run, with_payload: bool) -> None:
@@ -347,7 +326,7 @@ def _stretches(made: Run) -> tuple[list[Known], list[tuple[float, float, float]]
 def signals_figure(made: Run) -> Figure:
     """Draw inputs and outputs over time."""
     groups = signal_groups(made)
-    drawn, axes = figure(len(groups), [1.7] * len(groups))
+    drawn, axes = figure([1.7] * len(groups))
     for ax, group in zip(axes, groups, strict=True):
         lines(ax, made.signals.time, *group)
     axes[-1].set_xlim(0.0, made.end or 1.0)
@@ -357,7 +336,7 @@ def signals_figure(made: Run) -> Figure:
 
 def frequency_figure(made: Run) -> Figure:
     """Draw the frequencies with their bands, and the status."""
-    drawn, axes = figure(2, [3.2, 0.35])
+    drawn, axes = figure([3.2, 0.35])
     _estimates(axes, made, with_payload=False)
     events(axes, made.events)
     return drawn
@@ -365,7 +344,7 @@ def frequency_figure(made: Run) -> Figure:
 
 def payload_figure(made: Run) -> Figure:
     """Draw the payload with its interval, whole and close up; the consistency of the residuals below."""
-    drawn, axes = figure(3, [2.0, 2.4, 1.3])
+    drawn, axes = figure([2.0, 2.4, 1.3])
     payload(axes[0], made.estimates, made.start_ns, _stretches(made)[1])
     payload(axes[1], made.estimates, made.start_ns, _stretches(made)[1], zoom=True)
     rows = [estimate for estimate in made.estimates if estimate.payload is not None]
@@ -383,7 +362,7 @@ def payload_figure(made: Run) -> Figure:
 
 def validation_figure(scores: Scores, outputs: Sequence[str], *, has_arm: bool) -> Figure:
     """Draw what was measured after the identification, and what the model said."""
-    drawn, axes = figure(len(outputs), [1.7] * len(outputs))
+    drawn, axes = figure([1.7] * len(outputs))
     for k, (ax, name) in enumerate(zip(axes, outputs, strict=True)):
         joint, _, field = name.rpartition('/')
         _, unit, scale = _quantity(joint, field, has_arm)

@@ -140,7 +140,7 @@ def errors(rows: Sequence[Row]) -> Figure | None:
     true, mass, low, high = values.T
     relative = [100.0 * (part - true) / true for part in (mass, low, high)]
     held = np.array([bool(row['covered']) for row in good])
-    drawn, axes = plots.figure(1, [3.4], share_time=False)
+    drawn, axes = plots.figure([3.4], share_time=False)
     for chosen, colour, mark, label in ((held, plots.PAYLOAD_COLOUR, 'o', 'truth inside\nthe 95 % interval'),
                                         (~held, plots.EVENT_COLOUR, 'x', 'truth outside')):
         if chosen.any():

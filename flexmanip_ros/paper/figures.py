@@ -89,7 +89,7 @@ def _response(case: experiments.Case, model: StateSpace, payload: float) -> Resp
 
 def torques(run: Trajectory) -> Figure:
     """Fig. 2."""
-    drawn, axes = plots.figure(1, [2.2])
+    drawn, axes = plots.figure([2.2])
     plots.lines(axes[0], _time(run), run.effort, ['joint 1', 'joint 2'], 'torque', 'N m')
     plots.events(axes, CAPTURE)
     return drawn
@@ -97,7 +97,7 @@ def torques(run: Trajectory) -> Figure:
 
 def responses(run: Trajectory) -> Figure:
     """Fig. 3: angles from the working point, and bends."""
-    drawn, axes = plots.figure(2, [2.0, 2.0])
+    drawn, axes = plots.figure([2.0, 2.0])
     turned = np.degrees(run.position[:, :2] - run.position[0, :2])
     plots.lines(axes[0], _time(run), turned, ['joint 1', 'joint 2'], 'angle from the\nworking point', 'deg')
     plots.lines(axes[1], _time(run), 1e3 * run.position[:, 2:], ['link 1', 'link 2'], 'bend', 'mm')
@@ -114,7 +114,7 @@ def mid_span(run: Trajectory) -> tuple[Array, Array]:
 
 def finite_element(run: Trajectory) -> Figure:
     """Figs. 17 and 18: displacements and velocities of the links' middles, along X and Y."""
-    drawn, axes = plots.figure(4, [1.5] * 4)
+    drawn, axes = plots.figure([1.5] * 4)
     for row, (values, what, unit) in enumerate(zip(
             mid_span(run), ('displacement', 'velocity'), ('mm', 'mm/s'), strict=True)):
         for k, axis in enumerate('XY'):
@@ -128,7 +128,7 @@ def finite_element(run: Trajectory) -> Figure:
 
 def arms(cases: Sequence[experiments.Case], arm: ArmParameters) -> Figure:
     """Fig. 10: the configurations, to scale."""
-    drawn, columns = plots.row(len(cases), 2.6)
+    drawn, columns = plots.figure([2.6], columns=len(cases), share_time=False)
     reach = 1.08 * sum(arm.link_length)
     for ax, case in zip(columns, cases, strict=True):
         theta = np.radians(case.angles_deg)
@@ -149,7 +149,7 @@ def arms(cases: Sequence[experiments.Case], arm: ArmParameters) -> Figure:
 
 def test_response(true: Response, found: Mapping[str, Response]) -> Figure:
     """Figs. 4, 5, 11 and 12: angles and bends of all models, and how far the identified ones are off."""
-    drawn, axes = plots.figure(4, [1.9, 1.5, 1.9, 1.5])
+    drawn, axes = plots.figure([1.9, 1.5, 1.9, 1.5])
     for row, (name, unit, scale) in enumerate((('angle', 'deg', np.degrees(1.0)), ('bend', 'mm', 1e3))):
         top, below = axes[2 * row], axes[2 * row + 1]
         exact = scale * getattr(true, f'{name}s')
@@ -174,7 +174,7 @@ def test_response(true: Response, found: Mapping[str, Response]) -> Figure:
 
 def frequency_tracks(tracks: Tracks, before: Sequence[float], after: Sequence[float]) -> Figure:
     """Figs. 6 and 13: both frequencies by the paper's settings and ours; below, how far they are off."""
-    drawn, axes = plots.figure(3, [2.0, 2.0, 2.0])
+    drawn, axes = plots.figure([2.0, 2.0, 2.0])
     for ax, method in zip(axes, ('paper', experiments.BEST_MODEL), strict=False):
         for k in range(2):
             if tracks.get(method):
@@ -228,7 +228,7 @@ def quantile(runs: Array, share: float) -> Array:
 
 def payload_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Tracks]) -> Figure:
     """Figs. 7, 14 and 19: median and band of the runs in the paper's window."""
-    drawn, axes = plots.figure(len(cases), [2.2] * len(cases))
+    drawn, axes = plots.figure([2.2] * len(cases))
     for ax, case in zip(axes, cases, strict=True):
         for method, runs in tracks[case.name].items():
             if runs:
@@ -245,7 +245,7 @@ def payload_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Track
 
 def interval_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Tracks]) -> Figure:
     """One run of each case: what two of ours say, with the 95 % interval they claim."""
-    drawn, axes = plots.figure(len(cases), [2.2] * len(cases))
+    drawn, axes = plots.figure([2.2] * len(cases))
     for ax, case in zip(axes, cases, strict=True):
         widest = 0.0
         for method in CLOSE:
@@ -272,7 +272,7 @@ def interval_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Trac
 
 def error_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Tracks]) -> Figure:
     """Figs. 8, 15 and 19: median absolute error and band of the runs since the capture, logarithmic."""
-    drawn, axes = plots.figure(len(cases), [2.4] * len(cases))
+    drawn, axes = plots.figure([2.4] * len(cases))
     for ax, case in zip(axes, cases, strict=True):
         for method, runs in tracks[case.name].items():
             if not runs:
@@ -296,7 +296,7 @@ def error_points(
     cases: Sequence[experiments.Case], errors: Mapping[tuple[str, str], Sequence[float]],
 ) -> Figure:
     """Figs. 9, 16 and 19: mean relative error of each method, and the stretch that holds 95 % of the runs."""
-    drawn, columns = plots.row(len(cases), 3.0)
+    drawn, columns = plots.figure([3.0], columns=len(cases), share_time=False)
     names = [method.name for method in experiments.METHODS]
     for ax, case in zip(columns, cases, strict=True):
         for place, name in enumerate(names):
