@@ -22,23 +22,23 @@ from flexmanip_ros.errors import FlexmanipError
 
 SUCCESS, DEFECT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 LONGEST = 1e9
-"""Seconds; beyond it a stamp in nanoseconds may not be one."""
+"""Largest time that is accepted [s]; larger ones overflow a stamp in nanoseconds."""
 TRACEBACK = 'FLEXMANIP_TRACEBACK'
-"""Environment variable that lets the traceback of a defect through."""
+"""Environment variable; where it is set, a defect prints its traceback."""
 Report = Callable[[int, int | None], None]
-"""Called with what is done and what there is to do (None: unknown)."""
+"""Called with the steps done and the steps in all (None: unknown)."""
 
 
 class Parser(argparse.ArgumentParser):
-    """Arguments with one line for a mistake."""
+    """A parser that answers a mistake with one line."""
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong and where help is; exit 2."""
+        """Print the mistake and where to find help; exit with 2."""
         self.exit(BAD_INPUT, f'{self.prog}: {message}; see {self.prog} --help\n')
 
 
 def seconds(text: str) -> float:
-    """Return a time given as an argument [s]. Raises ArgumentTypeError when it is none."""
+    """Return an argument as a time [s]. Raises ArgumentTypeError."""
     try:
         value = float(text)
     except ValueError:
@@ -49,14 +49,14 @@ def seconds(text: str) -> float:
 
 
 def whole(text: str) -> int:
-    """Return a seed or count given as an argument. Raises ArgumentTypeError when it is none."""
+    """Return an argument as a seed or count. Raises ArgumentTypeError."""
     if not text.strip().isdecimal():
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 up")
     return int(text)
 
 
 def parser(prog: str, words: str, epilog: str) -> Parser:
-    """Return a parser whose examples keep their lines."""
+    """Return a parser. words: its description; epilog: printed as it is, below the arguments."""
     return Parser(prog=prog, description=words, epilog=epilog, allow_abbrev=False,
                   formatter_class=argparse.RawDescriptionHelpFormatter)
 
@@ -90,9 +90,9 @@ def require_matplotlib() -> None:
 
 
 def run(prog: str, body: Callable[[], int]) -> int:
-    """Run a program: our errors become one line and exit 2, an interrupt exit 130."""
+    """Run a program; return its exit status: 2 after an error of this package, 130 after an interrupt."""
     with _signals_as_interrupt(), warnings.catch_warnings():
-        warnings.simplefilter('ignore')  # numbers out of range have a status; stderr is for one line
+        warnings.simplefilter('ignore')  # numbers out of range are told by the status; stderr is for one line
         try:
             return body()
         except FlexmanipError as error:
@@ -102,7 +102,7 @@ def run(prog: str, body: Callable[[], int]) -> int:
             print_error(prog, 'interrupted')
             return INTERRUPTED
         except BrokenPipeError:
-            sys.stderr.close()  # the reader of our output is gone; nothing is left to say
+            sys.stderr.close()  # the reader of the output has ended
             return SUCCESS
         except Exception as error:
             if os.environ.get(TRACEBACK):
@@ -114,7 +114,7 @@ def run(prog: str, body: Callable[[], int]) -> int:
 
 @contextmanager
 def _signals_as_interrupt() -> Iterator[None]:
-    """Let SIGINT and SIGTERM raise, so that what was computed is written in both cases."""
+    """Raise KeyboardInterrupt on SIGINT and on SIGTERM, so that both write the results so far."""
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 

@@ -1,4 +1,4 @@
-"""identify_bag: the identifier over a recording, no ROS running."""
+"""identify_bag: identify model and payload from a recording. ROS need not run."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ EXAMPLES = """examples:
       --set 'outputs=[arm/position]' --set order=4 --validate-from 5
   identify_bag recording --output estimates.csv --json
 
-exit status: 0 on success (a line on stderr says what was left out); 2 on bad input or arguments, with one
-line on stderr. Of a damaged recording everything before the fault is used and written, then the
-fault is reported.
+exit status: 0 on success (stderr then tells in one line which messages were left out); 2 on bad input or
+arguments, with one line on stderr; 130 when interrupted. Of a damaged recording everything before the damage is used
+and written; then the damage is reported with exit status 2.
 
 parameters (in --params under rpbsid_identifier or /**, or with --set):
 """

@@ -1,4 +1,4 @@
-"""monte_carlo: many runs of a scenario, or many recordings; one row a run, resumable."""
+"""monte_carlo: run a scenario with many seeds, or identify many recordings; one row per run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ EXAMPLES = """examples:
   monte_carlo config/scenarios/capture.yaml --runs 100000 --scheduler tcp://head:8786 --output capture.parquet
 
 An interrupted study continues when the same command is given again; more --runs add to what is there.
-A run that fails is a row with its error. NAME.truth.json beside a recording tells the true payload.
+A run that fails gives a row with its error. The true payload of a recording is read from NAME.truth.json beside it.
 exit status: 0 on success, 2 on bad arguments, 130 when interrupted.
 """
 
@@ -72,7 +72,7 @@ def _main(given: argparse.Namespace) -> int:
         done = {row.get(workers.KEY) for row in journal.rows}
         left = [task for task in todo if task.key not in done]
         if done:
-            print(f'continuing: {len(todo) - len(left)} of {len(todo)} runs are there', file=sys.stderr)
+            print(f'continuing: {len(todo) - len(left)} of {len(todo)} runs are done already', file=sys.stderr)
         try:
             with console.progress('running', 'runs') as progress:
                 for count, outcome in enumerate(_compute(given, left), start=1):
@@ -96,10 +96,10 @@ def _main(given: argparse.Namespace) -> int:
 
 
 def _plan(given: argparse.Namespace) -> tuple[Sequence[workers.Task], dict[str, Any]]:
-    """Return the runs asked for, and what identifies the study in its journal."""
+    """Return the tasks that the arguments ask for, and the identity of the study for its journal."""
     from flexmanip_ros.cli import workers
 
-    source = Path(given.source).absolute()  # workers elsewhere stand in another folder
+    source = Path(given.source).absolute()  # a worker may have another current directory
     if source.is_dir():
         config = load(IdentifierParameters, 'rpbsid_identifier', given.params, given.set)
         found = workers.recordings(source)

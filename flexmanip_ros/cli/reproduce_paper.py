@@ -1,4 +1,4 @@
-"""reproduce_paper: every figure and table of the paper's section 4, and ours beside it."""
+"""reproduce_paper: every figure and table of the paper's section 4, with the methods of this package beside its own."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ EXAMPLES = """examples:
   reproduce_paper                                30 runs a case, into paper_reproduction/
   reproduce_paper --runs 5 --output quick
 
-Writes report.html (figures and tables, nothing else needed), runs.csv (one row a run and method) and
-summary.csv. The same seeds give the same numbers.
+Writes report.html (one file with figures and tables), runs.csv (one row per run and method) and summary.csv. The
+same seeds give the same numbers.
 exit status: 0 on success, 2 on bad arguments, 130 when interrupted.
 """
 PAGE, ROWS, SUMMARY = 'report.html', 'runs.csv', 'summary.csv'
@@ -42,7 +42,7 @@ SHOWN = ('mean error [%]', 'rms error at 6 s [%]', 'bound at 6 s [%]', '95 % int
 
 def _parser() -> console.Parser:
     made = console.parser(
-        PROG, "Regenerate the results of the paper's section 4, our estimators beside its own.", EXAMPLES)
+        PROG, "Reproduce the results of the paper's section 4, with our estimators beside its own.", EXAMPLES)
     add = made.add_argument
     add('--runs', type=int, default=30, metavar='N', help='runs a case (default 30, as the paper)')
     add('--case', action='append', choices=[case.name for case in experiments.CASES], metavar='NAME',
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class Job(NamedTuple):
-    """Something a worker does: a run, the bounds of a case, or a figure."""
+    """A task of a worker: a run, the bounds of a case, or a figure."""
 
     kind: str
     key: tuple[Any, ...]
@@ -68,12 +68,12 @@ class Job(NamedTuple):
 
 
 def work(job: Job) -> Any:
-    """Do it."""
+    """Do a job and return its result."""
     return job.call()
 
 
 class Collected:
-    """What came back, and what can be drawn of it."""
+    """The results so far, and the jobs that they make possible."""
 
     def __init__(self, cases: Sequence[experiments.Case], seeds: Sequence[int]) -> None:
         self.groups = {name: [case for case in group if case in cases] for name, group in GROUPS.items()}
@@ -84,7 +84,7 @@ class Collected:
         self.drawn: dict[tuple[str, int], bytes] = {}
 
     def first(self) -> list[Job]:
-        """Return what can be done at once; the runs of one group after the other."""
+        """Return the jobs that need no result; the runs of one group after the other."""
         from flexmanip_ros.paper import case_run, report
 
         cases = [case for group in self.groups.values() for case in group]
@@ -94,7 +94,7 @@ class Collected:
         return [*bounds, *self._drawings('signals', report.without_results()), *runs]
 
     def take(self, outcome: workers.Outcome) -> list[Job]:
-        """Keep an outcome; return what can be drawn now."""
+        """Keep an outcome; return the jobs that it makes possible."""
         job, found = outcome.task, outcome.result
         if job.kind == 'bounds':
             self.bounds |= {(*job.key, method): value for method, value in (found or {}).items()}
@@ -109,12 +109,12 @@ class Collected:
         return []
 
     def rows(self) -> list[Row]:
-        """Return every row there is, in the order of cases and seeds."""
+        """Return the rows so far, in the order of cases and seeds."""
         return [row for group in self.groups.values() for case in group for seed in self.seeds
                 for row in self.runs.get((case.name, seed), ([], {}))[0]]
 
     def pictures(self) -> dict[str, list[tuple[Planned, bytes]]]:
-        """Return planned figures with their pictures."""
+        """Return the planned figures with their PNG images."""
         return {group: [(one, self.drawn.get((group, k), b'')) for k, one in enumerate(planned)]
                 for group, planned in self.planned.items()}
 
@@ -160,11 +160,11 @@ def _main(given: argparse.Namespace) -> int:
     started = time.perf_counter()
     cases = [case for case in experiments.CASES if given.case is None or case.name in given.case]
     collected = Collected(cases, range(given.first_seed, given.first_seed + given.runs))
-    feed = workers.Feed(collected.first())
+    queue = workers.TaskQueue(collected.first())
     with console.progress('reproducing', 'steps') as progress:
-        for count, outcome in enumerate(_compute(given.workers, feed), start=1):
-            feed.add(collected.take(outcome))
-            progress(count, feed.total)
+        for count, outcome in enumerate(_compute(given.workers, queue), start=1):
+            queue.add(collected.take(outcome))
+            progress(count, queue.total)
     wall = time.perf_counter() - started
     rows = collected.rows()
     lines = summary.summary(rows, collected.bounds)

@@ -1,4 +1,4 @@
-"""simulate_bag: the simulated arm into a recording, as fast as it can, with the truth beside it."""
+"""simulate_bag: record the simulated arm, faster than real time, with the true values in a file beside it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ EXAMPLES = """examples:
   simulate_bag recording --set 'initial_angles=[0.0, 0.0]' --set excitation.shape=prbs
   simulate_bag recording --capture-time 3 --release-time 6 --duration 9 --params config/plant_simulator.yaml
 
-Writes the recording (rosbag2, mcap) and, beside it, NAME.truth.json with what an estimator should find.
+Writes the recording (rosbag2, mcap) and, beside it, NAME.truth.json with the true payload and frequencies.
 exit status: 0 on success; 2 on bad arguments, with one line on stderr.
 
 parameters of the plant (in --params under plant_simulator or /**, or with --set):
@@ -63,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def configurations(given: argparse.Namespace) -> tuple[PlantParameters, ExcitationParameters]:
-    """Return what the arguments ask for; named arguments win over --set, --set over the file."""
+    """Return the parameters: named arguments win over --set, and --set over the file."""
     from flexmanip_ros.studies.scenario import for_plant
 
     plant_items = [item for item in given.set if not item.startswith(PREFIX)]
@@ -71,7 +71,7 @@ def configurations(given: argparse.Namespace) -> tuple[PlantParameters, Excitati
         ('seed', given.seed), ('payload_mass', given.payload)) if value is not None]
     torque_items = [item.removeprefix(PREFIX) for item in given.set if item.startswith(PREFIX)]
     plant = load(PlantParameters, 'plant_simulator', given.params, plant_items, optional=True)
-    torque_items.append(f'rate={plant.rate!r}')  # one torque a sample
+    torque_items.append(f'rate={plant.rate!r}')  # one torque per sample
     torque = load(ExcitationParameters, 'excitation', given.params, torque_items, optional=True)
     return plant, for_plant(torque, plant)
 
@@ -112,7 +112,7 @@ def _main(given: argparse.Namespace) -> int:
 
 
 def truth(plant: PlantParameters, torque: ExcitationParameters, events: Sequence[CaptureEvent]) -> dict[str, Any]:
-    """Return what an estimator of this run should find."""
+    """Return the true values of the run."""
     from flexmanip_ros.studies.trial import true_frequencies
     from flexmanip_ros.types import EventKind
 

@@ -1,4 +1,4 @@
-"""write_urdf: the arm as URDF, for robot_state_publisher and RViz."""
+"""write_urdf: describe the arm as URDF, for robot_state_publisher and RViz."""
 
 from __future__ import annotations
 

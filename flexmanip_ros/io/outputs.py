@@ -1,4 +1,4 @@
-"""Where results go: files that are whole or not there, tables of estimates, and recordings of them.
+"""Files of results: written whole or not at all, as tables of estimates or as recordings of them.
 
 A table (.csv for people and spreadsheets, .npz with the matrices for numpy) is written at the end of a run; a recording
 grows with the run.
@@ -46,7 +46,7 @@ def write_file(path: str | Path, fill: Callable[[Any], Any]) -> None:
 
 
 def check_place(path: str | Path) -> None:
-    """Raise OutputError now, not after a long run, when a file cannot be written there."""
+    """Raise OutputError when a file cannot be written there. Call it before a long run."""
     folder = Path(path).absolute().parent
     try:
         is_directory = stat.S_ISDIR(os.stat(path).st_mode)
@@ -82,7 +82,7 @@ def columns(estimates: Sequence[Estimate], start_ns: int | None = None) -> dict[
 
     stamp_ns (T,), time_s (T,) from ``start_ns`` (default: the first estimate), status (T,), frequency_hz,
     damping_ratio and their _std (T, k), payload_mass_kg, payload_std_kg, payload_lower_kg, payload_upper_kg,
-    consistency, excitation, condition, innovation_power (T,). What there was not is NaN.
+    consistency, excitation, condition, innovation_power (T,). Values that an estimate does not have are NaN.
     """
     stamps = np.array([estimate.stamp_ns for estimate in estimates], dtype=np.int64)
     start = start_ns if start_ns is not None else next(iter(stamps), 0)
@@ -151,7 +151,7 @@ def _cell(value: Any) -> str:
 
 
 class Output(ABC):
-    """Takes estimates one by one. Leaving its ``with`` finishes it, after an exception too if it holds any."""
+    """Takes estimates one by one. Use it in a ``with``, which closes it; after an exception only if it is not empty."""
 
     def __init__(self) -> None:
         self.is_empty = True
@@ -163,7 +163,7 @@ class Output(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Finish."""
+        """Write what is left."""
 
     def __enter__(self) -> Output:
         return self

@@ -15,13 +15,13 @@ from flexmanip_ros.parameters.field import configure
 
 Config = TypeVar('Config')
 STANDARD = re.compile(r'^(use_sim_time|start_type_description_service|qos_overrides\..*)$')
-"""Parameters that every ROS node has; they mean nothing offline."""
+"""Parameters that every ROS node has and that have no meaning offline."""
 LARGEST_FILE = 1 << 20
-"""Bytes; a parameter file is a page of text."""
+"""Size of a file above which it is rejected [bytes]; a parameter file is a page of text."""
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML as ROS reads it: 1e-3 is a number, a name twice is a mistake, aliases are not understood."""
+    """Safe YAML as ROS reads it: 1e-3 is a number; a repeated name and an alias are errors."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.events.AliasEvent):

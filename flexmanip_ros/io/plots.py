@@ -1,7 +1,7 @@
-"""Figures of a run: first the parts that every figure is made of, then the figures of one run.
+"""Figures of a run: first the parts that all figures share, then the figures of one run.
 
-Every axis has its unit and every event its mark. The colours are Okabe and Ito's, which people with any colour vision
-tell apart. matplotlib is imported here and in the modules that draw alone, so everything else works without it.
+Every axis has its unit, and every event is marked. The colours are those of Okabe and Ito, which people with any
+colour vision can tell apart. matplotlib is imported only here and in other modules that draw.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointR
 
 COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#7F7F7F', '#000000')
 LINES: tuple[Any, ...] = ('-', (0, (4, 1.2)), (0, (1.2, 1)), (0, (6, 1.2, 1.2, 1.2)))
-"""Signals in one plot differ by more than their colour."""
+"""Line styles, so that signals in one plot differ by more than their colour."""
 PAYLOAD_COLOUR = '#009E73'
 TRUTH_COLOUR = '#000000'
 EVENT_COLOUR = '#AA0000'
@@ -36,19 +36,19 @@ STATUS_LOOKS: dict[Status, tuple[str, str]] = {
     Status.INCONSISTENT: ('#D55E00', '\\\\'), Status.NO_PAYLOAD_METHOD: ('#56B4E9', '--'),
     Status.UNOBSERVABLE: ('#7F7F7F', '++'), Status.DIVERGED: ('#000000', 'OO'), Status.ORDER_TOO_LOW: ('#F0E442', '**'),
 }
-"""Colour and hatch of each status, which so differs by more than its colour."""
+"""Colour and hatch of each status, so that they differ by more than their colour."""
 WIDTH = 10.0
-"""Inches; about the width of a page."""
+"""Width of a figure [inches], about that of a page."""
 DPI = 120
 POINTS = 2000
-"""A line is thinned to its envelope above this many points."""
+"""Points above which a line is reduced to its envelope."""
 
 MODES_APART = 4.0
-"""Ratio to the lowest frequency above which a mode does not set the range of a plot."""
+"""Ratio to the lowest frequency above which a mode does not set the range of a plot [-]."""
 
 Event = tuple[float, EventKind]
 Known = tuple[float, float, Sequence[float]]
-"""From and to [s], and the frequencies [Hz] that are true between."""
+"""Begin and end [s] of a stretch, and its true frequencies [Hz]."""
 
 
 def figure(heights: Sequence[float], *, columns: int = 1, share_time: bool = True) -> tuple[Figure, list[Any]]:
@@ -69,7 +69,7 @@ def figure(heights: Sequence[float], *, columns: int = 1, share_time: bool = Tru
 
 
 def envelope(time: Array, values: Array) -> tuple[Array, Array]:
-    """Thin a line (N,) so that its picture stays the same: the extremes of each stretch, in order."""
+    """Return fewer points of a line (N,) that look the same: the extremes of each stretch, in order."""
     stretch = 2 * values.size // POINTS
     if stretch < 2:
         return time, values
@@ -130,7 +130,7 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int, truth: Se
                     label='true' if index == k == 0 else None)
     if count:
         known_all = [f for _, _, known in truth for f in known]
-        if known_all:  # what is true sets the range, so that a change of it is seen
+        if known_all:  # the true frequencies set the range, so that their change is visible
             room = max(max(known_all) - min(known_all), 0.1 * max(known_all))
             ax.set_ylim(min(known_all) - room, max(known_all) + room)
         else:
@@ -144,7 +144,7 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int, truth: Se
 def _lowest(values: Array) -> Array:
     """Return the frequencies (T, k) that set the range, those far above the lowest as NaN.
 
-    Noise gives modes far above those of the arm; a range that holds them hides what a capture changes.
+    Noise gives modes far above those of the arm; a range that includes them would hide the change at a capture.
     """
     settled = values[values.shape[0] // 2:]
     low = settled[np.isfinite(settled)]
@@ -154,7 +154,7 @@ def _lowest(values: Array) -> Array:
 
 
 def _note_beyond(ax: Any, last: Array) -> None:
-    """Say in a corner which modes of the last estimate lie outside the range."""
+    """Write into a corner which modes of the last estimate lie outside the range."""
     low, high = ax.get_ylim()
     beyond = [f'{value:.1f}' for value in last if np.isfinite(value) and not low <= value <= high]
     if beyond:
@@ -182,7 +182,7 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
     last = table[-1] if len(held) and np.isfinite(table[-1]).all() else None
     if last is not None and not zoom:
         width = max(float(last[2] - last[1]), 1e-6)
-        digits = min(max(1 - math.floor(math.log10(width)), 0), 6)  # two of the interval's width
+        digits = min(max(1 - math.floor(math.log10(width)), 0), 6)  # two significant digits of the interval's width
         words = f'{last[0]:.{digits}f} kg, 95 %: {last[1]:.{digits}f} to {last[2]:.{digits}f} kg'
         ax.annotate(words, (1.0, 0.03), ha='right', va='bottom', xycoords='axes fraction',
                     color=PAYLOAD_COLOUR, fontsize=10, fontweight='bold')
@@ -191,7 +191,7 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
 
 
 def limit(ax: Any, values: Array, known: Sequence[float]) -> None:
-    """Choose the vertical range from where the values settle, so that a transient does not hide the rest."""
+    """Set the vertical range by the second half of the values, so that a transient does not hide the rest."""
     late = values[values.shape[0] // 2:]
     late = late[np.isfinite(late)]
     every = np.concatenate([values[np.isfinite(values)], np.asarray(known, dtype=np.float64)])
@@ -206,7 +206,7 @@ def limit(ax: Any, values: Array, known: Sequence[float]) -> None:
 
 
 def statuses(ax: Any, estimates: Sequence[Estimate], start_ns: int) -> None:
-    """Draw what the estimates were worth over time."""
+    """Draw the status over time."""
     time = times(estimates, start_ns)
     seen: list[Status] = []
     begin = 0
@@ -233,7 +233,7 @@ def _status_look(status: Status) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Truth:
-    """What a simulation knows, drawn beside the estimates.
+    """The true values of a simulation, drawn beside the estimates.
 
     payload: mass held after a capture [kg]; before, after: frequencies [Hz] without and with it.
     """
@@ -245,13 +245,13 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A run as the pictures need it."""
+    """The signals, estimates and events of a run."""
 
     signals: Signals
     estimates: Sequence[Estimate]
     events: tuple[Event, ...]
     has_arm: bool
-    """Bends are metres of a known arm; otherwise units are what the user's JointState has."""
+    """Whether the signals are those of the two-link arm, so that positions of bends are in metres."""
     truth: Truth = Truth()
 
     @property
@@ -267,7 +267,7 @@ class Run:
 
 def collect(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent],
             estimates: Sequence[Estimate], truth: Truth | None = None) -> Run:
-    """Return a run from the messages that went in and the estimates that came out."""
+    """Return a run from its messages and its estimates."""
     items = list(items)
     seen = [item for item in items if isinstance(item, CaptureEvent)]
     return run(config, sampling.collect(config, items), estimates, seen, truth)
@@ -275,7 +275,7 @@ def collect(config: IdentifierParameters, items: Iterable[JointRecord | CaptureE
 
 def run(config: IdentifierParameters, signals: Signals, estimates: Sequence[Estimate],
         events: Iterable[CaptureEvent], truth: Truth | None = None) -> Run:
-    """Return a run from its columns; events announced twice are drawn once."""
+    """Return a run from its signals; an event that was announced twice is kept once."""
     start = int(signals.stamp_ns[0]) if signals.stamp_ns.size else 0
     found: list[Event] = []
     for event in sorted(events, key=lambda item: item.stamp_ns):
@@ -310,7 +310,7 @@ def _estimates(axes: Sequence[Any], made: Run, with_payload: bool) -> None:
 
 
 def _stretches(made: Run) -> tuple[list[Known], list[tuple[float, float, float]]]:
-    """Return what is true from when to when: empty before the first capture, held until a release."""
+    """Return the true frequencies and masses of each stretch between two events."""
     frequencies: list[Known] = []
     masses: list[tuple[float, float, float]] = []
     changes = [(time, kind is EventKind.CAPTURE) for time, kind in made.events]
@@ -361,7 +361,7 @@ def payload_figure(made: Run) -> Figure:
 
 
 def validation_figure(scores: Scores, outputs: Sequence[str], *, has_arm: bool) -> Figure:
-    """Draw what was measured after the identification, and what the model said."""
+    """Draw the held-out outputs: measured, simulated by the model, and predicted one step ahead."""
     drawn, axes = figure([1.7] * len(outputs))
     for k, (ax, name) in enumerate(zip(axes, outputs, strict=True)):
         joint, _, field = name.rpartition('/')

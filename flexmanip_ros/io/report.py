@@ -1,4 +1,4 @@
-"""The reports: everything about one run on one page, and every run of a study on another."""
+"""Two reports as HTML pages: of one run of identify_bag, and of a study of monte_carlo."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def study_report(path: str | Path, name: str, rows: Sequence[Row]) -> None:
 
 
 def errors(rows: Sequence[Row]) -> Figure | None:
-    """Draw the error of each run over its payload [%]; None when no run has both."""
+    """Draw the relative error of each run [%] over its true payload [kg]; None when no run has both."""
     needed = ('payload_true_kg', 'payload_mass_kg', 'payload_lower_kg', 'payload_upper_kg')
     good = [row for row in rows if not row.get('error') and all(_finite(row.get(name)) for name in needed)
             and row['payload_true_kg'] > 0.0]
@@ -148,7 +148,7 @@ def errors(rows: Sequence[Row]) -> Figure | None:
             axes[0].plot(true[chosen], relative[0][chosen], mark, markersize=4, color=colour, label=label)
     axes[0].axhline(0.0, color=plots.TRUTH_COLOUR, linewidth=1.0)
     spread = float(np.percentile(np.abs(relative[0]), 95))
-    # intervals that are much wider than the errors must not hide them
+    # the errors stay visible where the intervals are much wider
     room = 1.5 * (spread + min(float(np.median(relative[2] - relative[1])), 3.0 * spread))
     axes[0].set_ylim(-room or -1.0, room or 1.0)
     axes[0].set_xlabel('true payload [kg]')

@@ -1,7 +1,7 @@
-"""One experiment of the paper: every method over the same samples, as rows and as tracks over time.
+"""One experiment of the paper: every method on the same samples, as rows and as tracks over time.
 
-Work that several methods share is done once: one pass of an identifier serves every method that reads it, the
-messages become samples once for the two baselines.
+Work that several methods share is done once: methods that read the same identifier share one pass of it, and the two
+baselines share the conversion of messages to samples.
 """
 
 from __future__ import annotations
@@ -42,19 +42,19 @@ class Track(NamedTuple):
     model: StateSpace | None
 
 
-class Reading(NamedTuple):
-    """What a method gave: its estimates, the last one at the last sample, and what they cost [s]."""
+class MethodResult(NamedTuple):
+    """The result of a method: its estimates, the last one at the last sample, and the time they took [s]."""
 
     estimates: list[Estimate]
     wall: float
 
 
 def run(case: Case, seed: int) -> tuple[list[trial.Row], dict[str, Track]]:
-    """Simulate one experiment and put every method over the same samples; rows and tracks.
+    """Simulate one experiment and run every method on the same samples; return rows and tracks.
 
-    Whatever goes wrong in a method becomes the ``error`` of its row; the others go on.
+    An exception of one method becomes the ``error`` of its row; the others are run all the same.
     """
-    found: dict[str, Reading] = {}
+    found: dict[str, MethodResult] = {}
     failed: dict[str, str] = {}
     alone = [method for method in experiments.METHODS if method.name == experiments.ALONE]
     others = [method for method in experiments.METHODS if method.name != experiments.ALONE]
@@ -76,14 +76,14 @@ def run(case: Case, seed: int) -> tuple[list[trial.Row], dict[str, Track]]:
 
 @contextmanager
 def _attempt(failed: dict[str, str], methods: Sequence[Method]) -> Iterator[None]:
-    """Keep an error as that of some methods: a defect in one must not hide the others."""
+    """Record an exception as the error of these methods, and go on."""
     try:
         yield
     except Exception as error:
         failed.update({method.name: trial.describe(error) for method in methods})
 
 
-def _rows(case: Case, seed: int, found: dict[str, Reading], failed: dict[str, str]
+def _rows(case: Case, seed: int, found: dict[str, MethodResult], failed: dict[str, str]
           ) -> tuple[list[trial.Row], dict[str, Track]]:
     rows: list[trial.Row] = []
     tracks: dict[str, Track] = {}
@@ -98,14 +98,14 @@ def _rows(case: Case, seed: int, found: dict[str, Reading], failed: dict[str, st
     return rows, tracks
 
 
-def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[Item]) -> dict[str, Reading]:
+def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[Item]) -> dict[str, MethodResult]:
     """Run one identifier once; each of the methods that read it costs the pass and its own reading.
 
     A method without settings of its own takes the identifier's estimates; the others read a block payload
     from its model, from the capture on.
     """
     configs = {method.name: _configured(case, method)[1].identifier for method in readers if method.settings}
-    found = {method.name: Reading([], 0.0) for method in readers}
+    found = {method.name: MethodResult([], 0.0) for method in readers}
     walls = dict.fromkeys(found, 0.0)
     begun = time.perf_counter()
     for state, estimate in pipeline.replay(_identifier(case, name), items):
@@ -130,7 +130,7 @@ def _with_block(config: IdentifierParameters, case: Case, state: pipeline.State,
     estimators = state.events.estimators
     try:
         found = rpbsid.identified(config, estimators.rpbsid, state.clock.dt)
-    except np.linalg.LinAlgError:  # nothing moves yet
+    except np.linalg.LinAlgError:  # no signal moves yet
         found = None
     if found is None:
         return now._replace(payload=None, status=now.model_status)
@@ -139,7 +139,7 @@ def _with_block(config: IdentifierParameters, case: Case, state: pipeline.State,
     return now._replace(payload=payload, status=status)
 
 
-def _compare(case: Case, methods: Sequence[Method], items: Sequence[Item]) -> dict[str, Reading]:
+def _compare(case: Case, methods: Sequence[Method], items: Sequence[Item]) -> dict[str, MethodResult]:
     """Run methods that are no part of the identifier over the same samples."""
     config = _configured(case, methods[0])[1].identifier
     begun = time.perf_counter()
@@ -149,19 +149,19 @@ def _compare(case: Case, methods: Sequence[Method], items: Sequence[Item]) -> di
     for method in methods:
         begun = time.perf_counter()
         estimates = list(baselines.run(method.baseline, config, sampled))
-        found[method.name] = Reading(estimates, shared + time.perf_counter() - begun)
+        found[method.name] = MethodResult(estimates, shared + time.perf_counter() - begun)
     return found
 
 
 @cache
 def _identifier(case: Case, name: str) -> IdentifierParameters:
-    """Return the configuration of one of the identifiers, whoever reads it."""
+    """Return the configuration of one of the identifiers."""
     return experiments.scenario(case, Method(name, '', name)).configuration(0, name).identifier
 
 
 @cache
 def _prepared(case: Case, name: str) -> tuple[Scenario, Run]:
-    """Return the scenario and its configurations but for the seed."""
+    """Return the scenario of a method and its configurations for seed 0."""
     made = experiments.scenario(case, next(method for method in experiments.METHODS if method.name == name))
     return made, made.configuration(0, name)
 
@@ -207,7 +207,7 @@ def _columns(estimates: Sequence[Estimate], track: Track, case: Case) -> trial.R
 
 
 def follow(estimates: Sequence[Estimate]) -> Track:
-    """Return estimates as arrays; what there was not is nan, and so is a mass of which nothing is known."""
+    """Return estimates as arrays. Missing values are nan, and so is a mass whose standard deviation is infinite."""
     count = len(estimates)
     table = np.full((count, 3), np.nan)
     frequencies = np.full((count, 2), np.nan)

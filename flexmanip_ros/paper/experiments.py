@@ -1,6 +1,6 @@
-"""Section 4 of the paper as cases and methods: what is simulated, and which estimators look at it.
+"""Section 4 of the paper as cases (what is simulated) and methods (how the payload is estimated).
 
-Linear plant at a fixed working point, one mode a link, the paper's torque convention (torque 2 does no work
+Linear plant at a fixed working point, one mode per link, the paper's torque convention (torque 2 does no work
 on bending), chord angles, rates continuous at the capture, 40 dB, 1 kHz, square waves, capture at 3 s,
 errors averaged over 4 to 6 s. Its Table 1 is lost: the arm is the reference arm of the parameters.
 """
@@ -44,7 +44,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Method:
-    """One way to a payload, and who proposed it."""
+    """One method to estimate the payload."""
 
     name: str
     words: str
@@ -69,7 +69,7 @@ IDENTIFIERS: Mapping[str, Mapping[str, Any]] = {
               'restart_on_event': False},
     'ours': {'payload_method': 'structured', 'forgetting_factor': [0.9995, 0.9995, 0.9995]},
 }
-"""What is run over the samples: identifier parameters over the defaults."""
+"""The identifiers that are run: parameters that differ from the defaults."""
 _BLOCK = {'payload_method': 'block'}
 _WEIGHED = {'payload.gravity': GRAVITY, 'outputs': ['joint2/position'], 'order': 1}
 METHODS = (

@@ -31,17 +31,17 @@ LOOKS: Mapping[str, tuple[str, str]] = {
     'structured': (plots.PAYLOAD_COLOUR, 'X')}
 """Colour and marker of each method."""
 SHARE = 0.95
-"""Of the runs, inside a band."""
+"""Share of the runs that a band contains."""
 TRUE = {'color': plots.TRUTH_COLOUR, 'linestyle': (0, (4, 3)), 'linewidth': 1.1}
 CAPTURE = ((experiments.CAPTURE_TIME, EventKind.CAPTURE),)
 CLOSE = ('restart', 'known M_b', 'structured')
-"""Methods whose own interval is looked at."""
+"""Methods whose own 95 % interval is drawn."""
 LEAST_KG = 1e-5
 """Bottom of the logarithmic axes over the payload."""
 RATE = 1000.0
 DURATION = 3.0
 TEST_INPUT = {'shape': 'multisine', 'band': [0.5, 10.0], 'repeat_time': 3.0, 'amplitude': [10.0, 5.0], 'seed': 4}
-"""A signal the model was not identified on."""
+"""A torque that the model was not identified with."""
 
 
 class Response(NamedTuple):
@@ -58,7 +58,7 @@ def arm() -> ArmParameters:
 
 
 def true_response(case: experiments.Case) -> Response:
-    """Return what the linearized arm with its true payload does."""
+    """Return the response of the linearized arm with its true payload."""
     Ac, Bc = linearization.vibration_model(arm(), np.radians(case.angles_deg), case.payload)
     A, B = linearization.discretize(Ac, Bc, 1.0 / RATE)
     n, r = B.shape
@@ -67,7 +67,7 @@ def true_response(case: experiments.Case) -> Response:
 
 
 def identified_response(case: experiments.Case, track: Track) -> Response | None:
-    """Return what the last identified model does, its angles with the estimated payload; None without one."""
+    """Return the response of the last identified model; None without one. Its angles need the estimated payload."""
     mass = track.mass[-1] if track.mass.size else np.nan
     if track.model is None or not np.isfinite(mass):
         return None
@@ -148,7 +148,7 @@ def arms(cases: Sequence[experiments.Case], arm: ArmParameters) -> Figure:
 
 
 def test_response(true: Response, found: Mapping[str, Response]) -> Figure:
-    """Figs. 4, 5, 11 and 12: angles and bends of all models, and how far the identified ones are off."""
+    """Figs. 4, 5, 11 and 12: angles and bends of all models, and the errors of the identified ones."""
     drawn, axes = plots.figure([1.9, 1.5, 1.9, 1.5])
     for row, (name, unit, scale) in enumerate((('angle', 'deg', np.degrees(1.0)), ('bend', 'mm', 1e3))):
         top, below = axes[2 * row], axes[2 * row + 1]
@@ -163,7 +163,7 @@ def test_response(true: Response, found: Mapping[str, Response]) -> Figure:
                 top.plot(true.time, estimate, **style)
                 below.semilogy(true.time[1:], np.abs(estimate - exact[:, k])[1:], **style)
         room = 1.2 * float(np.abs(exact).max())
-        top.set_ylim(-room, room)  # of the true one: a model far off must not hide it
+        top.set_ylim(-room, room)  # the range of the true response, which a wrong model must not hide
         below.set_ylim(1e-6 * room, 10.0 * room)
         top.set_ylabel(f'{name}\n[{unit}]')
         below.set_ylabel(f'error of\n{name} [{unit}]')
@@ -173,7 +173,7 @@ def test_response(true: Response, found: Mapping[str, Response]) -> Figure:
 
 
 def frequency_tracks(tracks: Tracks, before: Sequence[float], after: Sequence[float]) -> Figure:
-    """Figs. 6 and 13: both frequencies by the paper's settings and ours; below, how far they are off."""
+    """Figs. 6 and 13: both frequencies by the paper's settings and by ours; below, their errors."""
     drawn, axes = plots.figure([2.0, 2.0, 2.0])
     for ax, method in zip(axes, ('paper', experiments.BEST_MODEL), strict=False):
         for k in range(2):
@@ -210,7 +210,7 @@ def frequency(tracks: Sequence[Track], k: int) -> Array:
 
 
 def band(ax: Any, time: Array, runs: Array, label: str, **style: Any) -> None:
-    """Draw the median over the runs (T, runs) and the stretch that holds most of them."""
+    """Draw the median over the runs (T, runs) and the band that contains ``SHARE`` of them."""
     low, high = quantile(runs, (1.0 - SHARE) / 2.0), quantile(runs, (1.0 + SHARE) / 2.0)
     ax.fill_between(time, low, high, color=style['color'], alpha=0.2, linewidth=0)
     ax.plot(time, quantile(runs, 0.5), linewidth=1.4, label=label, **style)
@@ -244,7 +244,7 @@ def payload_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Track
 
 
 def interval_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Tracks]) -> Figure:
-    """One run of each case: what two of ours say, with the 95 % interval they claim."""
+    """One run of each case: the payload by the methods in ``CLOSE`` with their 95 % intervals."""
     drawn, axes = plots.figure([2.2] * len(cases))
     for ax, case in zip(axes, cases, strict=True):
         widest = 0.0
@@ -263,7 +263,7 @@ def interval_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Trac
         ax.set_xlim(experiments.CAPTURE_TIME - 0.1, experiments.WINDOW[1])
         ax.set_ylim(case.payload - room, case.payload + room)
         ax.set_ylabel('payload, close up\n[kg]')
-        ax.set_title(case.title, loc='right', fontsize=10)  # the event is named at the left
+        ax.set_title(case.title, loc='right', fontsize=10)  # the event's name is at the left
         plots.legend(ax)
         _say_last(ax, tracks[case.name].get('structured', ()))
     plots.events(axes, CAPTURE)
@@ -286,7 +286,7 @@ def error_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Tracks]
         ax.set_xlim(experiments.CAPTURE_TIME - 0.1, experiments.WINDOW[1])
         ax.set_ylim(LEAST_KG * case.payload, 100.0 * case.payload)
         ax.set_ylabel('absolute error\n[kg]')
-        ax.set_title(case.title, loc='right', fontsize=10)  # the event is named at the left
+        ax.set_title(case.title, loc='right', fontsize=10)  # the event's name is at the left
         plots.legend(ax)
     plots.events(axes, CAPTURE)
     return drawn

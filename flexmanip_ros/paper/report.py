@@ -50,7 +50,7 @@ DEVIATIONS = (
 
 
 class Planned(NamedTuple):
-    """A figure to be drawn: its numbers in the paper, what it shows, both claims, and the call."""
+    """A figure to be drawn: its numbers in the paper, its title, the paper's claim, our result, and the call."""
 
     numbers: str
     title: str
@@ -201,7 +201,7 @@ def simulation(case: experiments.Case, seed: int = 0) -> simulator.Trajectory:
 
 @dataclass(frozen=True)
 class Study:
-    """Everything that was computed. pictures: planned figures in the order of the page, and their PNG."""
+    """The results of reproduce_paper. pictures: planned figures in the order of the page, each with its PNG."""
 
     rows: Sequence[trial.Row]
     bounds: summary.Bounds

@@ -1,4 +1,4 @@
-"""The paper's baselines over the same messages and the same publishing grid as the identifier."""
+"""The methods that the paper compares with, on the messages and at the publishing instants of the identifier."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, Sa
 
 
 class Baseline(NamedTuple):
-    """The calls of one estimator."""
+    """The functions of one estimator."""
 
     init: Callable[[IdentifierParameters], RivalState]
     advance: Callable[[IdentifierParameters, RivalState, Sequence[Sample]], RivalState]

@@ -20,7 +20,7 @@ ADVICE: Mapping[Status, str] = {
     Status.UNOBSERVABLE: 'add the torques, angles and bends of both links to inputs, outputs and angles',
     Status.DIVERGED: 'check the units of the signals and the parameters arm.*',
 }
-"""What a user can do where the payload cannot be relied on."""
+"""What a user can do where the payload is not reliable."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Summary:
                 if item.name not in ('model_status', 'modes_deviation')}
 
     def payload_text(self) -> str:
-        """Return the payload with its interval in words, and where it cannot be relied on why, and what to do."""
+        """Return payload and interval in words; where they are not reliable, the reason and what to do next."""
         if self.payload_ci95_kg is None:
             return 'not estimated'
         status = Status[self.status]

@@ -1,4 +1,4 @@
-"""One run of a scenario to one row an estimator. The run's number is its seed."""
+"""One run of a scenario: one row per estimator. The number of the run is its seed."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ Row = dict[str, Any]
 
 
 def trial(scenario: Scenario, seed: int) -> list[Row]:
-    """Simulate one run and put every estimator of the scenario over the same samples.
+    """Simulate one run and run every estimator of the scenario on the same samples.
 
-    Whatever goes wrong in an estimator becomes the ``error`` of its row; the others go on.
+    An exception of one estimator becomes the ``error`` of its row; the others are run all the same.
     """
     rows = []
     for name in scenario.estimators:
@@ -46,27 +46,27 @@ def trial(scenario: Scenario, seed: int) -> list[Row]:
 
 
 def describe(error: BaseException) -> str:
-    """Return an error as the text of a row: ours as they are, others with their type."""
+    """Return an error as the text of a row; those of other packages with their type."""
     if isinstance(error, FlexmanipError):
         return str(error)
     return ' '.join(f'{type(error).__name__}: {error}'.split())
 
 
 def messages(scenario: Scenario, run: Run, seed: int) -> list[JointRecord | CaptureEvent]:
-    """Return what the estimators of a run receive."""
+    """Return the messages that the estimators of a run receive."""
     count = max(round(scenario.duration * run.plant.rate), 1)
     events = tuple(
         CaptureEvent(round(at * 1e9), kind)
         for at, kind in ((run.capture_time, EventKind.CAPTURE), (scenario.release_time, EventKind.RELEASE))
         if 0.0 <= at < scenario.duration)
     trajectory = simulator.simulate(run.plant, excitation.sequence(run.excitation, count), events)
-    rng = np.random.default_rng([seed, 1 << 20])  # a stream of its own beside those of `vary`
+    rng = np.random.default_rng([seed, 1 << 20])  # another random stream than those of `vary`
     return inject(simulator.records(trajectory, events), scenario.faults, rng)
 
 
 def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_kg: float | None,
             window: tuple[float, float], *, bound: bool = False, settled: float = 0.0) -> Row:
-    """Identify and return the columns of a row.
+    """Run the identifier and return the columns of a row.
 
     true_kg: mass held after a capture; None when unknown. window: from and to [s] of the mean error, at the
     earliest ``settled`` seconds after the event that made it true; bound: add the least standard deviation
@@ -137,7 +137,7 @@ def true_frequencies(plant: PlantParameters, mass: float) -> list[float]:
 
 
 def drawn_columns(drawn: Mapping[str, Any]) -> Row:
-    """Return what was drawn for a run as plain columns."""
+    """Return the values drawn for a run, a column for each number."""
     columns: Row = {}
     for name, value in drawn.items():
         if isinstance(value, (list, tuple)):
