@@ -1,8 +1,13 @@
-"""What every program shares: progress on a terminal, one line for an error, exit codes."""
+"""What every program shares: progress on a terminal, one line for an error, exit codes.
+
+The programs import numpy, scipy, numba, rosbags and matplotlib only after their arguments are parsed, so that
+``--help`` and a mistake in the arguments are answered at once.
+"""
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import math
 import os
 import signal
@@ -13,30 +18,27 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from flexmanip_ros.errors import FlexmanipError
 
 SUCCESS, DEFECT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 LONGEST = 1e9
-"""Seconds; beyond it a stamp in nanoseconds may not be one."""
+"""Largest time that is accepted [s]; larger ones overflow a stamp in nanoseconds."""
 TRACEBACK = 'FLEXMANIP_TRACEBACK'
-"""Environment variable that lets the traceback of a defect through."""
+"""Environment variable; where it is set, a defect prints its traceback."""
 Report = Callable[[int, int | None], None]
-"""Called with what is done and what there is to do (None: unknown)."""
+"""Called with the steps done and the steps in all (None: unknown)."""
 
 
 class Parser(argparse.ArgumentParser):
-    """Arguments with one line for a mistake."""
+    """A parser that answers a mistake with one line."""
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong and where help is; exit 2."""
+        """Print the mistake and where to find help; exit with 2."""
         self.exit(BAD_INPUT, f'{self.prog}: {message}; see {self.prog} --help\n')
 
 
 def seconds(text: str) -> float:
-    """Return a time given as an argument [s]. Raises ArgumentTypeError when it is none."""
+    """Return an argument as a time [s]. Raises ArgumentTypeError."""
     try:
         value = float(text)
     except ValueError:
@@ -47,14 +49,14 @@ def seconds(text: str) -> float:
 
 
 def whole(text: str) -> int:
-    """Return a seed or count given as an argument. Raises ArgumentTypeError when it is none."""
+    """Return an argument as a seed or count. Raises ArgumentTypeError."""
     if not text.strip().isdecimal():
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 up")
     return int(text)
 
 
 def parser(prog: str, words: str, epilog: str) -> Parser:
-    """Return a parser whose examples keep their lines."""
+    """Return a parser. words: its description; epilog: printed as it is, below the arguments."""
     return Parser(prog=prog, description=words, epilog=epilog, allow_abbrev=False,
                   formatter_class=argparse.RawDescriptionHelpFormatter)
 
@@ -62,57 +64,57 @@ def parser(prog: str, words: str, epilog: str) -> Parser:
 @contextmanager
 def progress(words: str, unit: str) -> Iterator[Report]:
     """Show a bar on stderr when that is a terminal; otherwise nothing."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
+    if not sys.stderr.isatty():
         yield lambda done, total: None
         return
-    bar = Progress(TextColumn(words), BarColumn(), MofNCompleteColumn(), TextColumn(unit),
-                   TimeRemainingColumn(), console=console, transient=True)
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    bar = Progress(TextColumn(words), BarColumn(), MofNCompleteColumn(), TextColumn(unit), TimeRemainingColumn(),
+                   console=Console(stderr=True), transient=True)
     with bar:
         task = bar.add_task(words, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def complain(prog: str, error: BaseException | str) -> None:
+def print_error(prog: str, error: BaseException | str) -> None:
     """Write one line on stderr."""
     print(f'{prog}: {" ".join(str(error).split())}', file=sys.stderr)
 
 
-def require_pictures() -> None:
-    """Raise now, not after the work, when pictures are asked for and cannot be drawn."""
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as err:
+def require_matplotlib() -> None:
+    """Raise FlexmanipError before the work when a report is asked for and its figures cannot be drawn."""
+    if importlib.util.find_spec('matplotlib') is None:
         raise FlexmanipError('a report needs matplotlib, which is not installed',
-                             "run 'pip install matplotlib', or leave --report away") from err
+                             "run 'pip install matplotlib', or leave --report away")
 
 
 def run(prog: str, body: Callable[[], int]) -> int:
-    """Run a program: our errors become one line and exit 2, an interrupt exit 130."""
+    """Run a program; return its exit status: 2 after an error of this package, 130 after an interrupt."""
     with _signals_as_interrupt(), warnings.catch_warnings():
-        warnings.simplefilter('ignore')  # numbers out of range have a status; stderr is for one line
+        warnings.simplefilter('ignore')  # numbers out of range are told by the status; stderr is for one line
         try:
             return body()
         except FlexmanipError as error:
-            complain(prog, error)
+            print_error(prog, error)
             return BAD_INPUT
         except KeyboardInterrupt:
-            complain(prog, 'interrupted')
+            print_error(prog, 'interrupted')
             return INTERRUPTED
         except BrokenPipeError:
-            sys.stderr.close()  # the reader of our output is gone; nothing is left to say
+            sys.stderr.close()  # the reader of the output has ended
             return SUCCESS
         except Exception as error:
             if os.environ.get(TRACEBACK):
                 raise
-            complain(prog, f'a defect of this program: {type(error).__name__}: {error}; '
+            print_error(prog, f'a defect of this program: {type(error).__name__}: {error}; '
                      f'please report it with the recording ({TRACEBACK}=1 shows where)')
             return DEFECT
 
 
 @contextmanager
 def _signals_as_interrupt() -> Iterator[None]:
-    """Let SIGINT and SIGTERM raise, so that what was computed is written in both cases."""
+    """Raise KeyboardInterrupt on SIGINT and on SIGTERM, so that both write the results so far."""
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 

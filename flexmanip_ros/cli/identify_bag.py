@@ -1,4 +1,4 @@
-"""identify_bag: the identifier over a recording, no ROS running."""
+"""identify_bag: identify model and payload from a recording. ROS need not run."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from flexmanip_ros.cli import console
-from flexmanip_ros.cli.replay import Request, Result, identify
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import help_text
-from flexmanip_ros.types import Status
+
+if TYPE_CHECKING:
+    from flexmanip_ros.cli.replay import Result
 
 PROG = 'identify_bag'
 NODE = 'rpbsid_identifier'
@@ -23,9 +25,9 @@ EXAMPLES = """examples:
       --set 'outputs=[arm/position]' --set order=4 --validate-from 5
   identify_bag recording --output estimates.csv --json
 
-exit status: 0 on success (a line on stderr says what was left out); 2 on bad input or arguments, with one
-line on stderr. Of a damaged recording everything before the fault is used and written, then the
-fault is reported.
+exit status: 0 on success (stderr then tells in one line which messages were left out); 2 on bad input or
+arguments, with one line on stderr; 130 when interrupted. Of a damaged recording everything before the damage is used
+and written; then the damage is reported with exit status 2.
 
 parameters (in --params under rpbsid_identifier or /**, or with --set):
 """
@@ -38,15 +40,13 @@ def _parser() -> console.Parser:
     add = made.add_argument
     add('bag', metavar='BAG', help='rosbag2 directory, or the .mcap or .db3 file itself')
     add('--params', metavar='FILE.yaml', help='ROS parameter file for rpbsid_identifier')
-    add('--set', metavar='name=value', action='append', default=[],
-        help='override one parameter (YAML value)')
+    add('--set', metavar='name=value', action='append', default=[], help='override one parameter (YAML value)')
     add('--validate-from', metavar='SECONDS', type=console.seconds,
         help='identify before this time from the first stamp, score the model on the rest')
     add('--output', metavar='OUT', help='estimates: .csv or .npz a table, anything else a rosbag2 recording')
     add('--report', metavar='REPORT.html', help='one page with pictures and tables')
     add('--json', action='store_true', help='print the result as JSON, the last line of stdout')
-    add('--joint-states', metavar='TOPIC', default='joint_states',
-        help='default: joint_states, in any namespace')
+    add('--joint-states', metavar='TOPIC', default='joint_states', help='default: joint_states, in any namespace')
     add('--capture-event', metavar='TOPIC', action='append',
         help='default: capture_event and capture_detected beside the joint states')
     add('--detect', action='store_true', help='find captures and releases in the signals')
@@ -63,6 +63,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(given: argparse.Namespace) -> int:
+    from flexmanip_ros.cli.replay import Request, identify
+
     config = load(IdentifierParameters, NODE, given.params, given.set)
     request = Request(
         given.bag, config, joint_states=given.joint_states,
@@ -79,15 +81,17 @@ def _main(given: argparse.Namespace) -> int:
         print(json.dumps(result.summary.as_json(), allow_nan=False))
     if result.fault is not None:
         kept = ''.join(f"; what was identified is in '{place}'" for place in result.written)
-        console.complain(PROG, f'{result.fault}{kept}')
+        console.print_error(PROG, f'{result.fault}{kept}')
         return console.INTERRUPTED if result.interrupted else console.BAD_INPUT
     if result.remark:
-        console.complain(PROG, result.remark)
+        console.print_error(PROG, result.remark)
     return console.SUCCESS
 
 
 def describe(result: Result) -> list[str]:
     """Return the result as lines for people."""
+    from flexmanip_ros.types import Status
+
     summary = result.summary
     lines = [f'samples      {summary.samples}, {summary.gaps} gaps, '
              f'sample time {_text(summary.sample_time_s)} s, identified in {summary.wall_s:.2f} s']
@@ -98,16 +102,14 @@ def describe(result: Result) -> list[str]:
         lines.append(f'model        {summary.model_status}: {Status[summary.model_status].value}')
     for k, mode in enumerate(result.modes):
         spread = f' +- {1.96 * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else ''
-        lines.append(f'mode {k + 1}       {mode.frequency_hz:.4f}{spread} Hz, '
-                     f'damping ratio {mode.damping_ratio:.4f}')
+        lines.append(f'mode {k + 1}       {mode.frequency_hz:.4f}{spread} Hz, damping ratio {mode.damping_ratio:.4f}')
     if summary.modes_deviation > 1.0:
-        lines.append('             they are not those of the arm with this payload: '
-                     f'off by {summary.modes_deviation:.1f} times what is tolerated')
+        lines.append('             these modes are not those of the arm with this payload: they deviate '
+                     f'{summary.modes_deviation:.1f} times as much as is tolerated; check the parameters arm.*')
     if summary.payload_ci95_kg is not None:
-        low, high = summary.payload_ci95_kg
-        lines.append(f'payload      {_text(summary.payload_mass_kg)} kg, '
-                     f'95 % interval {_text(low)} .. {_text(high)} kg, '
-                     f'residual power {_text(summary.consistency)}')
+        lines.append(f'payload      {summary.payload_text()}')
+        if summary.consistency is not None and summary.payload_std_kg is not None:
+            lines.append(f'residuals    power {summary.consistency:.6g} times that of the noise (1: noise only)')
     for words, values in (('simulation', summary.vaf_simulation_percent),
                           ('prediction', summary.vaf_prediction_percent)):
         if values is not None:

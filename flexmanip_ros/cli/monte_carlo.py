@@ -1,4 +1,4 @@
-"""monte_carlo: many runs of a scenario, or many recordings; one row a run, resumable."""
+"""monte_carlo: run a scenario with many seeds, or identify many recordings; one row per run."""
 
 from __future__ import annotations
 
@@ -11,18 +11,17 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from flexmanip_ros.cli import console, tasks, workers
-from flexmanip_ros.cli.console import require_pictures
+from flexmanip_ros.cli import console
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.io.journal import Journal
 from flexmanip_ros.io.parameter_file import load, parse, parse_overrides
-from flexmanip_ros.io.table import check_place
 from flexmanip_ros.parameters import IdentifierParameters, flatten
-from flexmanip_ros.studies.metrics import score
-from flexmanip_ros.studies.scenario import Scenario, scenario
-from flexmanip_ros.studies.trial import Row
+
+if TYPE_CHECKING:
+    from flexmanip_ros.cli import workers
+    from flexmanip_ros.studies.scenario import Scenario
+    from flexmanip_ros.studies.trial import Row
 
 PROG = 'monte_carlo'
 EXAMPLES = """examples:
@@ -31,18 +30,17 @@ EXAMPLES = """examples:
   monte_carlo config/scenarios/capture.yaml --runs 100000 --scheduler tcp://head:8786 --output capture.parquet
 
 An interrupted study continues when the same command is given again; more --runs add to what is there.
-A run that fails is a row with its error. NAME.truth.json beside a recording tells the true payload.
+A run that fails gives a row with its error. The true payload of a recording is read from NAME.truth.json beside it.
 exit status: 0 on success, 2 on bad arguments, 130 when interrupted.
 """
 
 
 def _parser() -> console.Parser:
     made = console.parser(
-        PROG, 'Repeat a scenario over many seeds, or identify a folder of recordings.', EXAMPLES)
+        PROG, 'Run a scenario with many seeds, or identify every recording in a folder; one row per run.', EXAMPLES)
     add = made.add_argument
     add('source', metavar='SCENARIO.yaml|FOLDER', help='what to repeat, or where the recordings are')
-    add('--runs', type=int, default=100, metavar='N',
-        help='seeds FIRST .. FIRST+N-1 of the scenario (default 100)')
+    add('--runs', type=int, default=100, metavar='N', help='seeds FIRST .. FIRST+N-1 of the scenario (default 100)')
     add('--first-seed', type=console.whole, default=0, metavar='FIRST', help='default: 0')
     add('--output', default='study.csv', metavar='TABLE', help='.csv or .parquet (default study.csv)')
     add('--report', metavar='REPORT.html', help='one page with scores and pictures')
@@ -61,60 +59,67 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(given: argparse.Namespace) -> int:
+    from flexmanip_ros.cli import workers
+    from flexmanip_ros.io.journal import Journal
+    from flexmanip_ros.io.outputs import check_place
+
     todo, identity = _plan(given)
     if given.report is not None:
         check_place(given.report)
-        require_pictures()
+        console.require_matplotlib()
     interrupted = False
     with Journal(given.output, identity) as journal:
-        done = {row.get(tasks.KEY) for row in journal.rows}
+        done = {row.get(workers.KEY) for row in journal.rows}
         left = [task for task in todo if task.key not in done]
         if done:
-            print(f'continuing: {len(todo) - len(left)} of {len(todo)} runs are there', file=sys.stderr)
+            print(f'continuing: {len(todo) - len(left)} of {len(todo)} runs are done already', file=sys.stderr)
         try:
             with console.progress('running', 'runs') as progress:
                 for count, outcome in enumerate(_compute(given, left), start=1):
                     journal.add(outcome.result if outcome.error is None
-                                else tasks.failed(outcome.task, outcome.error))
+                                else workers.failed(outcome.task, outcome.error))
                     progress(len(todo) - len(left) + count, len(todo))
         except KeyboardInterrupt:
             interrupted = True
-        journal.finish(('estimator', 'seed', tasks.KEY))
+        journal.finish(('estimator', 'seed', workers.KEY))
     if given.report is not None:
-        from flexmanip_ros.io import study_report
+        from flexmanip_ros.io.report import study_report
 
-        study_report.report(given.report, Path(given.source).stem, journal.rows)
+        study_report(given.report, Path(given.source).stem, journal.rows)
     for line in describe(journal.rows):
         print(line)
     print(f"wrote '{given.output}' ({len(journal.rows)} rows)")
     if interrupted:
-        console.complain(PROG, 'interrupted; the same command continues where this one stopped')
+        console.print_error(PROG, 'interrupted; the same command continues where this one stopped')
         return console.INTERRUPTED
     return console.SUCCESS
 
 
-def _plan(given: argparse.Namespace) -> tuple[Sequence[tasks.Task], dict[str, Any]]:
-    """Return the runs asked for, and what identifies the study in its journal."""
-    source = Path(given.source).absolute()  # workers elsewhere stand in another folder
+def _plan(given: argparse.Namespace) -> tuple[Sequence[workers.Task], dict[str, Any]]:
+    """Return the tasks that the arguments ask for, and the identity of the study for its journal."""
+    from flexmanip_ros.cli import workers
+
+    source = Path(given.source).absolute()  # a worker may have another current directory
     if source.is_dir():
         config = load(IdentifierParameters, 'rpbsid_identifier', given.params, given.set)
-        found = tasks.recordings(source)
+        found = workers.recordings(source)
         if not found:
-            raise ParameterError(f"folder '{given.source}' holds no recording",
-                                 'give a folder of rosbag2 recordings')
-        return ([tasks.Recorded(str(path), config, (0.0, float('inf'))) for path in found],
+            raise ParameterError(f"folder '{given.source}' holds no recording", 'give a folder of rosbag2 recordings')
+        return ([workers.Recorded(str(path), config, (0.0, float('inf'))) for path in found],
                 {'recordings': str(source), 'parameters': _digest(flatten(config))})
     if given.runs < 1:
         raise ParameterError(f'--runs is {given.runs}', 'give at least 1')
     if given.params is not None:
         raise ParameterError('--params is for recordings', 'put the parameters into the scenario file')
     study = read_scenario(Path(given.source), given.set)
-    return ([tasks.Simulated(study, given.first_seed + k) for k in range(given.runs)],
+    return ([workers.Simulated(study, given.first_seed + k) for k in range(given.runs)],
             {'scenario': study.name, 'parameters': _digest(asdict(study))})
 
 
 def read_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     """Return the scenario in a YAML file, with overrides of the identifier's parameters."""
+    from flexmanip_ros.studies.scenario import scenario
+
     try:
         text = path.read_text(encoding='utf-8')
     except (OSError, ValueError) as err:
@@ -124,8 +129,7 @@ def read_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
         made = scenario(parse(text, 'the file'))
         if overrides:
             values = parse_overrides(overrides)
-            made = replace(made, estimators={
-                name: {**given, **values} for name, given in made.estimators.items()})
+            made = replace(made, estimators={name: {**given, **values} for name, given in made.estimators.items()})
     except ParameterError as err:
         raise ParameterError(f"scenario '{path}': {err.problem}", err.remedy) from err
     return made
@@ -136,17 +140,21 @@ def _digest(values: Any) -> str:
     return hashlib.sha256(text.encode('utf-8')).hexdigest()[:16]
 
 
-def _compute(given: argparse.Namespace, todo: Sequence[tasks.Task]) -> Iterator[workers.Outcome]:
+def _compute(given: argparse.Namespace, todo: Sequence[workers.Task]) -> Iterator[workers.Outcome]:
+    from flexmanip_ros.cli import workers
+
     if given.scheduler is not None:
-        return workers.cluster(tasks.work, todo, given.scheduler)
+        return workers.cluster(workers.work, todo, given.scheduler)
     count = given.workers if given.workers is not None else len(os.sched_getaffinity(0))
     if count < 0:
         raise ParameterError(f'--workers is {count}', 'give 0 or more')
-    return workers.processes(tasks.work, todo, count) if count else workers.serial(tasks.work, todo)
+    return workers.processes(workers.work, todo, count) if count else workers.serial(workers.work, todo)
 
 
 def describe(rows: Sequence[Row]) -> list[str]:
     """Return the scores of each estimator as lines for people."""
+    from flexmanip_ros.studies.metrics import score
+
     lines = [f'{"estimator":24s} {"runs":>6s} {"failed":>6s} {"mean err %":>10s} {"median %":>9s} '
              f'{"rms %":>8s} {"bias kg":>9s} {"95 % interval holds":>22s} '
              f'{"rms/bound":>9s} {"us/sample":>9s}']

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,17 +12,14 @@ from typing import Any
 import numpy as np
 
 from flexmanip_ros import pipeline
-from flexmanip_ros.cli.console import require_pictures
+from flexmanip_ros.cli.console import require_matplotlib
 from flexmanip_ros.errors import BagError, FlexmanipError, ParameterError
 from flexmanip_ros.io import bag
-from flexmanip_ros.io.outputs import Outputs, TableOutput, open_output
-from flexmanip_ros.io.table import check_place
+from flexmanip_ros.io.outputs import TableOutput, check_place, open_output
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload.detected_events import with_detected
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies import holdout
-from flexmanip_ros.studies.achievable import payload_std
 from flexmanip_ros.studies.summary import Summary, summarize
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Mode
 
@@ -32,14 +29,14 @@ NEVER = (1 << 63) - 1
 
 @dataclass(frozen=True)
 class Request:
-    """What to identify from what, and where it goes. Times count from the first stamp [s]."""
+    """What identify_bag is asked for. Times count from the first stamp [s]."""
 
     bag: str | Path
     config: IdentifierParameters
     joint_states: str = 'joint_states'
     events: tuple[str, ...] = ('capture_event', 'capture_detected')
     events_required: bool = False
-    """The event topics were asked for by name: one that is not there is an error."""
+    """Whether a missing event topic is an error, as it is where the user named the topics."""
     capture_time: float | None = None
     release_time: float | None = None
     detect: bool = False
@@ -51,7 +48,7 @@ class Request:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What came out. ``fault`` is what was wrong with the recording: the rest was used all the same."""
+    """The result. fault: what was wrong with the recording, of which the rest was used all the same."""
 
     summary: Summary
     modes: tuple[Mode, ...]
@@ -60,58 +57,56 @@ class Result:
     fault: FlexmanipError | None
     interrupted: bool = False
     remark: str = ''
-    """What a user should know of a recording that could be used: messages left out, events not reached."""
+    """One line about messages that were left out and events that were not applied at their stamp; empty if none."""
 
 
 def identify(request: Request, progress: bag.Progress | None = None) -> Result:
-    """Run the identifier over a recording and write what was asked for.
+    """Replay a recording through the identifier; write the output and the report that are asked for.
 
-    Raises FlexmanipError when there is nothing to report: no usable message, no place to write.
+    Raises FlexmanipError when no message can be used and when a file cannot be written.
     """
     started = time.perf_counter()
     if request.report is not None:
         check_place(request.report)
-        require_pictures()
+        require_matplotlib()
         if request.output is not None and Path(request.output).resolve() == Path(request.report).resolve():
             raise ParameterError(f"--output and --report are both '{request.report}'", 'give two names')
-    feed = _Feed(request, progress)
+    messages = _Messages(request, progress)
     kept: list[Estimate] = []
     state = pipeline.init()
-    with ExitStack() as stack:
-        frame = request.config.payload_frame
-        outputs = [] if request.output is None else [open_output(request.output, frame)]
-        sink = stack.enter_context(Outputs(*outputs))
-        for now, estimate in pipeline.replay(request.config, feed):
+    output = None if request.output is None else open_output(request.output, request.config.payload_frame)
+    with output or nullcontext():
+        for now, estimate in pipeline.replay(request.config, messages):
             state = now
             if estimate is None:
                 continue
-            sink.write(estimate)
+            if output is not None:
+                output.write(estimate)
             if request.report is not None:
                 kept.append(estimate)
-        for output in outputs:
-            if isinstance(output, TableOutput):
-                output.start_ns = feed.first_ns
-    if feed.fault is not None and state.counters.accepted == 0:
-        raise feed.fault
+        if isinstance(output, TableOutput):
+            output.start_ns = messages.first_ns
+    if messages.fault is not None and state.counters.accepted == 0:
+        raise messages.fault
     last = pipeline.current(state)
     summary = summarize(state, last, time.perf_counter() - started)
     scores = None
-    signals = feed.signals() if feed.is_kept else None
+    signals = messages.signals() if messages.is_kept else None
     if request.validate_from is not None and signals is not None:
         scores = holdout.score(None if last is None else last.model, signals, request.validate_from)
         summary = replace(summary, vaf_simulation_percent=tuple(scores.simulation.tolist()),
                           vaf_prediction_percent=tuple(scores.prediction.tolist()))
-    fault = feed.fault or _dropped(state)
+    fault = messages.fault or _dropped(state)
     if request.report is not None and signals is not None:
-        _report(request, summary, feed, kept, signals, last, scores, state, fault)
+        _report(request, summary, messages, kept, signals, last, scores, state, fault)
     return Result(
         summary, () if last is None else last.modes, state.clock.outputs or request.config.outputs,
         tuple(str(place) for place in (request.output, request.report) if place is not None), fault,
-        feed.interrupted, _remark(state, feed.foreign))
+        messages.interrupted, _remark(state, messages.foreign))
 
 
-class _Feed:
-    """The messages of a recording, up to its fault; remembers what scores and pictures need."""
+class _Messages:
+    """Iterates over the messages of a recording up to its fault; keeps the signals for scores and figures."""
 
     def __init__(self, request: Request, progress: bag.Progress | None) -> None:
         self.fault: FlexmanipError | None = None
@@ -132,6 +127,8 @@ class _Feed:
         topics = bag.Topics(request.joint_states, request.events, request.events_required)
         try:
             if request.detect:
+                from flexmanip_ros.payload.detected_events import with_detected
+
                 items: Iterable[pipeline.Item] = with_detected(
                     request.config, bag.read(request.bag, topics, self._progress))
             else:
@@ -185,10 +182,10 @@ class _Feed:
 
 
 def _dropped(state: pipeline.State) -> FlexmanipError | None:
-    """Return what was wrong with messages that had to be left out; repeated stamps and gaps are a status."""
-    counters, refusal = state.counters, state.clock.rejection
+    """Return the fault of messages with unusable numbers; None without any."""
+    counters, rejection = state.counters, state.clock.rejection
     faulty = counters.not_finite + counters.unequal_sizes
-    if not faulty or refusal is None:
+    if not faulty or rejection is None:
         return None
     what = 'NaN or infinity in a configured signal' if counters.not_finite else 'arrays of unequal sizes'
     return BagError(f'{faulty} of {counters.received} messages hold {what} and were left out',
@@ -196,9 +193,9 @@ def _dropped(state: pipeline.State) -> FlexmanipError | None:
 
 
 def _remark(state: pipeline.State, foreign: int) -> str:
-    """Say in one line what was left out or applied at another time than it says; empty when all was used.
+    """Return one line about messages left out and events not applied at their stamp; empty if there are none.
 
-    foreign: messages of other publishers on the same topic, which nobody misses.
+    foreign: number of messages of other publishers on the same topic, which are left out without a word.
     """
     counters, line = state.counters, state.payload
     left_out = [f'{count} {why}' for count, why in (
@@ -218,17 +215,18 @@ def _remark(state: pipeline.State, foreign: int) -> str:
     return '; '.join(said)
 
 
-def _report(request: Request, summary: Summary, feed: _Feed, kept: list[Estimate], signals: Signals,
+def _report(request: Request, summary: Summary, messages: _Messages, kept: list[Estimate], signals: Signals,
             last: Estimate | None, scores: holdout.Scores | None, state: pipeline.State,
             fault: FlexmanipError | None) -> None:
-    from flexmanip_ros.io import pictures, report
+    from flexmanip_ros.io import plots, report
+    from flexmanip_ros.studies.metrics import payload_bound
 
     assert request.report is not None
     config = state.config or request.config
-    made = pictures.run(config, signals, kept, feed.events)
+    made = plots.run(config, signals, kept, messages.events)
     bound, mass = None, summary.payload_mass_kg
     if summary.capture_time_s is not None and mass is not None:
-        bound = payload_std(config, signals, summary.capture_time_s, mass, state.clock.dt)
+        bound = payload_bound(config, signals, summary.capture_time_s, mass, state.clock.dt)
     counts: dict[str, Any] = {**state.counters._asdict(), 'dropped': state.counters.dropped}
     report.identification_report(
         request.report, Path(request.bag).name, config, summary, made,

@@ -1,10 +1,8 @@
-"""reproduce_paper: every figure and table of the paper's section 4, and ours beside it."""
+"""reproduce_paper: every figure and table of the paper's section 4, with the methods of this package beside its own."""
 
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import math
 import os
 import sys
@@ -14,22 +12,23 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from flexmanip_ros.cli import console, workers
+from flexmanip_ros.cli import console
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.io.table import OutputError, check_place, write_file
-from flexmanip_ros.paper import case_run, experiments, summary
-from flexmanip_ros.studies import trial
+from flexmanip_ros.paper import experiments
 
 if TYPE_CHECKING:
-    from flexmanip_ros.paper.sections import Planned
+    from flexmanip_ros.cli import workers
+    from flexmanip_ros.paper.case_run import Track
+    from flexmanip_ros.paper.report import Planned
+    from flexmanip_ros.studies.trial import Row
 
 PROG = 'reproduce_paper'
 EXAMPLES = """examples:
   reproduce_paper                                30 runs a case, into paper_reproduction/
   reproduce_paper --runs 5 --output quick
 
-Writes report.html (figures and tables, nothing else needed), runs.csv (one row a run and method) and
-summary.csv. The same seeds give the same numbers.
+Writes report.html (one file with figures and tables), runs.csv (one row per run and method) and summary.csv. The
+same seeds give the same numbers.
 exit status: 0 on success, 2 on bad arguments, 130 when interrupted.
 """
 PAGE, ROWS, SUMMARY = 'report.html', 'runs.csv', 'summary.csv'
@@ -43,7 +42,7 @@ SHOWN = ('mean error [%]', 'rms error at 6 s [%]', 'bound at 6 s [%]', '95 % int
 
 def _parser() -> console.Parser:
     made = console.parser(
-        PROG, "Regenerate the results of the paper's section 4, our estimators beside its own.", EXAMPLES)
+        PROG, "Reproduce the results of the paper's section 4, with our estimators beside its own.", EXAMPLES)
     add = made.add_argument
     add('--runs', type=int, default=30, metavar='N', help='runs a case (default 30, as the paper)')
     add('--case', action='append', choices=[case.name for case in experiments.CASES], metavar='NAME',
@@ -61,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class Job(NamedTuple):
-    """Something a worker does: a run, the bounds of a case, or a figure."""
+    """A task of a worker: a run, the bounds of a case, or a figure."""
 
     kind: str
     key: tuple[Any, ...]
@@ -69,33 +68,33 @@ class Job(NamedTuple):
 
 
 def work(job: Job) -> Any:
-    """Do it."""
+    """Do a job and return its result."""
     return job.call()
 
 
 class Collected:
-    """What came back, and what can be drawn of it."""
+    """The results so far, and the jobs that they make possible."""
 
     def __init__(self, cases: Sequence[experiments.Case], seeds: Sequence[int]) -> None:
         self.groups = {name: [case for case in group if case in cases] for name, group in GROUPS.items()}
         self.seeds = seeds
-        self.runs: dict[tuple[str, int], tuple[list[trial.Row], dict[str, case_run.Track]]] = {}
+        self.runs: dict[tuple[str, int], tuple[list[Row], dict[str, Track]]] = {}
         self.bounds: dict[tuple[str, str], float] = {}
         self.planned: dict[str, Sequence[Planned]] = {}
         self.drawn: dict[tuple[str, int], bytes] = {}
 
     def first(self) -> list[Job]:
-        """Return what can be done at once; the runs of one group after the other."""
+        """Return the jobs that need no result; the runs of one group after the other."""
+        from flexmanip_ros.paper import case_run, report
+
         cases = [case for group in self.groups.values() for case in group]
-        bounds = [Job('bounds', (case.name,), partial(experiments.bounds_of, case)) for case in cases]
+        bounds = [Job('bounds', (case.name,), partial(case_run.bounds, case)) for case in cases]
         runs = [Job('run', (case, seed), partial(case_run.run, case, seed))
                 for group in self.groups.values() for seed in self.seeds for case in group]
-        from flexmanip_ros.paper import sections
-
-        return [*bounds, *self._drawings('signals', sections.without_results()), *runs]
+        return [*bounds, *self._drawings('signals', report.without_results()), *runs]
 
     def take(self, outcome: workers.Outcome) -> list[Job]:
-        """Keep an outcome; return what can be drawn now."""
+        """Keep an outcome; return the jobs that it makes possible."""
         job, found = outcome.task, outcome.result
         if job.kind == 'bounds':
             self.bounds |= {(*job.key, method): value for method, value in (found or {}).items()}
@@ -103,87 +102,90 @@ class Collected:
             self.drawn[job.key] = found or b''
         else:
             case, seed = job.key
-            self.runs[case.name, seed] = (
-                found if outcome.error is None else (_failed(case, seed, outcome.error), {}))
+            self.runs[case.name, seed] = (found if outcome.error is None else (_failed(case, seed, outcome.error), {}))
             group = next(name for name, cases in self.groups.items() if case in cases)
             if all((known.name, seed) in self.runs for known in self.groups[group] for seed in self.seeds):
                 return self._figures(group)
         return []
 
-    def rows(self) -> list[trial.Row]:
-        """Return every row there is, in the order of cases and seeds."""
+    def rows(self) -> list[Row]:
+        """Return the rows so far, in the order of cases and seeds."""
         return [row for group in self.groups.values() for case in group for seed in self.seeds
                 for row in self.runs.get((case.name, seed), ([], {}))[0]]
 
     def pictures(self) -> dict[str, list[tuple[Planned, bytes]]]:
-        """Return planned figures with their pictures."""
+        """Return the planned figures with their PNG images."""
         return {group: [(one, self.drawn.get((group, k), b'')) for k, one in enumerate(planned)]
                 for group, planned in self.planned.items()}
 
     def _figures(self, group: str) -> list[Job]:
-        from flexmanip_ros.paper import sections
+        from flexmanip_ros.paper import report
 
-        plan = {'payloads': sections.payload_example,
-                'configurations': sections.configuration_example,
-                'finite_element': sections.finite_element_example}[group]
+        plan = {'payloads': report.payload_example,
+                'configurations': report.configuration_example,
+                'finite_element': report.finite_element_example}[group]
         return self._drawings(group, plan(self._tracks(), self.rows()))
 
-    def _tracks(self) -> dict[str, dict[str, list[case_run.Track]]]:
+    def _tracks(self) -> dict[str, dict[str, list[Track]]]:
         return {case.name: {
             method.name: [self.runs[case.name, seed][1][method.name] for seed in self.seeds
                           if method.name in self.runs.get((case.name, seed), ([], {}))[1]]
             for method in experiments.METHODS} for case in experiments.CASES}
 
     def _drawings(self, group: str, planned: Sequence[Planned]) -> list[Job]:
-        from flexmanip_ros.paper import sections
+        from flexmanip_ros.paper import report
 
         self.planned[group] = planned
-        return [Job('figure', (group, k), partial(sections.drawing, one))
-                for k, one in enumerate(planned)]
+        return [Job('figure', (group, k), partial(report.drawing, one)) for k, one in enumerate(planned)]
 
 
 def _main(given: argparse.Namespace) -> int:
+    from flexmanip_ros.cli import workers
+    from flexmanip_ros.io.outputs import OutputError, check_place, write_rows
+
     if given.runs < 1:
         raise ParameterError(f'--runs is {given.runs}', 'give at least 1')
     if given.workers is not None and given.workers < 0:
         raise ParameterError(f'--workers is {given.workers}', 'give 0 or more')
-    console.require_pictures()
-    from flexmanip_ros.paper import report
+    console.require_matplotlib()
+    from flexmanip_ros.paper import report, summary
 
     folder = Path(given.output)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as err:
-        raise OutputError(f"folder '{folder}' cannot be made: {err.strerror}",
-                          'give another --output') from err
+        raise OutputError(f"folder '{folder}' cannot be made: {err.strerror}", 'give another --output') from err
     for name in (PAGE, ROWS, SUMMARY):
         check_place(folder / name)
     started = time.perf_counter()
     cases = [case for case in experiments.CASES if given.case is None or case.name in given.case]
     collected = Collected(cases, range(given.first_seed, given.first_seed + given.runs))
-    feed = workers.Feed(collected.first())
+    queue = workers.TaskQueue(collected.first())
     with console.progress('reproducing', 'steps') as progress:
-        for count, outcome in enumerate(_compute(given.workers, feed), start=1):
-            feed.add(collected.take(outcome))
-            progress(count, feed.total)
+        for count, outcome in enumerate(_compute(given.workers, queue), start=1):
+            queue.add(collected.take(outcome))
+            progress(count, queue.total)
     wall = time.perf_counter() - started
     rows = collected.rows()
     lines = summary.summary(rows, collected.bounds)
-    write_csv(folder / ROWS, rows)
-    write_csv(folder / SUMMARY, lines)
-    report.report(folder / PAGE, report.Study(
-        rows, collected.bounds, collected.pictures(), given.runs, wall))
+    write_rows(folder / ROWS, rows)
+    write_rows(folder / SUMMARY, lines)
+    report.report(folder / PAGE, report.Study(rows, collected.bounds, collected.pictures(), given.runs, wall))
     print('\n'.join(describe(lines)))
     print(f"{len(collected.runs)} runs in {wall:.1f} s; wrote '{folder / PAGE}', {ROWS} and {SUMMARY}")
     return console.SUCCESS
 
 
 def _compute(count: int | None, jobs: Iterable[Job]) -> Iterator[workers.Outcome]:
+    from flexmanip_ros.cli import workers
+
     cores = len(os.sched_getaffinity(0)) if count is None else count
     return workers.processes(work, jobs, cores) if cores > 0 else workers.serial(work, jobs)
 
 
-def _failed(case: experiments.Case, seed: int, error: BaseException) -> list[trial.Row]:
+def _failed(case: experiments.Case, seed: int, error: BaseException) -> list[Row]:
+    from flexmanip_ros.studies import trial
+
     return [{'case': case.name, 'method': method.name, 'seed': seed, 'error': trial.describe(error)}
             for method in experiments.METHODS]
 
@@ -201,16 +203,6 @@ def describe(lines: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _short(value: float | None) -> str:
     return '-' if value is None or math.isnan(value) else f'{value:.3g}'
-
-
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows as a table; a missing value is an empty cell."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, restval='', lineterminator='\n')
-    writer.writeheader()
-    writer.writerows({name: '' if row[name] is None else row[name] for name in row} for row in rows)
-    write_file(path, lambda file: file.write(text.getvalue().encode('utf-8')))
 
 
 if __name__ == '__main__':

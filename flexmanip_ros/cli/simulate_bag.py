@@ -1,4 +1,4 @@
-"""simulate_bag: the simulated arm into a recording, as fast as it can, with the truth beside it."""
+"""simulate_bag: record the simulated arm, faster than real time, with the true values in a file beside it."""
 
 from __future__ import annotations
 
@@ -8,21 +8,16 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from flexmanip_ros.arm import linearization
 from flexmanip_ros.cli import console
 from flexmanip_ros.errors import BagError, ParameterError
-from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.io.parameter_file import load
-from flexmanip_ros.io.table import check_place, write_file
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, flatten
 from flexmanip_ros.parameters.document import help_text
-from flexmanip_ros.simulation import excitation, excitation_design, simulator
-from flexmanip_ros.studies.scenario import for_plant
-from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+
+if TYPE_CHECKING:
+    from flexmanip_ros.types import CaptureEvent
 
 PROG = 'simulate_bag'
 START_NS = 1_700_000_000_000_000_000
@@ -34,7 +29,7 @@ EXAMPLES = """examples:
   simulate_bag recording --set 'initial_angles=[0.0, 0.0]' --set excitation.shape=prbs
   simulate_bag recording --capture-time 3 --release-time 6 --duration 9 --params config/plant_simulator.yaml
 
-Writes the recording (rosbag2, mcap) and, beside it, NAME.truth.json with what an estimator should find.
+Writes the recording (rosbag2, mcap) and, beside it, NAME.truth.json with the true payload and frequencies.
 exit status: 0 on success; 2 on bad arguments, with one line on stderr.
 
 parameters of the plant (in --params under plant_simulator or /**, or with --set):
@@ -51,8 +46,7 @@ def _parser() -> console.Parser:
     add('--duration', metavar='SECONDS', type=console.seconds, default=6.0, help='default: 6')
     add('--seed', metavar='N', type=int, help='seed of the noise (parameter seed)')
     add('--payload', metavar='KG', type=float, help='mass of the object (parameter payload_mass)')
-    add('--capture-time', metavar='SECONDS', type=console.seconds, default=3.0,
-        help='default: 3; negative: never')
+    add('--capture-time', metavar='SECONDS', type=console.seconds, default=3.0, help='default: 3; negative: never')
     add('--release-time', metavar='SECONDS', type=console.seconds, default=-1.0, help='default: never')
     add('--expected', action='store_true',
         help='say how accurate a payload estimate from this torque can be (takes some seconds)')
@@ -69,18 +63,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def configurations(given: argparse.Namespace) -> tuple[PlantParameters, ExcitationParameters]:
-    """Return what the arguments ask for; named arguments win over --set, --set over the file."""
+    """Return the parameters: named arguments win over --set, and --set over the file."""
+    from flexmanip_ros.studies.scenario import for_plant
+
     plant_items = [item for item in given.set if not item.startswith(PREFIX)]
     plant_items += [f'{name}={value!r}' for name, value in (
         ('seed', given.seed), ('payload_mass', given.payload)) if value is not None]
     torque_items = [item.removeprefix(PREFIX) for item in given.set if item.startswith(PREFIX)]
     plant = load(PlantParameters, 'plant_simulator', given.params, plant_items, optional=True)
-    torque_items.append(f'rate={plant.rate!r}')  # one torque a sample
+    torque_items.append(f'rate={plant.rate!r}')  # one torque per sample
     torque = load(ExcitationParameters, 'excitation', given.params, torque_items, optional=True)
     return plant, for_plant(torque, plant)
 
 
 def _main(given: argparse.Namespace) -> int:
+    from flexmanip_ros.io.bag_writer import BagWriter
+    from flexmanip_ros.io.outputs import check_place, write_text
+    from flexmanip_ros.simulation import excitation, excitation_design, simulator
+    from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+
     plant, torque = configurations(given)
     if not 0.0 < given.duration <= 1e6:
         raise ParameterError(f'--duration is {given.duration:g}', 'give seconds above 0, up to 1e6')
@@ -97,42 +98,34 @@ def _main(given: argparse.Namespace) -> int:
         raise BagError(f"'{target}' exists already", 'remove it or give another name')
     check_place(truth_path)
     trajectory = simulator.simulate(plant, excitation.sequence(torque, count), events, START_NS)
-    with (console.progress('simulating', 'samples') as progress,
-          BagWriter(target, flush_period=None) as writer):
+    with (console.progress('simulating', 'samples') as progress, BagWriter(target, flush_period=None) as writer):
         for k, item in enumerate(simulator.records(trajectory, events)):
             topic = '/joint_states' if isinstance(item, JointRecord) else '/capture_event'
             writer.write(topic, item.stamp_ns, item, latched=isinstance(item, CaptureEvent))
             if k % 1000 == 0:
                 progress(k, count)
-    known = truth(plant, torque, events)
-    text = json.dumps(known, indent=1) + '\n'
-    write_file(truth_path, lambda file: file.write(text.encode('utf-8')))
+    write_text(truth_path, json.dumps(truth(plant, torque, events), indent=1) + '\n')
     if given.expected:
         print(excitation_design.describe(torque))
     print(f"wrote '{target}' ({count} samples, {given.duration:g} s) and '{truth_path}'")
     return console.SUCCESS
 
 
-def truth(plant: PlantParameters, torque: ExcitationParameters, events: Sequence[CaptureEvent]
-          ) -> dict[str, Any]:
-    """Return what an estimator of this run should find."""
+def truth(plant: PlantParameters, torque: ExcitationParameters, events: Sequence[CaptureEvent]) -> dict[str, Any]:
+    """Return the true values of the run."""
+    from flexmanip_ros.studies.trial import true_frequencies
+    from flexmanip_ros.types import EventKind
+
     at = {event.kind: (event.stamp_ns - START_NS) * 1e-9 for event in events}
     return {
         'payload_mass_kg': plant.payload_mass if EventKind.CAPTURE in at else 0.0,
         'capture_time_s': at.get(EventKind.CAPTURE), 'release_time_s': at.get(EventKind.RELEASE),
         'working_point_deg': [math.degrees(angle) for angle in plant.initial_angles],
         'sample_time_s': 1.0 / plant.rate,
-        'frequencies_before_hz': frequencies(plant, 0.0),
-        'frequencies_after_hz': frequencies(plant, plant.payload_mass),
+        'frequencies_before_hz': true_frequencies(plant, 0.0),
+        'frequencies_after_hz': true_frequencies(plant, plant.payload_mass),
         'plant': flatten(plant), 'excitation': flatten(torque),
     }
-
-
-def frequencies(plant: PlantParameters, payload: float) -> list[float]:
-    """Return the damped frequencies of the arm linearized at its start, the lowest two [Hz]."""
-    Ac, _ = linearization.vibration_model(plant.arm, np.array(plant.initial_angles), payload)
-    found = np.sort(np.abs(np.linalg.eigvals(Ac).imag))[::-1] / (2.0 * np.pi)
-    return sorted(float(value) for value in found[found > 1e-9])[:4:2]
 
 
 if __name__ == '__main__':

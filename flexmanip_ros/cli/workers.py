@@ -1,9 +1,10 @@
-"""Where the runs of a study are computed: this process, this machine's cores, or a Dask cluster."""
+"""The runs of a study, and where they are computed: this process, this machine's cores, or a Dask cluster."""
 
 from __future__ import annotations
 
 import gc
 import importlib
+import json
 import math
 import multiprocessing
 import multiprocessing.connection
@@ -16,36 +17,118 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from flexmanip_ros.errors import FlexmanipError
+from flexmanip_ros.errors import BagError, FlexmanipError
+from flexmanip_ros.io import bag
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.studies import trial
+from flexmanip_ros.studies.scenario import Scenario
+from flexmanip_ros.types import CaptureEvent, JointBlock
+
+KEY = 'run'
+"""Column with the name of a run. A study continues with the runs whose names are not in its journal."""
+SETTLING_TIME = 1.0
+"""Seconds after a capture in a recording from which on the error counts, as in the paper."""
 
 THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 AHEAD = 4
-"""Runs handed out for each worker, so that none waits."""
+"""Runs submitted per worker, so that no worker waits for the next."""
 ANSWER_TIME = 10.0
-"""Seconds after which a scheduler that says nothing is taken not to be there."""
+"""Time after which a scheduler that does not answer counts as missing [s]."""
 GARBAGE = 20_000
-"""Objects made before old ones are looked through: a run holds many small ones as long as it lasts."""
+"""New objects between two collections of garbage. A run keeps many small objects, and each collection visits them."""
 RECOUNT = 5.0
-"""Seconds after which the workers of a cluster are counted again."""
+"""Time after which the workers of a cluster are counted again [s]."""
 ATTEMPTS = 2
-"""A run during which the worker died is tried once more, alone; then its death is its error."""
+"""Times that a run is tried when its worker dies; the last time it runs alone."""
 
 Task = Any
 Work = Callable[[Task], Any]
 
 
+@dataclass(frozen=True)
+class Simulated:
+    """One seed of a scenario."""
+
+    scenario: Scenario
+    seed: int
+
+    @property
+    def key(self) -> str:
+        """The name of the run."""
+        return str(self.seed)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One recording. window: from and to [s] of the mean error."""
+
+    path: str
+    config: IdentifierParameters
+    window: tuple[float, float]
+
+    @property
+    def key(self) -> str:
+        """The name of the run."""
+        return self.path
+
+
+def work(task: Simulated | Recorded) -> list[trial.Row]:
+    """Do one run and return its rows, each with the run's name."""
+    rows = trial.trial(task.scenario, task.seed) if isinstance(task, Simulated) else [_recorded(task)]
+    return [{KEY: task.key, **row} for row in rows]
+
+
+def failed(task: Simulated | Recorded, error: BaseException) -> list[trial.Row]:
+    """Return the row of a run that failed."""
+    return [{KEY: task.key, 'error': trial.describe(error)}]
+
+
+def _recorded(task: Recorded) -> trial.Row:
+    truth = true_payload(Path(task.path))
+    items: list[JointBlock | CaptureEvent] = []
+    fault = ''
+    try:
+        items.extend(bag.read_blocks(task.path))
+    except BagError as error:  # the messages before the fault are identified
+        if not items:
+            raise
+        fault = str(error)
+    row = trial.measure(task.config, items, truth, task.window, settled=SETTLING_TIME)
+    return {'bag': task.path, 'estimator': task.config.payload_method, **row, 'error': fault}
+
+
+def true_payload(path: Path) -> float | None:
+    """Return the mass in NAME.truth.json beside a recording, None when there is none."""
+    place = path.with_name(f'{path.stem if path.is_file() else path.name}.truth.json')
+    try:
+        found: Any = json.loads(place.read_text(encoding='utf-8'))
+    except (OSError, ValueError):
+        return None
+    mass = found.get('payload_mass_kg') if isinstance(found, dict) else None
+    return float(mass) if isinstance(mass, (int, float)) else None
+
+
+def recordings(folder: Path) -> list[Path]:
+    """Return every recording at or below a folder, in order."""
+    found = {path.parent for path in folder.rglob('metadata.yaml')}
+    loose = {path for suffix in ('*.mcap', '*.db3') for path in folder.rglob(suffix) if path.parent not in found}
+    return sorted(found | loose)
+
+
 class Outcome(NamedTuple):
-    """A task with its result, or with the error that came instead."""
+    """A task with its result or its error."""
 
     task: Task
     result: Any
     error: BaseException | None
 
 
-class Feed:
-    """Tasks that grow while a study runs: what an outcome makes possible is added before the next comes."""
+class TaskQueue:
+    """Tasks to which more are added while a study runs, as outcomes make them possible."""
 
     def __init__(self, tasks: Iterable[Task]) -> None:
         self.waiting = deque(tasks)
@@ -80,18 +163,17 @@ def serial(work: Work, tasks: Iterable[Task]) -> Iterator[Outcome]:
 def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome]:
     """Compute in ``count`` processes of this machine. Outcomes come as they are ready.
 
-    tasks may be a ``Feed``. A worker that dies (killed, out of memory) costs at most the run that
-    killed it.
+    tasks may be a ``TaskQueue``. A worker that dies (killed, out of memory) costs at most the run it was doing.
     """
     for name in THREADS:
-        os.environ.setdefault(name, '1')  # one run a core; more threads would only get in each other's way
+        os.environ.setdefault(name, '1')  # one run per core leaves no core for more threads
     waiting = iter(tasks)
     again: list[tuple[Task, int]] = []
     while True:
         pool = ProcessPoolExecutor(count, multiprocessing.get_context('spawn'), _serve)
         running: dict[Future[Any], tuple[Task, int]] = {}
         try:
-            if again:  # alone, so that it is known which one kills
+            if again:  # alone, so that it is known which run the worker dies of
                 task, attempt = again.pop()
                 running[pool.submit(work, task)] = (task, attempt)
             else:
@@ -117,17 +199,17 @@ def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome
 
 
 def _serve() -> None:
-    """Leave Ctrl-C, which reaches every process of a terminal, to the one that collects; end with it."""
+    """Set up a worker: it ignores Ctrl-C, which its parent handles, and ends when its parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.set_threshold(GARBAGE)
-    warnings.simplefilter('ignore')  # as in the collecting process: what matters is a status or an error
+    warnings.simplefilter('ignore')  # as in the parent: numbers out of range are told by the status
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
 
 
 def _end_with(sentinel: int) -> None:
-    """End this process, whatever it does, when the process behind the sentinel has ended."""
+    """End this process when the process of the sentinel has ended."""
     multiprocessing.connection.wait([sentinel])
     os._exit(1)
 
@@ -140,7 +222,7 @@ def _fill(pool: ProcessPoolExecutor, work: Work, waiting: Iterator[Task],
             running[pool.submit(work, task)] = (task, 0)
     except StopIteration:
         return
-    except BrokenProcessPool:  # the task that could not be handed out is tried with the others
+    except BrokenProcessPool:  # the task that could not be submitted is tried with the others
         broken: Future[Any] = Future()
         broken.set_exception(BrokenProcessPool())
         running[broken] = (task, 0)
@@ -169,9 +251,9 @@ def cluster(work: Work, tasks: Iterable[Task], address: str) -> Iterator[Outcome
         ready = dask.as_completed()
         most, counted = 0, -math.inf
 
-        def hand_out() -> None:
+        def submit() -> None:
             nonlocal most, counted
-            if time.monotonic() - counted > RECOUNT:  # workers may come and go
+            if time.monotonic() - counted > RECOUNT:  # workers may join and leave
                 most, counted = AHEAD * max(sum(client.nthreads().values()), 1), time.monotonic()
             while len(running) < most:
                 try:
@@ -182,10 +264,10 @@ def cluster(work: Work, tasks: Iterable[Task], address: str) -> Iterator[Outcome
                 running[future] = task
                 ready.add(future)
 
-        hand_out()
+        submit()
         for future in ready:
             task = running.pop(future)
             error = future.exception()
             yield Outcome(task, None if error else future.result(), error)
             future.release()
-            hand_out()
+            submit()

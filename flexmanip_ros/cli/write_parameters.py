@@ -24,10 +24,10 @@ def documents() -> Iterator[tuple[str, str]]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write what differs; say what was written."""
+    """Write the files that differ and print their names."""
     made = console.parser(PROG, 'Write config/*.yaml and docs/parameters.md from the declarations.', '')
     made.add_argument('repository', metavar='REPOSITORY', nargs='?', type=Path,
-                      default=Path(__file__).resolve().parents[2], help='default: where this package is')
+                      default=Path(__file__).resolve().parents[2], help='default: the checkout of this package')
     root: Path = made.parse_args(arguments).repository
     if not root.is_dir():
         made.error(f"directory '{root}' does not exist")

@@ -1,4 +1,4 @@
-"""write_urdf: the arm as URDF, for robot_state_publisher and RViz."""
+"""write_urdf: describe the arm as URDF, for robot_state_publisher and RViz."""
 
 from __future__ import annotations
 
@@ -25,10 +25,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Write the URDF to a file or to the standard output; 2 on bad input."""
     parser = console.parser(PROG, 'Describe the arm as URDF; its links bend with the joint states.', EXAMPLES)
     parser.add_argument('--params', metavar='FILE.yaml', help='ROS parameter file with the arm')
-    parser.add_argument('--set', metavar='name=value', action='append', default=[],
-                        help='override one parameter')
-    parser.add_argument('--segments', metavar='N', type=int, default=12,
-                        help='pieces of each link, default: 12')
+    parser.add_argument('--set', metavar='name=value', action='append', default=[], help='override one parameter')
+    parser.add_argument('--segments', metavar='N', type=int, default=12, help='pieces of each link, default: 12')
     parser.add_argument('--output', metavar='FILE', help='default: standard output')
     options = parser.parse_args(arguments)
     try:

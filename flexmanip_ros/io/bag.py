@@ -214,8 +214,7 @@ class _Recording:
                 self._kinds[event] = HEADER
             elif complete and self.topics.events_required:
                 listed = ', '.join(sorted(topic for topic, kind in there.items() if kind == HEADER)) or 'none'
-                raise BagError(f"bag '{self.path}' has no topic '{name}'",
-                               f'the event topics there are: {listed}')
+                raise BagError(f"bag '{self.path}' has no topic '{name}'", f'the event topics there are: {listed}')
         return any(topic in self._kinds for topic in there)
 
 

@@ -1,4 +1,4 @@
-"""Plain values -> a rosbag2 recording (mcap), on disk so soon that a kill loses a fraction of a second."""
+"""Plain values -> a rosbag2 recording (mcap). It is flushed so often that a kill loses a fraction of a second."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from flexmanip_ros.messages import Diagnostics, Inertia, LabelledArray
 from flexmanip_ros.types import CaptureEvent, JointRecord
 
 FLUSH_PERIOD = 0.2
-"""Seconds between two writes to disk; the library itself waits for a mebibyte (4 s of 1 kHz)."""
+"""Time between two flushes [s]. The library itself flushes after one mebibyte, which is 4 s at 1 kHz."""
 
 Value = JointRecord | CaptureEvent | float | LabelledArray | Inertia | Diagnostics
 KINDS: dict[type, str] = {
@@ -52,8 +52,8 @@ def _qos(latched: bool) -> Qos:
 class BagWriter:
     """A recording under ``path``, a new directory. Use it in a ``with``; any thread may write.
 
-    It is closed and readable after an exception too. Raises BagError when the path exists or the disk fails.
-    flush_period: seconds; None leaves it to the library, and the same messages then give the same bytes.
+    It is closed, and so readable, after an exception too. Raises BagError when the path exists or the disk fails.
+    flush_period: time between flushes [s]; None leaves them to the library, and equal messages then give equal bytes.
     """
 
     def __init__(self, path: str | Path, *, storage: StoragePlugin = StoragePlugin.MCAP,
@@ -76,7 +76,7 @@ class BagWriter:
         self._open = True
 
     def write(self, topic: str, log_ns: int, value: Value, *, latched: bool = False) -> None:
-        """Append a value as its message; ``log_ns`` is the time of recording, in rising order."""
+        """Append a value as its message. log_ns: time of recording [ns], which must not decrease."""
         kind = type(value)
         if kind not in KINDS:
             raise TypeError(f'no message for a {kind.__name__}')
@@ -95,7 +95,7 @@ class BagWriter:
                                'free some space; what was written before is kept') from err
 
     def flush(self) -> None:
-        """Put everything on disk now; a recorder calls this on a timer, for topics that fall silent."""
+        """Flush now. A recorder calls this on a timer, as ``write`` flushes only when a message comes."""
         with self._lock:
             if self._open:
                 self._flush()
@@ -128,7 +128,7 @@ class BagWriter:
             try:
                 self._writer.close()
             except OSError as err:
-                with contextlib.suppress(OSError):  # what is still buffered cannot be written either
+                with contextlib.suppress(OSError):  # the rest of the buffer cannot be written either
                     self._writer.abort()
                 raise BagError(f"bag '{self.path}' cannot be finished: {err.strerror}",
                                "free some space, then run 'ros2 bag reindex'; the messages are kept") from err
@@ -147,7 +147,7 @@ class _Stamp(NamedTuple):
 
 
 class _Conversion:
-    """Our values -> message classes of the recording library."""
+    """Converts the values of this package to message objects of the recording library."""
 
     def __init__(self, classes: Any) -> None:
         self._classes = classes
@@ -169,8 +169,7 @@ class _Conversion:
             com = self._new('geometry_msgs/msg/Vector3', *(float(part) for part in value.com))
             inner = self._new('geometry_msgs/msg/Inertia', float(value.mass), com,
                               *(float(part) for part in value.inertia))
-            return self._new('geometry_msgs/msg/InertiaStamped',
-                             self._header(value.stamp_ns, value.frame_id), inner)
+            return self._new('geometry_msgs/msg/InertiaStamped', self._header(value.stamp_ns, value.frame_id), inner)
         if isinstance(value, Diagnostics):
             return self._diagnostics(value)
         return self._new('std_msgs/msg/Float64', float(value))

@@ -1,4 +1,4 @@
-"""Pages that need nothing else: pictures and tables inside one HTML file."""
+"""HTML pages in one file, with their pictures and tables inside."""
 
 from __future__ import annotations
 
@@ -6,13 +6,11 @@ import base64
 import io
 from collections.abc import Iterable, Sequence
 from html import escape
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from flexmanip_ros.io.table import write_file
 from flexmanip_ros.types import Array
 
 STYLE = """
@@ -36,8 +34,7 @@ class Section(NamedTuple):
 def page(title: str, lead: str, sections: Sequence[Section]) -> str:
     """Return a whole page with a contents list. ``title`` and ``lead`` are plain text."""
     links = ''.join(f'<a href="#s{k}">{escape(section.title)}</a>' for k, section in enumerate(sections))
-    parts = ''.join(f'<h2 id="s{k}">{escape(section.title)}</h2>{section.body}'
-                    for k, section in enumerate(sections))
+    parts = ''.join(f'<h2 id="s{k}">{escape(section.title)}</h2>{section.body}' for k, section in enumerate(sections))
     return (f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
             f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head><body>'
             f'<h1>{escape(title)}</h1><p class="note">{escape(lead)}</p><nav>{links}</nav>{parts}'
@@ -57,13 +54,13 @@ def png(drawn: Figure) -> bytes:
 
 
 def image(data: bytes, words: str) -> str:
-    """Return a PNG as an inline image; words: for who cannot see it."""
+    """Return a PNG as an inline image. words: its description for readers who cannot see it."""
     text = base64.b64encode(data).decode('ascii')
     return f'<img alt="{escape(words)}" src="data:image/png;base64,{text}">'
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = '') -> str:
-    """Return a table; numbers are set right and short, texts are escaped."""
+    """Return a table. Numbers are rounded and right-aligned, texts are escaped."""
     head = ''.join(f'<th>{escape(name)}</th>' for name in header)
     body = ''.join('<tr>' + ''.join(_cell(value) for value in row) + '</tr>' for row in rows)
     top = f'<caption>{escape(caption)}</caption>' if caption else ''
@@ -71,14 +68,14 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = '
 
 
 def number(value: Any, digits: int = 5) -> str:
-    """Write a number for people; a missing one is a dash."""
+    """Return a number as text for people; None and nan give a dash."""
     if value is None or (isinstance(value, float) and np.isnan(value)):
         return '\N{EN DASH}'
     return str(value) if isinstance(value, (int, str)) else f'{float(value):.{digits}g}'
 
 
 def plain(value: float | None, digits: int = 2) -> str:
-    """Write a number with few digits and no exponent; a missing one is a dash."""
+    """Return a number as text with few digits and without an exponent; None and nan give a dash."""
     if value is None or np.isnan(value):
         return '\N{EN DASH}'
     return np.format_float_positional(value, precision=digits, fractional=False, trim='-')
@@ -91,12 +88,7 @@ def _cell(value: Any) -> str:
 
 
 def matrix(name: str, values: Array, rows: Sequence[str] = (), columns: Sequence[str] = ()) -> str:
-    """Return a matrix as a table with its signals named."""
+    """Return a matrix as a table. rows, columns: names of its rows and columns, x1, x2, ... where there are none."""
     header = ['', *(columns or [f'x{k + 1}' for k in range(values.shape[1])])]
     labels = rows or [f'x{k + 1}' for k in range(values.shape[0])]
     return table(header, [[label, *row] for label, row in zip(labels, values.tolist(), strict=True)], name)
-
-
-def write(path: str | Path, text: str) -> None:
-    """Write a page, whole or not at all."""
-    write_file(path, lambda file: file.write(text.encode('utf-8')))

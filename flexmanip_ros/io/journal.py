@@ -1,15 +1,13 @@
-"""The rows of a study as they come: one JSON line a run, on disk before the next; and the table made of them.
+"""The journal of a study: one JSON line per run, on disk before the next run is added.
 
-A study that was interrupted, or killed, continues from its journal. The table (.csv or .parquet) is written
-from it at the end and on an interrupt.
+A study that was interrupted or killed continues from its journal. The table of the study (.csv or .parquet) is made
+from the journal at the end, and on an interrupt.
 """
 
 from __future__ import annotations
 
-import csv
 import fcntl
 import importlib
-import io
 import json
 import os
 from collections.abc import Iterable, Mapping
@@ -18,7 +16,7 @@ from types import TracebackType
 from typing import Any
 
 from flexmanip_ros.errors import FlexmanipError
-from flexmanip_ros.io.table import OutputError, check_place, write_file
+from flexmanip_ros.io.outputs import OutputError, check_place, write_file, write_rows
 
 Row = dict[str, Any]
 SUFFIXES = ('.csv', '.parquet')
@@ -27,8 +25,8 @@ SUFFIXES = ('.csv', '.parquet')
 class Journal:
     """Rows of one study at ``path`` + '.journal'. Use it in a ``with``.
 
-    identity: what makes the study this one. Refused with OutputError: a journal of another study, one that is
-    damaged, and one that another process writes.
+    identity: names and values that differ between studies. Raises OutputError for the journal of another study, for a
+    damaged one, and for one that another process is writing.
     """
 
     def __init__(self, path: str | Path, identity: Mapping[str, Any]) -> None:
@@ -48,8 +46,7 @@ class Journal:
         try:
             self._file = self.journal.open('a', encoding='utf-8')
         except OSError as err:
-            raise OutputError(f"'{self.journal}' cannot be written: {err.strerror}",
-                              'give another place') from err
+            raise OutputError(f"'{self.journal}' cannot be written: {err.strerror}", 'give another place') from err
         try:
             self._lock()
             if is_new or not self._resume(head):
@@ -65,15 +62,14 @@ class Journal:
             raise OutputError(f"'{self.journal}' is being written by another process",
                               'wait for it, or give another --output') from err
         except OSError:
-            return  # a file system without locks
+            return  # this file system has no locks
 
     def _resume(self, head: str) -> bool:
-        """Read what is there; a line that a kill tore is taken back. Tell whether the head was whole."""
+        """Read the rows; drop an incomplete last line, as a kill leaves it. Return whether the first was complete."""
         content = self.journal.read_bytes()
         whole = content[:content.rfind(b'\n') + 1]
         if not whole and not f'{head}\n'.encode().startswith(content):
-            raise OutputError(f"'{self.journal}' is no journal of a study",
-                              'remove it, or give another --output')
+            raise OutputError(f"'{self.journal}' is no journal of a study", 'remove it, or give another --output')
         lines = whole.decode('utf-8', errors='replace').splitlines()
         if lines and lines[0] != head:
             raise OutputError(f"'{self.journal}' belongs to another study",
@@ -89,10 +85,10 @@ class Journal:
         return bool(lines)
 
     def add(self, rows: Iterable[Row]) -> None:
-        """Keep the rows of one run, all or none."""
+        """Add the rows of one run: all of them or, after an error, none."""
         kept = list(rows)
         line = json.dumps(kept)
-        self.rows.extend(kept)  # first: an interrupt while writing must not leave it out of the table
+        self.rows.extend(kept)  # before the file: after an interrupt while writing, the table still has the run
         self._append(line)
 
     def _append(self, text: str) -> None:
@@ -108,15 +104,11 @@ class Journal:
         """Write the table, sorted by the columns in ``order``."""
         names = list(order)
         rows = sorted(self.rows, key=lambda row: tuple(_sortable(row.get(name)) for name in names))
-        columns = list(dict.fromkeys(name for row in rows for name in row))
         if self.path.suffix == '.csv':
-            text = io.StringIO()
-            writer = csv.DictWriter(text, columns, restval='', lineterminator='\n')
-            writer.writeheader()
-            writer.writerows({name: '' if row[name] is None else row[name] for name in row} for row in rows)
-            write_file(self.path, lambda file: file.write(text.getvalue().encode('utf-8')))
+            write_rows(self.path, rows)
         else:
             arrow, parquet = _parquet()
+            columns = dict.fromkeys(name for row in rows for name in row)
             made = arrow.table({name: [row.get(name) for row in rows] for name in columns})
             write_file(self.path, lambda file: parquet.write_table(made, file))
 
@@ -129,7 +121,7 @@ class Journal:
 
 
 def _run(line: str) -> list[Row]:
-    """Return the rows of a run. Raises ValueError for anything else."""
+    """Return the rows in one line of the journal. Raises ValueError where it holds none."""
     found = json.loads(line)
     if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):
         raise ValueError('it holds no rows')

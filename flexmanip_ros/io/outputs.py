@@ -1,68 +1,219 @@
-"""Where estimates go: a table at the end, or a recording as they come."""
+"""Files of results: written whole or not at all, as tables of estimates or as recordings of them.
+
+A table (.csv for people and spreadsheets, .npz with the matrices for numpy) is written at the end of a run; a recording
+grows with the run.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
 import os
+import stat
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol
+from typing import Any
 
-from flexmanip_ros.errors import BagError
-from flexmanip_ros.io import table
+import numpy as np
+
+from flexmanip_ros.errors import BagError, FlexmanipError
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.messages import MODES, PAYLOAD_MASS, outgoing
-from flexmanip_ros.types import Estimate
+from flexmanip_ros.types import Array, Estimate
 
+PAYLOAD = ('mass', 'std', 'lower', 'upper', 'consistency')
+SCALARS = ('excitation', 'condition', 'innovation_power')
 NODE = 'rpbsid_identifier'
 
 
-class Output(Protocol):
-    """Takes estimates one by one; ``close`` makes them permanent, after an exception too."""
+class OutputError(FlexmanipError):
+    """A file cannot be written."""
 
+
+def write_file(path: str | Path, fill: Callable[[Any], Any]) -> None:
+    """Write a file whole or not at all; an older one stays until the new one is complete."""
+    path = Path(path)
+    partial = path.with_name(f'.{path.name}.part')
+    try:
+        with partial.open('wb') as file:
+            fill(file)
+        os.replace(partial, path)
+    except OSError as err:
+        partial.unlink(missing_ok=True)
+        raise OutputError(f"'{path}' cannot be written: {err.strerror}", 'give another place') from err
+
+
+def check_place(path: str | Path) -> None:
+    """Raise OutputError when a file cannot be written there. Call it before a long run."""
+    folder = Path(path).absolute().parent
+    try:
+        is_directory = stat.S_ISDIR(os.stat(path).st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        is_directory = not str(path)
+    except OSError as err:
+        raise OutputError(f"'{path}' cannot be written: {err.strerror}", 'give another place') from err
+    if is_directory:
+        raise OutputError(f"'{path}' is a directory", 'give a file name')
+    if not folder.is_dir():
+        raise OutputError(f"directory '{folder}' does not exist", 'make it first, or give another place')
+    if not os.access(folder, os.W_OK):
+        raise OutputError(f"directory '{folder}' cannot be written", 'give another place')
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file as UTF-8, whole or not at all."""
+    write_file(path, lambda file: file.write(text.encode('utf-8')))
+
+
+def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows of named values as .csv; a value that is None or not there is an empty cell."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(dict.fromkeys(name for row in rows for name in row)), restval='',
+                            lineterminator='\n')
+    writer.writeheader()
+    writer.writerows({name: '' if value is None else value for name, value in row.items()} for row in rows)
+    write_text(path, text.getvalue())
+
+
+def columns(estimates: Sequence[Estimate], start_ns: int | None = None) -> dict[str, Any]:
+    """Return arrays with one row an estimate.
+
+    stamp_ns (T,), time_s (T,) from ``start_ns`` (default: the first estimate), status (T,), frequency_hz,
+    damping_ratio and their _std (T, k), payload_mass_kg, payload_std_kg, payload_lower_kg, payload_upper_kg,
+    consistency, excitation, condition, innovation_power (T,). Values that an estimate does not have are NaN.
+    """
+    stamps = np.array([estimate.stamp_ns for estimate in estimates], dtype=np.int64)
+    start = start_ns if start_ns is not None else next(iter(stamps), 0)
+    count = max((len(estimate.modes) for estimate in estimates), default=0)
+    modes = np.full((len(estimates), count, 4), np.nan)
+    for row, estimate in enumerate(estimates):
+        if estimate.modes:
+            modes[row, :len(estimate.modes)] = estimate.modes
+    payload = np.full((len(estimates), len(PAYLOAD)), np.nan)
+    for row, estimate in enumerate(estimates):
+        if estimate.payload is not None:
+            payload[row] = [getattr(estimate.payload, name) for name in PAYLOAD]
+    found: dict[str, Any] = {
+        'stamp_ns': stamps,
+        'time_s': (stamps - start) * 1e-9,
+        'status': np.array([estimate.status.name for estimate in estimates], dtype=np.str_),
+        'model_status': np.array([estimate.model_status.name for estimate in estimates], dtype=np.str_),
+        'frequency_hz': modes[:, :, 0], 'damping_ratio': modes[:, :, 1],
+        'frequency_std_hz': modes[:, :, 2], 'damping_ratio_std': modes[:, :, 3],
+        'payload_mass_kg': payload[:, 0], 'payload_std_kg': payload[:, 1],
+        'payload_lower_kg': payload[:, 2], 'payload_upper_kg': payload[:, 3], 'consistency': payload[:, 4],
+    }
+    for name in SCALARS:
+        found[name] = np.array([getattr(estimate, name) for estimate in estimates], dtype=np.float64)
+    return found
+
+
+def matrices(estimates: Sequence[Estimate]) -> dict[str, Array]:
+    """Return A (T, n, n), B, C, D, K and dt (T,); rows without a model are NaN. Empty without any model."""
+    model = next((estimate.model for estimate in estimates if estimate.model is not None), None)
+    if model is None:
+        return {}
+    shapes = {name: getattr(model, name).shape for name in 'ABCDK'}
+    found = {name: np.full((len(estimates), *shape), np.nan) for name, shape in shapes.items()}
+    found['dt'] = np.full(len(estimates), np.nan)
+    for row, estimate in enumerate(estimates):
+        if estimate.model is not None:
+            for name in (*shapes, 'dt'):
+                found[name][row] = getattr(estimate.model, name)
+    return found
+
+
+def write_csv(path: str | Path, estimates: Sequence[Estimate], start_ns: int | None = None) -> None:
+    """Write one line an estimate; columns with several modes are numbered from 1, NaN is an empty cell."""
+    flat: dict[str, Any] = {}
+    for name, values in columns(estimates, start_ns).items():
+        if values.ndim == 2:
+            stem, _, unit = name.partition('_')
+            flat |= {f'{stem}{k + 1}_{unit}': values[:, k] for k in range(values.shape[1])}
+        else:
+            flat[name] = values
+    lines = [[_cell(values[row]) for values in flat.values()] for row in range(len(estimates))]
+    write_text(path, ''.join(','.join(line) + '\n' for line in [list(flat), *lines]))
+
+
+def write_npz(path: str | Path, estimates: Sequence[Estimate], start_ns: int | None = None) -> None:
+    """Write the columns and matrices as numpy arrays (nothing pickled)."""
+    arrays = columns(estimates, start_ns) | matrices(estimates)
+    write_file(path, lambda file: np.savez_compressed(file, **arrays))
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, (np.integer, np.str_)):
+        return str(value)
+    return '' if np.isnan(value) else repr(float(value))
+
+
+class Output(ABC):
+    """Takes estimates one by one. Use it in a ``with``, which closes it; after an exception only if it is not empty."""
+
+    def __init__(self) -> None:
+        self.is_empty = True
+
+    @abstractmethod
     def write(self, estimate: Estimate) -> None:
         """Take one estimate."""
+        self.is_empty = False
 
+    @abstractmethod
     def close(self) -> None:
-        """Finish."""
+        """Write what is left."""
+
+    def __enter__(self) -> Output:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        if kind is None or not self.is_empty:
+            self.close()
 
 
-class TableOutput:
+class TableOutput(Output):
     """A .csv or .npz file, written when closed."""
 
     def __init__(self, path: Path) -> None:
-        table.check_place(path)
+        super().__init__()
+        check_place(path)
         self.path = path
         self.estimates: list[Estimate] = []
         self.start_ns: int | None = None
+        """Stamp at which the time of the table is 0; None: the first estimate."""
 
     def write(self, estimate: Estimate) -> None:
         """Keep one row."""
+        super().write(estimate)
         self.estimates.append(estimate)
 
     def close(self) -> None:
         """Write the file."""
-        writer = table.write_csv if self.path.suffix == '.csv' else table.write_npz
+        writer = write_csv if self.path.suffix == '.csv' else write_npz
         writer(self.path, self.estimates, self.start_ns)
 
 
-class BagOutput:
-    """A recording with the identifier's topics, stamped as the input; made with the first estimate."""
+class BagOutput(Output):
+    """A recording with the identifier's topics, stamped as the input. It is made with the first estimate."""
 
-    def __init__(self, path: Path, frame_id: str, node: str = NODE) -> None:
-        if os.path.exists(path):  # a name too long is for check_place to say
+    def __init__(self, path: Path, frame_id: str) -> None:
+        super().__init__()
+        if os.path.exists(path):  # check_place names what is wrong with a name that is too long
             raise BagError(f"'{path}' exists already", 'remove it or give another name')
-        table.check_place(path)
+        check_place(path)
         self._path = path
         self._frame_id = frame_id
-        self._node = node
         self._writer: BagWriter | None = None
 
     def write(self, estimate: Estimate) -> None:
-        """Append what the node would have published."""
-        writer = self._opened()
+        """Append the messages that the node would have published."""
+        super().write(estimate)
         for name, value in outgoing(estimate, self._frame_id):
             latched = name not in (MODES, PAYLOAD_MASS)
-            writer.write(f'/{self._node}/{name}', estimate.stamp_ns, value, latched=latched)
+            self._opened().write(f'/{NODE}/{name}', estimate.stamp_ns, value, latched=latched)
 
     def close(self) -> None:
         """Finish the recording."""
@@ -74,30 +225,7 @@ class BagOutput:
         return self._writer
 
 
-class Outputs:
-    """Several outputs as one; closes all of them, whatever happens. Nothing is left of a run of nothing."""
-
-    def __init__(self, *outputs: Output) -> None:
-        self._outputs = outputs
-        self._written = False
-
-    def write(self, estimate: Estimate) -> None:
-        """Hand one estimate to each."""
-        self._written = True
-        for output in self._outputs:
-            output.write(estimate)
-
-    def __enter__(self) -> Outputs:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
-        if kind is None or self._written:
-            for output in self._outputs:
-                output.close()
-
-
 def open_output(path: str | Path, frame_id: str) -> Output:
-    """Return the output a name asks for: .csv or .npz a table, anything else a recording."""
+    """Return the output for a name: a table where it ends in .csv or .npz, else a recording."""
     path = Path(path)
     return TableOutput(path) if path.suffix in ('.csv', '.npz') else BagOutput(path, frame_id)

@@ -15,13 +15,13 @@ from flexmanip_ros.parameters import configure
 
 Config = TypeVar('Config')
 STANDARD = re.compile(r'^(use_sim_time|start_type_description_service|qos_overrides\..*)$')
-"""Parameters that every ROS node has; they mean nothing offline."""
+"""Parameters that every ROS node has and that have no meaning offline."""
 LARGEST_FILE = 1 << 20
-"""Bytes; a parameter file is a page of text."""
+"""Size of a file above which it is rejected [bytes]; a parameter file is a page of text."""
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML as ROS reads it: 1e-3 is a number, a name twice is a mistake, aliases are not understood."""
+    """Safe YAML as ROS reads it: 1e-3 is a number; a repeated name and an alias are errors."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.events.AliasEvent):
@@ -80,8 +80,7 @@ def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, An
         return {}
     sections = dict(_sections(document, '', where))
     if not sections:
-        raise ParameterError(f"{where} has no 'ros__parameters'",
-                             f"write '{node}: {{ros__parameters: {{...}}}}'")
+        raise ParameterError(f"{where} has no 'ros__parameters'", f"write '{node}: {{ros__parameters: {{...}}}}'")
     chosen = [name for name in sections if _applies(name, node)]
     if not chosen and not optional:
         near = difflib.get_close_matches(node, [name.rpartition('/')[2] for name in sections], n=1)
@@ -97,8 +96,7 @@ def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, An
 
 def _sections(tree: Any, prefix: str, where: str) -> Iterable[tuple[str, Any]]:
     if not isinstance(tree, Mapping):
-        raise ParameterError(f'{where} has {tree!r:.60} in place of a node',
-                             "write 'NODE: {ros__parameters: {...}}'")
+        raise ParameterError(f'{where} has {tree!r:.60} in place of a node', "write 'NODE: {ros__parameters: {...}}'")
     for key, value in tree.items():
         name = f'{prefix}/{key}'.replace('//', '/') if prefix else str(key)
         if isinstance(value, Mapping) and 'ros__parameters' in value:

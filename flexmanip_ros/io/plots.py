@@ -1,13 +1,15 @@
-"""The parts every picture is made of: one look, units on every axis, the event marked.
+"""Figures of a run: first the parts that all figures share, then the figures of one run.
 
-Colours are Okabe and Ito's, which people with any colour vision tell apart. matplotlib is imported only here
-and in the modules that draw, so everything else works without it.
+Every axis has its unit, and every event is marked. The colours are those of Okabe and Ito, which people with any
+colour vision can tell apart. matplotlib is imported only here and in other modules that draw.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,75 +18,58 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from flexmanip_ros.types import Array, Estimate, EventKind, Status
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.samples import sampling
+from flexmanip_ros.samples.sample_log import Signals
+from flexmanip_ros.studies.holdout import Scores
+from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointRecord, Status
 
 COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#7F7F7F', '#000000')
 LINES: tuple[Any, ...] = ('-', (0, (4, 1.2)), (0, (1.2, 1)), (0, (6, 1.2, 1.2, 1.2)))
-"""Signals in one plot differ by more than their colour."""
+"""Line styles, so that signals in one plot differ by more than their colour."""
 PAYLOAD_COLOUR = '#009E73'
 TRUTH_COLOUR = '#000000'
 EVENT_COLOUR = '#AA0000'
-STATUS_COLOURS = {
-    Status.WARMING_UP: '#C8C8C8', Status.TRACKING: '#009E73', Status.POORLY_EXCITED: '#E69F00',
-    Status.ILL_CONDITIONED: '#CC79A7', Status.SAMPLE_GAP: '#56B4E9', Status.INCONSISTENT: '#D55E00',
-    Status.NO_PAYLOAD_METHOD: '#56B4E9', Status.UNOBSERVABLE: '#7F7F7F', Status.DIVERGED: '#000000',
-    Status.ORDER_TOO_LOW: '#F0E442',
+STATUS_LOOKS: dict[Status, tuple[str, str]] = {
+    Status.WARMING_UP: ('#C8C8C8', '..'), Status.TRACKING: ('#009E73', ''), Status.POORLY_EXCITED: ('#E69F00', '//'),
+    Status.ILL_CONDITIONED: ('#CC79A7', 'xx'), Status.SAMPLE_GAP: ('#56B4E9', '||'),
+    Status.INCONSISTENT: ('#D55E00', '\\\\'), Status.NO_PAYLOAD_METHOD: ('#56B4E9', '--'),
+    Status.UNOBSERVABLE: ('#7F7F7F', '++'), Status.DIVERGED: ('#000000', 'OO'), Status.ORDER_TOO_LOW: ('#F0E442', '**'),
 }
-STATUS_HATCHES = {
-    Status.TRACKING: '', Status.WARMING_UP: '..', Status.POORLY_EXCITED: '//', Status.ILL_CONDITIONED: 'xx',
-    Status.SAMPLE_GAP: '||', Status.INCONSISTENT: '\\\\', Status.NO_PAYLOAD_METHOD: '--',
-    Status.UNOBSERVABLE: '++', Status.DIVERGED: 'OO', Status.ORDER_TOO_LOW: '**',
-}
-"""A status differs by more than its colour."""
+"""Colour and hatch of each status, so that they differ by more than their colour."""
 WIDTH = 10.0
-"""Inches; about the width of a page."""
+"""Width of a figure [inches], about that of a page."""
 DPI = 120
 POINTS = 2000
-"""A line is thinned to its envelope above this many points."""
+"""Points above which a line is reduced to its envelope."""
 
 MODES_APART = 4.0
-"""Ratio to the lowest frequency above which a mode does not set the range of a plot."""
+"""Ratio to the lowest frequency above which a mode does not set the range of a plot [-]."""
 
 Event = tuple[float, EventKind]
 Known = tuple[float, float, Sequence[float]]
-"""From and to [s], and the frequencies [Hz] that are true between."""
+"""Begin and end [s] of a stretch, and its true frequencies [Hz]."""
 
 
-def figure(rows: int, heights: Sequence[float], *, share_time: bool = True) -> tuple[Figure, list[Any]]:
-    """Return a figure of the page's width and its axes, one below the other with one time axis."""
+def figure(heights: Sequence[float], *, columns: int = 1, share_time: bool = True) -> tuple[Figure, list[Any]]:
+    """Return a figure of the page's width and its axes, row by row. heights: of the rows [inches].
+
+    share_time: the axes have one time axis, labelled at the bottom.
+    """
     made = Figure(figsize=(WIDTH, float(sum(heights)) + 0.6), dpi=DPI, layout='constrained')
     FigureCanvasAgg(made)
-    axes = made.subplots(rows, 1, sharex=share_time, squeeze=False, height_ratios=list(heights))[:, 0]
-    _plain(axes)
+    axes = made.subplots(len(heights), columns, sharex=share_time, squeeze=False, height_ratios=list(heights)).ravel()
+    for ax in axes:
+        ax.grid(True, color='#E4E4E4', linewidth=0.7)
+        ax.set_axisbelow(True)
+        ax.spines[['top', 'right']].set_visible(False)
     if share_time:
         axes[-1].set_xlabel('time since the first sample [s]')
     return made, list(axes)
 
 
-def row(columns: int, height: float) -> tuple[Figure, list[Any]]:
-    """Return a figure of the page's width and its axes side by side."""
-    made = Figure(figsize=(WIDTH, height + 0.6), dpi=DPI, layout='constrained')
-    FigureCanvasAgg(made)
-    axes = made.subplots(1, columns, squeeze=False)[0]
-    _plain(axes)
-    return made, list(axes)
-
-
-def _plain(axes: Iterable[Any]) -> None:
-    for ax in axes:
-        ax.grid(True, color='#E4E4E4', linewidth=0.7)
-        ax.set_axisbelow(True)
-        for side in ('top', 'right'):
-            ax.spines[side].set_visible(False)
-
-
-def save(made: Figure, path: str | Path) -> None:
-    """Write a figure as PNG."""
-    made.savefig(str(path), format='png')
-
-
 def envelope(time: Array, values: Array) -> tuple[Array, Array]:
-    """Thin a line (N,) so that its picture stays the same: the extremes of each stretch, in order."""
+    """Return fewer points of a line (N,) that look the same: the extremes of each stretch, in order."""
     stretch = 2 * values.size // POINTS
     if stretch < 2:
         return time, values
@@ -126,8 +111,7 @@ def times(estimates: Sequence[Estimate], start_ns: int) -> Array:
     return np.array([(estimate.stamp_ns - start_ns) * 1e-9 for estimate in estimates], dtype=np.float64)
 
 
-def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int,
-                truth: Sequence[Known] = ()) -> None:
+def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int, truth: Sequence[Known] = ()) -> None:
     """Draw the identified frequencies with their 95 % bands."""
     time = times(estimates, start_ns)
     count = max((len(estimate.modes) for estimate in estimates), default=0)
@@ -146,7 +130,7 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int,
                     label='true' if index == k == 0 else None)
     if count:
         known_all = [f for _, _, known in truth for f in known]
-        if known_all:  # what is true sets the range, so that a change of it is seen
+        if known_all:  # the true frequencies set the range, so that their change is visible
             room = max(max(known_all) - min(known_all), 0.1 * max(known_all))
             ax.set_ylim(min(known_all) - room, max(known_all) + room)
         else:
@@ -160,7 +144,7 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int,
 def _lowest(values: Array) -> Array:
     """Return the frequencies (T, k) that set the range, those far above the lowest as NaN.
 
-    Noise gives modes far above those of the arm; a range that holds them hides what a capture changes.
+    Noise gives modes far above those of the arm; a range that includes them would hide the change at a capture.
     """
     settled = values[values.shape[0] // 2:]
     low = settled[np.isfinite(settled)]
@@ -170,7 +154,7 @@ def _lowest(values: Array) -> Array:
 
 
 def _note_beyond(ax: Any, last: Array) -> None:
-    """Say in a corner which modes of the last estimate lie outside the range."""
+    """Write into a corner which modes of the last estimate lie outside the range."""
     low, high = ax.get_ylim()
     beyond = [f'{value:.1f}' for value in last if np.isfinite(value) and not low <= value <= high]
     if beyond:
@@ -198,7 +182,7 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
     last = table[-1] if len(held) and np.isfinite(table[-1]).all() else None
     if last is not None and not zoom:
         width = max(float(last[2] - last[1]), 1e-6)
-        digits = min(max(1 - math.floor(math.log10(width)), 0), 6)  # two of the interval's width
+        digits = min(max(1 - math.floor(math.log10(width)), 0), 6)  # two significant digits of the interval's width
         words = f'{last[0]:.{digits}f} kg, 95 %: {last[1]:.{digits}f} to {last[2]:.{digits}f} kg'
         ax.annotate(words, (1.0, 0.03), ha='right', va='bottom', xycoords='axes fraction',
                     color=PAYLOAD_COLOUR, fontsize=10, fontweight='bold')
@@ -207,7 +191,7 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
 
 
 def limit(ax: Any, values: Array, known: Sequence[float]) -> None:
-    """Choose the vertical range from where the values settle, so that a transient does not hide the rest."""
+    """Set the vertical range by the second half of the values, so that a transient does not hide the rest."""
     late = values[values.shape[0] // 2:]
     late = late[np.isfinite(late)]
     every = np.concatenate([values[np.isfinite(values)], np.asarray(known, dtype=np.float64)])
@@ -222,7 +206,7 @@ def limit(ax: Any, values: Array, known: Sequence[float]) -> None:
 
 
 def statuses(ax: Any, estimates: Sequence[Estimate], start_ns: int) -> None:
-    """Draw what the estimates were worth over time."""
+    """Draw the status over time."""
     time = times(estimates, start_ns)
     seen: list[Status] = []
     begin = 0
@@ -243,5 +227,178 @@ def statuses(ax: Any, estimates: Sequence[Estimate], start_ns: int) -> None:
 
 
 def _status_look(status: Status) -> dict[str, Any]:
-    return {'facecolor': STATUS_COLOURS[status], 'hatch': STATUS_HATCHES[status], 'edgecolor': '#FFFFFF',
-            'linewidth': 0}
+    colour, hatch = STATUS_LOOKS[status]
+    return {'facecolor': colour, 'hatch': hatch, 'edgecolor': '#FFFFFF', 'linewidth': 0}
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The true values of a simulation, drawn beside the estimates.
+
+    payload: mass held after a capture [kg]; before, after: frequencies [Hz] without and with it.
+    """
+
+    payload: float | None = None
+    before: tuple[float, ...] = ()
+    after: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """The signals, estimates and events of a run."""
+
+    signals: Signals
+    estimates: Sequence[Estimate]
+    events: tuple[Event, ...]
+    has_arm: bool
+    """Whether the signals are those of the two-link arm, so that positions of bends are in metres."""
+    truth: Truth = Truth()
+
+    @property
+    def start_ns(self) -> int:
+        """Stamp of the first sample."""
+        return int(self.signals.stamp_ns[0]) if self.signals.stamp_ns.size else 0
+
+    @property
+    def end(self) -> float:
+        """Time of the last sample [s]."""
+        return float(self.signals.time[-1]) if self.signals.stamp_ns.size else 0.0
+
+
+def collect(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent],
+            estimates: Sequence[Estimate], truth: Truth | None = None) -> Run:
+    """Return a run from its messages and its estimates."""
+    items = list(items)
+    seen = [item for item in items if isinstance(item, CaptureEvent)]
+    return run(config, sampling.collect(config, items), estimates, seen, truth)
+
+
+def run(config: IdentifierParameters, signals: Signals, estimates: Sequence[Estimate],
+        events: Iterable[CaptureEvent], truth: Truth | None = None) -> Run:
+    """Return a run from its signals; an event that was announced twice is kept once."""
+    start = int(signals.stamp_ns[0]) if signals.stamp_ns.size else 0
+    found: list[Event] = []
+    for event in sorted(events, key=lambda item: item.stamp_ns):
+        time = (event.stamp_ns - start) * 1e-9
+        if not any(kind is event.kind and abs(time - at) <= config.event_merge_time for at, kind in found):
+            found.append((time, event.kind))
+    return Run(signals, estimates, tuple(found), config.payload_method != 'none', truth or Truth())
+
+
+def overview_figure(made: Run, path: str | Path, title: str = '') -> None:
+    """Write one picture of a run as PNG: torques, bends, frequencies, payload, status over time."""
+    groups = signal_groups(made)
+    with_payload = any(estimate.payload is not None for estimate in made.estimates)
+    heights = [1.5] * len(groups) + [2.2] + [2.2] * with_payload + [0.35]
+    drawn, axes = figure(heights)
+    for ax, group in zip(axes, groups, strict=False):
+        lines(ax, made.signals.time, *group)
+    _estimates(axes[len(groups):], made, with_payload)
+    events(axes, made.events)
+    if title:
+        drawn.suptitle(title, x=0.02, ha='left', fontsize=13, fontweight='bold')
+    drawn.savefig(str(path), format='png')
+
+
+def _estimates(axes: Sequence[Any], made: Run, with_payload: bool) -> None:
+    frequency_truth, payload_truth = _stretches(made)
+    frequencies(axes[0], made.estimates, made.start_ns, frequency_truth)
+    if with_payload:
+        payload(axes[1], made.estimates, made.start_ns, payload_truth)
+    statuses(axes[-1], made.estimates, made.start_ns)
+    axes[-1].set_xlim(0.0, made.end or 1.0)
+
+
+def _stretches(made: Run) -> tuple[list[Known], list[tuple[float, float, float]]]:
+    """Return the true frequencies and masses of each stretch between two events."""
+    frequencies: list[Known] = []
+    masses: list[tuple[float, float, float]] = []
+    changes = [(time, kind is EventKind.CAPTURE) for time, kind in made.events]
+    for (begin, held), (end, _) in pairwise([(0.0, False), *changes, (made.end, False)]):
+        known = made.truth.after if held else made.truth.before
+        if known:
+            frequencies.append((begin, end, known))
+        if made.truth.payload is not None:
+            masses.append((begin, end, made.truth.payload if held else 0.0))
+    return frequencies, masses
+
+
+def signals_figure(made: Run) -> Figure:
+    """Draw inputs and outputs over time."""
+    groups = signal_groups(made)
+    drawn, axes = figure([1.7] * len(groups))
+    for ax, group in zip(axes, groups, strict=True):
+        lines(ax, made.signals.time, *group)
+    axes[-1].set_xlim(0.0, made.end or 1.0)
+    events(axes, made.events)
+    return drawn
+
+
+def frequency_figure(made: Run) -> Figure:
+    """Draw the frequencies with their bands, and the status."""
+    drawn, axes = figure([3.2, 0.35])
+    _estimates(axes, made, with_payload=False)
+    events(axes, made.events)
+    return drawn
+
+
+def payload_figure(made: Run) -> Figure:
+    """Draw the payload with its interval, whole and close up; the consistency of the residuals below."""
+    drawn, axes = figure([2.0, 2.4, 1.3])
+    payload(axes[0], made.estimates, made.start_ns, _stretches(made)[1])
+    payload(axes[1], made.estimates, made.start_ns, _stretches(made)[1], zoom=True)
+    rows = [estimate for estimate in made.estimates if estimate.payload is not None]
+    values = np.array([e.payload.consistency for e in rows if e.payload is not None], dtype=np.float64)
+    axes[2].plot(times(rows, made.start_ns), values, color=COLOURS[0], linewidth=1.2)
+    axes[2].axhline(1.0, color='#555555', linewidth=1.0, linestyle=':')
+    finite = values[np.isfinite(values)]
+    if finite.size:
+        axes[2].set_ylim(0.0, max(2.0, 1.2 * float(np.percentile(finite, 98))))
+    axes[2].set_ylabel('residual power\n[-], noise = 1')
+    axes[-1].set_xlim(0.0, made.end or 1.0)
+    events(axes, made.events)
+    return drawn
+
+
+def validation_figure(scores: Scores, outputs: Sequence[str], *, has_arm: bool) -> Figure:
+    """Draw the held-out outputs: measured, simulated by the model, and predicted one step ahead."""
+    drawn, axes = figure([1.7] * len(outputs))
+    for k, (ax, name) in enumerate(zip(axes, outputs, strict=True)):
+        joint, _, field = name.rpartition('/')
+        _, unit, scale = _quantity(joint, field, has_arm)
+        for values, label, colour, width, line in (
+                (scores.measured, 'measured', '#9A9A9A', 2.6, LINES[0]),
+                (scores.simulated, 'simulated', COLOURS[1], 1.1, LINES[0]),
+                (scores.predicted, 'one step ahead', COLOURS[0], 0.9, LINES[1])):
+            ax.plot(*envelope(scores.time, scale * values[:, k]), color=colour, linewidth=width,
+                    linestyle=line, label=label)
+        spread = scale * scores.measured[:, k]
+        room = 0.3 * (float(spread.max() - spread.min()) or 1.0)
+        ax.set_ylim(float(spread.min()) - room, float(spread.max()) + room)
+        ax.set_ylabel(f'{joint}\n{field}\n[{unit}]')
+        ax.set_title(f'VAF {scores.simulation[k]:.2f} % simulated, {scores.prediction[k]:.2f} % predicted',
+                     loc='left', fontsize=9)
+        if k == 0:
+            legend(ax)
+    return drawn
+
+
+def signal_groups(made: Run) -> list[tuple[Array, list[str], str, str]]:
+    """Return (columns, labels, title, unit) of the signals that belong in one plot."""
+    found: dict[tuple[str, str, float], list[tuple[str, Array]]] = {}
+    for names, table in ((made.signals.inputs, made.signals.u), (made.signals.outputs, made.signals.y)):
+        for k, name in enumerate(names):
+            joint, _, field = name.rpartition('/')
+            found.setdefault(_quantity(joint, field, made.has_arm), []).append((joint, table[:, k]))
+    return [(scale * np.column_stack([values for _, values in group]), [label for label, _ in group],
+             title, unit) for (title, unit, scale), group in found.items()]
+
+
+def _quantity(joint: str, field: str, has_arm: bool) -> tuple[str, str, float]:
+    if field == 'effort':
+        return 'torque', 'N m', 1.0
+    if not has_arm:
+        return field, 'rad or m' if field == 'position' else 'rad/s or m/s', 1.0
+    if 'bend' in joint:
+        return ('bend', 'mm', 1e3) if field == 'position' else ('bend rate', 'mm/s', 1e3)
+    return ('angle', 'rad', 1.0) if field == 'position' else ('rate', 'rad/s', 1.0)

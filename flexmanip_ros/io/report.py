@@ -1,47 +1,58 @@
-"""The report of identify_bag: everything about one run on one page."""
+"""Two reports as HTML pages: of one run of identify_bag, and of a study of monte_carlo."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from html import escape
 from pathlib import Path
+from typing import Any
 
-from flexmanip_ros.io import pictures
-from flexmanip_ros.io.html import Section, matrix, number, page, picture, table, write
-from flexmanip_ros.parameters import IdentifierParameters, flatten, leaves
+import numpy as np
+from matplotlib.figure import Figure
+
+from flexmanip_ros.io import plots
+from flexmanip_ros.io.html import Section, matrix, number, page, picture, table
+from flexmanip_ros.io.outputs import write_text
+from flexmanip_ros.parameters import IdentifierParameters, flatten
 from flexmanip_ros.parameters.document import written
+from flexmanip_ros.parameters.field import leaves
 from flexmanip_ros.studies.holdout import Scores
+from flexmanip_ros.studies.metrics import Score, score
 from flexmanip_ros.studies.summary import Summary
+from flexmanip_ros.studies.trial import Row
 from flexmanip_ros.types import StateSpace, Status
+
+SHOWN_FAILURES = 50
+"""Failed runs listed at most."""
 
 
 def identification_report(
-    path: str | Path, source: str, config: IdentifierParameters, summary: Summary, made: pictures.Run,
+    path: str | Path, source: str, config: IdentifierParameters, summary: Summary, made: plots.Run,
     model: StateSpace | None, scores: Scores | None, messages: dict[str, int], bound: float | None = None,
     fault: str = '',
 ) -> None:
     """Write the report of identify_bag."""
     sections = [Section('Result', _result(summary, made.signals.outputs, bound, fault)),
                 Section('Signals', picture(
-                    pictures.signals_figure(made), 'torques and measured signals over time'))]
+                    plots.signals_figure(made), 'torques and measured signals over time'))]
     if any(estimate.modes for estimate in made.estimates):
         sections.append(Section('Frequencies', picture(
-            pictures.frequency_figure(made), 'identified frequencies with 95 % bands over time')))
+            plots.frequency_figure(made), 'identified frequencies with 95 % bands over time')))
     if any(estimate.payload is not None for estimate in made.estimates):
         sections.append(Section('Payload', picture(
-            pictures.payload_figure(made), 'payload with its 95 % interval, and residual power over time')))
+            plots.payload_figure(made), 'payload with its 95 % interval, and residual power over time')))
     if scores is not None:
         note = '' if not scores.until_gap else '<p class="note">Scored up to the first gap.</p>'
-        drawn = pictures.validation_figure(scores, made.signals.outputs, has_arm=made.has_arm)
-        sections.append(Section(
-            'Validation', note + picture(drawn, 'measured, simulated and predicted outputs')))
+        drawn = plots.validation_figure(scores, made.signals.outputs, has_arm=made.has_arm)
+        sections.append(Section('Validation', note + picture(drawn, 'measured, simulated and predicted outputs')))
     if model is not None:
         sections.append(Section('Model', _model(model, made.signals.inputs, made.signals.outputs)))
     counts = [(name.replace('_', ' '), count) for name, count in messages.items()]
     sections += [Section('Parameters', _parameters(config)),
                  Section('Messages', table(['what became of the messages', 'count'], counts))]
     lead = f'{summary.samples} samples, {made.end:.3f} s, identified in {summary.wall_s:.2f} s'
-    write(path, page(f'Identification of {source}', lead, sections))
+    write_text(path, page(f'Identification of {source}', lead, sections))
 
 
 def _result(summary: Summary, outputs: Sequence[str], bound: float | None, fault: str) -> str:
@@ -52,9 +63,9 @@ def _result(summary: Summary, outputs: Sequence[str], bound: float | None, fault
     for k, (frequency, damping) in enumerate(modes):
         rows.append((f'mode {k + 1}', f'{frequency:.4f} Hz, damping ratio {damping:.4f}'))
     if summary.payload_ci95_kg is not None:
-        low, high = summary.payload_ci95_kg
-        rows.append(('payload', f'{number(summary.payload_mass_kg)} kg, 95 % interval {number(low)} to '
-                     f'{number(high)} kg, standard deviation {number(summary.payload_std_kg)} kg'))
+        rows.append(('payload', summary.payload_text()))
+        if summary.payload_std_kg is not None:
+            rows.append(('standard deviation', f'{number(summary.payload_std_kg)} kg'))
         if bound is not None:
             rows.append(('best possible', f'standard deviation {number(bound, 3)} kg (Cramer-Rao bound of '
                          'the samples after the capture, at the noise they show)'))
@@ -91,3 +102,60 @@ def _parameters(config: IdentifierParameters) -> str:
     return ('<p class="note">Marked: different from the default.</p><div class="wide"><table>'
             '<tr><th>parameter</th><th>value</th><th>unit</th><th>meaning</th></tr>'
             + ''.join(rows) + '</table></div>')
+
+
+def study_report(path: str | Path, name: str, rows: Sequence[Row]) -> None:
+    """Write the report of monte_carlo: how good each estimator was, and every run of it."""
+    names = sorted({str(row.get('estimator', '')) for row in rows})
+    groups = {item: [row for row in rows if str(row.get('estimator', '')) == item] for item in names}
+    header = ['estimator', *(item.name.replace('_', ' ') for item in fields(Score))]
+    scores = [[item, *vars(score(group)).values()] for item, group in groups.items()]
+    sections = [Section('Scores', table(header, scores))]
+    for item, group in groups.items():
+        drawn = errors(group)
+        if drawn is not None:
+            note = '<p class="note">Error of the last estimate of each run with its 95 % interval.</p>'
+            shown = picture(drawn, f'payload errors of {item}')
+            sections.append(Section(f'Payload: {item}', note + shown))
+    statuses = sorted({str(row.get('status') or 'failed') for row in rows})
+    sections.append(Section('Status at the end', table(['estimator', *statuses], [
+        [item, *(sum(str(row.get('status') or 'failed') == status for row in group) for status in statuses)]
+        for item, group in groups.items()])))
+    failed = [row for row in rows if row.get('error')]
+    if failed:
+        columns = ('run', 'estimator', 'error')
+        shown = table(columns, [[str(row.get(k, '')) for k in columns] for row in failed[:SHOWN_FAILURES]])
+        sections.append(Section(f'Failed: {len(failed)}', shown))
+    write_text(path, page(f'Study: {name}', f'{len(rows)} rows', sections))
+
+
+def errors(rows: Sequence[Row]) -> Figure | None:
+    """Draw the relative error of each run [%] over its true payload [kg]; None when no run has both."""
+    needed = ('payload_true_kg', 'payload_mass_kg', 'payload_lower_kg', 'payload_upper_kg')
+    good = [row for row in rows if not row.get('error') and all(_finite(row.get(name)) for name in needed)
+            and row['payload_true_kg'] > 0.0]
+    if not good:
+        return None
+    values = np.array([[row[name] for name in needed] for row in good], dtype=np.float64)
+    true, mass, low, high = values.T
+    relative = [100.0 * (part - true) / true for part in (mass, low, high)]
+    held = np.array([bool(row['covered']) for row in good])
+    drawn, axes = plots.figure([3.4], share_time=False)
+    for chosen, colour, mark, label in ((held, plots.PAYLOAD_COLOUR, 'o', 'truth inside\nthe 95 % interval'),
+                                        (~held, plots.EVENT_COLOUR, 'x', 'truth outside')):
+        if chosen.any():
+            axes[0].vlines(true[chosen], relative[1][chosen], relative[2][chosen], color=colour, alpha=0.5)
+            axes[0].plot(true[chosen], relative[0][chosen], mark, markersize=4, color=colour, label=label)
+    axes[0].axhline(0.0, color=plots.TRUTH_COLOUR, linewidth=1.0)
+    spread = float(np.percentile(np.abs(relative[0]), 95))
+    # the errors stay visible where the intervals are much wider
+    room = 1.5 * (spread + min(float(np.median(relative[2] - relative[1])), 3.0 * spread))
+    axes[0].set_ylim(-room or -1.0, room or 1.0)
+    axes[0].set_xlabel('true payload [kg]')
+    axes[0].set_ylabel('error [%]')
+    plots.legend(axes[0])
+    return drawn
+
+
+def _finite(value: Any) -> bool:
+    return isinstance(value, (int, float)) and bool(np.isfinite(value))

@@ -1,1 +1,1 @@
-"""Everything that reproduces the paper."""
+"""The reproduction of the paper's section 4."""

@@ -1,7 +1,7 @@
-"""One experiment of the paper: every method over the same samples, as rows and as tracks over time.
+"""One experiment of the paper: every method on the same samples, as rows and as tracks over time.
 
-Work that several methods share is done once: one pass of an identifier serves every method that reads it, the
-messages become samples once for the two baselines.
+Work that several methods share is done once: methods that read the same identifier share one pass of it, and the two
+baselines share the conversion of messages to samples.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.paper import experiments, single_link
 from flexmanip_ros.paper.experiments import Case, Method
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, PlantParameters, configure
-from flexmanip_ros.payload import block_extraction
+from flexmanip_ros.payload import block_extraction, cramer_rao
+from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.simulation.noise import std_for_snr
 from flexmanip_ros.studies import baselines, trial
 from flexmanip_ros.studies.scenario import Run, Scenario
-from flexmanip_ros.types import Array, CaptureEvent, Estimate, JointRecord, StateSpace, Status
+from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointRecord, StateSpace, Status
 
 Item = JointRecord | CaptureEvent
 
@@ -40,23 +42,23 @@ class Track(NamedTuple):
     model: StateSpace | None
 
 
-class Reading(NamedTuple):
-    """What a method gave: its estimates, the last one at the last sample, and what they cost [s]."""
+class MethodResult(NamedTuple):
+    """The result of a method: its estimates, the last one at the last sample, and the time they took [s]."""
 
     estimates: list[Estimate]
     wall: float
 
 
 def run(case: Case, seed: int) -> tuple[list[trial.Row], dict[str, Track]]:
-    """Simulate one experiment and put every method over the same samples; rows and tracks.
+    """Simulate one experiment and run every method on the same samples; return rows and tracks.
 
-    Whatever goes wrong in a method becomes the ``error`` of its row; the others go on.
+    An exception of one method becomes the ``error`` of its row; the others are run all the same.
     """
-    found: dict[str, Reading] = {}
+    found: dict[str, MethodResult] = {}
     failed: dict[str, str] = {}
     alone = [method for method in experiments.METHODS if method.name == experiments.ALONE]
     others = [method for method in experiments.METHODS if method.name != experiments.ALONE]
-    compared = [method for method in others if method.baseline]
+    baselined = [method for method in others if method.baseline]
     items: list[Item] = []
     with _attempt(failed, others):
         items = _messages(case, seed)
@@ -65,8 +67,8 @@ def run(case: Case, seed: int) -> tuple[list[trial.Row], dict[str, Track]]:
         with _attempt(failed, readers):
             found.update(_identify(case, name, readers, items))
     if items:
-        with _attempt(failed, compared):
-            found.update(_compare(case, compared, items))
+        with _attempt(failed, baselined):
+            found.update(_compare(case, baselined, items))
     with _attempt(failed, alone):
         found.update(_compare(case, alone, _own_run(case, seed)))
     return _rows(case, seed, found, failed)
@@ -74,20 +76,19 @@ def run(case: Case, seed: int) -> tuple[list[trial.Row], dict[str, Track]]:
 
 @contextmanager
 def _attempt(failed: dict[str, str], methods: Sequence[Method]) -> Iterator[None]:
-    """Keep an error as that of some methods: a defect in one must not hide the others."""
+    """Record an exception as the error of these methods, and go on."""
     try:
         yield
     except Exception as error:
         failed.update({method.name: trial.describe(error) for method in methods})
 
 
-def _rows(case: Case, seed: int, found: dict[str, Reading], failed: dict[str, str]
+def _rows(case: Case, seed: int, found: dict[str, MethodResult], failed: dict[str, str]
           ) -> tuple[list[trial.Row], dict[str, Track]]:
     rows: list[trial.Row] = []
     tracks: dict[str, Track] = {}
     for method in experiments.METHODS:
-        row: trial.Row = {'case': case.name, 'method': method.name, 'seed': seed,
-                          'error': failed.get(method.name, '')}
+        row: trial.Row = {'case': case.name, 'method': method.name, 'seed': seed, 'error': failed.get(method.name, '')}
         if method.name in found:
             reading = found[method.name]
             tracks[method.name] = follow(reading.estimates)
@@ -97,14 +98,14 @@ def _rows(case: Case, seed: int, found: dict[str, Reading], failed: dict[str, st
     return rows, tracks
 
 
-def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[Item]) -> dict[str, Reading]:
+def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[Item]) -> dict[str, MethodResult]:
     """Run one identifier once; each of the methods that read it costs the pass and its own reading.
 
     A method without settings of its own takes the identifier's estimates; the others read a block payload
     from its model, from the capture on.
     """
     configs = {method.name: _configured(case, method)[1].identifier for method in readers if method.settings}
-    found = {method.name: Reading([], 0.0) for method in readers}
+    found = {method.name: MethodResult([], 0.0) for method in readers}
     walls = dict.fromkeys(found, 0.0)
     begun = time.perf_counter()
     for state, estimate in pipeline.replay(_identifier(case, name), items):
@@ -116,8 +117,7 @@ def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[
             started = time.perf_counter()
             read = now
             if method in configs:
-                read = (_with_block(configs[method], case, state, now) if held
-                        else now._replace(payload=None))
+                read = (_with_block(configs[method], case, state, now) if held else now._replace(payload=None))
             found[method].estimates.append(read)
             walls[method] += time.perf_counter() - started
     shared = time.perf_counter() - begun - sum(walls.values())
@@ -130,7 +130,7 @@ def _with_block(config: IdentifierParameters, case: Case, state: pipeline.State,
     identifier = state.identifier.estimator
     try:
         found = rpbsid.identified(config, identifier.rpbsid, state.clock.dt)
-    except np.linalg.LinAlgError:  # nothing moves yet
+    except np.linalg.LinAlgError:  # no signal moves yet
         found = None
     if found is None:
         return now._replace(payload=None, status=now.model_status)
@@ -139,7 +139,7 @@ def _with_block(config: IdentifierParameters, case: Case, state: pipeline.State,
     return now._replace(payload=payload, status=status)
 
 
-def _compare(case: Case, methods: Sequence[Method], items: Sequence[Item]) -> dict[str, Reading]:
+def _compare(case: Case, methods: Sequence[Method], items: Sequence[Item]) -> dict[str, MethodResult]:
     """Run methods that are no part of the identifier over the same samples."""
     config = _configured(case, methods[0])[1].identifier
     begun = time.perf_counter()
@@ -149,19 +149,19 @@ def _compare(case: Case, methods: Sequence[Method], items: Sequence[Item]) -> di
     for method in methods:
         begun = time.perf_counter()
         estimates = list(baselines.run(method.baseline, config, recorded))
-        found[method.name] = Reading(estimates, shared + time.perf_counter() - begun)
+        found[method.name] = MethodResult(estimates, shared + time.perf_counter() - begun)
     return found
 
 
 @cache
 def _identifier(case: Case, name: str) -> IdentifierParameters:
-    """Return the configuration of one of the identifiers, whoever reads it."""
+    """Return the configuration of one of the identifiers."""
     return experiments.scenario(case, Method(name, '', name)).configuration(0, name).identifier
 
 
 @cache
 def _prepared(case: Case, name: str) -> tuple[Scenario, Run]:
-    """Return the scenario and its configurations but for the seed."""
+    """Return the scenario of a method and its configurations for seed 0."""
     made = experiments.scenario(case, next(method for method in experiments.METHODS if method.name == name))
     return made, made.configuration(0, name)
 
@@ -185,7 +185,7 @@ def _own_run(case: Case, seed: int) -> list[Item]:
 @cache
 def true_frequencies(case: Case, mass: float) -> tuple[float, ...]:
     """Return the two lowest frequencies of a case's arm with a payload [Hz]."""
-    return tuple(trial.true_frequencies(_configured(case, experiments.METHODS[0])[1], mass))
+    return tuple(trial.true_frequencies(_configured(case, experiments.METHODS[0])[1].plant, mass))
 
 
 def _columns(estimates: Sequence[Estimate], track: Track, case: Case) -> trial.Row:
@@ -207,7 +207,7 @@ def _columns(estimates: Sequence[Estimate], track: Track, case: Case) -> trial.R
 
 
 def follow(estimates: Sequence[Estimate]) -> Track:
-    """Return estimates as arrays; what there was not is nan, and so is a mass of which nothing is known."""
+    """Return estimates as arrays. Missing values are nan, and so is a mass whose standard deviation is infinite."""
     count = len(estimates)
     table = np.full((count, 3), np.nan)
     frequencies = np.full((count, 2), np.nan)
@@ -219,8 +219,29 @@ def follow(estimates: Sequence[Estimate]) -> Track:
         frequencies[k, :len(found)] = found
     start = estimates[0].stamp_ns if estimates else 0
     stamps = np.array([(estimate.stamp_ns - start) / 1e9 for estimate in estimates], dtype=np.float64)
-    return Track(stamps, table[:, 0], table[:, 1], table[:, 2], frequencies,
-                 estimates[-1].model if estimates else None)
+    return Track(stamps, table[:, 0], table[:, 1], table[:, 2], frequencies, estimates[-1].model if estimates else None)
+
+
+def bounds(case: Case) -> dict[str, float]:
+    """Return method -> Cramer-Rao bound of the payload [kg] at the end of a run, where a method has one.
+
+    ``structured`` knows the structure of the equations of motion. The block extractions know nothing of (A, B);
+    theirs is the bound of their own formula (``payload.cramer_rao.structure_unknown``).
+    """
+    if case.model != 'linear':
+        return {}
+    run = experiments.scenario(case, experiments.METHODS[0]).configuration(0, experiments.METHODS[0].name)
+    quiet = replace(run.plant, noise='none')
+    torque = excitation.sequence(run.excitation, round(experiments.WINDOW[1] * quiet.rate))
+    clean = simulator.simulate(quiet, torque, (CaptureEvent(round(experiments.CAPTURE_TIME * 1e9), EventKind.CAPTURE),))
+    noise = std_for_snr(clean.position, clean.velocity, run.plant.snr_db)
+    first = round(experiments.CAPTURE_TIME * quiet.rate)
+    states = np.hstack([clean.position[first:, 2:], clean.velocity[first:, 2:]])
+    given = (quiet.arm, np.radians(case.angles_deg), case.payload, states, torque[first:],
+             np.concatenate([noise[2:4], noise[6:8]]), 1.0 / quiet.rate, (len(states),))
+    structure = float(cramer_rao.structure_known(*given)[0])
+    trace, known = (float(cramer_rao.structure_unknown(*given, known_mb=known)[0]) for known in (False, True))
+    return {'paper': trace, 'restart': trace, 'known M_b': known, 'structured': structure}
 
 
 def _mean(values: Array) -> float | None:

@@ -1,6 +1,6 @@
-"""Section 4 of the paper as cases and methods: what is simulated, and which estimators look at it.
+"""Section 4 of the paper as cases (what is simulated) and methods (how the payload is estimated).
 
-Linear plant at a fixed working point, one mode a link, the paper's torque convention (torque 2 does no work
+Linear plant at a fixed working point, one mode per link, the paper's torque convention (torque 2 does no work
 on bending), chord angles, rates continuous at the capture, 40 dB, 1 kHz, square waves, capture at 3 s,
 errors averaged over 4 to 6 s. Its Table 1 is lost: the arm is the reference arm of the parameters.
 """
@@ -9,23 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
-from flexmanip_ros.paper import single_link
-from flexmanip_ros.payload import cramer_rao
-from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.simulation.noise import std_for_snr
 from flexmanip_ros.studies.scenario import Scenario
-from flexmanip_ros.types import CaptureEvent, EventKind
 
 ARM: Mapping[str, Any] = {
     'modes': 1, 'torque_convention': 'paper', 'angle_convention': 'chord', 'shortening': False,
     'slope_correction': False}
 WINDOW = (4.0, 6.0)
+"""From and to [s] of the mean errors."""
 CAPTURE_TIME = 3.0
+GRAVITY = 9.81
+"""In the run of link 2 alone [m/s^2]; the arm itself moves in a horizontal plane."""
 TRACK_RATE = 5.0
 """Estimates a second: enough for the tracks, and thirty runs stay quick."""
 
@@ -48,7 +44,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Method:
-    """One way to a payload, and who proposed it."""
+    """One method to estimate the payload."""
 
     name: str
     words: str
@@ -73,9 +69,9 @@ IDENTIFIERS: Mapping[str, Mapping[str, Any]] = {
               'restart_on_event': False},
     'ours': {'payload_method': 'structured', 'forgetting_factor': [0.9995, 0.9995, 0.9995]},
 }
-"""What is run over the samples: identifier parameters over the defaults."""
+"""The identifiers that are run: parameters that differ from the defaults."""
 _BLOCK = {'payload_method': 'block'}
-_WEIGHED = {'payload.gravity': single_link.GRAVITY, 'outputs': ['joint2/position'], 'order': 1}
+_WEIGHED = {'payload.gravity': GRAVITY, 'outputs': ['joint2/position'], 'order': 1}
 METHODS = (
     Method('paper', "the paper's settings: beta 0.99, no restart, block extraction", 'paper', _BLOCK),
     Method('restart', 'ours: restart at the capture, beta 0.9995, maximum-likelihood refinement; block '
@@ -92,28 +88,6 @@ METHODS = (
 ALONE = 'algebraic, 1 link'
 BEST_MODEL = 'restart'
 """The method whose state-space model is shown in the test responses and frequency tracks."""
-
-
-def bounds_of(case: Case) -> dict[str, float]:
-    """Return method -> Cramer-Rao bound of the payload [kg] at the end of a run, where a method has one.
-
-    ``structured`` knows the structure; the block extractions know nothing of (A, B), and theirs is the bound
-    of their own formula (docs of ``payload.bounds``).
-    """
-    if case.model != 'linear':
-        return {}
-    run = scenario(case, METHODS[0]).configuration(0, METHODS[0].name)
-    quiet = replace(run.plant, noise='none')
-    torque = excitation.sequence(run.excitation, round(WINDOW[1] * quiet.rate))
-    clean = simulator.simulate(quiet, torque, (CaptureEvent(round(CAPTURE_TIME * 1e9), EventKind.CAPTURE),))
-    noise = std_for_snr(clean.position, clean.velocity, run.plant.snr_db)
-    first = round(CAPTURE_TIME * quiet.rate)
-    states = np.hstack([clean.position[first:, 2:], clean.velocity[first:, 2:]])
-    given = (quiet.arm, np.radians(case.angles_deg), case.payload, states, torque[first:],
-             np.concatenate([noise[2:4], noise[6:8]]), 1.0 / quiet.rate, (len(states),))
-    structure = float(cramer_rao.structure_known(*given)[0])
-    trace, known = (float(cramer_rao.structure_unknown(*given, known_mb=known)[0]) for known in (False, True))
-    return {'paper': trace, 'restart': trace, 'known M_b': known, 'structured': structure}
 
 
 def scenario(case: Case, method: Method) -> Scenario:

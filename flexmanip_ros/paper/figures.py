@@ -1,4 +1,4 @@
-"""The figures of the paper's section 4 that show the arm and its identified model.
+"""The figures of the paper's section 4, and the test responses that some of them show.
 
 Every method has one colour and one marker in all of them; links and frequencies differ by the line.
 """
@@ -6,18 +6,22 @@ Every method has one colour and one marker in all of them; links and frequencies
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.integrate import cumulative_trapezoid
 
+from flexmanip_ros.arm import linearization
+from flexmanip_ros.identification import validation
 from flexmanip_ros.io import plots
+from flexmanip_ros.io.html import plain
 from flexmanip_ros.paper import experiments
 from flexmanip_ros.paper.case_run import Track
-from flexmanip_ros.paper.model_response import Response
-from flexmanip_ros.parameters import ArmParameters
+from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, configure
+from flexmanip_ros.simulation import excitation
 from flexmanip_ros.simulation.simulator import Trajectory
-from flexmanip_ros.types import Array, EventKind
+from flexmanip_ros.types import Array, EventKind, StateSpace
 
 Tracks = Mapping[str, Sequence[Track]]
 """Method -> one track a run."""
@@ -27,14 +31,65 @@ LOOKS: Mapping[str, tuple[str, str]] = {
     'structured': (plots.PAYLOAD_COLOUR, 'X')}
 """Colour and marker of each method."""
 SHARE = 0.95
-"""Of the runs, inside a band."""
+"""Share of the runs that a band contains."""
 TRUE = {'color': plots.TRUTH_COLOUR, 'linestyle': (0, (4, 3)), 'linewidth': 1.1}
 CAPTURE = ((experiments.CAPTURE_TIME, EventKind.CAPTURE),)
+CLOSE = ('restart', 'known M_b', 'structured')
+"""Methods whose own 95 % interval is drawn."""
+LEAST_KG = 1e-5
+"""Bottom of the logarithmic axes over the payload."""
+RATE = 1000.0
+DURATION = 3.0
+TEST_INPUT = {'shape': 'multisine', 'band': [0.5, 10.0], 'repeat_time': 3.0, 'amplitude': [10.0, 5.0], 'seed': 4}
+"""A torque that the model was not identified with."""
+
+
+class Response(NamedTuple):
+    """time (N,) [s], angles (N, 2) [rad] and bends (N, 2) [m] from rest."""
+
+    time: Array
+    angles: Array
+    bends: Array
+
+
+def arm() -> ArmParameters:
+    """Return the arm of the paper's cases."""
+    return configure(ArmParameters, experiments.ARM)
+
+
+def true_response(case: experiments.Case) -> Response:
+    """Return the response of the linearized arm with its true payload."""
+    Ac, Bc = linearization.vibration_model(arm(), np.radians(case.angles_deg), case.payload)
+    A, B = linearization.discretize(Ac, Bc, 1.0 / RATE)
+    n, r = B.shape
+    exact = StateSpace(A, B, np.eye(n), np.zeros((n, r)), np.zeros((n, n)), 1.0 / RATE)
+    return _response(case, exact, case.payload)
+
+
+def identified_response(case: experiments.Case, track: Track) -> Response | None:
+    """Return the response of the last identified model; None without one. Its angles need the estimated payload."""
+    mass = track.mass[-1] if track.mass.size else np.nan
+    if track.model is None or not np.isfinite(mass):
+        return None
+    return _response(case, track.model, float(mass))
+
+
+def _response(case: experiments.Case, model: StateSpace, payload: float) -> Response:
+    """Bends from the model; angles by integrating theta'' = Ma^-1 (B_theta tau - Mb eta'') (eq. 14) twice."""
+    source = configure(ExcitationParameters, {**TEST_INPUT, 'rate': RATE})
+    torque = excitation.sequence(source, round(DURATION * RATE))
+    outputs = validation.simulate(model, torque)
+    parts = linearization.blocks(arm(), np.radians(case.angles_deg), payload)
+    bend_acceleration = np.gradient(outputs[:, 2:], 1.0 / RATE, axis=0)
+    acceleration = np.linalg.solve(parts.Ma, parts.B_theta @ torque.T - parts.Mb @ bend_acceleration.T).T
+    rate = cumulative_trapezoid(acceleration, dx=1.0 / RATE, axis=0, initial=0)
+    angles = cumulative_trapezoid(rate, dx=1.0 / RATE, axis=0, initial=0)
+    return Response(np.arange(torque.shape[0]) / RATE, angles, outputs[:, :2])
 
 
 def torques(run: Trajectory) -> Figure:
     """Fig. 2."""
-    drawn, axes = plots.figure(1, [2.2])
+    drawn, axes = plots.figure([2.2])
     plots.lines(axes[0], _time(run), run.effort, ['joint 1', 'joint 2'], 'torque', 'N m')
     plots.events(axes, CAPTURE)
     return drawn
@@ -42,7 +97,7 @@ def torques(run: Trajectory) -> Figure:
 
 def responses(run: Trajectory) -> Figure:
     """Fig. 3: angles from the working point, and bends."""
-    drawn, axes = plots.figure(2, [2.0, 2.0])
+    drawn, axes = plots.figure([2.0, 2.0])
     turned = np.degrees(run.position[:, :2] - run.position[0, :2])
     plots.lines(axes[0], _time(run), turned, ['joint 1', 'joint 2'], 'angle from the\nworking point', 'deg')
     plots.lines(axes[1], _time(run), 1e3 * run.position[:, 2:], ['link 1', 'link 2'], 'bend', 'mm')
@@ -59,12 +114,11 @@ def mid_span(run: Trajectory) -> tuple[Array, Array]:
 
 def finite_element(run: Trajectory) -> Figure:
     """Figs. 17 and 18: displacements and velocities of the links' middles, along X and Y."""
-    drawn, axes = plots.figure(4, [1.5] * 4)
+    drawn, axes = plots.figure([1.5] * 4)
     for row, (values, what, unit) in enumerate(zip(
             mid_span(run), ('displacement', 'velocity'), ('mm', 'mm/s'), strict=True)):
         for k, axis in enumerate('XY'):
-            plots.lines(axes[2 * row + k], _time(run), 1e3 * values[k], ['link 1', 'link 2'],
-                        f'{axis} {what}', unit)
+            plots.lines(axes[2 * row + k], _time(run), 1e3 * values[k], ['link 1', 'link 2'], f'{axis} {what}', unit)
         top = 1.1e3 * float(np.abs(values).max())
         for ax in axes[2 * row:2 * row + 2]:
             ax.set_ylim(-top, top)
@@ -74,7 +128,7 @@ def finite_element(run: Trajectory) -> Figure:
 
 def arms(cases: Sequence[experiments.Case], arm: ArmParameters) -> Figure:
     """Fig. 10: the configurations, to scale."""
-    drawn, columns = plots.row(len(cases), 2.6)
+    drawn, columns = plots.figure([2.6], columns=len(cases), share_time=False)
     reach = 1.08 * sum(arm.link_length)
     for ax, case in zip(columns, cases, strict=True):
         theta = np.radians(case.angles_deg)
@@ -94,8 +148,8 @@ def arms(cases: Sequence[experiments.Case], arm: ArmParameters) -> Figure:
 
 
 def test_response(true: Response, found: Mapping[str, Response]) -> Figure:
-    """Figs. 4, 5, 11 and 12: angles and bends of all models, and how far the identified ones are off."""
-    drawn, axes = plots.figure(4, [1.9, 1.5, 1.9, 1.5])
+    """Figs. 4, 5, 11 and 12: angles and bends of all models, and the errors of the identified ones."""
+    drawn, axes = plots.figure([1.9, 1.5, 1.9, 1.5])
     for row, (name, unit, scale) in enumerate((('angle', 'deg', np.degrees(1.0)), ('bend', 'mm', 1e3))):
         top, below = axes[2 * row], axes[2 * row + 1]
         exact = scale * getattr(true, f'{name}s')
@@ -109,7 +163,7 @@ def test_response(true: Response, found: Mapping[str, Response]) -> Figure:
                 top.plot(true.time, estimate, **style)
                 below.semilogy(true.time[1:], np.abs(estimate - exact[:, k])[1:], **style)
         room = 1.2 * float(np.abs(exact).max())
-        top.set_ylim(-room, room)  # of the true one: a model far off must not hide it
+        top.set_ylim(-room, room)  # the range of the true response, which a wrong model must not hide
         below.set_ylim(1e-6 * room, 10.0 * room)
         top.set_ylabel(f'{name}\n[{unit}]')
         below.set_ylabel(f'error of\n{name} [{unit}]')
@@ -119,8 +173,8 @@ def test_response(true: Response, found: Mapping[str, Response]) -> Figure:
 
 
 def frequency_tracks(tracks: Tracks, before: Sequence[float], after: Sequence[float]) -> Figure:
-    """Figs. 6 and 13: both frequencies by the paper's settings and ours; below, how far they are off."""
-    drawn, axes = plots.figure(3, [2.0, 2.0, 2.0])
+    """Figs. 6 and 13: both frequencies by the paper's settings and by ours; below, their errors."""
+    drawn, axes = plots.figure([2.0, 2.0, 2.0])
     for ax, method in zip(axes, ('paper', experiments.BEST_MODEL), strict=False):
         for k in range(2):
             if tracks.get(method):
@@ -132,8 +186,7 @@ def frequency_tracks(tracks: Tracks, before: Sequence[float], after: Sequence[fl
                 axes[2].semilogy(time, off, linewidth=1.4, label=f'{method}, frequency {k + 1}', **style)
             for begin, end, values in ((0.0, experiments.CAPTURE_TIME, before),
                                        (experiments.CAPTURE_TIME, experiments.WINDOW[1], after)):
-                ax.plot([begin, end], [values[k]] * 2, **TRUE,
-                        label='true' if k == 0 and begin == 0.0 else None)
+                ax.plot([begin, end], [values[k]] * 2, **TRUE, label='true' if k == 0 and begin == 0.0 else None)
         low, high = min(*before, *after), max(*before, *after)
         ax.set_ylim(low - 0.7 * (high - low), high + 0.7 * (high - low))
         ax.set_ylabel(f'frequency [Hz],\n{method}')
@@ -157,7 +210,7 @@ def frequency(tracks: Sequence[Track], k: int) -> Array:
 
 
 def band(ax: Any, time: Array, runs: Array, label: str, **style: Any) -> None:
-    """Draw the median over the runs (T, runs) and the stretch that holds most of them."""
+    """Draw the median over the runs (T, runs) and the band that contains ``SHARE`` of them."""
     low, high = quantile(runs, (1.0 - SHARE) / 2.0), quantile(runs, (1.0 + SHARE) / 2.0)
     ax.fill_between(time, low, high, color=style['color'], alpha=0.2, linewidth=0)
     ax.plot(time, quantile(runs, 0.5), linewidth=1.4, label=label, **style)
@@ -171,6 +224,118 @@ def quantile(runs: Array, share: float) -> Array:
         if known.size:
             found[k] = np.quantile(known, share)
     return found
+
+
+def payload_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Tracks]) -> Figure:
+    """Figs. 7, 14 and 19: median and band of the runs in the paper's window."""
+    drawn, axes = plots.figure([2.2] * len(cases))
+    for ax, case in zip(axes, cases, strict=True):
+        for method, runs in tracks[case.name].items():
+            if runs:
+                colour, marker = LOOKS[method]
+                band(ax, runs[0].time, stack(runs, 'mass'), method, color=colour, marker=marker, markersize=4)
+        ax.axhline(case.payload, **TRUE, label='true')
+        ax.set_xlim(*experiments.WINDOW)
+        ax.set_ylim(-0.05 * case.payload, 2.0 * case.payload)
+        ax.set_ylabel('payload\n[kg]')
+        ax.set_title(f'{case.title}, captured at {experiments.CAPTURE_TIME:g} s', loc='left', fontsize=10)
+        plots.legend(ax)
+    return drawn
+
+
+def interval_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Tracks]) -> Figure:
+    """One run of each case: the payload by the methods in ``CLOSE`` with their 95 % intervals."""
+    drawn, axes = plots.figure([2.2] * len(cases))
+    for ax, case in zip(axes, cases, strict=True):
+        widest = 0.0
+        for method in CLOSE:
+            for track in tracks[case.name].get(method, ())[:1]:
+                late = track.time >= experiments.WINDOW[0]
+                colour, marker = LOOKS[method]
+                ax.fill_between(track.time, track.lower, track.upper, color=colour, alpha=0.25, linewidth=0,
+                                label=f'{method}, 95 % interval')
+                ax.plot(track.time, track.mass, color=colour, marker=marker, markersize=4, label=method)
+                ends = np.abs(np.concatenate([track.lower[late], track.upper[late]]) - case.payload)
+                known = ends[np.isfinite(ends)]
+                widest = max(widest, float(np.median(known)) if known.size else 0.0)
+        ax.axhline(case.payload, **TRUE, label='true')
+        room = min(1.8 * widest, case.payload) or case.payload
+        ax.set_xlim(experiments.CAPTURE_TIME - 0.1, experiments.WINDOW[1])
+        ax.set_ylim(case.payload - room, case.payload + room)
+        ax.set_ylabel('payload, close up\n[kg]')
+        ax.set_title(case.title, loc='right', fontsize=10)  # the event's name is at the left
+        plots.legend(ax)
+        _say_last(ax, tracks[case.name].get('structured', ()))
+    plots.events(axes, CAPTURE)
+    return drawn
+
+
+def error_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Tracks]) -> Figure:
+    """Figs. 8, 15 and 19: median absolute error and band of the runs since the capture, logarithmic."""
+    drawn, axes = plots.figure([2.4] * len(cases))
+    for ax, case in zip(axes, cases, strict=True):
+        for method, runs in tracks[case.name].items():
+            if not runs:
+                continue
+            since = runs[0].time >= experiments.CAPTURE_TIME
+            error = np.maximum(np.abs(stack(runs, 'mass') - case.payload), LEAST_KG * case.payload)[since]
+            if np.isfinite(error).any():
+                colour, marker = LOOKS[method]
+                band(ax, runs[0].time[since], error, method, color=colour, marker=marker, markersize=4)
+        ax.set_yscale('log')
+        ax.set_xlim(experiments.CAPTURE_TIME - 0.1, experiments.WINDOW[1])
+        ax.set_ylim(LEAST_KG * case.payload, 100.0 * case.payload)
+        ax.set_ylabel('absolute error\n[kg]')
+        ax.set_title(case.title, loc='right', fontsize=10)  # the event's name is at the left
+        plots.legend(ax)
+    plots.events(axes, CAPTURE)
+    return drawn
+
+
+def error_points(
+    cases: Sequence[experiments.Case], errors: Mapping[tuple[str, str], Sequence[float]],
+) -> Figure:
+    """Figs. 9, 16 and 19: mean relative error of each method, and the stretch that holds 95 % of the runs."""
+    drawn, columns = plots.figure([3.0], columns=len(cases), share_time=False)
+    names = [method.name for method in experiments.METHODS]
+    for ax, case in zip(columns, cases, strict=True):
+        for place, name in enumerate(names):
+            values = np.array(errors.get((case.name, name), ()), dtype=np.float64)
+            if values.size == 0:
+                continue
+            colour, marker = LOOKS[name]
+            low, high = np.quantile(values, [0.025, 0.975])
+            ax.plot([low, high], [place, place], color=colour, linewidth=4.0, alpha=0.4)
+            ax.plot(values.mean(), place, marker, markersize=8, color=colour)
+            ax.annotate(f'{plain(values.mean())} %', (values.mean(), place), xytext=(0, 6),
+                        textcoords='offset points', ha='center', fontsize=8)
+        ax.set_xscale('log')
+        ax.set_xlim(1e-3, 1e5)
+        ax.set_ylim(len(names) - 0.4, -0.8)
+        ax.set_yticks(range(len(names)), names if ax is columns[0] else [''] * len(names))
+        ax.set_xlabel('mean relative error,\n4 to 6 s [%]')
+        ax.set_title(case.title.replace(', ', ',\n'), loc='left', fontsize=10)
+    return drawn
+
+
+def stack(tracks: Sequence[Track], what: str) -> Array:
+    """Return one column a run (T, runs) of a quantity."""
+    return np.column_stack([getattr(track, what) for track in tracks])
+
+
+def median_error(tracks: Sequence[Track], payload: float) -> Array:
+    """Return the median over the runs of the absolute error (T,) [kg]."""
+    return quantile(np.abs(stack(tracks, 'mass') - payload), 0.5)
+
+
+def _say_last(ax: object, tracks: Sequence[Track]) -> None:
+    """Write the last estimate of the first run, whose band may be thinner than the line."""
+    if tracks and np.isfinite(tracks[0].mass[-1]):
+        track = tracks[0]
+        words = (f'structured at {track.time[-1]:.0f} s: {track.mass[-1]:.3f} kg, 95 %: '
+                 f'{track.lower[-1]:.3f} to {track.upper[-1]:.3f} kg')
+        ax.annotate(words, (1.0, 0.04), xycoords='axes fraction', ha='right',  # type: ignore[attr-defined]
+                    fontsize=9, fontweight='bold', color=LOOKS['structured'][0])
 
 
 def _time(run: Trajectory) -> Array:

@@ -1,8 +1,8 @@
-"""The run the paper gives the algebraic method: link 2 alone on a fixed base, under gravity.
+"""The run that the paper uses for the algebraic method: link 2 alone on a fixed base, under gravity.
 
-The link is rigid here. A constant torque balances the known link, a stiff joint holds it near its working
-point (a proportional and a derivative part), the square wave of joint 2 comes on top. What the joint gives is
-the measured torque; nobody tells it the payload, so the link sags at the capture.
+The link is rigid here. Its torque is the sum of a constant part that balances the known link, a proportional and a
+derivative part that keep it near its working point, and the square wave of joint 2. This torque is measured. It does
+not know the payload, so the link sags at the capture.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from functools import cache
 
 import numpy as np
 
+from flexmanip_ros.paper.experiments import GRAVITY
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters
 from flexmanip_ros.simulation import excitation
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointRecord
 
-GRAVITY = 9.81
 RATE = 1000.0
 STIFFNESS, DAMPING = 20000.0, 4000.0
-"""Of the joint that holds the link [N m/rad, N m s/rad]."""
+"""Proportional and derivative gain of the joint [N m/rad, N m s/rad]."""
 JOINT_NAMES = ('joint1', 'joint2')
 
 
@@ -41,7 +41,7 @@ def messages(arm: ArmParameters, angle: float, payload: float, seed: int, *, dur
 @cache
 def motion(arm: ArmParameters, angle: float, payload: float, duration: float, capture_time: float
            ) -> tuple[Array, Array]:
-    """Return what the joint gives [N m] and the angle [rad], (N,) each; all seeds share them."""
+    """Return the torque of the joint [N m] and its angle [rad], (N,) each; they are the same for all seeds."""
     count, capture = round(duration * RATE), round(capture_time * RATE)
     L, rho = arm.link_length[1], arm.linear_density[1]
     wave = excitation.sequence(ExcitationParameters(rate=RATE), count)[:, 1]

@@ -1,4 +1,4 @@
-"""What the runs of the paper's cases add up to: one line a case and method."""
+"""The results of the paper's cases over all runs: one line per case and method."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def of(rows: Sequence[trial.Row], case: experiments.Case, method: str) -> list[t
 
 
 def column(rows: Sequence[trial.Row], name: str) -> Array:
-    """Return what is known of a column."""
+    """Return the values of a column, without missing ones."""
     return np.array([row[name] for row in rows if row.get(name) is not None], dtype=np.float64)
 
 

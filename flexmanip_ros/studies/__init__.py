@@ -1,1 +1,1 @@
-"""Many runs of a scenario, and what they add up to."""
+"""Many runs of a scenario, and their scores."""

@@ -1,4 +1,4 @@
-"""The paper's baselines over the same messages and the same publishing grid as the identifier."""
+"""The methods that the paper compares with, on the messages and at the publishing instants of the identifier."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages as a bad network and a bad publisher deliver them."""
+"""Faults of networks and publishers, put into the messages of a simulation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def inject(items: Iterable[Item], faults: Faults, rng: np.random.Generator) -> l
     begin, end = (start + round(edge * 1e9) for edge in faults.gap)
     arriving: list[tuple[int, Item]] = []
     for record in records:
-        chances = rng.random(4)  # always drawn, so that one fault does not change where another falls
+        chances = rng.random(4)  # always drawn, so that the probability of one fault does not move another
         if chances[0] < faults.drop or begin <= record.stamp_ns < end:
             continue
         sent = _with_nan(record, rng) if chances[3] < faults.nan else record
@@ -34,7 +34,7 @@ def inject(items: Iterable[Item], faults: Faults, rng: np.random.Generator) -> l
             (earlier, first), (later, second) = arriving[-2:]
             arriving[-2:] = [(earlier, second), (later, first)]
     delay = round(faults.event_delay * 1e9)
-    # An event that is not late arrives before the sample of its own stamp, as a bag has it.
+    # An event without delay arrives before the sample of its own stamp, as in a recording.
     arriving += [(event.stamp_ns + delay - (delay == 0), event) for event in events]
     return [item for _, item in sorted(arriving, key=lambda pair: pair[0])]
 

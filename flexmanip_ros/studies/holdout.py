@@ -1,4 +1,4 @@
-"""Scores of a model on the part of a recording it was not identified on."""
+"""Scores of a model on the part of a recording that it was not identified on."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from flexmanip_ros.types import Array, StateSpace
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Variance accounted for per output [%], and the outputs behind it: time (N,), others (N, m)."""
+    """Variance accounted for (VAF) per output (m,) [%], and the outputs it is of.
+
+    time: (N,) [s]; measured, simulated, predicted (one step ahead): (N, m).
+    """
 
     simulation: Array
     prediction: Array
@@ -23,11 +26,11 @@ class Scores:
     simulated: Array
     predicted: Array
     until_gap: bool
-    """A gap ended the scored stretch before the recording did."""
+    """Whether a gap ended the scored stretch before the end of the recording."""
 
 
 def score(model: StateSpace | None, signals: Signals, start_s: float) -> Scores:
-    """Hold a model still and score it on the samples from ``start_s`` on, up to the first gap.
+    """Score a model that is not adapted further on the samples from ``start_s`` [s] on, up to the first gap.
 
     The state at the start is estimated on the samples before it, by least squares over a free run of the
     model and of its predictor; simulation then uses no measured output.
@@ -46,7 +49,7 @@ def score(model: StateSpace | None, signals: Signals, start_s: float) -> Scores:
     after = int(gaps[gaps > first][0]) if (gaps > first).any() else time.size
     u, y = signals.u[first:after], signals.y[first:after]
     x0 = validation.state_at_end(model, signals.u[before:first], signals.y[before:first])
-    with np.errstate(over='ignore', invalid='ignore'):  # an unstable model runs away: it scores 0
+    with np.errstate(over='ignore', invalid='ignore'):  # an unstable model overflows and scores 0
         simulated = validation.simulate(model, u, x0)
         seen = np.hstack([signals.u[before:first], signals.y[before:first]])
         filtered = validation.state_at_end(_predictor(model), seen, signals.y[before:first])

@@ -1,4 +1,4 @@
-"""What a study repeats: an arm, a motion, a payload, noise, faults and the estimators to compare."""
+"""The scenario of a study: arm, motion, payload, noise, faults, and the estimators to compare."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CAPTURE_TIME = 'capture_time'
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong on the way from the arm to the estimator; probabilities a message."""
+    """Faults between the arm and the estimator; probabilities are per message."""
 
     drop: float = 0.0
     duplicate: float = 0.0
@@ -52,8 +52,8 @@ class Scenario:
     """One experiment; a seed turns it into one run.
 
     duration, capture_time, release_time: [s], a negative time means never; window: the mean relative error is
-    taken between these times [s]; plant, excitation, identifier: dotted parameters; vary: what is drawn anew
-    for each seed; bound: add the Cramer-Rao bound to each row; estimators: name -> identifier parameters of
+    taken between these times [s]; plant, excitation, identifier: dotted parameters; vary: what is drawn for each
+    seed; bound: add the Cramer-Rao bound to each row; estimators: name -> identifier parameters of
     each estimator that sees the same samples.
     """
 
@@ -80,11 +80,11 @@ class Scenario:
         for name in self.vary:
             _check_varied(name, self.vary[name])
         for name in self.estimators:
-            self.configuration(0, name)  # unknown or bad parameters are said before the first run
+            self.configuration(0, name)  # raises before the first run where a parameter is unknown or out of range
 
     def configuration(self, seed: int, estimator: str) -> Run:
         """Return everything one run needs; the same seed gives the same run."""
-        # A stream for each name: what else is varied does not change it.
+        # One random stream per name, so that a name's values do not depend on what else is varied.
         drawn = {name: _draw(how, np.random.default_rng([seed, crc32(name.encode('utf-8'))]))
                  for name, how in self.vary.items()}
         groups: dict[str, dict[str, Any]] = {
@@ -94,7 +94,7 @@ class Scenario:
             group, _, rest = name.partition('.')
             if name == CAPTURE_TIME:
                 capture = float(value)
-            elif group == 'arm':  # the true arm and the one the estimator is told
+            elif group == 'arm':  # the true arm and the one that the estimator knows
                 groups['plant'][name] = groups['identifier'][name] = value
             else:
                 groups[group][rest] = value
@@ -108,7 +108,7 @@ class Scenario:
 
 
 def for_plant(torque: ExcitationParameters, plant: PlantParameters) -> ExcitationParameters:
-    """Return the torque as designed for the arm that is simulated."""
+    """Return the torque's parameters with the arm, start, payload and noise of the plant."""
     return replace(torque, arm=plant.arm, initial_angles=plant.initial_angles,
                    payload_mass=plant.payload_mass, snr_db=plant.snr_db)
 
@@ -212,7 +212,7 @@ def _check_varied(name: str, how: Mapping[str, Any]) -> None:
 
 
 def _check_range(name: str, kind: str, values: Sequence[Any]) -> None:
-    """Refuse ends (or mean and deviation) that are no numbers, of different sizes, or the wrong way round."""
+    """Raise ParameterError for ends (or mean and deviation) that are not finite, not of one size, or not in order."""
     try:
         first, second = (np.asarray(value, dtype=np.float64) for value in values)
         is_good = first.shape == second.shape and first.ndim <= 1 and bool(np.isfinite([first, second]).all())

@@ -1,13 +1,26 @@
-"""What a run came to, in the names of the ``--json`` line of identify_bag; studies use the same."""
+"""The result of a run: its numbers, named as in the ``--json`` line of identify_bag, and its payload in words."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 from flexmanip_ros import pipeline
-from flexmanip_ros.types import CaptureEvent, Estimate, EventKind
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, Status
+
+ADVICE: Mapping[Status, str] = {
+    Status.WARMING_UP: 'record for longer, while the arm moves',
+    Status.POORLY_EXCITED: 'move the arm more, or raise the torque',
+    Status.ILL_CONDITIONED: 'lower the order or the past window',
+    Status.ORDER_TOO_LOW: 'raise the order',
+    Status.SAMPLE_GAP: 'record without losses',
+    Status.INCONSISTENT: 'check the parameters arm.* and the time of the capture',
+    Status.UNOBSERVABLE: 'add the torques, angles and bends of both links to inputs, outputs and angles',
+    Status.DIVERGED: 'check the units of the signals and the parameters arm.*',
+}
+"""What a user can do where the payload is not reliable."""
 
 
 @dataclass(frozen=True)
@@ -30,20 +43,33 @@ class Summary:
     vaf_simulation_percent: tuple[float | None, ...] | None = None
     vaf_prediction_percent: tuple[float | None, ...] | None = None
     model_status: str = 'TRACKING'
-    """What the model is worth, where ``status`` is that of the payload; for people, not in the JSON."""
+    """Status of the model, where ``status`` is that of the payload. It is not in the JSON."""
     modes_deviation: float = math.nan
-    """Of the model's modes from the arm's with this payload, beyond 1 they disagree; not in the JSON."""
+    """Deviation of the model's modes from those of the arm with this payload, over what is tolerated: above 1
+    they disagree. It is not in the JSON."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the values as JSON has them: no NaN, no infinity, lists instead of tuples."""
         return {item.name: _json(getattr(self, item.name)) for item in fields(self)
                 if item.name not in ('model_status', 'modes_deviation')}
 
+    def payload_text(self) -> str:
+        """Return payload and interval in words; where they are not reliable, the reason and what to do next."""
+        if self.payload_ci95_kg is None:
+            return 'not estimated'
+        status = Status[self.status]
+        mass, (low, high) = self.payload_mass_kg, self.payload_ci95_kg
+        reason = '' if status is Status.TRACKING else (
+            f'{status.value.partition(";")[0]}; {ADVICE.get(status, "record again")}')
+        if mass is None or low is None or high is None:
+            return f'not known: {reason or "its interval is unbounded; record for longer, while the arm moves"}'
+        text = f'{mass:.6g} kg, 95 % interval {low:.6g} .. {high:.6g} kg'
+        return f'{text}, not reliable: {reason}' if reason else text
+
 
 def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -> Summary:
-    """Return what the last estimate of a run says. ``estimate`` is None when there never was one."""
-    modes = () if estimate is None else tuple(
-        mode for mode in estimate.modes if math.isfinite(mode.frequency_hz))
+    """Return the numbers of the last estimate of a run. ``estimate`` is None when there never was one."""
+    modes = () if estimate is None else tuple(mode for mode in estimate.modes if math.isfinite(mode.frequency_hz))
     payload = None if estimate is None else estimate.payload
     return Summary(
         samples=state.counters.accepted,

@@ -1,4 +1,4 @@
-"""One run of a scenario to one row an estimator. The run's number is its seed."""
+"""One run of a scenario: one row per estimator. The number of the run is its seed."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ import numpy as np
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm import linearization
 from flexmanip_ros.errors import FlexmanipError
-from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.parameters import IdentifierParameters, PlantParameters
 from flexmanip_ros.samples.sampling import collect
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.studies.achievable import payload_std
 from flexmanip_ros.studies.fault_injection import inject
-from flexmanip_ros.studies.metrics import relative_error_percent
+from flexmanip_ros.studies.metrics import payload_bound, relative_error_percent
 from flexmanip_ros.studies.scenario import Run, Scenario
 from flexmanip_ros.studies.summary import summarize
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord
@@ -27,9 +26,9 @@ Row = dict[str, Any]
 
 
 def trial(scenario: Scenario, seed: int) -> list[Row]:
-    """Simulate one run and put every estimator of the scenario over the same samples.
+    """Simulate one run and run every estimator of the scenario on the same samples.
 
-    Whatever goes wrong in an estimator becomes the ``error`` of its row; the others go on.
+    An exception of one estimator becomes the ``error`` of its row; the others are run all the same.
     """
     rows = []
     for name in scenario.estimators:
@@ -38,8 +37,7 @@ def trial(scenario: Scenario, seed: int) -> list[Row]:
             run = scenario.configuration(seed, name)
             row.update(drawn_columns(run.drawn))
             items = messages(scenario, run, seed)
-            row.update(measure(run.identifier, items, run.plant.payload_mass, scenario.window,
-                               bound=scenario.bound))
+            row.update(measure(run.identifier, items, run.plant.payload_mass, scenario.window, bound=scenario.bound))
             row.update(frequency_columns(run, row))
         except Exception as error:  # a defect in one estimator must not end a study of thousands
             row['error'] = describe(error)
@@ -48,27 +46,27 @@ def trial(scenario: Scenario, seed: int) -> list[Row]:
 
 
 def describe(error: BaseException) -> str:
-    """Return an error as the text of a row: ours as they are, others with their type."""
+    """Return an error as the text of a row; those of other packages with their type."""
     if isinstance(error, FlexmanipError):
         return str(error)
     return ' '.join(f'{type(error).__name__}: {error}'.split())
 
 
 def messages(scenario: Scenario, run: Run, seed: int) -> list[JointRecord | CaptureEvent]:
-    """Return what the estimators of a run receive."""
+    """Return the messages that the estimators of a run receive."""
     count = max(round(scenario.duration * run.plant.rate), 1)
     events = tuple(
         CaptureEvent(round(at * 1e9), kind)
         for at, kind in ((run.capture_time, EventKind.CAPTURE), (scenario.release_time, EventKind.RELEASE))
         if 0.0 <= at < scenario.duration)
     trajectory = simulator.simulate(run.plant, excitation.sequence(run.excitation, count), events)
-    rng = np.random.default_rng([seed, 1 << 20])  # a stream of its own beside those of `vary`
+    rng = np.random.default_rng([seed, 1 << 20])  # another random stream than those of `vary`
     return inject(simulator.records(trajectory, events), scenario.faults, rng)
 
 
 def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_kg: float | None,
             window: tuple[float, float], *, bound: bool = False, settled: float = 0.0) -> Row:
-    """Identify and return the columns of a row.
+    """Run the identifier and return the columns of a row.
 
     true_kg: mass held after a capture; None when unknown. window: from and to [s] of the mean error, at the
     earliest ``settled`` seconds after the event that made it true; bound: add the least standard deviation
@@ -90,8 +88,7 @@ def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_k
     for kind in ('frequencies_hz', 'damping_ratios'):
         for k, value in enumerate(row.pop(kind)):
             row[f'{kind.split("_")[0]}_{k + 1}'] = value
-    row.update(payload_lower_kg=low, payload_upper_kg=high,
-               us_per_sample=1e6 * wall / max(state.counters.accepted, 1))
+    row.update(payload_lower_kg=low, payload_upper_kg=high, us_per_sample=1e6 * wall / max(state.counters.accepted, 1))
     held = row['capture_time_s'] is not None and (
         row['release_time_s'] is None or row['release_time_s'] < row['capture_time_s'])
     true = None if true_kg is None else (true_kg if held else 0.0)
@@ -108,7 +105,7 @@ def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_k
 
 def _bound(config: IdentifierParameters, items: Sequence[pipeline.Item], capture_time: float,
            mass: float | None, dt: float) -> float | None:
-    return None if mass is None else payload_std(config, collect(config, items), capture_time, mass, dt)
+    return None if mass is None else payload_bound(config, collect(config, items), capture_time, mass, dt)
 
 
 def _window_error(state: pipeline.State, estimates: Sequence[Estimate], true: float,
@@ -123,7 +120,7 @@ def _window_error(state: pipeline.State, estimates: Sequence[Estimate], true: fl
 def frequency_columns(run: Run, row: Mapping[str, Any]) -> Row:
     """Return the true frequencies at the working point and the largest relative error of those found [%]."""
     mass = row.get('payload_true_kg') or 0.0
-    true = true_frequencies(run, mass)
+    true = true_frequencies(run.plant, mass)
     found = [row[f'frequencies_{k + 1}'] for k in range(len(true)) if f'frequencies_{k + 1}' in row]
     columns: Row = {f'true_frequency_{k + 1}': value for k, value in enumerate(true)}
     if len(found) == len(true):
@@ -132,15 +129,15 @@ def frequency_columns(run: Run, row: Mapping[str, Any]) -> Row:
     return columns
 
 
-def true_frequencies(run: Run, mass: float) -> list[float]:
-    """Return the two lowest damped frequencies of the arm at its start [Hz]."""
-    Ac, _ = linearization.vibration_model(run.plant.arm, np.array(run.plant.initial_angles), mass)
+def true_frequencies(plant: PlantParameters, mass: float) -> list[float]:
+    """Return the two lowest damped frequencies of the arm, linearized at its start, with a payload [kg]: [Hz]."""
+    Ac, _ = linearization.vibration_model(plant.arm, np.array(plant.initial_angles), mass)
     poles = np.linalg.eigvals(Ac)
     return sorted((poles.imag[poles.imag > 1e-9] / (2.0 * np.pi)).tolist())[:2]
 
 
 def drawn_columns(drawn: Mapping[str, Any]) -> Row:
-    """Return what was drawn for a run as plain columns."""
+    """Return the values drawn for a run, a column for each number."""
     columns: Row = {}
     for name, value in drawn.items():
         if isinstance(value, (list, tuple)):

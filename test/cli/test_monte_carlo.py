@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from quick_study import SCENARIO, rows_of, run, without_cost
 
-from flexmanip_ros.cli import tasks, workers
+from flexmanip_ros.cli import workers
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.types import JointRecord
 
@@ -34,7 +34,7 @@ def test_a_failed_run_is_a_row_with_its_error(scenario_file, tmp_path, capsys):
 
 
 def test_the_report_shows_scores_runs_and_failures(tmp_path):
-    from flexmanip_ros.io.study_report import report
+    from flexmanip_ros.io.report import study_report as report
 
     rows = [{'run': str(k), 'estimator': 'a', 'error': '', 'status': 'TRACKING', 'payload_true_kg': 20.0 + k,
              'payload_mass_kg': 20.1 + k, 'payload_lower_kg': 19.9 + k, 'payload_upper_kg': 20.2 + k,
@@ -77,7 +77,7 @@ def test_a_folder_of_recordings_is_a_study_and_a_broken_one_a_row(tmp_path):
     assert set(rows) == {'one', 'two', 'three.mcap'}
     assert 'cannot be read' in rows['three.mcap']['error']
     assert rows['one']['samples'] == '300'
-    assert tasks.true_payload(folder / 'one') == 20.0
+    assert workers.true_payload(folder / 'one') == 20.0
 
 
 FRAGILE = '''

@@ -23,7 +23,7 @@ def _estimates(extra: float | None = None) -> list[Estimate]:
 
 
 def _drawn(estimates, truth=()):
-    _, (ax,) = plots.figure(1, [2.0])
+    _, (ax,) = plots.figure([2.0])
     plots.frequencies(ax, estimates, 0, truth)
     return ax, [text.get_text() for text in ax.texts]
 
@@ -53,11 +53,11 @@ def test_estimates_without_modes_can_be_drawn():
     (0.0, 755.9, '20 kg, 95 %: 0 to 756 kg')])
 def test_an_interval_keeps_the_digits_that_tell_its_ends_apart(lower, upper, words):
     held = Payload(20.004, 0.006, lower, upper, 1.0, Status.TRACKING)
-    _, (ax,) = plots.figure(1, [2.0])
+    _, (ax,) = plots.figure([2.0])
     plots.payload(ax, [Estimate(k, Status.TRACKING, None, (), held) for k in range(3)], 0)
     assert [text.get_text() for text in ax.texts] == [words]
 
 
 def test_every_status_has_a_colour_and_a_pattern_of_its_own():
-    looks = [(plots.STATUS_COLOURS[status], plots.STATUS_HATCHES[status]) for status in Status]
+    looks = [plots.STATUS_LOOKS[status] for status in Status]
     assert len({hatch for _, hatch in looks}) == len(looks)

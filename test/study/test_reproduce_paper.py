@@ -11,8 +11,8 @@ import pytest
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm.linearization import discretize, vibration_model
 from flexmanip_ros.cli.reproduce_paper import main
-from flexmanip_ros.paper import case_run, experiments, sections
-from flexmanip_ros.paper.model_response import RATE, arm, identified_response, true_response
+from flexmanip_ros.paper import case_run, experiments, report
+from flexmanip_ros.paper.figures import RATE, arm, identified_response, true_response
 from flexmanip_ros.studies import trial
 from flexmanip_ros.types import StateSpace
 
@@ -64,9 +64,9 @@ def test_every_figure_of_the_paper_is_on_the_page():
     rows, tracks = case_run.run(experiments.PAYLOADS[0], 0)
     everywhere = {case.name: {name: [track] for name, track in tracks.items()} for case in experiments.CASES}
     all_rows = [row | {'case': case.name} for case in experiments.CASES for row in rows]
-    planned = [*sections.without_results(),
-               *(one for example in (sections.payload_example, sections.configuration_example,
-                                     sections.finite_element_example)
+    planned = [*report.without_results(),
+               *(one for example in (report.payload_example, report.configuration_example,
+                                     report.finite_element_example)
                  for one in example(everywhere, all_rows))]
     numbers = {int(number) for one in planned for number in one.numbers.split(',')}
     assert numbers == set(range(2, 20))

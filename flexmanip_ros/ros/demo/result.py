@@ -15,7 +15,7 @@ from rich.table import Table
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.arm.linearization import frequencies, vibration_model
 from flexmanip_ros.io import bag
-from flexmanip_ros.io.pictures import Truth, collect, overview_figure
+from flexmanip_ros.io.plots import Truth, collect, overview_figure
 from flexmanip_ros.messages import Inertia, LabelledArray, Value
 from flexmanip_ros.parameters import DemoParameters, IdentifierParameters, PlantParameters, flatten
 from flexmanip_ros.parameters.document import yaml_text
