@@ -22,6 +22,7 @@ OF_EVERY_NODE = {'autostart', 'use_sim_time'}
 PARAMETERS = {leaf.name for declared in NODES.values() for leaf in leaves(declared)}
 FOLDERS = ('flexmanip_ros', 'config', 'docs', 'test', 'benchmarks', 'requirements', 'launch')
 FILE = re.compile(r'`((?:[\w.-]+/)*[\w.-]+\.(?:py|md|yaml|xml|rst|toml))\b')
+STARTED = re.compile(r"(?:^\.venv/bin/|^ros2 run (?:--prefix '[^']*' )?flexmanip_ros )([a-z]\w+)")
 REMOVED = (
     'PM QoS', 'wake_latency', 'SCHED_FIFO', 'thread_priority', 'cpu_affinity', 'cpu_dma_latency', 'garbage collector',
     'pre-rendered', 'salvage',
@@ -83,10 +84,12 @@ def test_a_command_starts_something_that_exists(page: str) -> None:
     for command in [*commands(page), *inline(page)]:
         for target in re.findall(r'^make (\w+)', command):
             assert target in targets, f'{page}: {command}'
-        for program in re.findall(r'(?:^\.venv/bin/|^ros2 run flexmanip_ros )([a-z]\w+)', command):
+        for program in STARTED.findall(command):
             assert f"'{program}'" in SETUP, f'{page}: {command}'
-        for file in re.findall(r'^ros2 launch flexmanip_ros (\S+)', command):
+        for file, rest in re.findall(r'^ros2 launch flexmanip_ros (\S+)(.*)', command):
             assert (ROOT / 'launch' / file).is_file(), f'{page}: {command}'
+            launch = (ROOT / 'launch' / file).read_text(encoding='utf-8')
+            assert all(f"'{name}'" in launch for name in re.findall(r'(\w+):=', rest)), f'{page}: {command}'
         for module in re.findall(r'python3? -m (flexmanip_ros[\w.]+)', command):
             assert importlib.util.find_spec(module) is not None, f'{page}: {command}'
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import json
+import os
 import re
 import subprocess
 import sys
@@ -133,6 +134,17 @@ def test_a_deprecated_call_of_an_old_dateutil_is_no_error() -> None:
         warnings.warn_explicit('another', DeprecationWarning, 'tz.py', 1, module='dateutil.tz.tz')
     said = 'datetime.datetime.utcfromtimestamp() is deprecated and scheduled for removal in a future version.'
     warnings.warn_explicit(said, DeprecationWarning, 'tz.py', 37, module='dateutil.tz.tz')
+
+
+def test_a_test_that_needs_an_extra_is_skipped_without_it(tmp_path: Path) -> None:
+    (tmp_path / 'skfem.py').write_text("raise ModuleNotFoundError('not installed here')\n", encoding='utf-8')
+    tests = next((ROOT / 'test').rglob('test_finite_element*.py'))
+    command = [sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', str(tests)]
+    search = os.pathsep.join([str(tmp_path), str(ROOT), os.environ.get('PYTHONPATH', '')])
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | {'PYTHONPATH': search}, capture_output=True, text=True,
+                          check=False)
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert 'scikit-fem, which is not installed' in done.stdout
 
 
 def test_every_import_is_locked() -> None:
