@@ -117,6 +117,15 @@ def test_a_parameter_that_is_named_is_declared(page: str) -> None:
             assert name in PARAMETERS, f'{page}: {command}'
 
 
+def test_the_architecture_names_every_room_and_module_of_the_top_level() -> None:
+    text = text_of('docs/architecture.md')
+    for path in (ROOT / 'flexmanip_ros').iterdir():
+        if path.is_dir() and path.name != '__pycache__':
+            assert f'`{path.name}/`' in text, path.name
+        elif path.suffix == '.py' and path.stem != '__init__':
+            assert f'`{path.stem}`' in text or f'`{path.name}`' in text, path.name
+
+
 @pytest.mark.parametrize('page', ['docs/payload.md', 'docs/identification.md'])
 def test_a_reference_has_at_most_a_thousand_words(page: str) -> None:
     assert len(text_of(page).split()) <= 1000
