@@ -2,7 +2,7 @@
 
 from flexmanip_ros.parameters.arm import ArmParameters
 from flexmanip_ros.parameters.control import AdapterParameters, ControllerParameters
-from flexmanip_ros.parameters.field import Leaf, check, configure, flatten, leaves, parameter
+from flexmanip_ros.parameters.field import Leaf, check, configure, flatten, leaves
 from flexmanip_ros.parameters.identifier import IdentifierParameters, PayloadParameters
 from flexmanip_ros.parameters.simulation import (
     ActuatorParameters,
@@ -16,5 +16,5 @@ from flexmanip_ros.parameters.trigger import TriggerParameters
 __all__ = [
     'ActuatorParameters', 'AdapterParameters', 'ArmParameters', 'ControllerParameters', 'DemoParameters',
     'ExcitationParameters', 'IdentifierParameters', 'Leaf', 'PayloadParameters', 'PlantParameters', 'SensorParameters',
-    'TriggerParameters', 'check', 'configure', 'flatten', 'leaves', 'parameter',
+    'TriggerParameters', 'check', 'configure', 'flatten', 'leaves',
 ]

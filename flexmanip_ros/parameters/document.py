@@ -125,11 +125,11 @@ def markdown() -> str:
     return '\n'.join(parts)
 
 
-def help_text(cls: type, width: int = WIDTH) -> str:
+def help_text(cls: type) -> str:
     """Return the parameters as a list for --help."""
     lines = []
     for leaf in leaves(cls):
         words = f'{leaf.name} = {written(leaf, leaf.default)}'
         lines.append('  ' + words)
-        lines += textwrap.wrap(_comment(leaf), width - 8, initial_indent=' ' * 8, subsequent_indent=' ' * 8)
+        lines += textwrap.wrap(_comment(leaf), WIDTH - 8, initial_indent=' ' * 8, subsequent_indent=' ' * 8)
     return '\n'.join(lines)

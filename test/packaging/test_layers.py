@@ -17,7 +17,7 @@ MODULES = sorted(PACKAGE.rglob('*.py'))
 # leaves <- core <- pipeline <- doors; what is not named here is core.
 FORBIDDEN_TO_BAGS = ('flexmanip_ros.ros', 'flexmanip_ros.cli')
 LEAVES = {'', 'types', 'errors', 'parameters'}
-PIPELINE = {'estimator', 'event_replay', 'schedule', 'pipeline', 'studies'}
+PIPELINE = {'estimator', 'event_replay', 'pipeline', 'studies'}
 DOORS = {'io', 'ros', 'cli', 'paper'}
 ROS_LIBRARIES = {
     'rclpy', 'launch', 'launch_ros', 'ament_index_python', 'rosidl_runtime_py', 'rosbag2_py',
@@ -34,7 +34,7 @@ def name_of(path: Path) -> str:
 
 
 def part_of(module: str) -> str:
-    """Return the first name below the package: 'plant' for flexmanip_ros.plant.simulator."""
+    """Return the first name below the package: 'arm' for flexmanip_ros.arm.capture."""
     return [*module.split('.'), ''][1]
 
 

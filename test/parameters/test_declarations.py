@@ -1,8 +1,12 @@
+"""Declared parameters: each accepts its default, rejects what is wrong by name, and is declared once."""
+
 from __future__ import annotations
 
 import contextlib
 import math
 import pickle
+import re
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -13,6 +17,7 @@ from flexmanip_ros.errors import FlexmanipError, ParameterError
 from flexmanip_ros.parameters import IdentifierParameters, configure, flatten, leaves
 
 GROUPS = [getattr(parameters, name) for name in parameters.__all__ if name.endswith('Parameters')]
+PACKAGE = Path(parameters.__file__).parent
 
 
 @pytest.mark.parametrize('cls', GROUPS)
@@ -20,6 +25,20 @@ def test_every_parameter_says_what_it_is_and_accepts_its_own_default(cls: type) 
     for leaf in leaves(cls):
         assert leaf.words, leaf.name
         assert parameters.check(leaf, leaf.default) == leaf.default
+
+
+def test_every_declared_class_is_offered_by_the_package() -> None:
+    text = '\n'.join(path.read_text(encoding='utf-8') for path in PACKAGE.glob('*.py'))
+    assert {cls.__name__ for cls in GROUPS} == set(re.findall(r'^class (\w+Parameters)', text, re.MULTILINE))
+
+
+@pytest.mark.parametrize('cls', GROUPS)
+def test_a_choice_is_explained_or_names_itself(cls: type) -> None:
+    """A text with choices that are not plain words of the field says what each of them does."""
+    plain = {'shape'}
+    for leaf in leaves(cls):
+        for choice in leaf.choices if leaf.name.rpartition('.')[2] not in plain else ():
+            assert choice in leaf.words or leaf.name.endswith('payload_method'), f'{leaf.name}: {choice}'
 
 
 @pytest.mark.parametrize('cls', GROUPS)
