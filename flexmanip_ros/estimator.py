@@ -17,7 +17,7 @@ from flexmanip_ros.numerics.background import Background
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, model_check, structured
 from flexmanip_ros.payload.block_extraction import NOWHERE
-from flexmanip_ros.payload.model_comparison import Verdict
+from flexmanip_ros.payload.model_check import Verdict
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, Payload, Status
 

@@ -21,7 +21,7 @@ from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.numerics.background import INLINE, Background
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import model_check
-from flexmanip_ros.payload.model_comparison import Verdict
+from flexmanip_ros.payload.model_check import Verdict
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import SampleLog
 from flexmanip_ros.samples.sampling import Clock, Counters

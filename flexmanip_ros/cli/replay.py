@@ -127,7 +127,7 @@ class _Messages:
         topics = bag.Topics(request.joint_states, request.events, request.events_required)
         try:
             if request.detect:
-                from flexmanip_ros.payload.detected_events import with_detected
+                from flexmanip_ros.payload.capture_detection import with_detected
 
                 items: Iterable[pipeline.Item] = with_detected(
                     request.config, bag.read(request.bag, topics, self._progress))

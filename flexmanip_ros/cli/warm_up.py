@@ -18,7 +18,7 @@ import numpy as np
 from flexmanip_ros import pipeline
 from flexmanip_ros.identification import validation
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
-from flexmanip_ros.payload.detected_events import with_detected
+from flexmanip_ros.payload.capture_detection import with_detected
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, StateSpace
 

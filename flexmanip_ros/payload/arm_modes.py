@@ -1,4 +1,4 @@
-"""Modes of the arm that the structured estimator has learned, for many configurations at once."""
+"""Natural modes of the arm for a payload, and the modes and modal participation that the identified model has."""
 
 from __future__ import annotations
 
@@ -9,8 +9,57 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.arm.linearization import Blocks, blocks
-from flexmanip_ros.parameters import ArmParameters
+from flexmanip_ros.identification.modes import REAL
+from flexmanip_ros.identification.uncertainty import Identified
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
+from flexmanip_ros.payload.structured_model import Quantity, signals
 from flexmanip_ros.types import Array
+
+
+def sensor_matrix(config: IdentifierParameters, kappa: int) -> tuple[Array, tuple[bool, ...]] | None:
+    """Return S (m, 2 kappa), the modal coordinates each output sees, and which outputs are rates.
+
+    None when an output is no bend of the arm: a joint angle has a rigid part that the blocks leave out.
+    """
+    known = signals(config)
+    if known is None or not known.torques:
+        return None
+    S = np.zeros((len(known.outputs), 2 * kappa))
+    for row, role in enumerate(known.outputs):
+        if role.quantity not in (Quantity.BEND, Quantity.BEND_RATE):
+            return None
+        modes = np.arange(1, kappa + 1)
+        fraction = config.arm.sensor_position[role.link]
+        S[row, role.link * kappa:(role.link + 1) * kappa] = np.sin(modes * np.pi * fraction)
+    return S, tuple(role.quantity is Quantity.BEND_RATE for role in known.outputs)
+
+
+def to_modal(Ac: Array, Bc: Array, C: Array, S: Array, rates: tuple[bool, ...]) -> tuple[Array, Array]:
+    """Return (Ac, Bc) with the state [eta; eta'] from continuous models in any basis.
+
+    Ac: (..., n, n), Bc: (..., n, r), C: (..., m, n), S: (m, n / 2). A displacement without its rate among the
+    outputs is completed by C Ac, in continuous time, where that is known to read the rates (a discrete
+    C A is not: it depends on the payload). Raises numpy.linalg.LinAlgError when that fixes no basis.
+    """
+    h = S.shape[1]
+    is_rate = np.array(rates, dtype=bool)
+    known = np.zeros((S.shape[0], 2 * h))
+    known[~is_rate, :h] = S[~is_rate]
+    known[is_rate, h:] = S[is_rate]
+    seen = np.broadcast_to(C, (*Ac.shape[:-2], *C.shape[-2:]))
+    alone = [row for row in np.flatnonzero(~is_rate)
+             if not any(np.allclose(S[row], S[other]) for other in np.flatnonzero(is_rate))]
+    if alone:
+        derived = np.zeros((len(alone), 2 * h))
+        derived[:, h:] = S[alone]
+        known = np.vstack([known, derived])
+        seen = np.concatenate([seen, C[..., alone, :] @ Ac], axis=-2)
+    if np.linalg.matrix_rank(known) < 2 * h:
+        raise np.linalg.LinAlgError('the outputs do not see every modal coordinate')
+    # eq. (44): seen = known T, so T = known^+ seen takes the identified state to [eta; eta']
+    T = np.linalg.pinv(known) @ seen
+    Ac_modal = np.swapaxes(np.linalg.solve(np.swapaxes(T, -1, -2), np.swapaxes(T @ Ac, -1, -2)), -1, -2)
+    return Ac_modal, T @ Bc
 
 
 class Parts(NamedTuple):
@@ -86,3 +135,42 @@ def _parts(arm: ArmParameters) -> Parts:
 
 def _mass(parts: Blocks) -> Array:
     return np.asarray(np.block([[parts.Ma, parts.Mb], [parts.Mb.T, parts.Mc]]))
+
+
+def drive(identified: Identified, chosen: Array, rows: Array, rates: Array, weights: Array
+          ) -> tuple[Array, Array]:
+    """Return a sum over modes and outputs of (what an output sees of a mode) x (what an input does to it).
+
+    chosen: indices into ``modal.modes``; rows: (k,) outputs, displacements or (rates: (k,) bool)
+    their rates; weights: (k, r) of the outputs in the sum of each input. Returns sums (r,) and standard
+    deviations (r,), to first order and without the share of the pole's own frequency.
+
+    A mode of unit mass, seen with c and driven with b, has the residue c b / (2 j omega) at its pole in a
+    displacement, c b / 2 in a rate. Raises numpy.linalg.LinAlgError when the poles are not distinct.
+    """
+    model = identified.model
+    n, r, m = model.order, model.B.shape[1], model.C.shape[0]
+    poles, V = np.linalg.eig(model.A)
+    W = np.linalg.inv(V)
+    order = np.flatnonzero((poles.imag > 0.0) & (np.angle(poles) >= REAL))
+    picked = order[np.argsort(np.angle(poles[order]))][chosen]
+    s = np.log(poles[picked]) / model.dt
+    # a torque that is held drives a pole by (exp(s dt) - 1) / s
+    factor = np.where(rates[:, None], 2.0, 2.0j * np.abs(s)) * s / (poles[picked] - 1.0)
+    C, B = model.C[rows] @ V, W @ model.B  # what each pole shows, and how it is driven
+    gap = poles[:, None] - poles[picked]
+    gap[picked, np.arange(picked.size)] = np.inf
+    seen = weights.T @ (factor * C[:, picked])  # (r, picked)
+    value = np.array([(seen[i] @ B[picked, i]).real for i in range(r)])
+    gradient = np.zeros((r, n * (n + r + m)))
+    for i in range(r):
+        scaled = weights[:, i, None] * factor  # (k, picked)
+        # along dA the vectors of a pole turn towards those of the others, by 1 / gap
+        G = np.zeros((n, n), dtype=complex)
+        G[:, picked] = (C.T @ scaled) / -gap * B[picked, i]
+        G[picked] += (B[:, i, None] / -gap * seen[i]).T
+        parts = gradient[i]
+        parts[:n * n] = (W.T @ G @ V.T).real.ravel()
+        parts[n * n:n * (n + r)].reshape(n, r)[:, i] = (seen[i] @ W[picked]).real
+        parts[n * (n + r):].reshape(m, n)[rows] = (scaled * B[picked, i] @ V[:, picked].T).real
+    return value, np.asarray(np.linalg.norm(gradient @ identified.spread[:gradient.shape[1]], axis=1))

@@ -18,8 +18,7 @@ import numpy as np
 
 from flexmanip_ros.numerics.compiled import kernel
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload.angles import chords
-from flexmanip_ros.payload.structured_model import pinned_frequencies
+from flexmanip_ros.payload.structured_model import chords, pinned_frequencies
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload, Status
 

@@ -1,25 +1,22 @@
-"""Capture and release found in the signals, sample by sample, without a trigger.
-
-A structured filter that takes nothing to change runs along; its innovations are tested for a force that began
-to push on the tip within the last ``detection_window`` (``detection_kernel``). The threshold follows from the
-rate of false alarms allowed, and rises with what the model always misses, so that a plant the model does not
-quite fit (unmodelled shortening, omitted modes) does not trip it.
-"""
+"""Captures and releases told from the signals alone: generalized likelihood ratio on the innovations."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
 
+from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.numerics.compiled import Prepared
 from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
 from flexmanip_ros.payload import capture_detection_kernel as kernel
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured
+from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Rows
-from flexmanip_ros.types import CaptureEvent, EventKind
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
 SETTLE = 0.5
 """Seconds after the start or an event before the next can be told."""
@@ -185,3 +182,38 @@ def _quiet(watch: kernel.Watch) -> kernel.Watch:
     fresh.history[:] = 0.0
     fresh.scores[:] = 0.0
     return fresh
+
+
+Item = JointRecord | CaptureEvent
+
+
+def with_detected(config: IdentifierParameters, items: Iterable[Item]) -> Iterator[Item]:
+    """Yield every message, and after the one that revealed it each event that was found.
+
+    The event carries the stamp of its onset; the pipeline goes back for it, as it does live.
+    """
+    if not config.angles:
+        raise ParameterError('captures cannot be found in the signals without angles',
+                             'name the joints in parameter angles, or give --capture-time')
+    # The angles are needed here whether or not a payload is estimated.
+    config = replace(config, payload_method='structured')
+    clock, log = sampling.Clock(), sampling.EMPTY
+    state: DetectionState | None = None
+    trigger = TriggerParameters()
+    cursor = 0
+    for item in items:
+        yield item
+        if isinstance(item, CaptureEvent):
+            continue
+        clock, log, reset = sampling.push(config, clock, log, item)
+        if clock.outputs is None:
+            continue
+        if state is None or reset:
+            trigger = TriggerParameters(
+                mode='auto', inputs=config.inputs, outputs=clock.outputs, angles=config.angles,
+                arm=config.arm, payload=config.payload)
+            state, cursor = init(trigger), 0
+        state, events = advance(trigger, state, log.rows(cursor, log.end))
+        cursor = log.end
+        log = log.from_row(first_needed(state))
+        yield from events

@@ -17,7 +17,7 @@ from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
-from flexmanip_ros.payload import structured_start as start
+from flexmanip_ros.payload import structured_model
 from flexmanip_ros.payload.block_extraction import masses
 from flexmanip_ros.payload.process_model import PARAMETERS, predict
 from flexmanip_ros.payload.structured_model import build, sensors
@@ -96,16 +96,16 @@ def nonlinear(
         raise ModelError('the configured signals cannot give a payload', 'name both torques and both angles')
     n = model.motion.q.size
     m = mem.memory(2 * n + model.motion.G.shape[1], len(model.roles))
-    start.first(config, model, m, np.zeros(len(model.roles)))
+    structured_model.first(config, model, m, np.zeros(len(model.roles)))
     m.x[:2] = theta
     m.x[n:n + 2] = 0.0 if rates is None else rates
     p = m.x.size - PARAMETERS
     m.S[2 * n:p] = 0.0  # the structure is known, of every mode
     m.x[p] = np.log(max(payload, 1e-9) / model.motion.scale)
-    m.S[p, p] = 10.0 * start.PAYLOAD_STD
+    m.S[p, p] = 10.0 * structured_model.PAYLOAD_STD
     if config.payload.rotary_inertia:
-        m.S[-1, -1] = start.PAYLOAD_STD
-    start.freeze(config, model, theta)
+        m.S[-1, -1] = structured_model.PAYLOAD_STD
+    structured_model.freeze(config, model, theta)
     seen = sensors(config, model, dt, np.zeros(m.x.size), theta)
     information = np.zeros((m.x.size, m.x.size))
     found = []

@@ -13,8 +13,8 @@ import numpy as np
 
 from flexmanip_ros.arm.linearization import blocks
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
-from flexmanip_ros.payload.angles import chords
-from flexmanip_ros.payload.block_interval import unknown
+from flexmanip_ros.payload.block_extraction import unknown
+from flexmanip_ros.payload.structured_model import chords
 from flexmanip_ros.types import Array, Mode, Payload, Status
 
 GRID = 400

@@ -31,13 +31,13 @@ from flexmanip_ros.payload.filter_state import (
     WHITE,
 )
 from flexmanip_ros.payload.process_model import PARAMETERS
-from flexmanip_ros.payload.tail_kernel import amplitude, ringing
+from flexmanip_ros.payload.residual_modes import amplitude, ringing
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
     from flexmanip_ros.payload.filter_state import Memory
     from flexmanip_ros.payload.process_model import Motion
-    from flexmanip_ros.payload.tail_kernel import Tail
+    from flexmanip_ros.payload.residual_modes import Tail
 
 OUTLIER = 4.0
 """Innovations beyond this many standard deviations count less (Huber)."""

@@ -30,7 +30,7 @@ from flexmanip_ros.payload.filter_state import (
 )
 from flexmanip_ros.payload.measurement_update import OUTLIER, judge_payload, learn_noise, measure
 from flexmanip_ros.payload.process_model import PARAMETERS, predict
-from flexmanip_ros.payload.tail_kernel import amplitude, believed, push, ring, ringing
+from flexmanip_ros.payload.residual_modes import amplitude, believed, push, ring, ringing
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:

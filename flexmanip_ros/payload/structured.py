@@ -12,14 +12,13 @@ import numpy as np
 from flexmanip_ros.numerics.compiled import Prepared
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
-from flexmanip_ros.payload import residual_modes
-from flexmanip_ros.payload import structured_start as start
+from flexmanip_ros.payload import residual_modes, structured_model
 from flexmanip_ros.payload.interval import inexact, judge
 from flexmanip_ros.payload.measurement_update import Sensors
 from flexmanip_ros.payload.moving_horizon import advance as run_kernel
 from flexmanip_ros.payload.process_model import PARAMETERS, predict
+from flexmanip_ros.payload.residual_modes import believed, push, ring
 from flexmanip_ros.payload.structured_model import Model, build, sensors
-from flexmanip_ros.payload.tail_kernel import believed, push, ring
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload
 
@@ -127,20 +126,20 @@ def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: Eve
     payload = m.x.size - PARAMETERS
     held = bool(m.counts[mem.HELD])
     before = float(model.motion.scale * np.exp(min(m.x[payload], 12.0))) if held else 0.0
-    columns = start.jump(config, model, m)
+    columns = structured_model.jump(config, model, m)
     opened = np.zeros((m.x.size, 2))
     if kind is EventKind.CAPTURE:
         if not held:
             _forget_payload(config, model, m)  # the arm was empty: what it seemed to hold were its errors
-        opened[payload, 0] = start.PAYLOAD_STD
-        opened[-1, 1] = start.PAYLOAD_STD if config.payload.rotary_inertia else 0.0
+        opened[payload, 0] = structured_model.PAYLOAD_STD
+        opened[-1, 1] = structured_model.PAYLOAD_STD if config.payload.rotary_inertia else 0.0
         m.counts[mem.HELD] = 1
     else:
         _forget_payload(config, model, m)
-        opened[payload, 0] = start.EMPTY_STD * model.motion.scale + 0.3 * before
+        opened[payload, 0] = structured_model.EMPTY_STD * model.motion.scale + 0.3 * before
         m.counts[mem.HELD] = 0
-    m.S[:] = start.widen(m.S, np.hstack([columns, opened]))
-    start.shake(model, m)
+    m.S[:] = structured_model.widen(m.S, np.hstack([columns, opened]))
+    structured_model.shake(model, m)
     _anchor(m)
 
 
@@ -185,12 +184,12 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     dt = float(np.median(np.diff(rows.stamp_ns) * 1e-9))
     size = 2 * model.motion.q.size + model.motion.G.shape[1]
     m = mem.memory(size, len(model.roles), 2 * residual_modes.MODES)
-    m.noise[:] = start.noise(model, Y)
-    start.first(config, model, m, Y[0])
-    start.freeze(config, model, np.mean(rows.angles, axis=0))
+    m.noise[:] = structured_model.noise(model, Y)
+    structured_model.first(config, model, m, Y[0])
+    structured_model.freeze(config, model, np.mean(rows.angles, axis=0))
     m.torque[:] = rows.u[0]
     _anchor(m)
-    seen = sensors(config, model, dt, start.diffusion(config, model, m), m.x[:2])
+    seen = sensors(config, model, dt, structured_model.diffusion(config, model, m), m.x[:2])
     m.score[mem.ODDS] = 0.0 if seen.tail.push.any() else residual_modes.UNBENT_ODDS
     events = state.early
     first_ns, effort = int(rows.stamp_ns[0]), rows.u[0].copy()
@@ -226,7 +225,7 @@ def reopen(
     m = mem.copy(state.memory)
     n = state.model.motion.q.size
     parameters, spread = m.x[2 * n:].copy(), m.S[2 * n:].copy()
-    start.first(config, state.model, m, m.recent[:, 0] if y is None else y)
+    structured_model.first(config, state.model, m, m.recent[:, 0] if y is None else y)
     m.tail[:] = 0.0
     m.x[2 * n:] = parameters
     m.S[2 * n:] = 0.0

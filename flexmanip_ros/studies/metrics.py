@@ -13,7 +13,7 @@ from scipy.special import betaincinv
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import cramer_rao
-from flexmanip_ros.payload.angles import chords
+from flexmanip_ros.payload.structured_model import chords
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.types import Array
 

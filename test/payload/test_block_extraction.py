@@ -15,9 +15,9 @@ from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
-from flexmanip_ros.payload import block_truncation
+from flexmanip_ros.payload import block_extraction
+from flexmanip_ros.payload.arm_modes import to_modal
 from flexmanip_ros.payload.block_extraction import estimate, extract, sweep
-from flexmanip_ros.payload.modal_basis import to_modal
 from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.types import StateSpace, Status
 
@@ -116,7 +116,7 @@ def _config(**changes):
 def test_modes_that_the_model_has_not_widen_the_interval_to_hold_the_payload(convention, known):
     theta = np.radians([60.0, 45.0])
     config = _config(arm__modes=5, arm__torque_convention=convention, payload__known_coupling=known)
-    seen = block_truncation.truncated(config, theta, 20.0, 1)
+    seen = block_extraction.truncated(config, theta, 20.0, 1)
     found = estimate(config, _sharp(seen), theta)
     assert found.mass > 20.01  # what two modes of ten make of 20 kg
     assert found.lower <= 20.0 <= found.upper

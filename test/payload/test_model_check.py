@@ -20,9 +20,8 @@ from flexmanip_ros.parameters import (
     PlantParameters,
 )
 from flexmanip_ros.payload import model_check, structured
-from flexmanip_ros.payload.arm_modes import arm_modes
-from flexmanip_ros.payload.identified_drive import drive
-from flexmanip_ros.payload.model_comparison import Verdict
+from flexmanip_ros.payload.arm_modes import arm_modes, drive
+from flexmanip_ros.payload.model_check import Verdict
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, StateSpace, Status
 

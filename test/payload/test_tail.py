@@ -11,11 +11,10 @@ from scipy.linalg import expm
 
 from flexmanip_ros.arm import linearization
 from flexmanip_ros.payload import filter_state as mem
-from flexmanip_ros.payload import structured, structured_start
-from flexmanip_ros.payload.judgement_kernel import TAIL_SHARE, misjudged
-from flexmanip_ros.payload.residual_modes import MODES, tail
+from flexmanip_ros.payload import structured, structured_model
+from flexmanip_ros.payload.interval import TAIL_SHARE, misjudged
+from flexmanip_ros.payload.residual_modes import MODES, amplitude, believed, push, ring, ringing, tail
 from flexmanip_ros.payload.structured_model import motion
-from flexmanip_ros.payload.tail_kernel import amplitude, believed, push, ring, ringing
 from flexmanip_ros.types import Status
 
 THETA = np.array([0.4, 1.1])
@@ -111,7 +110,7 @@ def test_an_event_shakes_the_rates_of_an_arm_of_more_modes(of_three, of_six):
     model = structured.init(config(replace(ARM, modes=3))).model
     for memory, least, most in ((of_three, 0.8, 2.5), (of_six, 8.0, 12.0)):
         shaken = mem.copy(memory)
-        structured_start.shake(model, shaken)
+        structured_model.shake(model, shaken)
         ratio = shaken.noise[2:4, mem.EFFECTIVE] / shaken.noise[2:4, mem.WHITE]
         assert np.all((ratio > least) & (ratio < most))
 
