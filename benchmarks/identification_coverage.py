@@ -18,8 +18,8 @@ import numpy as np
 
 from flexmanip_ros.arm.linearization import discretize, vibration_model
 from flexmanip_ros.identification import rpbsid
-from flexmanip_ros.identification.modes import modes
 from flexmanip_ros.identification.realization import to_continuous
+from flexmanip_ros.identification.uncertainty import modes
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
 from flexmanip_ros.payload.block_extraction import estimate, extract
 from flexmanip_ros.samples.sample_log import log_of

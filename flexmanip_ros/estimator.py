@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.identification import rpbsid
-from flexmanip_ros.identification.memory_kernel import FILLED, REJECTED
-from flexmanip_ros.identification.modes import modes
-from flexmanip_ros.identification.uncertainty import Identified
+from flexmanip_ros.identification.factor import FILLED, REJECTED
+from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.numerics.background import Background
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, model_check, structured

@@ -13,6 +13,8 @@ from flexmanip_ros.identification.prediction_error import (
     Fit,
     Structure,
     Theta,
+    averaged,
+    candidate,
     covariance_root,
     derivatives,
     descend,
@@ -20,7 +22,6 @@ from flexmanip_ros.identification.prediction_error import (
     forgets,
 )
 from flexmanip_ros.identification.realization import lightly_damped
-from flexmanip_ros.identification.starts import averaged, candidate
 from flexmanip_ros.types import Array, StateSpace
 
 ITERATIONS = 12

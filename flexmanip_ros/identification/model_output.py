@@ -10,7 +10,7 @@ from scipy.linalg.lapack import dtrtrs
 
 from flexmanip_ros.identification import realization, uncertainty
 from flexmanip_ros.identification.batch_fit import Recursion
-from flexmanip_ros.identification.memory_kernel import POWER, WEIGHT, WEIGHT2
+from flexmanip_ros.identification.factor import POWER, WEIGHT, WEIGHT2
 from flexmanip_ros.identification.moments import Realized, realize, triangle
 from flexmanip_ros.identification.uncertainty import Identified, Tangent
 from flexmanip_ros.identification.varx import observability_controllability, open_loop_weight

@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numba import njit
 
-from flexmanip_ros.identification.factor import GROWTH
-from flexmanip_ros.identification.memory_kernel import (
+from flexmanip_ros.identification.factor import (
     FILLED,
     GAMMA,
+    GROWTH,
     OPEN,
     PRIOR,
     USED,

@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.identification.past_window import past_windows
-from flexmanip_ros.identification.varx import observability_controllability
+from flexmanip_ros.identification.varx import observability_controllability, past_windows
 from flexmanip_ros.types import Array, StateSpace
 
 

@@ -1,19 +1,190 @@
-"""Prediction-error (maximum-likelihood) fit of the innovation form, started from the subspace model.
-
-With a short past window the subspace model is biased where the noise is on the sensors alone: its predictor
-has no time to average. The fit has no window: it runs the model over the stretch and descends on the
-determinant of its innovation covariance. Unidentifiable directions (changes of basis) are left out by
-moving only orthogonally to them (data-driven local coordinates).
-"""
+"""Prediction-error (maximum-likelihood) fit of the innovation form, started from the subspace model."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
-from flexmanip_ros.identification.prediction_error_kernel import linearize, residual_moments
-from flexmanip_ros.types import Array
+from flexmanip_ros.errors import ModelError
+from flexmanip_ros.identification.pbsid import pbsid
+from flexmanip_ros.identification.realization import to_continuous, to_discrete
+from flexmanip_ros.types import Array, StateSpace
+
+
+@njit(cache=True, nogil=True)
+def innovation(u: Array, y: Array, C: Array, D: Array, x: Array, e: Array) -> None:
+    """Fill e (m,) = y - C x - D u."""
+    for o in range(e.size):
+        total = y[o]
+        for i in range(x.size):
+            total -= C[o, i] * x[i]
+        for i in range(u.size):
+            total -= D[o, i] * u[i]
+        e[o] = total
+
+
+@njit(cache=True, nogil=True)
+def following(u: Array, A: Array, B: Array, K: Array, x: Array, e: Array, after: Array) -> None:
+    """Fill after (n,) = A x + B u + K e."""
+    for i in range(x.size):
+        total = 0.0
+        for j in range(x.size):
+            total += A[i, j] * x[j]
+        for j in range(u.size):
+            total += B[i, j] * u[j]
+        for j in range(e.size):
+            total += K[i, j] * e[j]
+        after[i] = total
+
+
+@njit(cache=True, nogil=True)
+def linearize(
+    U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, K: Array, x: Array, whiten: Array,
+    free_system: int, free_gain: int, free_output: int, free_direct: int,
+    N: Array, g: Array, moments: Array, X: Array,
+) -> None:
+    """Run the predictor x+ = A x + B u + K e, e = y - C x - D u over (L, r), (L, m), and its derivatives.
+
+    Parameters in order: A, B row-major if free_system, K if free_gain, C if free_output, D if free_direct,
+    then x at the start. whiten: (m, m), whiten' whiten = inverse innovation covariance. On return x is the
+    state after the last sample, N (d, d) += J' J (upper triangle) and g (d,) += J' e with J the derivatives
+    of the whitened predictions; moments (m, m) += e e' and X (n, d) = dx/dparameters, started at [0 I] by
+    the caller.
+    """
+    n, r, m = A.shape[0], B.shape[1], C.shape[0]
+    d = N.shape[0]
+    at_b = n * n
+    at_k = at_b + n * r if free_system else 0
+    at_c = at_k + (n * m if free_gain else 0)
+    at_d = at_c + (m * n if free_output else 0)
+    closed = A - K @ C
+    J = np.empty((m, d))
+    Jw = np.empty((m, d))
+    ew = np.empty(m)
+    e = np.empty(m)
+    after = np.empty(n)
+    moved = np.empty((n, d))
+    for k in range(U.shape[0]):
+        innovation(U[k], Y[k], C, D, x, e)
+        for o in range(m):
+            for j in range(d):
+                J[o, j] = 0.0
+            for i in range(n):
+                c = C[o, i]
+                if c != 0.0:
+                    for j in range(d):
+                        J[o, j] += c * X[i, j]
+            if free_output:
+                for i in range(n):
+                    J[o, at_c + o * n + i] += x[i]
+            if free_direct:
+                for i in range(r):
+                    J[o, at_d + o * r + i] += U[k, i]
+        for o in range(m):
+            ew[o] = 0.0
+            for j in range(d):
+                Jw[o, j] = 0.0
+            for i in range(m):
+                w = whiten[o, i]
+                if w != 0.0:
+                    ew[o] += w * e[i]
+                    for j in range(d):
+                        Jw[o, j] += w * J[i, j]
+            for i in range(m):
+                moments[o, i] += e[o] * e[i]
+        for o in range(m):
+            for i in range(d):
+                a = Jw[o, i]
+                g[i] += a * ew[o]
+                if a != 0.0:
+                    for j in range(i, d):
+                        N[i, j] += a * Jw[o, j]
+        for i in range(n):
+            for j in range(d):
+                moved[i, j] = 0.0
+            for q in range(n):
+                a = closed[i, q]
+                for j in range(d):
+                    moved[i, j] += a * X[q, j]
+            if free_system:
+                for j in range(n):
+                    moved[i, i * n + j] += x[j]
+                for j in range(r):
+                    moved[i, at_b + i * r + j] += U[k, j]
+            if free_gain:
+                for j in range(m):
+                    moved[i, at_k + i * m + j] += e[j]
+            for o in range(m):
+                gain = K[i, o]
+                if free_output:
+                    for j in range(n):
+                        moved[i, at_c + o * n + j] -= gain * x[j]
+                if free_direct:
+                    for j in range(r):
+                        moved[i, at_d + o * r + j] -= gain * U[k, j]
+        following(U[k], A, B, K, x, e, after)
+        for i in range(n):
+            x[i] = after[i]
+            for j in range(d):
+                X[i, j] = moved[i, j]
+
+
+@njit(cache=True, nogil=True)
+def residual_moments(
+    U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, K: Array, x: Array, moments: Array,
+) -> None:
+    """Run the predictor only: moments (m, m) += e e', x (n,) becomes the state after the last sample."""
+    n, m = A.shape[0], C.shape[0]
+    e = np.empty(m)
+    after = np.empty(n)
+    for k in range(U.shape[0]):
+        innovation(U[k], Y[k], C, D, x, e)
+        following(U[k], A, B, K, x, e, after)
+        for i in range(n):
+            x[i] = after[i]
+        for o in range(m):
+            for i in range(m):
+                moments[o, i] += e[o] * e[i]
+
+
+@njit(cache=True, nogil=True)
+def condition(H: Array, root: Array, gradient: Array, step: Array) -> None:
+    """Update in square-root form: root (k, k) <- root L^-T with L L' = I + H, step = (I + H)^-1 gradient.
+
+    H: (k, k) symmetric, overwritten with L (lower); gradient, step: (k,). A library's routine would start
+    threads for this.
+    """
+    k = H.shape[0]
+    for i in range(k):
+        H[i, i] += 1.0
+        for j in range(i + 1):
+            total = H[i, j]
+            for q in range(j):
+                total -= H[i, q] * H[j, q]
+            if i == j:
+                H[i, i] = math.sqrt(max(total, 1.0))  # I + H is never below I
+            else:
+                H[i, j] = total / H[j, j]
+    for i in range(k):
+        total = gradient[i]
+        for q in range(i):
+            total -= H[i, q] * step[q]
+        step[i] = total / H[i, i]
+    for i in range(k - 1, -1, -1):
+        total = step[i]
+        for q in range(i + 1, k):
+            total -= H[q, i] * step[q]
+        step[i] = total / H[i, i]
+    for row in range(root.shape[0]):
+        for i in range(k):
+            total = root[row, i]
+            for q in range(i):
+                total -= H[i, q] * root[row, q]
+            root[row, i] = total / H[i, i]
+
 
 DAMPING = 1e-9
 """First Levenberg-Marquardt damping, relative to the diagonal of the information."""
@@ -202,3 +373,41 @@ def covariance_root(information: Array) -> Array:
     values = np.maximum(values, 1e-11 * max(float(values[-1]), 1e-300))
     root: Array = (vectors / np.sqrt(values)) / size[:, None]
     return root
+
+
+ROWS, PAST, RIDGE = 128, 8, 1e-3
+"""Means over the stretch, their past window, and the ridge on them, of a start for slow modes."""
+
+
+def candidate(model: StateSpace, feedthrough: bool) -> tuple[Theta, Structure]:
+    """Starting point from a model of scaled signals, C held when it can fix the basis."""
+    n, m = model.A.shape[0], model.C.shape[0]
+    theta = Theta(model.A, model.B, model.C, model.D, model.K, np.zeros(n))
+    if n == m and np.linalg.cond(model.C) < 1e6:
+        W = model.C
+        A = np.asarray(np.linalg.solve(W.T, (W @ model.A).T).T, dtype=np.float64)
+        theta = Theta(A, W @ model.B, np.eye(n), model.D, W @ model.K, np.zeros(n))
+        return _dense(theta), Structure(False, feedthrough, False)
+    return _dense(theta), Structure(True, feedthrough, False)
+
+
+def averaged(U: Array, Y: Array, n: int) -> StateSpace | None:
+    """Model of order n from the means over many samples (N, r), (N, m): a short past that reaches far back.
+
+    Its own past is as many samples as the window of the recursion, and yet sees whole periods of slow modes.
+    """
+    every = len(U) // ROWS
+    if every < 2:
+        return None
+    u, y = (X[:every * ROWS].reshape(ROWS, every, -1).mean(axis=1) for X in (U, Y))
+    try:
+        model, _ = pbsid(u, y, n=n, p=PAST, f=PAST, dt=float(every), regularization=RIDGE)
+        A, B = to_discrete(*to_continuous(model.A, model.B, float(every)), 1.0)
+    except (ModelError, np.linalg.LinAlgError):
+        return None
+    found = StateSpace(A, B, model.C, np.zeros_like(model.D), np.zeros((n, Y.shape[1])), 1.0)
+    return found if all(np.all(np.isfinite(part)) for part in (A, B, model.C)) else None
+
+
+def _dense(theta: Theta) -> Theta:
+    return Theta(*(np.ascontiguousarray(part) for part in theta))

@@ -13,17 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.identification import (
-    decimation,
-    factor,
-    fitting,
-    memory_kernel,
-    model_output,
-    paper_recursion,
-    recursive_fit,
-)
-from flexmanip_ros.identification.factor import Kinds
-from flexmanip_ros.identification.memory_kernel import FILLED, POWER, PRIOR, USED, WEIGHT, WEIGHT2
+from flexmanip_ros.identification import decimation, factor, model_output, paper_recursion, recursive_fit
+from flexmanip_ros.identification.factor import FILLED, POWER, PRIOR, USED, WEIGHT, WEIGHT2, Outcomes
 from flexmanip_ros.identification.moments import solve_regressor
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.numerics.background import INLINE, Background
@@ -32,8 +23,8 @@ from flexmanip_ros.samples.sample_log import Rows, SampleLog, Width
 from flexmanip_ros.types import Array, Status
 
 MODES = {
-    'constant': memory_kernel.CONSTANT, 'excitation': memory_kernel.EXCITATION,
-    'innovation': memory_kernel.INNOVATION,
+    'constant': factor.CONSTANT, 'excitation': factor.EXCITATION,
+    'innovation': factor.INNOVATION,
 }
 FRESH = 3.0
 """A fit is published while the subspace model rests on at most this many times its samples."""
@@ -74,11 +65,11 @@ def init(config: IdentifierParameters) -> RpbsidState:
     r, m = len(config.inputs), len(config.outputs)
     p = config.past_window
     memory = _paper_memory(config, r, m) if config.estimator == 'paper' else _factor_memory(config, r, m)
-    scalars = np.zeros(memory_kernel.SCALARS)
+    scalars = np.zeros(factor.SCALARS)
     scalars[PRIOR] = scalars[POWER] = 1.0
     return RpbsidState(
         z=np.zeros(p * (r + m)), scale=np.zeros(r + m), mean=np.zeros((2, r + m)), variance=np.zeros(m),
-        scalars=scalars, counts=np.zeros(memory_kernel.COUNTS, dtype=np.int64), memory=memory,
+        scalars=scalars, counts=np.zeros(factor.COUNTS, dtype=np.int64), memory=memory,
         refined=recursive_fit.start(0) if _is_refined(config, r, m) else None,
         decimator=decimation.start(config.decimation, r + m) if config.decimation > 1 else None,
         decimated=SampleLog(Width(r, m, 0)) if config.decimation > 1 else None)
@@ -155,7 +146,7 @@ def _advance(config: IdentifierParameters, state: RpbsidState, rows: Rows, backg
         some = rows.between(done, until)
         outcome = _run(config, new, np.ascontiguousarray(some.u), np.ascontiguousarray(some.y))
         if new.refined is not None:
-            new = new._replace(refined=fitting.refine(
+            new = new._replace(refined=recursive_fit.refine(
                 config, new.refined, some, outcome, new.memory[0], new.scale, background))
         done = until
     return new
@@ -174,7 +165,7 @@ def _decimate(config: IdentifierParameters, state: RpbsidState, decimator: decim
     return state._replace(decimator=decimator, decimated=log), log.rows(first, log.end)
 
 
-def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array) -> Kinds:
+def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array) -> Outcomes:
     """Run the compiled kernel, overwriting the arrays of the state; return what became of each sample."""
     recursive = config.estimator == 'paper'  # stale states: it must forget
     mode = MODES['excitation' if recursive and config.forgetting == 'innovation' else config.forgetting]
@@ -201,7 +192,7 @@ def finish(config: IdentifierParameters, state: RpbsidState, background: Backgro
     """No sample follows: take the result of the fit under way now."""
     if state.refined is None:
         return state
-    return state._replace(refined=fitting.delivered(state.refined, background))
+    return state._replace(refined=recursive_fit.delivered(state.refined, background))
 
 
 def window_restart(config: IdentifierParameters, state: RpbsidState, background: Background = INLINE
@@ -214,7 +205,7 @@ def window_restart(config: IdentifierParameters, state: RpbsidState, background:
     if new.decimator is not None:
         new = new._replace(decimator=decimation.restart(new.decimator))
     if new.refined is not None:
-        new = new._replace(refined=fitting.broken(new.refined, background))
+        new = new._replace(refined=recursive_fit.broken(new.refined, background))
     return new
 
 

@@ -1,10 +1,4 @@
-"""First-order uncertainty of the model: the spread of the VARX parameters carried to (A, B, C, D, K).
-
-The model is a function of the VARX parameters Xi whose covariance is (innovation covariance) x (inverse
-information). Where the noise-free relation A T z = T z_next holds, the fluctuations of the moments
-themselves drop out to first order, and any selection S of the state gives the same system up to
-similarity; so S and the moments are held and only Xi varies.
-"""
+"""First-order uncertainty: the spread of the VARX parameters carried to (A, B, C, D, K) and to the modes."""
 
 from __future__ import annotations
 
@@ -13,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.identification.moments import Realized, solved
-from flexmanip_ros.types import Array, StateSpace, Status
+from flexmanip_ros.types import Array, Mode, StateSpace, Status
 
 NEARLY_SINGULAR = 1e-12
 """Relative size of a regressor of the state below which it is taken for none."""
@@ -179,3 +173,37 @@ def known_basis_tangent(model: StateSpace, along: Tangent) -> Array | None:
     Ac = np.real(V @ (logs[:, None] * U)) / model.dt
     dAc = np.real(V @ (divided * (U @ along.A @ V)) @ U) / model.dt
     return np.concatenate([along.C, along.C @ Ac + model.C @ dAc], axis=1)
+
+
+REAL = 1e-9
+"""A pole whose angle [rad per sample] is below this does not oscillate."""
+
+
+def poles(A: Array) -> tuple[Array, Array, Array]:
+    """Eigenvalues (n,), right (n, n) and left (n, n) eigenvectors with left' right = I."""
+    values, right = np.linalg.eig(A)
+    return values, right, np.linalg.inv(right).conj().T
+
+
+def modes(identified: Identified) -> tuple[Mode, ...]:
+    """Oscillations of the identified model, rising frequency; deviations to first order (nan: unknown)."""
+    A, dt = identified.model.A, identified.model.dt
+    n = A.shape[0]
+    values, right = np.linalg.eig(A)
+    found = []
+    spread = identified.spread[:n * n]
+    for index in np.flatnonzero(values.imag > 0.0):
+        pole = values[index]
+        if abs(np.angle(pole)) < REAL or abs(pole) == 0.0:
+            continue
+        s = np.log(pole) / dt
+        left = np.linalg.solve(right.T, np.eye(n)[index])
+        sensitivity = np.outer(left, right[:, index]).ravel()
+        change = sensitivity @ spread / (pole * dt)
+        frequency = s.imag / (2.0 * np.pi)
+        damping = -s.real / abs(s)
+        dampings = -(change.real * s.imag - change.imag * s.real) * s.imag / abs(s) ** 3
+        std = float(np.linalg.norm(change.imag)) / (2.0 * np.pi) if spread.size else float('nan')
+        damping_std = float(np.linalg.norm(dampings)) if spread.size else float('nan')
+        found.append(Mode(float(frequency), float(damping), std, damping_std))
+    return tuple(sorted(found))

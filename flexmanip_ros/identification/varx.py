@@ -1,14 +1,58 @@
-"""From VARX parameters to observability x controllability (paper eqs. 26-35).
-
-A regressor z stacks the past window as blocks [u; y], oldest first; Xi is (m, p (r + m)).
-"""
+"""From VARX parameters to observability x controllability (paper eqs. 26-35), and the regressors of a record."""
 
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
-from flexmanip_ros.identification.varx_kernel import open_loop, predictions
 from flexmanip_ros.types import Array
+
+
+def past_windows(U: Array, Y: Array, p: int) -> Array:
+    """(N - p + 1, p (r + m)): row k holds [u; y] of samples k..k+p-1, oldest first (eqs. 24-25).
+
+    The last row is the window after the last sample.
+    """
+    joint = np.hstack([U, Y])
+    count = max(joint.shape[0] - p + 1, 0)
+    columns = [joint[i:i + count] for i in range(p)]
+    return np.hstack(columns) if columns else np.zeros((count, 0))
+
+
+@njit(cache=True)
+def predictions(Xi: Array, f: int, r: int, weighted: bool, G: Array) -> None:
+    """Fill G (f m, past): Xi (m, past) on windows shifted by 0..f - 1 samples, see ``varx``."""
+    m, past = Xi.shape
+    width = r + m
+    for i in range(f):
+        for o in range(m):
+            for q in range(i * width):
+                G[i * m + o, q] = 0.0
+            for q in range(i * width, past):
+                G[i * m + o, q] = Xi[o, q - i * width]
+        if weighted:
+            for j in range(i):
+                at = past - (i - j) * width + r
+                for o in range(m):
+                    for k in range(m):
+                        a = Xi[o, at + k]
+                        for q in range(past):
+                            G[i * m + o, q] += a * G[j * m + k, q]
+
+
+@njit(cache=True)
+def open_loop(Xi: Array, f: int, r: int, L: Array) -> None:
+    """Turn L (f m, f m), the identity, into the weight from predictor to system, see ``varx``."""
+    m, past = Xi.shape
+    width = r + m
+    for i in range(f):
+        for j in range(i):
+            at = past - (i - j) * width + r
+            for o in range(m):
+                for k in range(m):
+                    a = Xi[o, at + k]
+                    for q in range((j + 1) * m):
+                        L[i * m + o, q] += a * L[j * m + k, q]
 
 
 def shifted(Xi: Array, block: int, width: int) -> Array:

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.arm.linearization import Blocks, blocks
-from flexmanip_ros.identification.modes import REAL
-from flexmanip_ros.identification.uncertainty import Identified
+from flexmanip_ros.identification.uncertainty import REAL, Identified
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload.structured_model import Quantity, signals
 from flexmanip_ros.types import Array

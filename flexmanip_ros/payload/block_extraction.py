@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flexmanip_ros.arm.linearization import Blocks, blocks, vibration_model
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.identification.memory_kernel import POWER_RATE
+from flexmanip_ros.identification.factor import POWER_RATE
 from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters

@@ -8,8 +8,7 @@ from linear_arm import benchmark
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from flexmanip_ros.identification.mode_drift import Drift, drifting, turns
-from flexmanip_ros.identification.mode_drift_kernel import sway
+from flexmanip_ros.identification.mode_drift import Drift, drifting, sway, turns
 from flexmanip_ros.identification.prediction_error import Fit, Structure, Theta, descend, moved
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from linear_arm import configuration, random_system, record, run, sorted_poles
 
 from flexmanip_ros.identification import rpbsid
-from flexmanip_ros.identification.memory_kernel import REJECTED, USED
+from flexmanip_ros.identification.factor import REJECTED, USED
 
 MODES = [{'forgetting': 'innovation'}, {'forgetting': 'excitation'}, {'forgetting': 'constant'},
          {'estimator': 'paper', 'forgetting': 'excitation'}, {'estimator': 'paper', 'forgetting': 'constant'}]

@@ -8,9 +8,8 @@ from linear_arm import benchmark, configuration, random_system, record, run
 
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.model_output import based, from_factor
-from flexmanip_ros.identification.modes import modes
 from flexmanip_ros.identification.moments import realize
-from flexmanip_ros.identification.uncertainty import Tangent, tangent, variance
+from flexmanip_ros.identification.uncertainty import Tangent, modes, tangent, variance
 from flexmanip_ros.types import StateSpace
 
 

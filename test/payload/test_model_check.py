@@ -11,7 +11,7 @@ from recording import ARM, config, event, record
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm import linearization
-from flexmanip_ros.identification import modes
+from flexmanip_ros.identification import uncertainty
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import (
     ArmParameters,
@@ -56,7 +56,7 @@ def compared(identified: Identified) -> tuple[Verdict, Payload, Payload]:
     settings, state = holding_20_kg()
     alone = structured.estimate(settings, state)
     swept = np.array([*np.repeat(np.cos(THETA[1] - THETA[0]), 2), THETA[0], THETA[0], 0.0])
-    found = model_check.check(settings, state, alone, swept, identified, modes.modes(identified), 2500, EVENT)
+    found = model_check.check(settings, state, alone, swept, identified, uncertainty.modes(identified), 2500, EVENT)
     assert found is not None
     return found, alone, model_check.apply(state, alone, (found,), EVENT)
 
@@ -150,7 +150,7 @@ def test_only_a_refined_fit_of_some_length_is_heard(change):
     settings, state = holding_20_kg()
     identified = model_of(ARM, 60.0)._replace(**change)
     assert model_check.check(settings, state, structured.estimate(settings, state), np.zeros(5), identified,
-                             modes.modes(identified)) is None
+                             uncertainty.modes(identified)) is None
 
 
 def test_a_verdict_counts_until_the_next_event():
