@@ -14,8 +14,7 @@ from setuptools.command.install import install
 NAME = 'flexmanip_ros'
 HERE = Path(__file__).resolve().parent
 NODES = (
-    'plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'payload_controller',
-    'payload_adapter', 'demo',
+    'plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'payload_controller', 'payload_adapter',
 )
 PROGRAMS = ('identify_bag', 'simulate_bag', 'reproduce_paper', 'monte_carlo', 'write_urdf')
 
@@ -96,6 +95,10 @@ setup(
     description='Online identification of a flexible two-link arm and of the payload it catches.',
     license='Apache-2.0',
     entry_points={
-        'console_scripts': [f'{name} = {NAME}.cli.start:{name}' for name in (*NODES, *PROGRAMS)],
+        'console_scripts': [
+            *(f'{name} = {NAME}.ros.nodes.{name}:main' for name in NODES),
+            f'demo = {NAME}.ros.demo.program:main',
+            *(f'{name} = {NAME}.cli.{name}:main' for name in PROGRAMS),
+        ],
     },
 )

@@ -1,11 +1,11 @@
-"""Claim: SIGINT, SIGTERM and SIGKILL at any moment leave whole files, no orphan, and no traceback.
+"""Claim: SIGINT, SIGTERM and SIGKILL at any moment of a program's work leave whole files, no orphan, and no traceback.
 
 Every executable is started and stopped again after delays drawn between its start and its end: while modules
 are imported, while kernels load, during discovery, at work, while files are written. After SIGINT and SIGTERM
 the exit code is 0 (a node, or the work was done), 128 + the signal or 130 (it was not), and what was begun is
 closed and readable; after SIGKILL a recording gives back what was flushed, a checkpoint is the old or the new
-one, a journal ends in a whole line. A signal that Python gets before the first line of this package is
-Python's own, and counted apart. Use: ros_signals.py [RUNS] [PART_OF_A_NAME]
+one, a journal ends in a whole line. A signal that comes before a program's main function, while modules are
+imported, is answered by Python itself, and counted apart. Use: ros_signals.py [RUNS] [PART_OF_A_NAME]
 """
 
 from __future__ import annotations
@@ -32,8 +32,14 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 PATIENCE_S = 30.0
 
 
-START = 'import sys; from flexmanip_ros.cli.start import {0}; sys.exit({0}())'
-"""What the installed scripts do."""
+NODES = ('plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'payload_controller',
+         'payload_adapter')
+
+
+def command(name: str) -> list[str]:
+    """Return what the installed script of a program does."""
+    where = 'ros.nodes.' + name if name in NODES else 'ros.demo.program' if name == 'demo' else 'cli.' + name
+    return [sys.executable, '-c', f'import sys; from flexmanip_ros.{where} import main; sys.exit(main())']
 
 
 class Program(NamedTuple):
@@ -153,7 +159,7 @@ def attempt(program: Program, number: signal.Signals, delay: float, places: dict
     with tempfile.TemporaryDirectory() as folder:
         given = [text.format(out=folder, **places) for text in program.arguments]
         process = subprocess.Popen(
-            [sys.executable, '-c', START.format(program.module), *given], text=True, stdout=subprocess.PIPE,
+            [*command(program.module), *given], text=True, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, start_new_session=True,
             env={**os.environ, 'ROS_LOG_DIR': folder})
         try:
@@ -179,7 +185,7 @@ def attempt(program: Program, number: signal.Signals, delay: float, places: dict
         killed = number == signal.SIGKILL
         allowed = {-number} if killed else {0, 128 + number, 130}
         loud = 'Traceback' in err or 'terminate called' in err
-        early = process.returncode in (-number, 1) and 'flexmanip_ros/' not in err
+        early = process.returncode in (-number, 1) and ', in main\n' not in err
         if process.returncode not in allowed and not early and not finished:
             problem.append(f'exit code {process.returncode}')
         if loud and not early:
@@ -204,7 +210,7 @@ def feeding(wanted: bool) -> Iterator[None]:
     """Have a plant and its torque run meanwhile."""
     names = ('plant_simulator', 'excitation') if wanted else ()
     feeders = [subprocess.Popen(
-        [sys.executable, '-c', START.format(name), '--ros-args', '-p', 'rate:=500.0'],
+        [*command(name), '--ros-args', '-p', 'rate:=500.0'],
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for name in names]
     try:
         yield
@@ -218,7 +224,7 @@ def inputs(folder: Path, seconds: int) -> dict[str, str]:
     """Make a recording and a scenario for the programs that read them; return where they are."""
     places = {'bag': str(folder / 'bag'), 'scenario': str(folder / 'scenario.yaml')}
     Path(places['scenario']).write_text(SCENARIO, encoding='utf-8')
-    make = [sys.executable, '-c', START.format('simulate_bag'), places['bag'], '--duration', str(seconds)]
+    make = [*command('simulate_bag'), places['bag'], '--duration', str(seconds)]
     subprocess.run(make, check=True, stdout=subprocess.DEVNULL)
     return places
 

@@ -14,13 +14,14 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.types import Array, Estimate, Mode, Payload, StateSpace
+from flexmanip_ros.types import Array, Estimate, Mode, Payload, StateSpace, Status
 
 MODEL = 'model'
 MODES = 'modes'
 PAYLOAD_MASS = 'payload_mass'
 PAYLOAD_ESTIMATE = 'payload_estimate'
 PAYLOAD = 'payload'
+STATUS = 'status'
 ROWS = re.compile(r'^rows: state=(\d+) output=(\d+) dt=(\S+)$')
 COLUMNS = re.compile(r'^columns: state=(\d+) input=(\d+) innovation=(\d+)$')
 
@@ -121,7 +122,36 @@ def inertia(payload: Payload, stamp_ns: int, frame_id: str) -> Inertia:
     return Inertia(stamp_ns, frame_id, payload.mass, payload.com, payload.inertia)
 
 
-Value = LabelledArray | Inertia | float
+def payload_status(payload: Payload, stamp_ns: int, frame_id: str) -> Diagnostics:
+    """Return payload, interval and status under one stamp; level OK only where the payload is to be trusted.
+
+    mass_kg is nan while nothing is known of it.
+    """
+    known = math.isfinite(payload.std)
+    trusted = known and payload.status is Status.TRACKING
+    numbers = {'mass_kg': payload.mass if known else math.nan, 'std_kg': payload.std, 'lower95_kg': payload.lower,
+               'upper95_kg': payload.upper, 'consistency': payload.consistency,
+               **dict(zip(('com_x_m', 'com_y_m', 'com_z_m'), payload.com, strict=True)),
+               **dict(zip(('ixx', 'ixy', 'ixz', 'iyy', 'iyz', 'izz'), payload.inertia, strict=True))}
+    return _status('payload', payload.status, trusted, stamp_ns, frame_id, numbers)
+
+
+def model_status(estimate: Estimate) -> Diagnostics:
+    """Return the status of model and modes under their stamp; level OK only where they are to be trusted."""
+    numbers = {f'{name}{k}': value for k, mode in enumerate(estimate.modes, start=1) for name, value in (
+        ('frequency_hz_', mode.frequency_hz), ('frequency_std_hz_', mode.frequency_std_hz),
+        ('damping_ratio_', mode.damping_ratio), ('damping_ratio_std_', mode.damping_ratio_std))}
+    status = estimate.model_status
+    return _status('model', status, status is Status.TRACKING, estimate.stamp_ns, '', numbers)
+
+
+def _status(name: str, status: Status, trusted: bool, stamp_ns: int, hardware_id: str, numbers: dict[str, float]
+            ) -> Diagnostics:
+    values = (('status', status.name), *((key, repr(float(value))) for key, value in numbers.items()))
+    return Diagnostics(stamp_ns, (DiagnosticStatus(0 if trusted else 1, name, status.value, hardware_id, values),))
+
+
+Value = LabelledArray | Inertia | Diagnostics | float
 
 
 def outgoing(estimate: Estimate, frame_id: str) -> Iterator[tuple[str, Value]]:
@@ -133,7 +163,8 @@ def outgoing(estimate: Estimate, frame_id: str) -> Iterator[tuple[str, Value]]:
 def outgoing_payload(payload: Payload | None, stamp_ns: int, frame_id: str) -> Iterator[tuple[str, Value]]:
     """Yield what an estimate says of the payload.
 
-    Never a NaN; an interval without bound is said as infinite, and then no driver is told a payload.
+    Never a NaN outside the status. While nothing is known the interval is infinite, and neither ``payload`` nor
+    ``payload_mass`` is published.
     """
     if payload is None or not math.isfinite(payload.mass):
         return
@@ -143,17 +174,20 @@ def outgoing_payload(payload: Payload | None, stamp_ns: int, frame_id: str) -> I
     if all(map(math.isfinite, (payload.std, *payload.com, *payload.inertia))):
         yield PAYLOAD, inertia(payload, stamp_ns, frame_id)
     yield PAYLOAD_ESTIMATE, payload_row(payload)
-    yield PAYLOAD_MASS, payload.mass
+    if math.isfinite(payload.std):
+        yield PAYLOAD_MASS, payload.mass
+    yield STATUS, payload_status(payload, stamp_ns, frame_id)
 
 
 def outgoing_model(estimate: Estimate) -> Iterator[tuple[str, Value]]:
-    """Yield model and modes if they were read with this estimate. Never a NaN."""
+    """Yield model, modes and their status if they were read with this estimate."""
     model = estimate.model
     if model is None or not estimate.model_is_new:
         return
     if all(np.isfinite(part).all() for part in model_parts(model)):
         yield MODEL, model_matrix(model)
         yield MODES, modes_matrix(estimate.modes)
+        yield STATUS, model_status(estimate)
 
 
 def model_parts(model: StateSpace) -> tuple[Array, ...]:

@@ -2,7 +2,8 @@
 
     ros2 launch flexmanip_ros demo.launch.py capture_time:=3.0 payload_mass:=20.0
 
-With the executable `demo` the same nodes share one process, a bag is recorded and a picture drawn.
+The identifier logs the payload when it is first trusted. With the executable `demo` the same nodes share one
+process, a bag is recorded and a picture drawn.
 """
 
 from launch import LaunchDescription
@@ -20,7 +21,7 @@ ARGUMENTS = (
     ('release_time', '-1.0', 'release this long after the first sample [s]; negative: never'),
     ('payload_method', 'structured', 'none | block | structured'),
     ('namespace', '', 'namespace of all nodes'),
-    ('cpu_affinity', '[]', 'cores of all nodes but the identifier, such as [0]; empty: any'),
+    ('prefix', '', "command before the identifier's own, such as 'taskset -c 1' or 'chrt -f 20'"),
     ('log_level', 'info', 'debug | info | warn | error'),
 )
 
@@ -29,15 +30,10 @@ def _number(name):
     return ParameterValue(LaunchConfiguration(name), value_type=float)
 
 
-def _node(executable, parameters):
+def _node(executable, parameters, **more):
     return Node(
         package=PACKAGE, executable=executable, namespace=LaunchConfiguration('namespace'), output='screen',
-        parameters=[parameters], arguments=['--ros-args', '--log-level', LaunchConfiguration('log_level')])
-
-
-def _kept(parameters):
-    return {**parameters, 'cpu_affinity': ParameterValue(LaunchConfiguration('cpu_affinity'),
-                                                         value_type=list[int])}
+        parameters=[parameters], arguments=['--ros-args', '--log-level', LaunchConfiguration('log_level')], **more)
 
 
 def generate_launch_description():
@@ -46,11 +42,10 @@ def generate_launch_description():
         *(DeclareLaunchArgument(name, default_value=default, description=words)
           for name, default, words in ARGUMENTS),
         _node('rpbsid_identifier', {
-            'payload_method': ParameterValue(LaunchConfiguration('payload_method'), value_type=str)}),
-        _node('capture_trigger', _kept({
-            'mode': 'time', 'capture_time': _number('capture_time'),
-            'release_time': _number('release_time')})),
-        _node('excitation', _kept({'rate': _number('rate'), 'clock': 'joint_states'})),
-        _node('plant_simulator', _kept({
-            'rate': _number('rate'), 'payload_mass': _number('payload_mass')})),
+            'payload_method': ParameterValue(LaunchConfiguration('payload_method'), value_type=str)},
+            prefix=LaunchConfiguration('prefix')),
+        _node('capture_trigger', {
+            'mode': 'time', 'capture_time': _number('capture_time'), 'release_time': _number('release_time')}),
+        _node('excitation', {'rate': _number('rate'), 'clock': 'joint_states'}),
+        _node('plant_simulator', {'rate': _number('rate'), 'payload_mass': _number('payload_mass')}),
     ])

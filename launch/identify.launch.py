@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
@@ -16,14 +16,27 @@ from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 PACKAGE = 'flexmanip_ros'
 
 
+def check_params_file(context):
+    """Stop the launch when the parameter file is missing; launch_ros itself only warns."""
+    path = LaunchConfiguration('params_file').perform(context)
+    if not Path(path).is_file():
+        raise RuntimeError(f"params_file '{path}' does not exist; give the path of a ROS parameter file")
+    return []
+
+
 def generate_launch_description():
     """Return the identifier and, unless it is turned off, the capture trigger."""
     config = Path(get_package_share_directory(PACKAGE)) / 'config'
-    remap = [('joint_states', LaunchConfiguration('joint_states'))]
-    simulated = {'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}
+    shared = {
+        'package': PACKAGE, 'namespace': LaunchConfiguration('namespace'), 'output': 'screen',
+        'remappings': [('joint_states', LaunchConfiguration('joint_states'))],
+    }
+    parameters = [ParameterFile(LaunchConfiguration('params_file')),
+                  {'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}]
+    mode = {'mode': ParameterValue(LaunchConfiguration('trigger_mode'), value_type=str)}
     return LaunchDescription([
         DeclareLaunchArgument('params_file', default_value=str(config / 'rpbsid_identifier.yaml'),
-                              description='parameter file with the arm and the signals'),
+                              description='parameter file with the arm and the signals, for both nodes'),
         DeclareLaunchArgument('joint_states', default_value='joint_states',
                               description='topic of the joint states'),
         DeclareLaunchArgument('namespace', default_value='', description='namespace of both nodes'),
@@ -31,11 +44,10 @@ def generate_launch_description():
         DeclareLaunchArgument('trigger', default_value='true',
                               description='start capture_trigger too (services capture and release)'),
         DeclareLaunchArgument('trigger_mode', default_value='service', description='service | time | auto'),
-        Node(package=PACKAGE, executable='rpbsid_identifier', namespace=LaunchConfiguration('namespace'),
-             parameters=[ParameterFile(LaunchConfiguration('params_file')), simulated], remappings=remap,
-             output='screen'),
-        Node(package=PACKAGE, executable='capture_trigger', namespace=LaunchConfiguration('namespace'),
-             parameters=[{'mode': ParameterValue(LaunchConfiguration('trigger_mode'), value_type=str)},
-                         simulated],
-             remappings=remap, output='screen', condition=IfCondition(LaunchConfiguration('trigger'))),
+        DeclareLaunchArgument('prefix', default_value='', description=(
+            "command before the identifier's own, such as 'taskset -c 1' or 'chrt -f 20'")),
+        OpaqueFunction(function=check_params_file),
+        Node(executable='rpbsid_identifier', parameters=parameters, prefix=LaunchConfiguration('prefix'), **shared),
+        Node(executable='capture_trigger', parameters=[*parameters, mode],
+             condition=IfCondition(LaunchConfiguration('trigger')), **shared),
     ])

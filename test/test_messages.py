@@ -67,5 +67,5 @@ def _names(payload: Payload) -> list[str]:
 
 
 def test_a_driver_is_told_no_payload_of_unbounded_uncertainty():
-    assert _names(_payload(0.0, math.inf)) == ['payload_estimate', 'payload_mass']
-    assert _names(_payload()) == ['payload', 'payload_estimate', 'payload_mass']
+    assert _names(_payload(0.0, math.inf)) == ['payload_estimate', 'status']
+    assert _names(_payload()) == ['payload', 'payload_estimate', 'payload_mass', 'status']

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import suppress
 
 import rclpy
 from geometry_msgs.msg import InertiaStamped
@@ -19,8 +20,7 @@ from flexmanip_ros.io import cdr
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, configure
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import joint_state, time_message
-from flexmanip_ros.ros.node import with_info
-from flexmanip_ros.ros.spin import Interrupt, make_executor, spin
+from flexmanip_ros.ros.rclpy_workarounds import make_executor, spin, with_info
 from flexmanip_ros.simulation import excitation, simulator
 
 EVERY = 20
@@ -89,15 +89,14 @@ class Player(Node):
 
 def main() -> None:
     """Run one of the two until a signal."""
-    interrupt = Interrupt()
     rclpy.init()
     role, rate = sys.argv[1], float(sys.argv[2])
     node: Node = Echo() if role == 'echo' else Source(rate) if role == 'source' else Player(
         rate, float(sys.argv[3]))
     executor = make_executor()
-    interrupt.install()
     executor.add_node(node)
-    spin(executor, None, interrupt)
+    with suppress(KeyboardInterrupt):
+        spin(executor)
     executor.shutdown()
 
 

@@ -82,10 +82,12 @@ def _comment(leaf: Leaf) -> str:
 def yaml_text(node: str, values: Mapping[str, Any] | None = None, heading: str = '') -> str:
     """Return a ROS parameter file of a node: every parameter with its words, unit and range.
 
+    Its section is ``/**``, so it holds in any namespace and for a node that was renamed.
+
     values: dotted names that differ from the defaults. With ``values`` only those are written.
     """
     lines = [f'# {line}' for line in textwrap.wrap(heading, WIDTH)]
-    lines += [f'{node}:', '  ros__parameters:']
+    lines += ['/**:', '  ros__parameters:']
     group: tuple[str, ...] = ()
     for leaf in leaves(NODES[node]):
         if values is not None and leaf.name not in values:

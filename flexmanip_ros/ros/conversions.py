@@ -1,4 +1,4 @@
-"""ROS messages to values of the core, and back. Nothing is judged here: sampling does that."""
+"""ROS messages to values of the core, and back. Whether a value can be used is for ``samples.sampling`` to decide."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import InertiaStamped
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header, MultiArrayDimension
 
+from flexmanip_ros import messages
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.io import cdr
-from flexmanip_ros.messages import Dimension, Inertia, LabelledArray, Value
+from flexmanip_ros.messages import Diagnostics, Dimension, Inertia, LabelledArray, Value
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointRecord
 
 SECOND = 1_000_000_000
@@ -151,10 +153,39 @@ def inertia(message: InertiaStamped) -> Inertia:
                    (body.ixx, body.ixy, body.ixz, body.iyy, body.iyz, body.izz))
 
 
-def to_message(value: Value) -> Float64MultiArray | InertiaStamped | Float64:
+def diagnostic_array(value: Diagnostics) -> DiagnosticArray:
+    """Return diagnostic entries as a message."""
+    message = DiagnosticArray(status=[
+        DiagnosticStatus(level=bytes([item.level]), name=item.name, message=item.message, hardware_id=item.hardware_id,
+                         values=[KeyValue(key=key, value=text) for key, text in item.values])
+        for item in value.statuses])
+    message.header.stamp = time_message(value.stamp_ns)
+    return message
+
+
+def diagnostics(message: DiagnosticArray) -> Diagnostics:
+    """Return a message as diagnostic entries."""
+    return Diagnostics(stamp_ns(message.header.stamp), tuple(
+        messages.DiagnosticStatus(item.level[0], item.name, item.message, item.hardware_id,
+                                  tuple((pair.key, pair.value) for pair in item.values))
+        for item in message.status))
+
+
+def to_message(value: Value) -> Float64MultiArray | InertiaStamped | DiagnosticArray | Float64:
     """Return any value an estimate publishes as its message."""
+    if isinstance(value, Diagnostics):
+        return diagnostic_array(value)
     if isinstance(value, LabelledArray):
         return multi_array(value)
     if isinstance(value, Inertia):
         return inertia_stamped(value)
     return Float64(data=float(value))
+
+
+def from_message(message: Any) -> Value:
+    """Return the value of a message that the identifier publishes; the inverse of ``to_message``."""
+    if isinstance(message, DiagnosticArray):
+        return diagnostics(message)
+    if isinstance(message, Float64MultiArray):
+        return labelled_array(message)
+    return inertia(message) if isinstance(message, InertiaStamped) else float(message.data)

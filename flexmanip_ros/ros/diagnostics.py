@@ -1,9 +1,10 @@
-"""What a node says about itself once a second: rates, losses and callback times."""
+"""What a node reports once a second: rates, losses, callback times, and what its latest estimate is worth."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import TracebackType
@@ -13,12 +14,19 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from flexmanip_ros.identification.realization import suggested_order
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.payload.signals import signals
+from flexmanip_ros.types import Estimate, Status
+
 OK = 0
 WARN = 1
 ERROR = 2
 STALE = 3
 _SEVERITY = (OK, WARN, STALE, ERROR)
-"""Silence is told before a warning, a known error before silence."""
+"""From the least to the most severe: silence hides a warning, and a known error hides silence."""
+RECENT_S = 60.0
+"""A loss is a warning for so long: long enough to be seen by somebody who looks now and then."""
 
 
 @dataclass
@@ -28,17 +36,27 @@ class Report:
     values: dict[str, Any] = field(default_factory=dict)
     level: int = OK
     words: list[str] = field(default_factory=list)
+    waits_for: str = ''
+    """The topic that the node needs and that is silent."""
 
     def worse(self, level: int, words: str) -> None:
         """Note a problem."""
         self.level = max(self.level, level, key=_SEVERITY.index)
         self.words.append(words)
 
-    def message(self, node_name: str, stamp: Time) -> DiagnosticArray:
-        """Return the entry as it goes out on /diagnostics."""
+    def silent(self, topic: str) -> None:
+        """Note that no message comes on a topic that the node needs."""
+        self.waits_for = topic
+        self.worse(STALE, f'no {topic}')
+
+    def message(self, node: str, namespace: str, stamp: Time) -> DiagnosticArray:
+        """Return the entry as it goes out on /diagnostics; node: its name with the namespace.
+
+        Nodes in one namespace belong to one arm, which the hardware_id names.
+        """
         status = DiagnosticStatus(
-            level=bytes([self.level]), name=f'{node_name}: status', message='; '.join(self.words) or 'ok',
-            hardware_id='flexmanip_ros',
+            level=bytes([self.level]), name=f'{node}: status', message='; '.join(self.words) or 'ok',
+            hardware_id=f'flexmanip_ros {namespace}',
             values=[KeyValue(key=key, value=text(value)) for key, value in self.values.items()])
         array = DiagnosticArray(status=[status])
         array.header.stamp = stamp
@@ -98,24 +116,117 @@ class Meter:
 
 
 class LossCounter:
-    """Messages that never arrived, from the publisher's sequence numbers.
+    """Messages that were sent and never arrived, from the publishers' sequence numbers.
 
-    Numbers count per publisher; a step back means that the publisher is a new one. With several
-    publishers on the topic the count means nothing, and ``lost`` is then None.
+    Each publisher counts its messages. rclpy does not say which publisher a message is from, so a number belongs to the
+    publisher whose next one it is; after a gap, to the one with the largest number before it. A publisher that comes or
+    goes starts the comparison again (``matched``), so its numbers are no loss.
     """
 
     def __init__(self) -> None:
         self.lost = 0
-        self._last: int | None = None
+        """Since the node started."""
+        self._publishers = 1
+        self._expected: list[int] = []
+        """The next number of each publisher heard."""
+        self._losses: deque[tuple[float, int]] = deque()
+        """When [s] how many were lost, within ``RECENT_S``."""
+
+    def matched(self, event: Any) -> None:
+        """Take the event that a publisher came or went."""
+        self._publishers = max(int(event.current_count), 1)
+        if event.current_count_change < 0:
+            self._expected = []
 
     def note(self, number: int | None) -> None:
         """Take the sequence number of an arrived message (None where the middleware has none)."""
         if number is None:
             return
-        if self._last is not None and number > self._last + 1:
-            self.lost += number - self._last - 1
-        self._last = number
+        if number in self._expected:
+            self._expected.remove(number)
+        elif len(self._expected) >= self._publishers:
+            before = max((expected for expected in self._expected if expected < number), default=None)
+            if before is None:  # a publisher began again, and the middleware did not tell
+                self._expected.pop()
+            else:
+                self._expected.remove(before)
+                self._add(number - before)
+        self._expected.append(number + 1)
 
-    def restart(self) -> None:
-        """Forget the last number: the publisher is another one."""
-        self._last = None
+    def _add(self, count: int) -> None:
+        self.lost += count
+        self._losses.append((time.monotonic(), count))
+
+    def recent(self) -> int:
+        """Return how many were lost in the last ``RECENT_S`` seconds."""
+        while self._losses and time.monotonic() - self._losses[0][0] > RECENT_S:
+            self._losses.popleft()
+        return sum(count for _, count in self._losses)
+
+    def report(self, report: Report, name: str, what: str) -> None:
+        """Add the total under a name; losses of the last ``RECENT_S`` are a warning. what: of messages, commands."""
+        report.values[name] = self.lost
+        recent = self.recent()
+        if recent:
+            report.worse(WARN, f'{recent} {what} lost in the last {RECENT_S:.0f} s')
+
+
+ADVICE = {
+    Status.WARMING_UP: 'move the arm; the first estimates take some tenths of a second',
+    Status.TRACKING: 'nothing to do',
+    Status.POORLY_EXCITED: 'move the arm, or raise the torque (node excitation)',
+    Status.ILL_CONDITIONED: 'lower order or past_window',
+    Status.ORDER_TOO_LOW: 'raise order (suggested_order in /diagnostics)',
+    Status.SAMPLE_GAP: 'look for lost or late joint states (gaps and lost in /diagnostics)',
+    Status.INCONSISTENT: 'check the parameters of the arm; announce each capture and release, or set '
+                         'trigger_mode:=auto at launch',
+    Status.NO_PAYLOAD_METHOD: 'set payload_method to structured for the payload',
+    Status.UNOBSERVABLE: 'correct inputs, outputs and angles, or set payload_method to none',
+    Status.DIVERGED: 'check units and signs of the signals',
+}
+"""What a user can do about each status."""
+UNANNOUNCED = ('nothing is known of the payload and no capture was announced: publish capture_event, call '
+               'capture_trigger/capture, or have captures found in the signals (trigger_mode:=auto)')
+"""What to do about an interval of [0, inf] without any event."""
+
+
+def unobservable_reason(config: IdentifierParameters) -> str:
+    """Return why these signals give no payload, in words."""
+    known = signals(config)
+    if known is None:
+        return ('the outputs are not those of a two-link arm: a name that is in neither inputs nor angles is a bend '
+                'sensor, of which there may be two, and no output may be an effort')
+    if not known.angles:
+        return 'angles does not name the position of two joints'
+    if not known.torques:
+        return 'inputs does not name the effort of both joints, in the order of angles'
+    return 'the outputs do not show the bending of both links'
+
+
+def status_line(config: IdentifierParameters, status: Status) -> str:
+    """Return a status with its meaning, its reason where that is known, and what to do about it."""
+    reason = f': {unobservable_reason(config)}' if status is Status.UNOBSERVABLE else ''
+    return f'status {status.name}: {status.value}{reason}; {ADVICE[status]}'
+
+
+def report_estimate(report: Report, estimate: Estimate | None, order: int) -> None:
+    """Add status, excitation, conditioning, order and payload to a report; order: the one configured."""
+    status = Status.WARMING_UP if estimate is None else estimate.status
+    payload = None if estimate is None else estimate.payload
+    report.values['status'] = status.name
+    report.values['model_status'] = (Status.WARMING_UP if estimate is None else estimate.model_status).name
+    report.values['converged'] = status in (Status.TRACKING, Status.NO_PAYLOAD_METHOD)
+    report.values['consistent'] = payload is None or payload.status is not Status.INCONSISTENT
+    if status not in (Status.TRACKING, Status.WARMING_UP, Status.NO_PAYLOAD_METHOD):
+        report.worse(WARN, status.value)
+    if estimate is None:
+        return
+    report.values.update(
+        excitation=estimate.excitation, condition=estimate.condition,
+        innovation_power=estimate.innovation_power, modes_deviation=estimate.modes_deviation)
+    if estimate.singular_values is not None:
+        report.values['order'] = order
+        report.values['suggested_order'] = suggested_order(estimate.singular_values)
+        report.values['singular_values'] = ' '.join(f'{value:.4g}' for value in estimate.singular_values)
+    if payload is not None:
+        report.values.update(payload_mass_kg=payload.mass, payload_std_kg=payload.std, consistency=payload.consistency)

@@ -1,71 +1,76 @@
-"""What every node of this package shares: parameters, managed life, diagnostics, throttled words."""
+"""What every node of this package shares: parameters, managed life, topics, diagnostics, log lines, the program."""
 
 from __future__ import annotations
 
-import inspect
+import argparse
 import math
+import sys
 import textwrap
 import time
 import traceback
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.context import Context
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.executors import Executor
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import InvalidQosOverridesError
+from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
+from rclpy.utilities import remove_ros_args
 
 from flexmanip_ros.errors import FlexmanipError, ParameterError
 from flexmanip_ros.io import cdr
-from flexmanip_ros.ros import qos
+from flexmanip_ros.parameters.document import help_text
+from flexmanip_ros.ros import qos, rclpy_workarounds
 from flexmanip_ros.ros.diagnostics import ERROR, WARN, Report
-from flexmanip_ros.ros.parameters import NodeParameters
-from flexmanip_ros.ros.real_time import RealTime
-from flexmanip_ros.ros.wake_latency import UNASKED
+from flexmanip_ros.ros.parameters import NodeParameters, arm_line
 
 Config = TypeVar('Config')
+BAD_INPUT = 2
+"""Exit code of a program whose arguments or parameters are wrong."""
 THROTTLE_S = 2.0
-"""A repeated complaint is written at most this often."""
-LONGEST_WORDS = 600
-"""Characters of a complaint: it may quote a message, and that may be of any length, over any lines."""
+"""An error that repeats is logged at most this often: a reader can follow it, and it does not fill the disk."""
+LONGEST_LINE = 600
+"""Characters of a logged error: it may quote a message of any length."""
 
 
-class FlexmanipNode(LifecycleNode, Generic[Config]):
+class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
     """A managed node over one configuration class.
 
-    Subclasses write ``start`` (configure), ``activated``, ``deactivated`` and ``report``. Topics and
-    services are made once and stay: what is not active takes nothing and says nothing.
+    Subclasses write ``start`` (configure), ``activated``, ``deactivated`` and ``report``. Topics and services are made
+    once and stay: a node that is not active ignores what it receives and publishes nothing.
     """
 
-    THREAD_PRIORITY, WAKE_LATENCY = 0, UNASKED
-    """Defaults of ``thread_priority`` and ``wake_latency``."""
+    def __init__(self, name: str, cls: type[Config], *, overrides: list[Parameter] | None = None, **options: Any
+                 ) -> None:
+        """Declare the parameters. Raises ParameterError naming the one that is wrong.
 
-    def __init__(self, name: str, cls: type[Config], *, context: Context | None = None,
-                 overrides: list[Parameter] | None = None, namespace: str | None = None,
-                 cli_args: list[str] | None = None) -> None:
-        """Declare the parameters; raises ParameterError naming the one that is wrong."""
-        super().__init__(name, context=context, parameter_overrides=overrides, namespace=namespace,
-                         cli_args=cli_args)
+        overrides: values given in code; options: those of ``rclpy.node.Node``, such as context and namespace.
+        """
+        super().__init__(name, parameter_overrides=overrides, **options)
         self.active = False
-        self._entities_made = False
         self.events: dict[str, int] = {}
+        """Events of the middleware, by topic: missed deadlines, incompatible publishers, ..."""
+        self._entities_made = False
         self._logged_at: dict[str, float] = {}
+        self._waited_for: str | None = None
         try:
             self.autostarts = bool(self.declare_parameter(
                 'autostart', True, ParameterDescriptor(
                     description='configure and activate at start; false: wait for ros2 lifecycle set',
                     read_only=True)).value)
-            self.real_time = RealTime(self, self.THREAD_PRIORITY, self.WAKE_LATENCY)
             self.parameters: NodeParameters[Config] = NodeParameters(self, cls, self.configuration_changed)
         except BaseException:
             self.destroy_node()
@@ -86,7 +91,11 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
         """Create publishers, subscriptions, services and timers; called once, at the first configure."""
 
     def start(self) -> None:
-        """Build the state, compile what must be compiled. FlexmanipError refuses the configuration."""
+        """Build the state, compile what must be compiled. A FlexmanipError rejects the configuration."""
+
+    def summary(self) -> str:
+        """Return what the node does with these parameters, for the log at activation."""
+        return ''
 
     def activated(self) -> None:
         """Begin to work."""
@@ -98,7 +107,7 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
         """Take parameters that were changed while running."""
 
     def report(self, report: Report) -> None:
-        """Fill the node's diagnostic entry."""
+        """Fill the node's diagnostic entry; called once ``make_entities`` was."""
 
     # Managed life.
 
@@ -115,40 +124,32 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
         return self._transition(self._deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forget the state; the next configure builds it anew."""
+        """Forget the state; the next configure builds a new one."""
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Cease to work for good."""
         return self._transition(self._deactivate)
 
-    def _LifecycleNodeMixin__on_change_state(self, request: Any, response: Any) -> Any:
-        """Answer no to a transition that the present state does not have.
-
-        The method of rclpy 7.1 (Jazzy) raises, which ends the node: ros2/rclpy#1209.
-        """
-        try:
-            return super()._LifecycleNodeMixin__on_change_state(request, response)
-        except RuntimeError as error:
-            state, reason = self._state_machine.current_state[1], str(error).split(', at ')[0]
-            self.get_logger().error(f"a transition was refused in state '{state}': {reason}")
-            response.success = False
-            return response
-
     def autostart(self) -> bool:
         """Configure and activate at once, as a plain ``ros2 run`` expects, unless ``autostart`` is false.
 
         Return False, with the reason logged, when the node could not.
         """
-        return not self.autostarts or all(
-            transition() == TransitionCallbackReturn.SUCCESS
-            for transition in (self.trigger_configure, self.trigger_activate))
+        if not self.autostarts:
+            self.get_logger().info(f'waits for: ros2 lifecycle set {self.get_fully_qualified_name()} configure')
+            return True
+        return all(transition() == TransitionCallbackReturn.SUCCESS
+                   for transition in (self.trigger_configure, self.trigger_activate))
 
     def close(self) -> None:
         """Cease to work before the node is destroyed."""
         self._transition(self._deactivate)
 
     def _configure(self) -> None:
+        arm = arm_line(self)
+        if arm:
+            self.get_logger().info(arm)
         if not self._entities_made:
             self.make_entities()
             self._entities_made = True
@@ -156,7 +157,8 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
 
     def _activate(self) -> None:
         self.activated()
-        self.active = True
+        self.active, self._waited_for = True, None
+        self.get_logger().info(f'ready: {self.summary()}' if self.summary() else 'ready')
 
     def _deactivate(self) -> None:
         if self.active:
@@ -164,7 +166,7 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
             self.deactivated()
 
     def _transition(self, work: Callable[[], None]) -> TransitionCallbackReturn:
-        """Run a part of a transition; rclpy would swallow its exception without a word."""
+        """Run a part of a transition and log its exception, which rclpy would drop."""
         try:
             work()
         except FlexmanipError as error:
@@ -182,9 +184,8 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
         with _qos_errors(topic):
             return self.create_publisher(kind, topic, profile, qos_overriding_options=qos.overridable())
 
-    def subscription(self, kind: type[Any], topic: str, callback: Callable[..., None],
-                     profile: QoSProfile, *, raw: bool = False,
-                     matched: Callable[[Any], None] | None = None) -> Subscription:
+    def subscription(self, kind: type[Any], topic: str, callback: Callable[..., None], profile: QoSProfile, *,
+                     raw: bool = False, matched: Callable[[Any], None] | None = None) -> Subscription:
         """Create a subscription whose quality of service the user may override; its events are counted.
 
         matched: called when a publisher comes or goes.
@@ -195,9 +196,8 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
             liveliness=lambda event: self._count(topic, 'publishers_not_alive', event.not_alive_count),
             incompatible_qos=lambda event: self._incompatible(topic, event))
         with _qos_errors(topic):
-            return self.create_subscription(
-                kind, topic, callback, profile, raw=raw, qos_overriding_options=qos.overridable(),
-                event_callbacks=watch)
+            return self.create_subscription(kind, topic, callback, profile, raw=raw, event_callbacks=watch,
+                                            qos_overriding_options=qos.overridable())
 
     def _count(self, topic: str, what: str, count: int) -> None:
         self.events[f'{topic} {what}'] = count
@@ -206,31 +206,31 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
         self._count(topic, 'incompatible_publishers', event.total_count)
         self.get_logger().error(
             f"a publisher of '{topic}' offers a quality of service this node cannot take; set "
-            f'qos_overrides.{self.resolve_topic_name(topic)}.subscription.reliability or its like')
-
-    # Words.
-
-    def log_throttled(self, reason: str, words: str) -> None:
-        """Log an error, at most every few seconds for one reason."""
-        now = time.monotonic()
-        if now - self._logged_at.get(reason, -math.inf) >= THROTTLE_S:
-            self._logged_at[reason] = now
-            self.get_logger().error(textwrap.shorten(words, LONGEST_WORDS, placeholder=' ...'))
+            f'qos_overrides.{self.resolve_topic_name(topic)}.subscription.reliability or a similar parameter')
 
     def stamp_of(self, raw: bytes) -> int | None:
-        """Return the header stamp [ns] of a serialized JointState; None, with a complaint, without one."""
+        """Return the header stamp [ns] of a serialized JointState; None, with an error logged, without one."""
         try:
             return cdr.stamp_ns(raw)
         except cdr.CdrError:
             self.log_throttled('encoding', 'a JointState of another encoding than CDR was dropped')
             return None
 
+    # Log lines and diagnostics.
+
+    def log_throttled(self, reason: str, words: str) -> None:
+        """Log an error, for one reason at most every ``THROTTLE_S``."""
+        now = time.monotonic()
+        if now - self._logged_at.get(reason, -math.inf) >= THROTTLE_S:
+            self._logged_at[reason] = now
+            self.get_logger().error(textwrap.shorten(words, LONGEST_LINE, placeholder=' ...'))
+
     def diagnose(self) -> None:
-        """Publish the node's diagnostic entry."""
+        """Publish the node's diagnostic entry; log when the messages that it needs stop or come."""
         report = Report()
-        self.report(report)
+        if self._entities_made:
+            self.report(report)
         report.values['active'] = self.active
-        self.real_time.report(report)
         for name, count in self.events.items():
             report.values[name] = count
             if count:
@@ -240,12 +240,18 @@ class FlexmanipNode(LifecycleNode, Generic[Config]):
             report.worse(ERROR, 'another node has the same name; stop one, or rename it with __node')
         if not self.active:
             report.words.insert(0, 'not active')
-        self._diagnostics.publish(report.message(self.get_name(), self.get_clock().now().to_msg()))
+        elif report.waits_for != self._waited_for and 'rate_hz' in report.values:
+            self._waited_for = report.waits_for
+            self.get_logger().info(
+                f'waiting for {self.resolve_topic_name(report.waits_for)}' if report.waits_for
+                else f'messages arrive: {report.values["rate_hz"]:.0f} a second')
+        self._diagnostics.publish(report.message(
+            self.get_fully_qualified_name(), self.get_namespace(), self.get_clock().now().to_msg()))
 
 
 @contextmanager
 def _qos_errors(topic: str) -> Iterator[None]:
-    """Say a quality of service that cannot be as an error of the parameter that asked for it."""
+    """Raise ParameterError for a quality of service that cannot be, naming the parameter that asked for it."""
     try:
         yield
     except (RuntimeError, ValueError, InvalidQosOverridesError, ParameterException) as error:
@@ -253,22 +259,92 @@ def _qos_errors(topic: str) -> Iterator[None]:
                              'give a policy that ROS knows, such as reliable or best_effort') from error
 
 
-def with_info(callback: Callable[[Any, Any], None]) -> Callable[..., None]:
-    """Adapt a ``(message, info)`` callback to both executors.
+class SampleGrid:
+    """A uniform grid of instants that begins at ``begin``: instant k is k / rate seconds later.
 
-    rclpy looks at the signature to see that the information is wanted; the events executor of Jazzy then
-    hands over one tuple where the others give two arguments.
+    On the wall clock elapsed time is steady, so a correction of the system clock moves no stamp. With ``use_sim_time``
+    it is that of /clock.
     """
-    def adapter(message: Any, info: Any = None) -> None:
-        if info is None:
-            message, info = message
-        callback(message, info)
 
-    adapter.__signature__ = inspect.signature(callback)  # type: ignore[attr-defined]
-    return adapter
+    def __init__(self, node: rclpy.node.Node, rate: float) -> None:
+        self._ros = node.get_clock()
+        self.clock: Clock = self._ros if node.get_parameter('use_sim_time').value \
+            else Clock(clock_type=ClockType.STEADY_TIME)
+        self.rate = rate
+        self.start_ns = 0
+        self._origin_ns: int | None = None
+
+    def begin(self) -> bool:
+        """Set instant 0 to now; False while simulated time has not come yet."""
+        self.start_ns = int(self._ros.now().nanoseconds)
+        self._origin_ns = int(self.clock.now().nanoseconds) if self.start_ns > 0 else None
+        return self._origin_ns is not None
+
+    @property
+    def begun(self) -> bool:
+        """Whether instant 0 is set."""
+        return self._origin_ns is not None
+
+    def stop(self) -> None:
+        """Forget instant 0."""
+        self._origin_ns = None
+
+    def latest(self) -> int:
+        """Return the index of the latest instant reached; negative when the clock went back before 0."""
+        assert self._origin_ns is not None
+        elapsed_ns = int(self.clock.now().nanoseconds) - self._origin_ns
+        return int(elapsed_ns * self.rate / 1e9 + 1e-6) if elapsed_ns >= 0 else -1
 
 
-def sequence_number(info: Any) -> int | None:
-    """Return the publisher's number of a message, None where the middleware has none."""
-    number = info['publication_sequence_number']
-    return None if number is None or math.isnan(number) else int(number)
+def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cls: type,
+        argv: Sequence[str] | None = None) -> int:
+    """Run one node until it is asked to stop; return the exit code.
+
+    0 after SIGINT or SIGTERM, 2 with one line on stderr for bad arguments or parameters.
+    """
+    arguments = list(sys.argv if argv is None else argv)
+    rclpy_workarounds.interrupt_on_signals()
+    try:
+        parser(name, about, cls).parse_args(remove_ros_args(arguments)[1:])
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rcl raises types of its C extension for --ros-args and parameter files
+        return reject(name, rclpy_workarounds.first_line(error))
+    warnings.simplefilter('ignore', RuntimeWarning)  # numbers out of range have a status
+    node: FlexmanipNode[Any] | None = None
+    executor: Executor | None = None
+    try:
+        node = make()
+        executor = rclpy_workarounds.make_executor()
+        rclpy_workarounds.interrupt_on_signals()
+        executor.add_node(node)
+        if not node.autostart():
+            return BAD_INPUT  # the node has logged why
+        rclpy_workarounds.spin(executor)
+    except (FlexmanipError, ParameterException) as error:
+        return reject(name, str(error))
+    except KeyboardInterrupt:
+        pass
+    finally:
+        with rclpy_workarounds.shutdown():
+            if node is not None:
+                node.close()
+            if executor is not None:
+                executor.shutdown()
+            if node is not None:
+                node.destroy_node()
+            executor = node = None
+    return 0
+
+
+def reject(name: str, problem: str) -> int:
+    """Print to stderr why a program does not start; return its exit code."""
+    print(f'{name}: {problem}', file=sys.stderr)
+    return BAD_INPUT
+
+
+def parser(name: str, about: str | None, cls: type) -> argparse.ArgumentParser:
+    """Return the parser behind --help: what the node is, its topics and services, its parameters."""
+    return argparse.ArgumentParser(
+        prog=name, formatter_class=argparse.RawDescriptionHelpFormatter,
+        usage=f'{name} [--help] [--ros-args -p NAME:=VALUE --params-file FILE.yaml ...]',
+        description=about, epilog='parameters:\n' + help_text(cls))

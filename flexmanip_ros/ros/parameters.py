@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import sys
 from collections.abc import Callable, Iterable
+from itertools import pairwise
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -15,8 +16,7 @@ from rclpy.parameter import Parameter
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import Leaf, check, configure, flatten, leaves
 from flexmanip_ros.parameters.document import NODES, limits
-from flexmanip_ros.ros import real_time
-from flexmanip_ros.ros.declaration import declare, overrides
+from flexmanip_ros.ros.rclpy_workarounds import declare, parameter_overrides
 
 Config = TypeVar('Config')
 
@@ -30,8 +30,7 @@ _ARRAY = {
 }
 _EXAMPLE = {bool: 'true or false', int: 'a whole number such as 100',
             float: 'a number with a decimal point such as 100.0', str: 'a text'}
-_ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.', 'autostart',
-            *real_time.PARAMETERS)
+_ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.', 'autostart')
 _LARGEST = sys.float_info.max
 _LARGEST_INT = 2**63 - 1
 
@@ -49,7 +48,7 @@ class NodeParameters(Generic[Config]):
         self._cls = cls
         self._leaves = {leaf.name: leaf for leaf in leaves(cls)}
         self._on_change = on_change
-        _refuse_unknown(node, self._leaves)
+        _reject_unknown(node, self._leaves)
         self.config: Config = configure(cls, {leaf.name: _declare(node, leaf) for leaf in leaves(cls)})
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._apply)
@@ -116,19 +115,19 @@ def _declare(node: Node, leaf: Leaf) -> Any:
             f"parameter '{leaf.name}' is of type {_given_type(node, leaf)}",
             f'give {"a list, each " if leaf.is_array else ""}{_EXAMPLE[leaf.kind]}') from error
     except InvalidParameterValueException as error:
-        given = overrides(node)[leaf.name].value
+        given = parameter_overrides(node)[leaf.name].value
         check(leaf, given)  # says it in our words
         raise ParameterError(f"parameter '{leaf.name}' is {given!r}", str(error)) from error
     return check(leaf, value)
 
 
 def _given_type(node: Node, leaf: Leaf) -> str:
-    return str(overrides(node)[leaf.name].type_.name).lower().replace('_', ' ')
+    return str(parameter_overrides(node)[leaf.name].type_.name).lower().replace('_', ' ')
 
 
-def _refuse_unknown(node: Node, known: dict[str, Leaf]) -> None:
-    """Refuse an override that no node of this package has: a typing error must not pass silently."""
-    for name in overrides(node):
+def _reject_unknown(node: Node, known: dict[str, Leaf]) -> None:
+    """Raise ParameterError for an override that no node of this package declares, such as a misspelt name."""
+    for name in parameter_overrides(node):
         if name in known or name.startswith(_ROS_OWN) or name in _package_names():
             continue
         near = difflib.get_close_matches(name, known, n=1)
@@ -139,3 +138,29 @@ def _refuse_unknown(node: Node, known: dict[str, Leaf]) -> None:
 def _package_names() -> frozenset[str]:
     """Names of all nodes' parameters: a file under /** may serve several nodes."""
     return frozenset(leaf.name for cls in NODES.values() for leaf in leaves(cls))
+
+
+def arm_line(node: Any) -> str:
+    """Return which arm a node computes with and where its parameters come from; empty for a node without one.
+
+    rclpy keeps what was given at start by name, not by origin: parameter files and ``-p`` look the same.
+    """
+    arm = getattr(node.config, 'arm', None)
+    if arm is None:
+        return ''
+    given = sorted(name for name in parameter_overrides(node) if name.startswith('arm.'))
+    files = [path for option, path in pairwise(sys.argv) if option == '--params-file']
+    if given:
+        origin = f'set at start: {", ".join(given)}' + (f' (parameter files: {", ".join(files)})' if files else '')
+    elif files:
+        origin = (f'all defaults: {", ".join(files)} sets no parameter arm.* of {node.get_fully_qualified_name()} '
+                  '(write the section /**, or the name of the node)')
+    else:
+        origin = 'all defaults'
+
+    def both(values: Iterable[float]) -> str:
+        return ' and '.join(f'{value:g}' for value in values)
+
+    return (f'arm: links of {both(arm.link_length)} m, {both(arm.linear_density)} kg/m, '
+            f'{both(arm.bending_stiffness)} N m^2, masses {arm.joint_mass:g} kg at joint 2 and {arm.tip_mass:g} kg at '
+            f'the tip; {origin}')

@@ -39,7 +39,7 @@ def test_a_text_stays_a_text(value):
 def test_only_what_differs_is_written_on_request():
     text = yaml_text('rpbsid_identifier', {'order': 2, 'arm.modes': 1, 'angles': ()})
     assert yaml.safe_load(text) == {
-        'rpbsid_identifier': {'ros__parameters': {'order': 2, 'angles': [''], 'arm': {'modes': 1}}}}
+        '/**': {'ros__parameters': {'order': 2, 'angles': [''], 'arm': {'modes': 1}}}}
 
 
 def test_the_files_are_written_once(tmp_path, capsys):

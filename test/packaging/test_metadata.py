@@ -177,7 +177,8 @@ def test_the_three_locks_agree() -> None:
 def test_every_program_imports_and_is_callable(distribution: Distribution) -> None:
     for name, target in programs(distribution).items():
         module, function = target.split(':')
-        assert function == name
+        assert function == 'main'
+        assert module.rpartition('.')[2] == ('program' if name == 'demo' else name)
         assert callable(getattr(importlib.import_module(module), function))
 
 

@@ -6,18 +6,17 @@ from functools import lru_cache
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import InertiaStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64, Float64MultiArray, Header
+from std_msgs.msg import Header
 
-from flexmanip_ros import messages, pipeline
+from flexmanip_ros import pipeline
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters
 from flexmanip_ros.ros import conversions, qos
-from flexmanip_ros.ros.demo.result import outgoing
-from flexmanip_ros.ros.nodes.rpbsid_identifier import RpbsidIdentifier
+from flexmanip_ros.ros.demo.program import outgoing
+from flexmanip_ros.ros.nodes.rpbsid_identifier import TOPICS, RpbsidIdentifier
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
@@ -39,16 +38,11 @@ class Live:
     def __init__(self, ros: Ros, **values: Any) -> None:
         self.ros = ros
         self.said: dict[str, list[Any]] = {}
-        for name, kind, back in (
-                (messages.MODEL, Float64MultiArray, conversions.labelled_array),
-                (messages.MODES, Float64MultiArray, conversions.labelled_array),
-                (messages.PAYLOAD_MASS, Float64, lambda message: message.data),
-                (messages.PAYLOAD_ESTIMATE, Float64MultiArray, conversions.labelled_array),
-                (messages.PAYLOAD, InertiaStamped, conversions.inertia)):
+        for name, (kind, _) in TOPICS.items():
             heard = self.said[name] = []
             ros.helper.create_subscription(
                 kind, f'/rpbsid_identifier/{name}',
-                lambda message, heard=heard, back=back: heard.append(back(message)), 1000)
+                lambda message, heard=heard: heard.append(conversions.from_message(message)), 1000)
         self.diagnostics = ros.listen(DiagnosticArray, '/diagnostics', 10)
         self.node = ros.managed(RpbsidIdentifier(context=ros.context, overrides=overrides(**values)))
         self.joint_states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
@@ -75,7 +69,7 @@ class Live:
         """Return the latest diagnostic values."""
         for message in reversed(self.diagnostics):
             for status in message.status:
-                if status.name.startswith('rpbsid_identifier'):
+                if status.name == '/rpbsid_identifier: status':
                     return {item.key: item.value for item in status.values}
         return {}
 

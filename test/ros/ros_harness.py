@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
-from flexmanip_ros.ros.spin import make_executor
+from flexmanip_ros.ros.rclpy_workarounds import make_executor
 
 Found = TypeVar('Found', bound=Node)
 

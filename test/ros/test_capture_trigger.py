@@ -39,7 +39,7 @@ def test_nothing_is_announced_before_its_lead_time(ros: Ros) -> None:
     for k in range(70):
         publisher.publish(joint_state(k))
     ros.wait(lambda: node._last_ns == START_NS + 69_000_000)
-    assert node.announced.count == 0
+    assert node.announced == 0
 
 
 def test_a_looped_recording_starts_the_count_again(ros: Ros) -> None:
@@ -52,7 +52,7 @@ def test_a_looped_recording_starts_the_count_again(ros: Ros) -> None:
             publisher.publish(joint_state(k, start_ns=start))
     ros.wait(lambda: len(heard) == 2)
     assert [stamp_ns(event.stamp) for event in heard] == [START_NS + 10**7, START_NS - 5 * 10**9 + 10**7]
-    assert node.announced.count == 2
+    assert node.announced == 2
 
 
 def test_one_stamp_from_far_ahead_does_not_make_the_count_begin_again(ros: Ros) -> None:
@@ -86,7 +86,7 @@ def test_a_request_without_joint_states_is_refused_with_the_reason(ros: Ros) -> 
     answer = ros.call(Trigger, 'capture_trigger/capture')
     assert not answer.success
     assert 'no joint_states' in answer.message
-    assert node.announced.count == 0
+    assert node.announced == 0
 
 
 def test_mode_auto_finds_a_capture_and_tells_it_where_the_plant_does_not_listen(ros: Ros) -> None:
@@ -99,9 +99,9 @@ def test_mode_auto_finds_a_capture_and_tells_it_where_the_plant_does_not_listen(
     for k, record in enumerate(simulator.records(run)):
         publisher.publish(joint_state_message(record))
         if k % 200 == 199:
-            ros.wait(lambda k=k: node._watcher.counters.received == k + 1)
+            ros.wait(lambda k=k: node._detector.clock.counters.received == k + 1)
     ros.wait(lambda: detected, what='the detected capture')
     assert detected[0].frame_id == 'capture'
     assert abs(stamp_ns(detected[0].stamp) - capture.stamp_ns) < 30_000_000
-    assert node.detected.count == 1
+    assert node.detected == 1
     assert commanded == []

@@ -16,7 +16,7 @@ from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
 
 
 def entries(heard: list[DiagnosticArray], name: str) -> list[Any]:
-    return [status for message in heard for status in message.status if status.name == f'{name}: status']
+    return [status for message in heard for status in message.status if status.name == f'/{name}: status']
 
 
 def values(status: Any) -> dict[str, str]:

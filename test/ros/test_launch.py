@@ -35,19 +35,26 @@ class DeclareLaunchArgument(Call):
 class LaunchConfiguration(Call):
     """An argument that is used."""
 
+    def perform(self, context: dict[str, str]) -> str:
+        return context[self.args[0]]
+
+
+class OpaqueFunction(Call):
+    """A function that is called while launching."""
+
 
 @pytest.fixture
 def described(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Return what a launch file describes."""
     classes = {
-        'launch': ['LaunchDescription'], 'launch.actions': ['DeclareLaunchArgument'],
+        'launch': ['LaunchDescription'], 'launch.actions': ['DeclareLaunchArgument', 'OpaqueFunction'],
         'launch.conditions': ['IfCondition'], 'launch.substitutions': ['LaunchConfiguration'],
         'launch_ros': [], 'launch_ros.actions': ['Node'],
         'launch_ros.parameter_descriptions': ['ParameterFile', 'ParameterValue'],
         'ament_index_python': [], 'ament_index_python.packages': [],
     }
     known = {'Node': Node, 'DeclareLaunchArgument': DeclareLaunchArgument,
-             'LaunchConfiguration': LaunchConfiguration}
+             'LaunchConfiguration': LaunchConfiguration, 'OpaqueFunction': OpaqueFunction}
     for name, members in classes.items():
         module: Any = types.ModuleType(name)
         for member in members:
@@ -78,7 +85,7 @@ def test_every_node_and_parameter_is_of_the_package(described: list[Any]) -> Non
         declared = {leaf.name: leaf for leaf in leaves(NODES[node.kwargs['executable']])}
         for group in node.kwargs['parameters']:
             for name, value in (group.items() if isinstance(group, dict) else ()):
-                if name in ('use_sim_time', 'cpu_affinity'):  # every node has them
+                if name == 'use_sim_time':  # every node has it
                     continue
                 assert name in declared
                 wanted = list if declared[name].is_array else declared[name].kind
@@ -96,5 +103,26 @@ def test_every_argument_is_declared_described_and_used(described: list[Any]) -> 
     assert all(item.kwargs['description'] for item in arguments)
 
 
-def test_the_shared_parameter_file_is_there() -> None:
-    assert (ROOT / 'config' / 'rpbsid_identifier.yaml').is_file()
+@pytest.mark.parametrize('described', FILES, indirect=True, ids=lambda path: path.name)
+def test_the_identifier_alone_may_be_started_behind_another_command(described: list[Any]) -> None:
+    prefixed = [item.kwargs['executable'] for item in described if isinstance(item, Node) and 'prefix' in item.kwargs]
+    (default,) = [item.kwargs['default_value'] for item in described
+                  if isinstance(item, DeclareLaunchArgument) and item.args[0] == 'prefix']
+    assert (prefixed, default) == (['rpbsid_identifier'], '')
+
+
+@pytest.mark.parametrize('described', FILES[1:], indirect=True, ids=lambda path: path.name)
+def test_identifier_and_trigger_get_the_same_parameter_file(described: list[Any]) -> None:
+    nodes = {item.kwargs['executable']: item.kwargs['parameters'] for item in described if isinstance(item, Node)}
+    files = {name: [one.args[0].args[0] for one in given if isinstance(one, Call)] for name, given in nodes.items()}
+    assert files == {'rpbsid_identifier': ['params_file'], 'capture_trigger': ['params_file']}
+
+
+@pytest.mark.parametrize('described', FILES[1:], indirect=True, ids=lambda path: path.name)
+def test_a_parameter_file_that_is_not_there_stops_the_launch(described: list[Any]) -> None:
+    (check,) = [item.kwargs['function'] for item in described if isinstance(item, OpaqueFunction)]
+    with pytest.raises(RuntimeError, match=r"params_file 'nowhere\.yaml' does not exist"):
+        check({'params_file': 'nowhere.yaml'})
+    (default,) = [item.kwargs['default_value'] for item in described
+                  if isinstance(item, DeclareLaunchArgument) and item.args[0] == 'params_file']
+    assert check({'params_file': default}) == []

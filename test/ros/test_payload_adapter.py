@@ -15,7 +15,7 @@ from std_msgs.msg import Float64MultiArray
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.nodes import payload_adapter
-from flexmanip_ros.ros.nodes.payload_adapter import PayloadAdapter, fill, refusal, service_class
+from flexmanip_ros.ros.nodes.payload_adapter import PayloadAdapter, fill, rejection, service_class
 from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
 
 
@@ -38,7 +38,7 @@ def test_a_trusted_payload_becomes_a_parameter_of_another_node(ros: Ros) -> None
         target_node='plant_simulator', settle_time=0.1)))
     say(ros, 31.5, 0.1)
     ros.wait(lambda: plant.config.payload_mass == 31.5, what='the parameter')
-    ros.wait(lambda: adapter.told == 1)
+    ros.wait(lambda: adapter.sent == 1)
     assert adapter.state.told_mass == 31.5
 
 
@@ -49,7 +49,7 @@ def test_a_doubtful_payload_is_not_told(ros: Ros) -> None:
     heard = ros.listen(Float64MultiArray, 'rpbsid_identifier/payload_estimate', 10)
     say(ros, 31.5, 9.0)
     ros.wait(lambda: len(heard) > 20)
-    assert (plant.config.payload_mass, adapter.told) == (20.0, 0)
+    assert (plant.config.payload_mass, adapter.sent) == (20.0, 0)
 
 
 def test_a_refusal_is_reported_with_its_reason_and_asked_again(ros: Ros) -> None:
@@ -58,7 +58,7 @@ def test_a_refusal_is_reported_with_its_reason_and_asked_again(ros: Ros) -> None
         target_node='plant_simulator', mass_parameter='rate', settle_time=0.0, min_period=0.05)))
     say(ros, 31.5, 0.1)
     ros.wait(lambda: 'read-only' in adapter.problem, what='the reason')
-    assert adapter.told == 0
+    assert adapter.sent == 0
 
 
 def test_a_driver_that_is_not_there_is_named(ros: Ros) -> None:
@@ -84,12 +84,12 @@ def test_a_payload_that_is_not_that_of_its_estimate_is_not_told(ros: Ros) -> Non
     adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
         target_node='plant_simulator', settle_time=0.0)))
     payload, _ = say(ros, 31.5, 0.1)
-    ros.wait(lambda: adapter.told == 1)
+    ros.wait(lambda: adapter.sent == 1)
     payload.publish(InertiaStamped(inertia=Inertia(m=90.0)))
     ros.wait(lambda: adapter._inertia.m == 90.0)
     adapter.state = adapter.state._replace(told_mass=None, told_at=-1e9)
     ros.wait(lambda: adapter.doubtful > 0)
-    assert (plant.config.payload_mass, adapter.told) == (31.5, 1)
+    assert (plant.config.payload_mass, adapter.sent) == (31.5, 1)
 
 
 def test_a_driver_that_does_not_answer_is_said_and_its_requests_are_not_kept(
@@ -143,6 +143,6 @@ def test_answers_of_drivers_and_nodes_are_understood() -> None:
         success = False
         message = 'too heavy'
 
-    assert refusal(Answer()) == 'too heavy'
+    assert rejection(Answer()) == 'too heavy'
     Answer.success = True
-    assert refusal(Answer()) == ''
+    assert rejection(Answer()) == ''

@@ -95,14 +95,14 @@ def test_two_publishers_with_numbers_of_their_own_are_no_loss(ros: Ros) -> None:
     node, _ = start(ros)
     node.trigger_activate()
     first, second = (ros.publisher(Float64MultiArray, 'effort_controller/commands') for _ in range(2))
-    ros.wait(lambda: node._several)
+    ros.wait(lambda: node.lost_commands._publishers == 2)
     torque = 0.0
     for publisher in (*[first] * 50, second, first, second):
         torque += 1.0
         publisher.publish(Float64MultiArray(data=[torque, 1.0]))
         ros.wait(lambda torque=torque: node.efforts[0] == torque)
     ros.helper.destroy_publisher(second)
-    ros.wait(lambda: not node._several)
+    ros.wait(lambda: node.lost_commands._publishers == 1)
     first.publish(Float64MultiArray(data=[-1.0, 1.0]))
     ros.wait(lambda: node.efforts[0] == -1.0)
     assert node.lost_commands.lost == 0
@@ -116,7 +116,7 @@ def test_dropped_commands_show_in_the_diagnostics(ros: Ros) -> None:
 
     def warned() -> bool:
         return any(
-            status.name == 'plant_simulator: status' and status.level == b'\x01'
+            status.name == '/plant_simulator: status' and status.level == b'\x01'
             and {'dropped_commands': '1'}.items() <= {v.key: v.value for v in status.values}.items()
             for message in diagnostics for status in message.status)
 

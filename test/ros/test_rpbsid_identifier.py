@@ -11,7 +11,7 @@ from std_srvs.srv import Trigger
 
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.ros import conversions, qos
-from flexmanip_ros.ros.demo.result import compare
+from flexmanip_ros.ros.demo.program import compare
 from flexmanip_ros.types import JointRecord
 
 
@@ -173,7 +173,7 @@ def test_the_publishing_rate_changes_while_it_runs(ros: Ros) -> None:
     before = live.node.published
     live.send(*samples[350:])
     live.finish()
-    assert live.node.published - before == 2 * len({k // 4 for k in range(352, 700)})
+    assert live.node.published - before == 3 * len({k // 4 for k in range(352, 700)})
     (result,) = live.node.set_parameters([Parameter('publish_rate', value=-1.0)])
     assert not result.successful
     (result,) = live.node.set_parameters([Parameter('order', value=6)])

@@ -1,66 +1,151 @@
-"""All nodes of the demonstration in one process, on one executor, over DDS."""
+"""All nodes of the demonstration, and a recorder, in one process on one executor, over DDS."""
 
 from __future__ import annotations
 
-import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rclpy.context import Context
 from rclpy.executors import Executor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, Header
 
-from flexmanip_ros.errors import FlexmanipError
-from flexmanip_ros.parameters import leaves
-from flexmanip_ros.parameters.document import NODES, written
-from flexmanip_ros.parameters.simulation import DemoParameters, settings
-from flexmanip_ros.ros.demo.recorder import Recorder
-from flexmanip_ros.ros.demo.result import Facts
+from flexmanip_ros import messages
+from flexmanip_ros.errors import BagError, FlexmanipError
+from flexmanip_ros.io.bag_writer import BagWriter, Value
+from flexmanip_ros.parameters import DemoParameters
+from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.conversions import JointStateReader, capture_event, from_message
+from flexmanip_ros.ros.diagnostics import LossCounter
 from flexmanip_ros.ros.node import FlexmanipNode
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.nodes.excitation import Excitation
 from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
-from flexmanip_ros.ros.nodes.rpbsid_identifier import RpbsidIdentifier
-from flexmanip_ros.ros.spin import make_executor
+from flexmanip_ros.ros.nodes.rpbsid_identifier import TOPICS, RpbsidIdentifier
+from flexmanip_ros.ros.rclpy_workarounds import make_executor, sequence_number, with_info
 
 READERS = 4
-"""Who reads joint_states here: identifier, trigger, excitation, recorder."""
-DISCOVERY_TIMEOUT = 20.0
-DRAIN_TIMEOUT = 30.0
+"""Subscriptions to joint_states here: identifier, trigger, excitation, recorder."""
+DISCOVERY_TIMEOUT_S = 20.0
+DRAIN_TIMEOUT_S = 30.0
 """A busy machine works off its backlog; an idle one needs milliseconds."""
+FLUSH_PERIOD_S = 0.25
 
 
 class CompositionError(FlexmanipError):
     """The nodes cannot work together as they should."""
 
 
+class Recorder(Node):
+    """Writes joint states, commands, events and the identifier's outputs into a bag; counts what it missed.
+
+    In the order of arrival, so that a replay meets events and samples as the identifier did. The bag is closed and
+    readable whatever happens.
+    """
+
+    def __init__(self, path: Path, **options: Any) -> None:
+        """Open the bag; raises BagError when it exists or cannot be written."""
+        super().__init__('recorder', **options)
+        self.writer = BagWriter(path)
+        self.failure: BagError | None = None
+        self.first_ns: int | None = None
+        self.last_ns = self.joint_states = self._log_ns = 0
+        self.published: dict[str, list[messages.Value]] = {name: [] for name in TOPICS}
+        """What the identifier published, by topic, in order."""
+        self.losses = LossCounter()
+        self._reader = JointStateReader()
+        deep = QoSProfile(depth=qos.SENSOR_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
+        self.create_subscription(JointState, 'joint_states', with_info(self._on_joint_states), deep, raw=True)
+        self.create_subscription(Float64MultiArray, 'effort_controller/commands', self._on_command, deep)
+        for topic in ('capture_event', 'capture_detected'):
+            self.create_subscription(Header, topic, partial(self._on_event, '/' + topic), qos.latched_input())
+        for name, (kind, _) in TOPICS.items():
+            self.create_subscription(kind, f'/rpbsid_identifier/{name}', partial(self._on_output, name), deep)
+        self.create_timer(FLUSH_PERIOD_S, self._flush)
+
+    def _on_joint_states(self, raw: bytes, info: object) -> None:
+        self.losses.note(sequence_number(info))
+        record = self._reader(raw)
+        if self.first_ns is None:
+            self.first_ns = record.stamp_ns
+        self.last_ns = record.stamp_ns
+        self.joint_states += 1
+        self._write('/joint_states', record)
+
+    def _on_command(self, message: Float64MultiArray) -> None:
+        self._write('/effort_controller/commands', from_message(message))
+
+    def _on_event(self, topic: str, message: Header) -> None:
+        self._write(topic, capture_event(message), latched=True)
+
+    def _on_output(self, name: str, message: Any) -> None:
+        value = from_message(message)
+        self.published[name].append(value)
+        self._write(f'/rpbsid_identifier/{name}', value)
+
+    def _write(self, topic: str, value: Value, *, latched: bool = False) -> None:
+        if self.failure is not None:
+            return
+        self._log_ns = max(time.time_ns(), self._log_ns)
+        try:
+            self.writer.write(topic, self._log_ns, value, latched=latched)
+        except BagError as error:
+            self._fail(error)
+
+    def _flush(self) -> None:
+        try:
+            if self.failure is None:
+                self.writer.flush()
+        except OSError as error:
+            self._fail(BagError(f"bag '{self.writer.path}' cannot be written: {error.strerror}",
+                                'free some space; what was written before is kept'))
+
+    def _fail(self, error: BagError) -> None:
+        self.failure = error
+        self.get_logger().error(f'recording ended: {error}')
+
+    def close(self) -> None:
+        """Finish the bag; what could be written stays readable."""
+        try:
+            self.writer.close()
+        except BagError as error:
+            self.failure = self.failure or error
+
+
 class Composition:
     """Plant, excitation, trigger, identifier and recorder; made, started, and ended as one."""
 
-    def __init__(self, config: DemoParameters, bag: Path, context: Context | None = None) -> None:
+    def __init__(self, config: DemoParameters, bag: Path) -> None:
         """Create every node; nothing runs and nothing is written yet."""
         self.config = config
-        self._nodes: list[Node] = []
-        self._bag, self._context = bag, context
+        self._nodes: list[Any] = []
+        self._bag = bag
         self._recorder: Recorder | None = None
-        self._started = 0.0
-        self.executor: Executor = make_executor(context)
+        self.executor: Executor = make_executor()
         try:
-            self.plant = self._add(PlantSimulator(context=context))
-            self.excitation = self._add(Excitation(context=context))
-            self.trigger = self._add(CaptureTrigger(context=context))
-            self.identifier = self._add(RpbsidIdentifier(context=context))
+            self.plant: PlantSimulator = self._add(PlantSimulator())
+            self.excitation: Excitation = self._add(Excitation())
+            self.trigger: CaptureTrigger = self._add(CaptureTrigger())
+            self.identifier: RpbsidIdentifier = self._add(RpbsidIdentifier())
         except BaseException:
             self.close()
             raise
 
     @property
-    def managed(self) -> tuple[FlexmanipNode[Any], ...]:
-        """The nodes with a managed life, in the order in which they start."""
+    def managed(self) -> Sequence[FlexmanipNode[Any]]:
+        """The nodes with a managed life in the order in which they start: readers first, the plant's clock last."""
         return self.identifier, self.trigger, self.excitation, self.plant
+
+    @property
+    def recorder(self) -> Recorder:
+        """The recorder; there is one from ``connect`` on."""
+        assert self._recorder is not None
+        return self._recorder
 
     def _add(self, node: Any) -> Any:
         self._nodes.append(node)
@@ -73,40 +158,24 @@ class Composition:
             if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
                 raise CompositionError(f'{node.get_name()} could not be configured', 'see its log above')
 
-    @property
-    def recorder(self) -> Recorder:
-        """The recorder; there is one from ``connect`` on."""
-        assert self._recorder is not None
-        return self._recorder
-
-    def connect(self, interrupted: Callable[[], bool]) -> None:
+    def connect(self) -> None:
         """Open the bag, wait until every reader is matched with its writer, and that nobody else is there."""
-        self._recorder = self._add(Recorder(self._bag, context=self._context))
-        limit = time.monotonic() + DISCOVERY_TIMEOUT
-        while not self._matched():
-            if interrupted():
-                return
-            if time.monotonic() > limit:
-                raise CompositionError(
-                    f'the nodes did not find each other within {DISCOVERY_TIMEOUT:.0f} s',
-                    'unset ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS')
-            self.executor.spin_once(timeout_sec=0.05)
+        self._recorder = self._add(Recorder(self._bag))
+        if not self._spin_until(self._matched, DISCOVERY_TIMEOUT_S):
+            raise CompositionError(f'the nodes did not find each other within {DISCOVERY_TIMEOUT_S:.0f} s',
+                                   'unset ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS')
         if foreign_arm(self.recorder, own_writers=1, own_readers=2):
             raise CompositionError('another arm or controller is on these topics',
                                    'run again, or set ROS_DOMAIN_ID to a free number')
 
     def _matched(self) -> bool:
         commands, events = self.excitation.commands, self.trigger.events_publisher
-        outputs = self.identifier.outputs.values()
         return (self.plant.joint_states.get_subscription_count() >= READERS
                 and commands.get_subscription_count() >= 2 and events.get_subscription_count() >= 3
-                and all(item.get_subscription_count() >= 1 for item in outputs))
+                and all(item.get_subscription_count() >= 1 for item in self.identifier.outputs.values()))
 
     def start(self) -> None:
-        """Begin: who listens first, the plant's clock last."""
-        gc.collect()
-        self._started = time.monotonic()
-        gc.freeze()  # what lives from here on is not looked through again while the clock runs
+        """Activate every node."""
         for node in self.managed:
             node.trigger_activate()
 
@@ -121,36 +190,31 @@ class Composition:
         """Whether the last sample of the run was recorded."""
         return self.recorder.joint_states >= round(self.config.duration * self.config.rate)
 
+    @property
+    def lost(self) -> int:
+        """Joint states that recorder or identifier missed."""
+        return self.recorder.losses.lost + self.identifier.losses.lost
+
     def drain(self) -> None:
-        """Stop the plant and let everybody take what is still on the way."""
+        """Stop the plant, and let every node take what is still on the way."""
         self.plant.trigger_deactivate()
         self.excitation.trigger_deactivate()
         sent, recorder, identifier = self.plant.samples, self.recorder, self.identifier
         self._spin_until(lambda: recorder.joint_states + recorder.losses.lost >= sent
                          and identifier.state.counters.received + identifier.losses.lost >= sent)
         identifier.trigger_deactivate()  # publishes the last model
-        self._spin_until(lambda: sum(map(len, recorder.said.values())) >= identifier.published)
+        self._spin_until(lambda: sum(map(len, recorder.published.values())) >= identifier.published)
 
-    def _spin_until(self, condition: Callable[[], bool]) -> None:
-        limit = time.monotonic() + DRAIN_TIMEOUT
+    def _spin_until(self, condition: Callable[[], bool], seconds: float = DRAIN_TIMEOUT_S) -> bool:
+        limit = time.monotonic() + seconds
         while time.monotonic() < limit and not condition():
             self.executor.spin_once(timeout_sec=0.02)
-
-    def facts(self) -> Facts:
-        """Return what the run came to."""
-        identifier, recorder = self.identifier, self.recorder
-        return Facts(
-            identifier.config, self.plant.config, self.elapsed, time.monotonic() - self._started,
-            recorder.joint_states, recorder.losses.lost + identifier.losses.lost,
-            identifier.meter.worst_p99_us(),
-            recorder.said,
-            str(recorder.failure) if recorder.failure is not None else '')
+        return condition()
 
     def close(self) -> None:
         """Finish the bag, stop and destroy every node. May be called at any moment, and again."""
         for node in self._nodes:
-            if isinstance(node, (FlexmanipNode, Recorder)):
-                node.close()
+            node.close()
         self.executor.shutdown()
         for node in self._nodes:
             node.destroy_node()
@@ -158,17 +222,7 @@ class Composition:
 
 
 def foreign_arm(node: Node, own_writers: int, own_readers: int) -> bool:
-    """Tell whether somebody else publishes joint states or listens to efforts on this domain."""
+    """Whether another process publishes joint states or efforts, or listens to efforts, on this domain."""
     return bool(node.count_publishers('joint_states') > own_writers
                 or node.count_subscribers('effort_controller/commands') > own_readers
                 or node.count_publishers('effort_controller/commands') > own_writers)
-
-
-def arguments(config: DemoParameters) -> list[str]:
-    """Return the nodes' parameters as ROS arguments; what the user gives after them wins."""
-    given = ['--ros-args']
-    for node, values in settings(config).items():
-        for leaf in leaves(NODES[node]):
-            if leaf.name in values:
-                given += ['-p', f'{node}:{leaf.name}:={written(leaf, values[leaf.name])}']
-    return [*given, '--']

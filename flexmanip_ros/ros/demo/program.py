@@ -9,103 +9,144 @@ from __future__ import annotations
 
 import argparse
 import os
+import struct
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from rich.console import Console
+from rich.table import Table
 
+from flexmanip_ros import messages, pipeline
+from flexmanip_ros.arm.linearization import frequencies, vibration_model
 from flexmanip_ros.errors import FlexmanipError, ParameterError
-from flexmanip_ros.parameters import DemoParameters, configure, leaves
+from flexmanip_ros.io import bag
+from flexmanip_ros.io.plots import Truth, collect, overview_figure
+from flexmanip_ros.messages import Inertia, LabelledArray, Value
+from flexmanip_ros.parameters import DemoParameters, PlantParameters, configure, flatten, leaves
+from flexmanip_ros.parameters.document import NODES, written, yaml_text
+from flexmanip_ros.parameters.simulation import settings
+from flexmanip_ros.ros import rclpy_workarounds
 from flexmanip_ros.ros.demo.composition import Composition, foreign_arm
-from flexmanip_ros.ros.demo.composition import arguments as composition_arguments
-from flexmanip_ros.ros.demo.progress import Progress
-from flexmanip_ros.ros.demo.result import finish
-from flexmanip_ros.ros.spin import (
-    BAD_INPUT,
-    FAREWELL_S,
-    Interrupt,
-    bury,
-    first_line,
-    make_executor,
-    spin,
-    time_limit,
-)
+from flexmanip_ros.ros.node import BAD_INPUT
+from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord
 
 NAME = 'demo'
 LOOK_AROUND_S = 0.5
-"""Time for an arm that is on the domain already to be noticed."""
-FAILED = 1
+"""Time in which an arm that is on the domain already is noticed."""
+FAILED, INTERRUPTED = 1, 130
+"""Exit codes: it could not run, or live and replay differ; it was stopped by a signal."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the demonstration; return 0, 1 when live and replay differ or it could not run, 2 for bad input."""
     arguments = list(sys.argv if argv is None else argv)
-    interrupt = Interrupt(exit_with_signal=True)
-    interrupt.install()
-    try:
-        options = parser().parse_args(remove_ros_args(arguments)[1:])
-    except RuntimeError as error:  # --ros-args that rcl cannot read
-        return _refuse(first_line(error), BAD_INPUT)
+    rclpy_workarounds.interrupt_on_signals()
     console = Console(highlight=False, soft_wrap=True)
-    try:
-        config = configure(DemoParameters, {
-            leaf.name: getattr(options, leaf.name) for leaf in leaves(DemoParameters)})
-        folder = new_folder(Path(options.output))
-    except ParameterError as error:
-        return _refuse(str(error), BAD_INPUT)
-    except OSError as error:
-        problem = f"'{options.output}' cannot be written: {error.strerror}; give another folder"
-        return _refuse(problem, BAD_INPUT)
     # A demonstration must never reach a robot on the network.
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     try:
-        _init([arguments[0], *composition_arguments(config), *arguments[1:]], console)
+        options = parser().parse_args(remove_ros_args(arguments)[1:])
+        config = configure(DemoParameters, {
+            leaf.name: getattr(options, leaf.name) for leaf in leaves(DemoParameters)})
+        folder = new_folder(Path(options.output))
+        _init([arguments[0], *node_arguments(config), *arguments[1:]], console)
+    except OSError as error:
+        return _reject(f"'{options.output}' cannot be written: {error.strerror}; give another folder", BAD_INPUT)
     except Exception as error:  # rcl raises types of its C extension for --ros-args and parameter files
-        return _refuse(first_line(error), BAD_INPUT)
+        return _reject(rclpy_workarounds.first_line(error), BAD_INPUT)
     try:
-        return _run(config, folder, console, interrupt)
-    except ParameterError as error:
-        return _refuse(str(error), BAD_INPUT)
+        return _run(config, folder, console)
+    except KeyboardInterrupt:
+        console.print(f"interrupted; the bag so far is '{folder / 'bag'}'")
+        return INTERRUPTED
     except FlexmanipError as error:
-        return _refuse(str(error), FAILED)
-    finally:
-        with time_limit(FAREWELL_S):
-            rclpy.try_shutdown()
-            bury()
+        return _reject(str(error), BAD_INPUT if isinstance(error, ParameterError) else FAILED)
 
 
-def _run(config: DemoParameters, folder: Path, console: Console, interrupt: Interrupt) -> int:
+def _run(config: DemoParameters, folder: Path, console: Console) -> int:
     console.print('Starting the nodes (the first time, kernels are compiled)')
     began = time.monotonic()
-    composition = Composition(config, folder / 'bag')
-    interrupt.install()
+    composition: Composition | None = None
     try:
+        composition = Composition(config, folder / 'bag')
+        rclpy_workarounds.interrupt_on_signals()
         composition.configure()
-        interrupt.graceful = True  # from here on there is a bag to be closed
-        composition.connect(lambda: interrupt.raised)
-        console.print(
-            f'Ready after {time.monotonic() - began:.1f} s: plant_simulator, excitation, capture_trigger, '
-            f'rpbsid_identifier over {rclpy.utilities.get_rmw_implementation_identifier()}')
+        composition.connect()
+        console.print(f'Ready after {time.monotonic() - began:.1f} s: plant_simulator, excitation, capture_trigger, '
+                      f'rpbsid_identifier over {rclpy.utilities.get_rmw_implementation_identifier()}')
+        began = time.monotonic()
         composition.start()
-        progress = Progress(console, composition)
-        spin(composition.executor, None, interrupt, until=progress.update)
-        progress.end()
+        rclpy_workarounds.spin(composition.executor, until=Progress(console, composition).update)
         composition.drain()
-        facts = composition.facts()
+        failure, live = composition.recorder.failure, composition.recorder.published
+        identifier, plant = composition.identifier.config, composition.plant.config
+        console.print(
+            f'\n{composition.recorder.joint_states} samples in {time.monotonic() - began:.2f} s, {composition.lost} '
+            f'lost; identifier callback p99 {composition.identifier.meter.worst_p99_us():.0f} us')
     finally:
-        composition.close()
-    interrupt.graceful = False
-    if interrupt.raised:
-        console.print(f"interrupted after {facts.seconds:.1f} s; the bag so far is '{folder / 'bag'}'")
-        return interrupt.exit_code
-    return finish(config, facts, folder, console)
+        with rclpy_workarounds.shutdown():
+            if composition is not None:
+                composition.close()
+            composition = None
+    rclpy_workarounds.interrupt_on_signals()
+    if failure is not None:
+        console.print(f"recording: {failure}\nbag      {folder / 'bag'}")
+        return FAILED
+    items = list(bag.read(folder / 'bag'))
+    began = time.monotonic()
+    estimates = list(pipeline.run(identifier, items))
+    different = compare(live, outgoing(estimates, identifier.payload_frame))
+    replay_s = time.monotonic() - began
+    truth = known_truth(config, plant, items)
+    # The two lowest modes are those whose change a payload shows; with the next at 50 Hz they were one line.
+    shown = [estimate._replace(modes=estimate.modes[:len(truth.before)]) for estimate in estimates]
+    overview_figure(collect(identifier, items, shown, truth), folder / 'overview.png', _title(config))
+    console.print(_table(config, estimates, items, truth))
+    console.print(f'replay: {different}' if different else
+                  f'replay of the bag ({replay_s:.1f} s): all {sum(map(len, live.values()))} live messages of the '
+                  'identifier, bit for bit')
+    (folder / 'identifier.yaml').write_text(
+        yaml_text('rpbsid_identifier', flatten(identifier), 'The identifier as it ran in this demonstration.'),
+        encoding='utf-8')
+    console.print(f"\nbag      {folder / 'bag'}\npicture  {folder / 'overview.png'}\n"
+                  f"again    identify_bag {folder / 'bag'} --params {folder / 'identifier.yaml'}")
+    return FAILED if different else 0
+
+
+class Progress:
+    """Prints once a second where the run is and what is estimated."""
+
+    def __init__(self, console: Console, composition: Composition) -> None:
+        self._console, self._composition = console, composition
+        self._next = time.monotonic() + 1.0
+
+    def update(self) -> bool:
+        """Print if a second has passed; return True when the run is over."""
+        now = time.monotonic()
+        if now >= self._next:
+            self._next = now + 1.0
+            composition = self._composition
+            self._console.print(f'{composition.elapsed:5.1f} / {composition.config.duration:.1f} s  {self._words()}')
+        return self._composition.finished
+
+    def _words(self) -> str:
+        estimate, event = self._composition.identifier.estimate, self._composition.trigger.latest
+        if estimate is None:
+            return 'warming up'
+        words = [' '.join(f'{mode.frequency_hz:.2f}' for mode in estimate.modes[:2]) + ' Hz'] if estimate.modes else []
+        if event is not None:
+            words.append(event.kind.value)
+        if estimate.payload is not None:
+            words.append(f'payload {estimate.payload.mass:.2f} +- {estimate.payload.std:.2g} kg')
+        return ', '.join(words)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -120,6 +161,16 @@ def parser() -> argparse.ArgumentParser:
         made.add_argument('--' + leaf.name.replace('_', '-'), type=leaf.kind, default=leaf.default,
                           metavar=leaf.name.upper(), help=f'{leaf.words}{unit} (default: %(default)s)')
     return made
+
+
+def node_arguments(config: DemoParameters) -> list[str]:
+    """Return the nodes' parameters as ROS arguments; those that the user gives after them win."""
+    given = ['--ros-args']
+    for node, values in settings(config).items():
+        for leaf in leaves(NODES[node]):
+            if leaf.name in values:
+                given += ['-p', f'{node}:{leaf.name}:={written(leaf, values[leaf.name])}']
+    return [*given, '--']
 
 
 def new_folder(base: Path) -> Path:
@@ -151,9 +202,9 @@ def _init(arguments: Sequence[str], console: Console) -> None:
 
 
 def _occupied() -> bool:
-    """Look around for somebody else's joint states and efforts."""
+    """Whether joint states or efforts of another process are on the domain."""
     node: Any = Node('demo_lookout')
-    executor = make_executor()
+    executor = rclpy_workarounds.make_executor()
     executor.add_node(node)
     limit = time.monotonic() + LOOK_AROUND_S
     found = False
@@ -165,9 +216,86 @@ def _occupied() -> bool:
     return found
 
 
-def _refuse(problem: str, code: int) -> int:
+def _reject(problem: str, code: int) -> int:
     print(f'{NAME}: {problem}', file=sys.stderr)
     return code
+
+
+def outgoing(estimates: Iterable[Estimate], frame_id: str) -> dict[str, list[Value]]:
+    """Return everything that estimates publish, per topic, in order."""
+    published: dict[str, list[Value]] = {}
+    for estimate in estimates:
+        for name, value in messages.outgoing(estimate, frame_id):
+            published.setdefault(name, []).append(value)
+    return published
+
+
+def compare(live: Mapping[str, Sequence[Value]], replayed: Mapping[str, Sequence[Value]]) -> str:
+    """Return in words where two sets of messages differ in any bit; empty when they do not."""
+    for name in sorted({*live, *replayed}):
+        ours, theirs = live.get(name, ()), replayed.get(name, ())
+        if len(ours) != len(theirs):
+            return f'~/{name} has {len(ours)} messages live and {len(theirs)} replayed'
+        for k, (one, other) in enumerate(zip(ours, theirs, strict=True)):
+            if _bits(one) != _bits(other):
+                return f'message {k} of ~/{name} differs between live and replay'
+    return ''
+
+
+def _bits(value: Value) -> bytes:
+    """Return a published value as bytes, equal only when every bit is."""
+    if isinstance(value, LabelledArray):
+        return repr(value.dimensions).encode() + np.asarray(value.data, dtype=np.float64).tobytes()
+    if isinstance(value, Inertia):
+        return repr(value).encode()
+    return struct.pack('<d', value) if isinstance(value, float) else repr(value).encode()
+
+
+def known_truth(config: DemoParameters, plant: PlantParameters, items: Sequence[JointRecord | CaptureEvent]) -> Truth:
+    """Return what the simulation knows: the payload, and the frequencies of the arm.
+
+    The arm moves, and the identifier's memory grows from the start and again from the capture on: the frequencies are
+    those of the mean configuration of that time.
+    """
+    records = [item for item in items if isinstance(item, JointRecord)]
+    first_ns, end_ns = records[0].stamp_ns, records[-1].stamp_ns
+    caught_ns = min((item.stamp_ns for item in items if isinstance(item, CaptureEvent)), default=end_ns)
+
+    def lowest(mass: float, from_ns: int, until_ns: int) -> tuple[float, ...]:
+        angles = [np.cumsum(record.position[:2]) for record in records if from_ns <= record.stamp_ns <= until_ns]
+        found = frequencies(vibration_model(plant.arm, np.mean(angles, axis=0), mass)[0])
+        return tuple(float(f) for f in found[:2])
+
+    return Truth(config.payload_mass if config.capture_time >= 0.0 else None, lowest(0.0, first_ns, caught_ns),
+                 lowest(config.payload_mass, min(caught_ns, end_ns), end_ns))
+
+
+def _title(config: DemoParameters) -> str:
+    if config.capture_time < 0.0:
+        return 'Two flexible links, identified live'
+    return f'Two flexible links catch {config.payload_mass:g} kg after {config.capture_time:g} s, identified live'
+
+
+def _table(config: DemoParameters, estimates: Sequence[Estimate], items: Sequence[JointRecord | CaptureEvent],
+           truth: Truth) -> Table:
+    """Return estimates beside the truth, before and after the capture."""
+    table = Table('', 'estimate', '95 % interval', 'true')
+    capture_ns = min((item.stamp_ns for item in items if isinstance(item, CaptureEvent)), default=None)
+    before = [e for e in estimates if e.modes and (capture_ns is None or e.stamp_ns < capture_ns)]
+    after = [e for e in estimates if e.modes and capture_ns is not None and e.stamp_ns >= capture_ns]
+    for words, found, known in (('before', before, truth.before), ('after', after, truth.after)):
+        for k, mode in enumerate(found[-1].modes[:len(known)] if found else ()):
+            band = 1.96 * mode.frequency_std_hz
+            low, high = mode.frequency_hz - band, mode.frequency_hz + band
+            table.add_row(f'frequency {k + 1} {words} [Hz]', f'{mode.frequency_hz:.3f}',
+                          f'{low:.3f} .. {high:.3f}' if np.isfinite(band) else '-', f'{known[k]:.3f}')
+    held = [e.payload for e in estimates if e.payload is not None]
+    if held and truth.payload is not None:
+        last, true = held[-1], 0.0 if config.release_time >= 0.0 else truth.payload
+        table.add_row('payload [kg]', f'{last.mass:.3f}', f'{last.lower:.3f} .. {last.upper:.3f}', f'{true:.3f}')
+        table.add_row('residual power / noise', f'{last.consistency:.2f}', '', '1')
+        table.add_row('status', last.status.value, '', '')
+    return table
 
 
 if __name__ == '__main__':

@@ -1,8 +1,8 @@
-"""Node ``capture_trigger``: says when the arm took or let go of an object.
+"""Node ``capture_trigger``: publishes when the arm took or let go of an object.
 
 mode service  `capture_trigger/capture` and `capture_trigger/release` announce an event `service_delay` later
 mode time     the first sample starts the count; events come at `capture_time` and `release_time`, each
-              announced `lead_time` ahead, so that everybody applies it at the same stamp
+              announced `lead_time` ahead, so that every node applies it at the same stamp
 mode auto     events are found in the signals and go out on `capture_detected` (the services work too)
 
 subscribes  joint_states      sensor_msgs/JointState  best effort, depth 1000; its stamps are the clock
@@ -14,49 +14,80 @@ services    capture_trigger/capture, capture_trigger/release   std_srvs/Trigger
 
 from __future__ import annotations
 
+import math
 import sys
 import time
+from dataclasses import replace
+from typing import Any
 
-from rclpy.context import Context
-from rclpy.parameter import Parameter
+import numpy as np
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.parameters import TriggerParameters
+from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
+from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.auto_mode import Watcher, rehearse
 from flexmanip_ros.ros.conversions import JointStateReader, header
-from flexmanip_ros.ros.diagnostics import STALE, Meter, Report
-from flexmanip_ros.ros.node import FlexmanipNode
-from flexmanip_ros.ros.spin import run
-from flexmanip_ros.types import CaptureEvent, EventKind
+from flexmanip_ros.ros.diagnostics import Meter, Report
+from flexmanip_ros.ros.node import FlexmanipNode, run
+from flexmanip_ros.samples import sampling
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
 NAME = 'capture_trigger'
 LOOPED_NS = 1_000_000_000
 """Stamps that go back further than this are a new recording, and the count begins again."""
+WARM_UP_SAMPLES = 1500
+"""Made-up samples that reach every compiled function of the detector."""
 
 
-class Told:
-    """How many events were told, and the latest of them."""
+class Detector:
+    """Mode auto: joint states in, the events that they reveal out."""
 
-    def __init__(self) -> None:
-        self.count = 0
-        self.latest: CaptureEvent | None = None
+    def __init__(self, config: TriggerParameters) -> None:
+        self._config = self._settled = config
+        self._sampling = IdentifierParameters(
+            inputs=config.inputs, outputs=config.outputs, angles=config.angles, arm=config.arm, payload=config.payload)
+        self.clock, self._log, self._cursor = sampling.Clock(), sampling.EMPTY, 0
+        self._state: capture_detection.DetectionState | None = None
 
-    def note(self, event: CaptureEvent) -> None:
-        """One more."""
-        self.count, self.latest = self.count + 1, event
+    def take(self, record: JointRecord) -> tuple[CaptureEvent, ...]:
+        """Take one message; return the events found with it, each dated at its onset."""
+        self.clock, self._log, reset = sampling.push(self._sampling, self.clock, self._log, record)
+        if self.clock.outputs is None:
+            return ()
+        if self._state is None or reset:
+            self._settled = replace(self._config, outputs=self.clock.outputs)
+            self._state, self._cursor = capture_detection.init(self._settled), 0
+        rows = self._log.rows(self._cursor, self._log.end)
+        self._cursor = self._log.end
+        self._state, events = capture_detection.advance(self._settled, self._state, rows)
+        self._log = self._log.from_row(capture_detection.first_needed(self._state))
+        return events
+
+    @property
+    def statistic(self) -> tuple[float, float]:
+        """The latest statistic and its threshold."""
+        return (0.0, math.inf) if self._state is None else capture_detection.statistic(self._state)
+
+
+def warm_up(config: TriggerParameters) -> None:
+    """Run the detector once on made-up samples, so that nothing is compiled while real ones come."""
+    names = tuple(dict.fromkeys(
+        signal.rpartition('/')[0] for signal in (*config.inputs, *config.outputs, *config.angles)))
+    detector = Detector(config)
+    for k in range(WARM_UP_SAMPLES):
+        wave = np.array([math.sin(0.05 * k * (i + 1)) for i in range(len(names))]) * 1e-3
+        detector.take(JointRecord(k * 1_000_000, names, wave, wave * 0.0, wave * 1e3))
 
 
 class CaptureTrigger(FlexmanipNode[TriggerParameters]):
     """Announces events on the clock of the joint states."""
 
-    def __init__(self, *, context: Context | None = None, overrides: list[Parameter] | None = None,
-                 namespace: str | None = None, cli_args: list[str] | None = None) -> None:
-        super().__init__(NAME, TriggerParameters, context=context, overrides=overrides,
-                         namespace=namespace, cli_args=cli_args)
+    def __init__(self, **options: Any) -> None:
+        super().__init__(NAME, TriggerParameters, **options)
         self._meter = Meter()
         self._first_ns: int | None = None
         self._last_ns: int | None = None
@@ -64,28 +95,36 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         """Stamp before the last."""
         self._arrived = -1.0
         self._pending: tuple[CaptureEvent, ...] = ()
-        self._watcher: Watcher | None = None
+        self._detector: Detector | None = None
         self._reader = JointStateReader()
-        self.detected = Told()
-        self.announced = Told()
+        self.detected = self.announced = 0
+        """Events published on capture_detected, and on capture_event."""
+        self.latest: CaptureEvent | None = None
 
     def make_entities(self) -> None:
         """Publishers, subscription and services."""
         self.events_publisher = self.publisher(Header, 'capture_event', qos.latched())
         self.detected_publisher = self.publisher(Header, 'capture_detected', qos.latched())
         self.subscription(JointState, 'joint_states', self._on_joint_states, qos.sensor_input(), raw=True)
-        self.create_service(Trigger, '~/capture', self._on_capture)
-        self.create_service(Trigger, '~/release', self._on_release)
+        self.create_service(Trigger, '~/capture', lambda _, response: self._requested(EventKind.CAPTURE, response))
+        self.create_service(Trigger, '~/release', lambda _, response: self._requested(EventKind.RELEASE, response))
 
     def start(self) -> None:
         """Compile or load what mode auto needs, before the first sample."""
         if self.config.mode == 'auto':
-            rehearse(self.config)
+            warm_up(self.config)
+
+    def summary(self) -> str:
+        """Say how events are found."""
+        config = self.config
+        if config.mode == 'time':
+            return f'mode time, capture after {config.capture_time:g} s, release after {config.release_time:g} s'
+        return f'mode {config.mode}' + (f', signals {", ".join(config.outputs)}' if config.mode == 'auto' else '')
 
     def activated(self) -> None:
         """Count from the next sample, and watch from there on."""
-        self._watcher = Watcher(self.config) if self.config.mode == 'auto' else None
-        self._first_ns = self._last_ns = self._before_ns = None
+        self._detector = Detector(self.config) if self.config.mode == 'auto' else None
+        self._first_ns = self._last_ns = self._before_ns = self.latest = None
         self._pending = ()
 
     def _on_joint_states(self, raw: bytes) -> None:
@@ -96,41 +135,40 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
             if stamp is None:
                 return
             self._arrived = time.monotonic()
-            if self._first_ns is None or self._is_anew(stamp):
+            if self._first_ns is None or self._is_new_recording(stamp):
                 self._begin(stamp)
             self._before_ns, self._last_ns = self._last_ns, stamp
             while self._pending and stamp >= self._pending[0].stamp_ns - int(self.config.lead_time * 1e9):
                 self._announce(self._pending[0])
                 self._pending = self._pending[1:]
-            if self._watcher is not None:
-                self._watch(self._watcher, raw)
+            if self._detector is not None:
+                self._detect(self._detector, raw)
 
-    def _is_anew(self, stamp: int) -> bool:
-        """Say whether stamps went back to a new recording, and not from one wrong stamp to the right ones."""
+    def _is_new_recording(self, stamp: int) -> bool:
+        """Whether stamps went back to a new recording, and not from one wrong stamp to the right ones."""
         if self._last_ns is None or stamp >= self._last_ns - LOOPED_NS:
             return False
         return self._before_ns is None or not 0 <= stamp - self._before_ns <= LOOPED_NS
 
-    def _watch(self, watcher: Watcher, raw: bytes) -> None:
-        """Mode auto: tell what the sample reveals."""
-        dropped = watcher.counters.dropped
+    def _detect(self, detector: Detector, raw: bytes) -> None:
+        """Mode auto: publish what the sample reveals."""
+        dropped = detector.clock.counters.dropped
         try:
             record = self._reader(raw)
         except SignalError as error:
             self.log_throttled('encoding', f'message dropped: {error}')
             return
-        for event in watcher.take(record):
-            self.detected_publisher.publish(header(event))
-            self.detected.note(event)
-            self.get_logger().info(f'{event.kind.value} detected at {event.stamp_ns * 1e-9:.6f}')
-        if watcher.counters.dropped > dropped and watcher.rejection is not None:
-            self.log_throttled(watcher.rejection.reason,
-                          f'message dropped: {watcher.rejection.problem}; {watcher.rejection.remedy}')
+        for event in detector.take(record):
+            self._publish(self.detected_publisher, event, 'detected ')
+            self.detected += 1
+        rejection = detector.clock.rejection
+        if detector.clock.counters.dropped > dropped and rejection is not None:
+            self.log_throttled(rejection.reason, f'message dropped: {rejection.problem}; {rejection.remedy}')
 
     def _begin(self, stamp: int) -> None:
         """Plan the events of mode time from the first stamp."""
         self._first_ns = stamp
-        self._pending = ()
+        self._pending, self.latest = (), None
         if self.config.mode != 'time':
             return
         plan = ((self.config.capture_time, EventKind.CAPTURE), (self.config.release_time, EventKind.RELEASE))
@@ -139,15 +177,21 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
             key=lambda event: event.stamp_ns))
 
     def _announce(self, event: CaptureEvent) -> None:
-        self.events_publisher.publish(header(event))
-        self.announced.note(event)
-        self.get_logger().info(f'{event.kind.value} at {event.stamp_ns * 1e-9:.6f}')
+        self._publish(self.events_publisher, event, '')
+        self.announced += 1
 
-    def _on_capture(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._requested(EventKind.CAPTURE, response)
+    def _publish(self, publisher: Publisher, event: CaptureEvent, how: str) -> None:
+        publisher.publish(header(event))
+        second = self._adds_an_object(event)
+        self.latest = event
+        self.get_logger().info(f'{event.kind.value} {how}at {event.stamp_ns * 1e-9:.6f}{second}')
 
-    def _on_release(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._requested(EventKind.RELEASE, response)
+    def _adds_an_object(self, event: CaptureEvent) -> str:
+        """Return the words for a capture while the arm holds something; empty for any other event."""
+        holds = self.latest is not None and self.latest.kind is EventKind.CAPTURE
+        if not holds or event.kind is not EventKind.CAPTURE:
+            return ''
+        return ': the arm holds an object already, a second one is added (call release first if it let go)'
 
     def _requested(self, kind: EventKind, response: Trigger.Response) -> Trigger.Response:
         silent = time.monotonic() - self._arrived
@@ -161,22 +205,23 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
             response.message = f'no joint_states for {silent:.1f} s; is the driver alive?'
         else:
             event = CaptureEvent(self._last_ns + round(self.config.service_delay * 1e9), kind)
+            response.success = True
+            response.message = f'{kind.value} at {event.stamp_ns * 1e-9:.6f}{self._adds_an_object(event)}'
             self._announce(event)
-            response.success, response.message = True, f'{kind.value} at {event.stamp_ns * 1e-9:.6f}'
         return response
 
     def report(self, report: Report) -> None:
         """Rate of the joint states and what was announced."""
         report.values.update(self._meter.window())
         report.values['mode'] = self.config.mode
-        report.values['announced'] = self.announced.count
+        report.values['announced'] = self.announced
         report.values['pending'] = len(self._pending)
-        if self._watcher is not None:
-            report.values['detected'] = self.detected.count
-            report.values['dropped'] = self._watcher.counters.dropped
-            report.values['statistic'], report.values['threshold'] = self._watcher.statistic
+        if self._detector is not None:
+            report.values['detected'] = self.detected
+            report.values['dropped'] = self._detector.clock.counters.dropped
+            report.values['statistic'], report.values['threshold'] = self._detector.statistic
         if self.active and report.values['rate_hz'] == 0.0:
-            report.worse(STALE, 'no joint_states')
+            report.silent('joint_states')
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""Node ``excitation``: a torque source that makes the arm tell what it carries.
+"""Node ``excitation``: a torque source that moves the arm so that its payload shows.
 
 subscribes  joint_states                sensor_msgs/JointState  only with `clock: joint_states`
 publishes   effort_controller/commands  std_msgs/Float64MultiArray  one torque per joint [N m], at `rate`
@@ -11,22 +11,18 @@ When the node is deactivated or stopped it sends zero torque once.
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import numpy as np
-from rclpy.context import Context
-from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from flexmanip_ros.messages import LabelledArray
 from flexmanip_ros.parameters import ExcitationParameters
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.clock import SampleGrid
+from flexmanip_ros.ros.conversions import doubles
 from flexmanip_ros.ros.diagnostics import WARN, Meter, Report
-from flexmanip_ros.ros.encoding import Encoder
-from flexmanip_ros.ros.node import FlexmanipNode
-from flexmanip_ros.ros.spin import run
+from flexmanip_ros.ros.node import FlexmanipNode, SampleGrid, run
 from flexmanip_ros.simulation import excitation, excitation_design
 from flexmanip_ros.types import Array
 
@@ -36,10 +32,8 @@ NAME = 'excitation'
 class Excitation(FlexmanipNode[ExcitationParameters]):
     """Publishes the torque of the present instant."""
 
-    def __init__(self, *, context: Context | None = None, overrides: list[Parameter] | None = None,
-                 namespace: str | None = None, cli_args: list[str] | None = None) -> None:
-        super().__init__(NAME, ExcitationParameters, context=context, overrides=overrides,
-                         namespace=namespace, cli_args=cli_args)
+    def __init__(self, **options: Any) -> None:
+        super().__init__(NAME, ExcitationParameters, **options)
         self._meter = Meter()
         self._last = -1
         self._first_ns: int | None = None
@@ -48,7 +42,6 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
     def make_entities(self) -> None:
         """Publisher, and the timer or the subscription that sets the pace."""
         self.commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.command())
-        self._encoded = Encoder()
         self._grid = SampleGrid(self, self.config.rate)
         self._timer: Timer | None = None
         if self.config.clock == 'joint_states':
@@ -58,10 +51,16 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
             self._timer.cancel()
 
     def start(self) -> None:
-        """Compute one sample, so that nothing is late later; say what a designed torque will tell."""
+        """Compute one sample, so that the first one is not late; log the payload accuracy that a design will reach."""
         excitation.torque(self.config, 0)
         if self.config.allowed_angle or self.config.shape in ('multisine', 'prbs', 'chirp'):
             self.get_logger().info(excitation_design.describe(self.config))
+
+    def summary(self) -> str:
+        """Say which torque it is."""
+        config = self.config
+        return (f'{config.shape} of {config.amplitude[0]:g} and {config.amplitude[1]:g} N m at {config.rate:g} Hz, '
+                f'clock {config.clock}')
 
     def activated(self) -> None:
         """Sample 0 is now."""
@@ -107,14 +106,16 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
         self._send(excitation.torque(self.config, latest))
 
     def _send(self, torque: Array) -> None:
-        self.commands.publish(self._encoded(LabelledArray((), torque)))
+        self.commands.publish(Float64MultiArray(data=doubles(torque)))
 
     def report(self, report: Report) -> None:
         """Rate and instants that passed without a command."""
         report.values.update(self._meter.window())
         report.values['skipped_instants'] = self.skipped
         report.values['shape'] = self.config.shape
-        if self.active and report.values['rate_hz'] < 0.9 * self.config.rate:
+        if self.active and self.config.clock == 'joint_states' and report.values['rate_hz'] == 0.0:
+            report.silent('joint_states')
+        elif self.active and report.values['rate_hz'] < 0.9 * self.config.rate:
             report.worse(WARN, f'{report.values["rate_hz"]:.0f} of {self.config.rate:.0f} commands a second')
 
 

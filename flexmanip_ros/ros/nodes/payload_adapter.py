@@ -1,12 +1,12 @@
 """Node ``payload_adapter``: hands a trusted payload to a robot driver.
 
 subscribes  rpbsid_identifier/payload_estimate  std_msgs/Float64MultiArray   whether to trust it
-            rpbsid_identifier/payload           geometry_msgs/InertiaStamped what to tell
+            rpbsid_identifier/payload           geometry_msgs/InertiaStamped what to send
 publishes   /diagnostics                        diagnostic_msgs/DiagnosticArray  1 Hz
 calls       the driver's service (`service`, `service_type`), whose request has a geometry_msgs/Inertia, or
             `mass` and `center_of_gravity`; with `target_node` its SetParameters for `mass_parameter`
 
-A payload is told once it has been trusted for `settle_time`, and again when it changed by `min_change`.
+A payload is sent once it has been trusted for `settle_time`, and again when it changed by `min_change`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from typing import Any
 from geometry_msgs.msg import Inertia, InertiaStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
-from rclpy.context import Context
 from rclpy.parameter import Parameter
 from std_msgs.msg import Float64MultiArray
 
@@ -30,8 +29,7 @@ from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import AdapterParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.diagnostics import ERROR, WARN, Report
-from flexmanip_ros.ros.node import FlexmanipNode
-from flexmanip_ros.ros.spin import run
+from flexmanip_ros.ros.node import FlexmanipNode, run
 
 NAME = 'payload_adapter'
 ANSWER_S = 5.0
@@ -41,12 +39,10 @@ ANSWER_S = 5.0
 class PayloadAdapter(FlexmanipNode[AdapterParameters]):
     """Asks the driver, one request at a time."""
 
-    def __init__(self, *, context: Context | None = None, overrides: list[Parameter] | None = None,
-                 namespace: str | None = None, cli_args: list[str] | None = None) -> None:
-        super().__init__(NAME, AdapterParameters, context=context, overrides=overrides,
-                         namespace=namespace, cli_args=cli_args)
+    def __init__(self, **options: Any) -> None:
+        super().__init__(NAME, AdapterParameters, **options)
         self.state = handover.HandoverState()
-        self.told = 0
+        self.sent = 0
         self.problem = ''
         self._inertia: Inertia | None = None
         self.doubtful = 0
@@ -60,14 +56,18 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
                 SetParameters, f'{self.config.target_node}/set_parameters')
         else:
             kind = service_class(self.config.service_type)
-            fill(kind.Request(), Inertia())  # refuses a request that has no place for a payload
+            fill(kind.Request(), Inertia())  # rejects a service whose request has no place for a payload
             self._client = self.create_client(kind, self.config.service)
         self.subscription(InertiaStamped, 'rpbsid_identifier/payload', self._on_payload, qos.latched_input())
         self.subscription(Float64MultiArray, 'rpbsid_identifier/payload_estimate', self._on_estimate,
                           qos.latched_input())
 
+    def summary(self) -> str:
+        """Say where payloads go."""
+        return f'payloads go to {self._client.srv_name}'
+
     def activated(self) -> None:
-        """Begin with nothing told."""
+        """Begin with nothing sent."""
         self._forget_request()
         self.state, self.problem = handover.HandoverState(), ''
 
@@ -88,12 +88,12 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
             return
         if not fits(self._inertia, found):
             self.doubtful += 1
-            self.log_throttled('payload', 'a payload was not told: its mass is not that of the estimate, or it '
+            self.log_throttled('payload', 'a payload was not sent: its mass is not that of the estimate, or it '
                           'has a value that is not finite')
             return
-        self._tell(self._inertia, now)
+        self._send(self._inertia, now)
 
-    def _tell(self, inertia: Inertia, now: float) -> None:
+    def _send(self, inertia: Inertia, now: float) -> None:
         if not self._client.service_is_ready():
             self.problem = f"service '{self._client.srv_name}' is not there"
             self.log_throttled('service', f'{self.problem}; start the driver, or correct the parameters')
@@ -119,21 +119,21 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         if self._asked is None or self._asked[0] is not future:
             return  # the answer to a request that was given up
         self._asked = None
-        reason = refusal(future.result())
+        reason = rejection(future.result())
         if reason:
-            self.problem = f'{mass:.3f} kg was refused: {reason}'
-            self.log_throttled('refused', self.problem)
+            self.problem = f'{mass:.3f} kg was rejected: {reason}'
+            self.log_throttled('rejected', self.problem)
             self.state = handover.refused(self.state, time.monotonic())
             return
         self.problem = ''
-        self.told += 1
+        self.sent += 1
         self.state = handover.told(self.state, mass, time.monotonic())
         self.get_logger().info(f'the driver took {mass:.3f} kg')
 
     def report(self, report: Report) -> None:
-        """What was told, and what went wrong."""
-        report.values['told'] = self.told
-        report.values['told_mass_kg'] = 'none' if self.state.told_mass is None else self.state.told_mass
+        """What was sent, and what went wrong."""
+        report.values['sent'] = self.sent
+        report.values['sent_mass_kg'] = 'none' if self.state.told_mass is None else self.state.told_mass
         report.values['trusted'] = self.state.trusted_since is not None
         report.values['doubtful'] = self.doubtful
         if self.problem:
@@ -143,7 +143,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
 
 
 def fits(inertia: Inertia, found: PayloadEstimate) -> bool:
-    """Say whether a body may be told: all finite, not below zero, its mass that of the trusted estimate."""
+    """Say whether a body may be sent: all finite, not below zero, its mass that of the trusted estimate."""
     com, body = inertia.com, inertia
     numbers = (com.x, com.y, com.z, body.ixx, body.ixy, body.ixz, body.iyy, body.iyz, body.izz)
     near = abs(inertia.m - found.mass) <= max(3.0 * found.std, 1e-3 * abs(found.mass))  # one sample apart
@@ -178,7 +178,7 @@ def fill(request: Any, inertia: Inertia) -> Any:
     return request
 
 
-def refusal(response: Any) -> str:
+def rejection(response: Any) -> str:
     """Return why a driver or a node said no; empty when it said yes."""
     results = getattr(response, 'results', None)
     answer = results[0] if results else response

@@ -16,10 +16,9 @@ from __future__ import annotations
 
 import sys
 import time
+from typing import Any
 
 import numpy as np
-from rclpy.context import Context
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -29,14 +28,13 @@ from flexmanip_ros.errors import SignalError
 from flexmanip_ros.parameters import ControllerParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, doubles
-from flexmanip_ros.ros.diagnostics import ERROR, STALE, WARN, Meter, Report
-from flexmanip_ros.ros.node import FlexmanipNode
-from flexmanip_ros.ros.spin import run
+from flexmanip_ros.ros.diagnostics import ERROR, WARN, Meter, Report
+from flexmanip_ros.ros.node import FlexmanipNode, run
 from flexmanip_ros.types import Array, JointRecord
 
 NAME = 'payload_controller'
 LONG_GAP = 10
-"""Missing samples after which the filter starts anew instead of believing its prediction."""
+"""Missing samples after which the filter starts again instead of trusting its prediction."""
 CLOCK_SET_BACK_NS = 1_000_000_000
 """Stamps that go back further than this are a new clock (a simulation that began again)."""
 LARGEST = 1e6
@@ -46,10 +44,8 @@ LARGEST = 1e6
 class PayloadController(FlexmanipNode[ControllerParameters]):
     """One torque for every joint state."""
 
-    def __init__(self, *, context: Context | None = None, overrides: list[Parameter] | None = None,
-                 namespace: str | None = None, cli_args: list[str] | None = None) -> None:
-        super().__init__(NAME, ControllerParameters, context=context, overrides=overrides,
-                         namespace=namespace, cli_args=cli_args)
+    def __init__(self, **options: Any) -> None:
+        super().__init__(NAME, ControllerParameters, **options)
         self.state: controller.ControllerState | None = None
         self._estimate: PayloadEstimate | None = None
         self.dropped = 0
@@ -75,6 +71,11 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
     def start(self) -> None:
         """Design the first gains."""
         self.state = controller.init(self.config)
+
+    def summary(self) -> str:
+        """Say what is controlled."""
+        names = ', '.join((*self.config.joints, *self.config.bends))
+        return f'{names} at {self.config.rate:g} Hz'
 
     def activated(self) -> None:
         """Hold from the next sample on."""
@@ -169,7 +170,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._added, self._added_at = np.array(message.data), time.monotonic()
 
     def _watch(self) -> None:
-        """Send zero torque once when the joint states fall silent."""
+        """Send zero torque once when the joint states cease."""
         if not self.active or time.monotonic() - self._arrived <= self.config.stale_after:
             return
         self._arrived = np.inf
@@ -190,7 +191,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         if self.dropped:
             report.worse(WARN, f'{self.dropped} messages dropped')
         if self.active and report.values['rate_hz'] == 0.0:
-            report.worse(STALE, 'no joint_states')
+            report.silent('joint_states')
         elif self.active and abs(report.values['rate_hz'] / self.config.rate - 1.0) > 0.2:
             report.worse(ERROR, f'{report.values["rate_hz"]:.0f} joint states a second, designed for '
                          f'{self.config.rate:.0f}; set rate')

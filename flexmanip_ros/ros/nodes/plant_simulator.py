@@ -17,8 +17,6 @@ import sys
 from typing import Any
 
 import numpy as np
-from rclpy.context import Context
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
 from std_srvs.srv import Trigger
@@ -26,12 +24,10 @@ from std_srvs.srv import Trigger
 from flexmanip_ros.errors import FlexmanipError, SignalError
 from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.clock import SampleGrid
-from flexmanip_ros.ros.conversions import capture_event, numbers
+from flexmanip_ros.ros.conversions import capture_event, joint_state, numbers
 from flexmanip_ros.ros.diagnostics import ERROR, WARN, LossCounter, Meter, Report
-from flexmanip_ros.ros.encoding import JointStateWriter
-from flexmanip_ros.ros.node import FlexmanipNode, sequence_number, with_info
-from flexmanip_ros.ros.spin import run
+from flexmanip_ros.ros.node import FlexmanipNode, SampleGrid, run
+from flexmanip_ros.ros.rclpy_workarounds import sequence_number, with_info
 from flexmanip_ros.simulation import simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
@@ -45,20 +41,17 @@ MOST_EVENTS = 100
 class PlantSimulator(FlexmanipNode[PlantParameters]):
     """Steps the plant along the grid of stamps and publishes every sample."""
 
-    def __init__(self, *, context: Context | None = None, overrides: list[Parameter] | None = None,
-                 namespace: str | None = None, cli_args: list[str] | None = None) -> None:
-        super().__init__(NAME, PlantParameters, context=context, overrides=overrides,
-                         namespace=namespace, cli_args=cli_args)
+    def __init__(self, **options: Any) -> None:
+        super().__init__(NAME, PlantParameters, **options)
         self.state: simulator.PlantState | None = None
         self.efforts = np.zeros(2)
         self.dropped_commands = 0
         self.lost_commands = LossCounter()
-        self._several = False
         self.late_events = 0
-        self.refused_events = 0
+        self.rejected_events = 0
         self.samples = 0
         self.backlog = 0
-        self._alive_ns = 0
+        self._restarted_ns = 0
         self._pending: tuple[CaptureEvent, ...] = ()
         self._meter = Meter()
         self._fault = ''
@@ -66,10 +59,9 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
     def make_entities(self) -> None:
         """Publisher, subscriptions, service and timer."""
         self.joint_states = self.publisher(JointState, 'joint_states', qos.sensor_output())
-        self._encoded = JointStateWriter()
         self.subscription(
             Float64MultiArray, 'effort_controller/commands', with_info(self._on_command), qos.command(),
-            raw=True, matched=self._on_publisher)
+            raw=True, matched=self.lost_commands.matched)
         self.subscription(Header, 'capture_event', self._on_event, qos.latched_input())
         self.create_service(Trigger, '~/reset', self._on_reset)
         self._grid = SampleGrid(self, self.config.rate)
@@ -83,6 +75,10 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         state = simulator.attach(self.config, state)
         state, _ = simulator.step(self.config, state, np.zeros(2))
         simulator.release(self.config, state)
+
+    def summary(self) -> str:
+        """Say what is simulated."""
+        return f'{self.config.rate:g} samples a second, object of {self.config.payload_mass:g} kg'
 
     def activated(self) -> None:
         """Sample 0 is now."""
@@ -99,13 +95,13 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         self.samples = 0
         if not self._grid.begin():
             return False
-        self._revive()
+        self._restart()
         return True
 
-    def _revive(self) -> None:
+    def _restart(self) -> None:
         """Put the arm at its start from the next stamp on: stamps never go back."""
-        self._alive_ns = self._stamp(self.samples)
-        self.state = simulator.init(self.config, self._alive_ns, self._noise_std)
+        self._restarted_ns = self._stamp(self.samples)
+        self.state = simulator.init(self.config, self._restarted_ns, self._noise_std)
         self._pending, self._fault, self.efforts = (), '', np.zeros(2)
 
     def _stamp(self, index: int) -> int:
@@ -136,7 +132,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             return
         self.samples += 1
         if record is not None:  # lost on its way (sensors.drop_probability)
-            self.joint_states.publish(self._encoded(record))
+            self.joint_states.publish(joint_state(record))
 
     def _apply_events(self, stamp: int) -> None:
         """Take or let go of the object before the first sample that is not older than the event."""
@@ -147,8 +143,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             self.state = change(self.config, self.state)
 
     def _on_command(self, raw: bytes, info: object) -> None:
-        if not self._several:
-            self.lost_commands.note(sequence_number(info))
+        self.lost_commands.note(sequence_number(info))
         try:
             efforts = numbers(raw)
         except SignalError as error:
@@ -161,12 +156,6 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         else:
             self.efforts = efforts
 
-    def _on_publisher(self, event: Any) -> None:
-        """Each publisher has numbers of its own: count those of one, anew once another is gone."""
-        self._several = event.current_count > 1
-        if self._several or event.current_count_change < 0:
-            self.lost_commands.restart()
-
     def _drop(self, words: str) -> None:
         self.dropped_commands += 1
         self.log_throttled('command', words)
@@ -175,13 +164,13 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         try:
             event = capture_event(message)
         except FlexmanipError as error:
-            self._refuse_event(str(error))
+            self._reject_event(str(error))
             return
-        if not self.active or event.stamp_ns < self._alive_ns:
+        if not self.active or event.stamp_ns < self._restarted_ns:
             self.get_logger().info(f'{event.kind.value} from before the start is ignored')
             return
         if len(self._pending) >= MOST_EVENTS:
-            self._refuse_event(f'{MOST_EVENTS} events wait for their stamps already; one more was refused')
+            self._reject_event(f'{MOST_EVENTS} events wait for their stamps already; one more was rejected')
             return
         if self.samples and event.stamp_ns <= self._stamp(self.samples - 1):
             self.late_events += 1
@@ -191,8 +180,8 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
                 'service_delay of capture_trigger')
         self._pending = tuple(sorted((*self._pending, event), key=lambda item: item.stamp_ns))
 
-    def _refuse_event(self, words: str) -> None:
-        self.refused_events += 1
+    def _reject_event(self, words: str) -> None:
+        self.rejected_events += 1
         self.log_throttled('event', words)
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -200,7 +189,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             response.success, response.message = False, f'{NAME} is not active'
             return response
         if self._grid.begun:
-            self._revive()
+            self._restart()
         response.success, response.message = True, 'the arm is at its start, at rest and empty'
         return response
 
@@ -211,20 +200,17 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         values['samples'] = self.samples
         values['backlog'] = self.backlog
         values['dropped_commands'] = self.dropped_commands
-        lost = self.lost_commands.lost
-        values['lost_commands'] = f'{lost} or more (several publishers)' if self._several else lost
         values['late_events'] = self.late_events
-        values['refused_events'] = self.refused_events
+        values['rejected_events'] = self.rejected_events
         if self._fault:
             report.worse(ERROR, self._fault)
         elif self.active and values['rate_hz'] < 0.9 * self.config.rate:
             report.worse(WARN, f'{values["rate_hz"]:.0f} of {self.config.rate:.0f} samples a second')
         if self.dropped_commands:
             report.worse(WARN, f'{self.dropped_commands} commands dropped')
-        if lost:
-            report.worse(WARN, f'{lost} commands lost: they came faster than they were taken')
-        if self.refused_events:
-            report.worse(WARN, f'{self.refused_events} events refused')
+        self.lost_commands.report(report, 'lost_commands', 'commands')
+        if self.rejected_events:
+            report.worse(WARN, f'{self.rejected_events} events rejected')
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -5,21 +5,23 @@ subscribes  joint_states      sensor_msgs/JointState  best effort, depth 1000; m
             capture_detected  std_msgs/Header         an event inferred from the signals
 publishes   ~/model           std_msgs/Float64MultiArray  [[A, B, K], [C, D, I]]; latched
             ~/modes           std_msgs/Float64MultiArray  damped frequency [Hz], damping ratio
-            ~/payload_mass    std_msgs/Float64            kg
+            ~/payload_mass    std_msgs/Float64            kg; nothing while nothing is known
             ~/payload_estimate std_msgs/Float64MultiArray mass, std, 95 % interval, consistency; latched
             ~/payload         geometry_msgs/InertiaStamped at the stamp of the sample that gave it; latched
+            ~/status          diagnostic_msgs/DiagnosticArray stamp, status and numbers of payload or model; latched
             /diagnostics      diagnostic_msgs/DiagnosticArray  1 Hz
 services    rpbsid_identifier/reset   std_srvs/Trigger   forget everything
 """
 
 from __future__ import annotations
 
+import math
 import sys
 from functools import partial
+from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import InertiaStamped
-from rclpy.context import Context
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
 from std_srvs.srv import Trigger
@@ -30,18 +32,27 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.background import Background, CheckpointWriter, too_old, warm_up
 from flexmanip_ros.ros.conversions import JointStateReader, capture_event, to_message
-from flexmanip_ros.ros.diagnostics import ERROR, STALE, WARN, LossCounter, Meter, Report
-from flexmanip_ros.ros.estimate_report import report_estimate
-from flexmanip_ros.ros.node import FlexmanipNode, sequence_number, with_info
-from flexmanip_ros.ros.spin import run
-from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord
+from flexmanip_ros.ros.diagnostics import (
+    ERROR,
+    UNANNOUNCED,
+    WARN,
+    LossCounter,
+    Meter,
+    Report,
+    report_estimate,
+    status_line,
+)
+from flexmanip_ros.ros.node import FlexmanipNode, run
+from flexmanip_ros.ros.rclpy_workarounds import sequence_number, with_info
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Status
 
 NAME = 'rpbsid_identifier'
-_TOPICS = (
-    (messages.MODEL, Float64MultiArray, qos.latched), (messages.MODES, Float64MultiArray, qos.output),
-    (messages.PAYLOAD_MASS, Float64, qos.output), (messages.PAYLOAD_ESTIMATE, Float64MultiArray, qos.latched),
-    (messages.PAYLOAD, InertiaStamped, qos.latched),
-)
+TOPICS = {
+    messages.MODEL: (Float64MultiArray, qos.latched), messages.MODES: (Float64MultiArray, qos.output),
+    messages.PAYLOAD_MASS: (Float64, qos.output), messages.PAYLOAD_ESTIMATE: (Float64MultiArray, qos.latched),
+    messages.PAYLOAD: (InertiaStamped, qos.latched), messages.STATUS: (DiagnosticArray, qos.latched),
+}
+"""Type and quality of service of each output."""
 
 
 class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
@@ -51,28 +62,26 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
     model goes out when the node is deactivated.
     """
 
-    def __init__(self, *, context: Context | None = None, overrides: list[Parameter] | None = None,
-                 namespace: str | None = None, cli_args: list[str] | None = None) -> None:
-        super().__init__(NAME, IdentifierParameters, context=context, overrides=overrides,
-                         namespace=namespace, cli_args=cli_args)
+    def __init__(self, **options: Any) -> None:
+        super().__init__(NAME, IdentifierParameters, **options)
         self.state = pipeline.init()
         self.estimate: Estimate | None = None
         """The latest one published."""
-        self.rejected = 0
-        self.published = 0
+        self.rejected = self.published = 0
         self.losses = LossCounter()
         self.meter = Meter()
         self._reader = JointStateReader()
         self._background = Background()
         self._checkpoints: CheckpointWriter | None = None
         self._resumed = False
+        self._logged: dict[str, object] = {}
+        """What was last logged of status, trusted payload and missing announcement."""
 
     def make_entities(self) -> None:
         """Publishers, subscriptions and the reset service."""
-        self.outputs = {
-            name: self.publisher(kind, f'~/{name}', profile()) for name, kind, profile in _TOPICS}
-        self._joint_states = self.subscription(
-            JointState, 'joint_states', with_info(self._on_joint_states), qos.sensor_input(), raw=True)
+        self.outputs = {name: self.publisher(kind, f'~/{name}', profile()) for name, (kind, profile) in TOPICS.items()}
+        self.subscription(JointState, 'joint_states', with_info(self._on_joint_states), qos.sensor_input(), raw=True,
+                          matched=self.losses.matched)
         for topic in ('capture_event', 'capture_detected'):
             self.subscription(Header, topic, partial(self._on_event, topic), qos.latched_input())
         self.create_service(Trigger, '~/reset', self._on_reset)
@@ -92,6 +101,12 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self.estimate = state.model.estimate if state.model is not None else None
             self.get_logger().info(f'resumed after {state.counters.accepted} samples')
 
+    def summary(self) -> str:
+        """Say what is identified from which signals."""
+        config = self.config
+        return (f'inputs {", ".join(config.inputs)}; outputs {", ".join(config.outputs)}; order {config.order}; '
+                f'payload_method {config.payload_method}; {config.publish_rate:g} estimates a second')
+
     def activated(self) -> None:
         """Have threads for fits and models."""
         self._background = Background()
@@ -110,7 +125,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self.state = pipeline.reconfigure(config, self.state, self._background)
 
     def _forget(self) -> None:
-        self.state, self.estimate, self._resumed = pipeline.init(), None, False
+        self.state, self.estimate, self._resumed, self._logged = pipeline.init(), None, False, {}
 
     def _on_joint_states(self, raw: bytes, info: object) -> None:
         """Convert, take one step, publish."""
@@ -141,17 +156,19 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self._step(event)
 
     def _step(self, item: JointRecord | CaptureEvent) -> None:
-        """One step of the pipeline; a message that cannot be used is counted and logged."""
-        dropped = self.state.counters.dropped
+        """Take one step of the pipeline and publish; a message that cannot be used is counted and logged."""
+        before = self.state.counters
         try:
             self.state, estimates = pipeline.step(self.config, self.state, item, self._background)
         except FlexmanipError as error:
             self._reject('configuration', str(error))
             return
         self._publish(estimates)
-        rejection = self.state.clock.rejection
-        if rejection is not None and self.state.counters.dropped > dropped:
+        if self.state.counters.dropped > before.dropped and self.state.clock.rejection is not None:
+            rejection = self.state.clock.rejection
             self.log_throttled(rejection.reason, f'message dropped: {rejection.problem}; {rejection.remedy}')
+        if self.state.counters.resets > before.resets:
+            self.get_logger().warning('the stamps jumped or their rate changed: everything identified is forgotten')
 
     def _publish(self, estimates: tuple[Estimate, ...]) -> None:
         """Publish what is new in each estimate."""
@@ -177,14 +194,14 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._forget()
         response.success, response.message = True, 'everything identified so far is forgotten'
+        self.get_logger().info(f'reset: {response.message}')
         return response
 
     def report(self, report: Report) -> None:
         """Rate, losses, drops by reason, and what the latest estimate is worth."""
         values, counters = report.values, self.state.counters
         values.update(self.meter.window())
-        several = self.count_publishers(self._joint_states.topic_name) > 1
-        values['lost'] = 'unknown (several publishers)' if several else self.losses.lost
+        self.losses.report(report, 'lost', 'messages')
         values.update(counters._asdict())
         values['dropped'] = counters.dropped
         values['rejected'] = self.rejected
@@ -197,14 +214,32 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             values.update(late_events=events.late_events, repeated_events=events.repeated_events,
                           rewinds=events.rewinds, outliers=identifier.estimator.outliers)
         if self.active and values['rate_hz'] == 0.0:
-            report.worse(STALE, 'no joint_states')
+            report.silent('joint_states')
         if self.rejected:
             report.worse(ERROR, f'{self.rejected} messages rejected')
         if counters.dropped:
             report.worse(WARN, f'{counters.dropped} messages dropped')
-        if not several and self.losses.lost:
-            report.worse(WARN, f'{self.losses.lost} messages lost')
         report_estimate(report, self.estimate, self.config.order)
+        if self.active and self.estimate is not None:
+            self._log_estimate(self.estimate)
+
+    def _log_estimate(self, estimate: Estimate) -> None:
+        """Log each change of the status, a payload when it is first trusted, and that a capture seems unannounced."""
+        log = self.get_logger()
+        if self._logged.get('status') is not estimate.status:
+            self._logged['status'] = estimate.status
+            log.info(status_line(self.config, estimate.status))
+        payload, since_ns = estimate.payload, self.state.stamp_of(EventKind.CAPTURE)
+        if payload is None:
+            return
+        if (payload.status is Status.TRACKING and math.isfinite(payload.std)
+                and ('payload' not in self._logged or self._logged['payload'] != since_ns)):
+            self._logged['payload'] = since_ns
+            log.info(f'payload {payload.mass:.4g} kg, 95 % interval {payload.lower:.4g} to {payload.upper:.4g} kg')
+        known = payload.status in (Status.WARMING_UP, Status.UNOBSERVABLE) or math.isfinite(payload.upper)
+        if not known and since_ns is None and 'unannounced' not in self._logged:
+            self._logged['unannounced'] = True
+            log.warning(UNANNOUNCED)
 
 
 def main(argv: list[str] | None = None) -> int:

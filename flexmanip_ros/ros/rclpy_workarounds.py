@@ -1,0 +1,171 @@
+"""Every defect or surprise of rclpy 7.1 (Jazzy) and Fast DDS 2.14 that the nodes work around, in one place.
+
+Each piece says what happens without it, and names the upstream issue where one is known.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import gc
+import inspect
+import math
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.context import Context
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+POLL_S = 0.1
+"""Longest wait inside the executor, hence the longest delay of a signal on an idle node."""
+LONGEST_END_S = 10.0
+"""Longest time in which a process leaves the middleware; it takes some tenths of a second."""
+
+
+def make_executor(context: Context | None = None) -> Executor:
+    """Return the events executor, or the plain one where rclpy has none.
+
+    Without the events executor a node takes four times the processor time at 1 kHz. MultiThreadedExecutor does not
+    keep up at all: 2.5 of 1000 messages a second were measured (https://github.com/ros2/rclpy/issues/1452).
+    """
+    try:
+        from rclpy.experimental import EventsExecutor
+    except ImportError:
+        return SingleThreadedExecutor(context=context)
+    return EventsExecutor(context=context)
+
+
+def interrupt_on_signals() -> None:
+    """Let SIGINT and SIGTERM raise KeyboardInterrupt; call it again after an executor was made.
+
+    rclpy's own handlers end the context before a node can send its last message, such as zero torque. With
+    ``SignalHandlerOptions.NO`` SIGTERM ends the process at once, and the events executor sets handlers of its own.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
+
+
+def spin(executor: Executor, context: Context | None = None, until: Callable[[], bool] = lambda: False) -> None:
+    """Run callbacks until the context ends or a condition holds. SIGINT and SIGTERM raise KeyboardInterrupt.
+
+    The events executor of rclpy 7.1 runs no callback in ``spin()`` without a time-out. It reports a KeyboardInterrupt
+    inside a callback as a fatal error with a traceback, so the signals raise it between two callbacks.
+    """
+    caught: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, frame: caught.append(number))
+    try:
+        while not caught and rclpy.ok(context=context) and not until():
+            executor.spin_once(timeout_sec=POLL_S)
+    except ExternalShutdownException:
+        return
+    finally:
+        interrupt_on_signals()
+    if caught:
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def shutdown(context: Context | None = None) -> Iterator[None]:
+    """End what rclpy and Fast DDS hold; the body stops and forgets executor and nodes.
+
+    Signals are ignored: ``ros2 launch`` and the terminal both send SIGINT, and the second would interrupt the end.
+    A node is part of a reference cycle, so ``destroy_node`` leaves its DDS participant until a garbage collection
+    (https://github.com/ros2/rclpy/issues/1710). Without one, the participant goes in C's exit handlers while a thread
+    of rmw_fastrtps still waits on its readers, and the process aborts ("malloc_consolidate(): unaligned fastbin chunk
+    detected"). Fast DDS can also wait for ever where a participant is destroyed just as another leaves
+    (https://github.com/eProsima/Fast-DDS/issues/6193): after ``LONGEST_END_S`` the process ends with exit code 1.
+    """
+    _ignore_signals()
+    faulthandler.dump_traceback_later(LONGEST_END_S, exit=True)
+    try:
+        yield
+    finally:
+        rclpy.try_shutdown(context=context)
+        gc.collect()
+        faulthandler.cancel_dump_traceback_later()
+        _ignore_signals()  # the executor that went gave the signals their default actions back
+
+
+def _ignore_signals() -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+
+
+def with_info(callback: Callable[[Any, Any], None]) -> Callable[..., None]:
+    """Adapt a ``(message, info)`` callback to both executors.
+
+    rclpy reads off the signature that the information is wanted. The events executor then calls the callback with one
+    tuple, where the others give two arguments.
+    """
+    def adapter(message: Any, info: Any = None) -> None:
+        if info is None:
+            message, info = message
+        callback(message, info)
+
+    adapter.__signature__ = inspect.signature(callback)  # type: ignore[attr-defined]
+    return adapter
+
+
+def sequence_number(info: Any) -> int | None:
+    """Return the publisher's number of a message; None where the middleware has none, which rclpy gives as NaN."""
+    number = info['publication_sequence_number']
+    return None if number is None or math.isnan(number) else int(number)
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error without source locations: rcl puts paths of its build machine there."""
+    text = str(error).strip().splitlines()
+    line = text[0] if text else type(error).__name__
+    return line.split(', at ./')[0].split(', at /')[0]
+
+
+class ManagedNode(LifecycleNode):
+    """A lifecycle node that rejects a transition which its state does not have.
+
+    rclpy 7.1 raises in the service callback instead, which ends the node (https://github.com/ros2/rclpy/issues/1209).
+    """
+
+    def _LifecycleNodeMixin__on_change_state(self, request: Any, response: Any) -> Any:
+        try:
+            return super()._LifecycleNodeMixin__on_change_state(request, response)
+        except RuntimeError as error:
+            state = self._state_machine.current_state[1]
+            self.get_logger().error(f"a transition was rejected in state '{state}': {first_line(error)}")
+            response.success = False
+            return response
+
+
+def parameter_overrides(node: Node) -> dict[str, Parameter]:
+    """Return what file, command line or code gave at start; rclpy has no public name for it."""
+    given: dict[str, Parameter] = node._parameter_overrides
+    return given
+
+
+def declare(node: Node, name: str, default: Any, kind: Parameter.Type, descriptor: ParameterDescriptor) -> Any:
+    """Declare a parameter and return its value, from an override or the default; raises what rclpy raises.
+
+    rclpy reads the type off the default and takes an empty list for bytes: it then rejects every override but an empty
+    one (https://github.com/ros2/rclpy/issues/912). So a parameter with an empty default is declared by its type, and
+    set afterwards.
+    """
+    if not isinstance(default, list) or default:
+        return node.declare_parameter(name, default, descriptor).value
+    given = parameter_overrides(node).get(name)
+    has_value = given is not None and not _is_empty(given.value)
+    node.declare_parameter(name, kind, ignore_override=not has_value)
+    if not has_value:
+        node.set_parameters([Parameter(name, kind, [])])
+    descriptor.type = kind.value
+    node.set_descriptor(name, descriptor)
+    return node.get_parameter(name).value
+
+
+def _is_empty(value: Any) -> bool:
+    return value is None or (isinstance(value, Sequence) and not isinstance(value, str) and not value)
