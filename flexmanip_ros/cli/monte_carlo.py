@@ -6,7 +6,6 @@ import argparse
 import hashlib
 import json
 import math
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
@@ -44,7 +43,7 @@ def _parser() -> console.Parser:
     add('--first-seed', type=console.whole, default=0, metavar='FIRST', help='default: 0')
     add('--output', default='study.csv', metavar='TABLE', help='.csv or .parquet (default study.csv)')
     add('--report', metavar='REPORT.html', help='one page with scores and pictures')
-    add('--workers', type=int, metavar='N', help='processes; default: one a core; 0: this one only')
+    add('--workers', type=console.whole, metavar='N', help='processes; default: one per core; 0: this one only')
     add('--scheduler', metavar='ADDRESS', help='send the runs to this Dask cluster instead')
     add('--params', metavar='FILE.yaml', help='parameter file of the identifier, for recordings')
     add('--set', metavar='name=value', action='append', default=[],
@@ -145,10 +144,7 @@ def _compute(given: argparse.Namespace, todo: Sequence[workers.Task]) -> Iterato
 
     if given.scheduler is not None:
         return workers.cluster(workers.work, todo, given.scheduler)
-    count = given.workers if given.workers is not None else len(os.sched_getaffinity(0))
-    if count < 0:
-        raise ParameterError(f'--workers is {count}', 'give 0 or more')
-    return workers.processes(workers.work, todo, count) if count else workers.serial(workers.work, todo)
+    return workers.compute(workers.work, todo, given.workers)
 
 
 def describe(rows: Sequence[Row]) -> list[str]:

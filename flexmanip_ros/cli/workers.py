@@ -13,7 +13,6 @@ import signal
 import threading
 import time
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -127,26 +126,11 @@ class Outcome(NamedTuple):
     error: BaseException | None
 
 
-class TaskQueue:
-    """Tasks to which more are added while a study runs, as outcomes make them possible."""
-
-    def __init__(self, tasks: Iterable[Task]) -> None:
-        self.waiting = deque(tasks)
-        self.total = len(self.waiting)
-
-    def add(self, tasks: Iterable[Task]) -> None:
-        """Append tasks."""
-        more = list(tasks)
-        self.waiting.extend(more)
-        self.total += len(more)
-
-    def __iter__(self) -> Iterator[Task]:
-        return self
-
-    def __next__(self) -> Task:
-        if not self.waiting:
-            raise StopIteration
-        return self.waiting.popleft()
+def compute(work: Work, tasks: Iterable[Task], count: int | None) -> Iterator[Outcome]:
+    """Compute in ``count`` processes of this machine (None: one per core), or where it is 0 in this process."""
+    if count is None:
+        count = len(os.sched_getaffinity(0))
+    return processes(work, tasks, count) if count else serial(work, tasks)
 
 
 def serial(work: Work, tasks: Iterable[Task]) -> Iterator[Outcome]:
@@ -163,7 +147,7 @@ def serial(work: Work, tasks: Iterable[Task]) -> Iterator[Outcome]:
 def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome]:
     """Compute in ``count`` processes of this machine. Outcomes come as they are ready.
 
-    tasks may be a ``TaskQueue``. A worker that dies (killed, out of memory) costs at most the run it was doing.
+    A worker that dies (killed, out of memory) costs at most the run it was doing.
     """
     for name in THREADS:
         os.environ.setdefault(name, '1')  # one run per core leaves no core for more threads

@@ -323,11 +323,6 @@ def stack(tracks: Sequence[Track], what: str) -> Array:
     return np.column_stack([getattr(track, what) for track in tracks])
 
 
-def median_error(tracks: Sequence[Track], payload: float) -> Array:
-    """Return the median over the runs of the absolute error (T,) [kg]."""
-    return quantile(np.abs(stack(tracks, 'mass') - payload), 0.5)
-
-
 def _say_last(ax: object, tracks: Sequence[Track]) -> None:
     """Write the last estimate of the first run, whose band may be thinner than the line."""
     if tracks and np.isfinite(tracks[0].mass[-1]):

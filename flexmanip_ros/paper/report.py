@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -65,6 +64,33 @@ def drawing(planned: Planned) -> bytes:
     return png(planned.draw(*planned.arguments))
 
 
+def planned(tracks: Mapping[str, figures.Tracks], rows: Sequence[trial.Row]) -> list[Planned]:
+    """Return the figures in the order of the page: signals, example 1, example 2, section 4.3.
+
+    tracks: of each case, method -> one track per run; cases without any are left out.
+    """
+    signals = {one.numbers: one for one in without_results()}
+    first = [case for case in experiments.PAYLOADS[:1] if any(tracks[case.name].values())]
+    there = [case for case in experiments.CONFIGURATIONS if any(tracks[case.name].values())]
+    return [
+        signals['2'], signals['3'], *(_response(case, '4, 5', tracks) for case in first),
+        *(_frequency_figure(case, '6', tracks, rows) for case in first),
+        *_payloads(
+            experiments.PAYLOADS, ('7', '8', '9'), tracks, rows,
+            ('between 4 and 6 s all three methods have settled; least squares reads slightly high: links bend.',
+             'the proposed method identifies the payload stably.',
+             'the error of the proposed method grows with the payload and stays acceptable.')),
+        signals['10'], *(_response(case, '11, 12', tracks) for case in there),
+        *(_frequency_figure(case, '13', tracks, rows) for case in there),
+        *_payloads(experiments.CONFIGURATIONS, ('14', '15', '16'), tracks, rows,
+                   ('the proposed method reaches the original value fast in every configuration.',
+                    'the same.', 'satisfactory accuracy.')),
+        signals['17, 18'],
+        *_payloads((experiments.FINITE_ELEMENT,), ('19', '19', '19'), tracks, rows,
+                   ('the error is higher than with the mathematical model, the payload is still tracked.',
+                    'no errors are shown.', 'no mean error is given.'))]
+
+
 def without_results() -> list[Planned]:
     """Return the figures that need no estimate."""
     first, last = (simulation(case) for case in (experiments.PAYLOADS[0], experiments.FINITE_ELEMENT))
@@ -73,44 +99,14 @@ def without_results() -> list[Planned]:
     return [
         Planned('2', 'input torques', 'square waves, so that the arm stays near its working point.',
                 '10 N m with a period of 1 s, 5 N m with 0.5 s.', figures.torques, (first,)),
-        Planned('3', 'responses, 20 kg at 60/45 deg', 'angles below 3 deg and small vibration, so a linear '
-                'model serves.', f'angles turn by up to {angle:.2f} deg.', figures.responses, (first,)),
+        Planned('3', 'responses, 20 kg at 60/45 deg', 'angles below 3 deg and small vibration: a linear model serves.',
+                f'angles turn by up to {angle:.2f} deg.', figures.responses, (first,)),
         Planned('10', 'configurations', 'three configurations for 100 kg.', 'the same, drawn to scale.',
                 figures.arms, (experiments.CONFIGURATIONS, figures.arm())),
         Planned('17, 18', 'finite element plant, middles of the links, 20 kg at 45/0 deg',
                 'link 2 hardly moves along X, because the signals are mainly lateral deflection.',
                 f'link 2 deflects up to {across:.3f} mm along Y, {along:.4f} mm along X.',
                 figures.finite_element, (last,))]
-
-
-def payload_example(tracks: Mapping[str, figures.Tracks], rows: Sequence[trial.Row]) -> list[Planned]:
-    """Return the figures of example 1: three payloads."""
-    case = experiments.PAYLOADS[0]
-    planned = []
-    if any(tracks[case.name].values()):
-        planned += [_response(case, '4, 5', tracks), _frequency_figure(case, '6', tracks, rows)]
-    return planned + _payloads(
-        experiments.PAYLOADS, ('7', '8', '9'), tracks, rows,
-        ('between 4 and 6 s all three methods have settled; least squares reads slightly high: links bend.',
-         'the proposed method identifies the payload stably.',
-         'the error of the proposed method grows with the payload and stays acceptable.'))
-
-
-def configuration_example(tracks: Mapping[str, figures.Tracks], rows: Sequence[trial.Row]) -> list[Planned]:
-    """Return the figures of example 2: three configurations."""
-    there = [case for case in experiments.CONFIGURATIONS if any(tracks[case.name].values())]
-    return [*(_response(case, '11, 12', tracks) for case in there),
-            *(_frequency_figure(case, '13', tracks, rows) for case in there),
-            *_payloads(experiments.CONFIGURATIONS, ('14', '15', '16'), tracks, rows,
-                       ('the proposed method reaches the original value fast in every configuration.',
-                        'the same.', 'satisfactory accuracy.'))]
-
-
-def finite_element_example(tracks: Mapping[str, figures.Tracks], rows: Sequence[trial.Row]) -> list[Planned]:
-    """Return the figures of section 4.3."""
-    return _payloads((experiments.FINITE_ELEMENT,), ('19', '19', '19'), tracks, rows,
-                     ('the error is higher than with the mathematical model, the payload is still tracked.',
-                      'no errors are shown.', 'no mean error is given.'))
 
 
 def _response(case: experiments.Case, numbers: str, tracks: Mapping[str, figures.Tracks]) -> Planned:
@@ -199,31 +195,25 @@ def simulation(case: experiments.Case, seed: int = 0) -> simulator.Trajectory:
     return simulator.simulate(run.plant, torque, events)
 
 
-@dataclass(frozen=True)
-class Study:
-    """The results of reproduce_paper. pictures: planned figures in the order of the page, each with its PNG."""
+class Study(NamedTuple):
+    """The results of reproduce_paper. pictures: the planned figures, each with its PNG (empty: not drawn)."""
 
     rows: Sequence[trial.Row]
     bounds: summary.Bounds
-    pictures: Mapping[str, Sequence[tuple[Planned, bytes]]]
+    pictures: Sequence[tuple[Planned, bytes]]
     runs: int
     wall_s: float
 
 
 def report(path: str | Path, done: Study) -> None:
     """Write the page."""
-    drawn = {group: [_section(*item) for item in items] for group, items in done.pictures.items()}
-    still = {item[0].numbers: section for item, section in zip(
-        done.pictures.get('signals', ()), drawn.get('signals', ()), strict=True)}
-    sections = [
-        Section('Result', _result(done)),
-        Section('Deviations', table(['the paper', 'here'], DEVIATIONS)),
-        Section('Table 1: the arm', _arm()),
-        *(still[name] for name in ('2', '3') if name in still), *drawn.get('payloads', ()),
-        *(still[name] for name in ('10',) if name in still),
-        Section('Table 2: frequency errors', _frequencies(done.rows)), *drawn.get('configurations', ()),
-        *(still[name] for name in ('17, 18',) if name in still), *drawn.get('finite_element', ())]
-    lead = (f'{done.runs} runs a case, {len(done.rows)} rows, computed in {done.wall_s:.0f} s. Mean relative '
+    sections = [Section('Result', _result(done)), Section('Deviations', table(['the paper', 'here'], DEVIATIONS)),
+                Section('Table 1: the arm', _arm())]
+    for planned, drawn in done.pictures:
+        sections.append(_section(planned, drawn))
+        if planned.numbers == '10':
+            sections.append(Section('Table 2: frequency errors', _frequencies(done.rows)))
+    lead = (f'{done.runs} runs per case, {len(done.rows)} rows, computed in {done.wall_s:.0f} s. Mean relative '
             f'error over {experiments.WINDOW[0]:g} to {experiments.WINDOW[1]:g} s; '
             'the interval is judged at the end.')
     write_text(path, page("The paper's section 4, its method and ours", lead, sections))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from functools import cache
 from pathlib import Path
 
@@ -164,3 +165,18 @@ def test_a_garbled_message_among_thousands_is_named_and_costs_no_other(tmp_path)
     assert len(items) == COUNT - 1
     assert 'message 1235 ' in line
     assert 'garbled' in line
+
+
+def test_the_memory_of_reading_does_not_grow_with_the_recording(tmp_path):
+    raw = joint_state_record(0)
+    peaks = []
+    for count in (20_000, 60_000):
+        path = tmp_path / str(count)
+        with BagWriter(path, flush_period=None) as writer:
+            for k in range(count):
+                writer.write('/joint_states', START + k, raw)
+        tracemalloc.start()
+        assert sum(len(item.stamp_ns) for item in bag.read_blocks(path)) == count
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.2 * peaks[0]

@@ -1,0 +1,43 @@
+"""A payload is printed with what it is worth: nobody takes a number for a mass that is not known."""
+
+from __future__ import annotations
+
+import pytest
+
+from flexmanip_ros.studies.summary import ADVICE, Summary
+from flexmanip_ros.types import Status
+
+
+def summary(status: Status, mass: float | None, low: float | None, high: float | None) -> Summary:
+    return Summary(
+        samples=100, gaps=0, sample_time_s=0.001, wall_s=0.1, status=status.name, frequencies_hz=(), damping_ratios=(),
+        payload_mass_kg=mass, payload_std_kg=None, payload_ci95_kg=(low, high), consistency=1.0, capture_time_s=None,
+        release_time_s=None)
+
+
+def test_a_payload_that_is_tracked_is_its_mass_and_interval():
+    assert summary(Status.TRACKING, 20.0, 19.5, 20.5).payload_text() == '20 kg, 95 % interval 19.5 .. 20.5 kg'
+
+
+@pytest.mark.parametrize('status', [status for status in Status if status is not Status.NO_PAYLOAD_METHOD])
+def test_a_payload_without_an_upper_bound_is_not_known_and_no_number_is_shown(status):
+    text = summary(status, 0.0, 0.0, None).payload_text()
+    assert text.startswith('not known: ')
+    assert not any(character.isdigit() for character in text)
+    assert '; ' in text
+
+
+@pytest.mark.parametrize('status', list(ADVICE))
+def test_a_payload_of_any_other_status_is_not_reliable_with_the_reason_and_what_to_do(status):
+    text = summary(status, 20.0, 10.0, 30.0).payload_text()
+    reason = status.value.partition(';')[0]
+    assert text == f'20 kg, 95 % interval 10 .. 30 kg, not reliable: {reason}; {ADVICE[status]}'
+
+
+def test_every_status_of_a_payload_has_an_advice():
+    assert set(Status) - set(ADVICE) == {Status.TRACKING, Status.NO_PAYLOAD_METHOD}
+
+
+def test_a_run_without_a_payload_method_has_no_payload():
+    run = summary(Status.NO_PAYLOAD_METHOD, None, None, None)
+    assert Summary(**{**vars(run), 'payload_ci95_kg': None}).payload_text() == 'not estimated'
