@@ -26,11 +26,11 @@ DOMAIN = 77
 def plant(seconds: float, bare: bool, results: Any) -> None:
     """Run the node (or a bare timer) and hand back the instants of its ticks [s]."""
     import rclpy
-    from flexmanip_ros.ros.rclpy_workarounds import make_executor
     from rclpy.context import Context
     from rclpy.parameter import Parameter
 
     from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
+    from flexmanip_ros.ros.rclpy_workarounds import make_executor
 
     context = Context()
     rclpy.init(context=context, domain_id=DOMAIN)
@@ -68,12 +68,12 @@ def plant(seconds: float, bare: bool, results: Any) -> None:
 def listener(seconds: float, results: Any) -> None:
     """Collect the stamps [ns] that arrive."""
     import rclpy
-    from flexmanip_ros.ros.rclpy_workarounds import make_executor
     from rclpy.context import Context
     from sensor_msgs.msg import JointState
 
     from flexmanip_ros.ros import qos
     from flexmanip_ros.ros.conversions import stamp_ns
+    from flexmanip_ros.ros.rclpy_workarounds import make_executor
 
     context = Context()
     rclpy.init(context=context, domain_id=DOMAIN)

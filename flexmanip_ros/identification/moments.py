@@ -14,14 +14,11 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 from scipy.linalg.lapack import dtrtrs
 
-from flexmanip_ros.identification.riccati_kernel import gain as stationary_gain
 from flexmanip_ros.identification.varx import observability_controllability, open_loop_weight
 from flexmanip_ros.types import Array
 
 RIDGE = 1e-8
 """Relative ridge that picks the solution of least norm where the data leave a direction free."""
-LEAST_KNOWN = 1e-6
-"""Share of an output's noise that the others' must leave for the quick way to the stationary gain."""
 
 
 class Realized(NamedTuple):
@@ -111,15 +108,15 @@ def row_whitening(
 
 
 def riccati_gain(A: Array, C: Array, process: Array, measurement: Array, fallback: Array) -> Array:
-    """K (n, m) of the stationary Kalman filter for residuals of state (q, n) and output (q, m)."""
+    """K (n, m) of the stationary Kalman filter: K = (A P C' + S) (C P C' + R)^-1, P from the Riccati equation.
+
+    process: (q, n) residuals of the state, measurement: (q, m) residuals of the outputs; their second moments are
+    Q, S and R. fallback: (n, m) returned where the equation has no stabilizing solution.
+    """
     floor = RIDGE ** 2 * max(np.trace(measurement.T @ measurement), 1e-300)
     R = measurement.T @ measurement + floor * np.eye(C.shape[0])
     scale = np.trace(R)
     Q, S = process.T @ process / scale, process.T @ measurement / scale
-    found: Array = np.empty(S.shape)
-    if stationary_gain(np.ascontiguousarray(A), np.ascontiguousarray(C), np.ascontiguousarray(Q),
-                       np.ascontiguousarray(S), np.asarray(R / scale), LEAST_KNOWN, found):
-        return found
     try:
         P = solve_discrete_are(A.T, C.T, Q, R / scale, s=S)
         gain: Array = np.linalg.solve(C @ P @ C.T + R / scale, (A @ P @ C.T + S).T).T

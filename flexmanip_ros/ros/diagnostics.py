@@ -16,7 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from flexmanip_ros.identification.realization import suggested_order
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload.signals import signals
+from flexmanip_ros.payload.structured_model import signals
 from flexmanip_ros.types import Estimate, Status
 
 OK = 0
