@@ -1,0 +1,205 @@
+"""What somebody sees who starts the nodes for the first time: log lines, names, parameter files, losses."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from identifier_harness import CAPTURE, Live, recording
+from joint_states import joint_state
+from ros_harness import Ros, overrides
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from flexmanip_ros import messages
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.parameters.document import yaml_text
+from flexmanip_ros.ros import conversions, diagnostics, qos
+from flexmanip_ros.ros.diagnostics import WARN, LossCounter, Report, unobservable_reason
+from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
+from flexmanip_ros.ros.nodes.excitation import Excitation
+from flexmanip_ros.ros.nodes.payload_adapter import PayloadAdapter
+from flexmanip_ros.ros.nodes.payload_controller import PayloadController
+from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
+from flexmanip_ros.ros.nodes.rpbsid_identifier import RpbsidIdentifier
+
+NODES = (PlantSimulator, Excitation, CaptureTrigger, PayloadController, PayloadAdapter, RpbsidIdentifier)
+
+
+@pytest.fixture
+def log(ros: Ros, capfd: pytest.CaptureFixture[str]) -> Callable[[str], str]:
+    """Return a function that waits until a text was logged, and returns the log so far."""
+    lines = ['']
+
+    def logged(text: str) -> bool:
+        lines[0] += capfd.readouterr().err
+        return text in lines[0]
+
+    def wait(text: str) -> str:
+        ros.wait(lambda: logged(text), what=f'the log line {text!r} in {lines[0]}')
+        return lines[0]
+
+    return wait
+
+
+@pytest.mark.parametrize('cls', NODES)
+def test_a_node_that_waits_to_be_configured_reports_that_it_is_not_active(ros: Ros, cls: Any) -> None:
+    heard = ros.listen(DiagnosticArray, '/diagnostics', 10)
+    node = ros.add(cls(context=ros.context, overrides=overrides(autostart=False)))
+    assert node.autostart()
+    ros.wait(lambda: heard)
+    assert heard[0].status[0].message.startswith('not active')
+
+
+@pytest.mark.parametrize('remapping', [['-r', '__ns:=/left'], ['-r', '__node:=arm'], []])
+def test_a_written_parameter_file_holds_in_any_namespace_and_under_any_name(
+        ros: Ros, tmp_path: Path, remapping: list[str]) -> None:
+    file = tmp_path / 'plant.yaml'
+    file.write_text(yaml_text('plant_simulator', {'rate': 250.0, 'arm.tip_mass': 3.0}), encoding='utf-8')
+    node = ros.add(PlantSimulator(
+        context=ros.context, cli_args=['--ros-args', '--params-file', str(file), *remapping]))
+    assert (node.config.rate, node.config.arm.tip_mass) == (250.0, 3.0)
+
+
+@pytest.mark.parametrize('name', ['rpbsid_identifier', 'plant_simulator', 'capture_trigger', 'quanser_2dsfl'])
+def test_the_files_in_config_are_for_every_name(name: str) -> None:
+    text = (Path(__file__).resolve().parents[2] / 'config' / f'{name}.yaml').read_text(encoding='utf-8')
+    assert '\n/**:\n' in text
+
+
+def test_a_node_logs_its_arm_and_where_it_comes_from(
+        ros: Ros, log: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
+    ros.managed(CaptureTrigger(context=ros.context, namespace='one'))
+    log('arm: links of 3 and 3 m, 5 and 5 kg/m, 5000 and 5000 N m^2, masses 10 kg at joint 2 and 10 kg at the tip; '
+        'all defaults')
+    ros.managed(CaptureTrigger(context=ros.context, namespace='two', overrides=overrides(arm__tip_mass=4.0)))
+    log('4 kg at the tip; set at start: arm.tip_mass')
+    monkeypatch.setattr(sys, 'argv', ['capture_trigger', '--ros-args', '--params-file', 'other.yaml'])
+    ros.managed(CaptureTrigger(context=ros.context, namespace='three'))
+    log('all defaults: other.yaml sets no parameter arm.* of /three/capture_trigger')
+
+
+def test_nodes_of_two_arms_have_diagnostics_of_their_own(ros: Ros) -> None:
+    heard = ros.listen(DiagnosticArray, '/diagnostics', 10)
+    for arm in ('left', 'right'):
+        ros.managed(CaptureTrigger(context=ros.context, namespace=arm))
+    ros.wait(lambda: len({message.status[0].name for message in heard}) == 2)
+    assert {(message.status[0].name, message.status[0].hardware_id) for message in heard} == {
+        ('/left/capture_trigger: status', 'flexmanip_ros /left'),
+        ('/right/capture_trigger: status', 'flexmanip_ros /right')}
+
+
+def test_the_identifier_logs_what_it_does_waits_for_and_finds(ros: Ros, log: Callable[[str], str]) -> None:
+    live = Live(ros)
+    log('ready: inputs joint1/effort, joint2/effort; outputs link1_bend/position, link2_bend/position, '
+        'link1_bend/velocity, link2_bend/velocity; order 4; payload_method structured; 50 estimates a second')
+    log('waiting for /joint_states')
+    samples = recording(1500)
+    live.send(*samples[:300])
+    log('messages arrive: ')
+    live.events.publish(conversions.header(CAPTURE))
+    log('capture_event: capture at ')
+    live.send(*samples[300:])
+    log('status TRACKING: tracking; nothing to do')
+    said = log(' kg, 95 % interval ')
+    mass = float(said.rpartition(' kg, 95 % interval ')[0].rpartition('payload ')[2])
+    assert abs(mass - 20.0) < 2.0 or mass == 0.0
+    assert ros.call(Trigger, 'rpbsid_identifier/reset').success
+    log('reset: everything identified so far is forgotten')
+
+
+def test_an_unannounced_capture_is_hinted_at_once(ros: Ros, log: Callable[[str], str]) -> None:
+    live = Live(ros)
+    live.send(*recording(600))
+    unknown = live.node.estimate.payload._replace(
+        mass=0.0, std=math.inf, upper=math.inf, status=diagnostics.Status.INCONSISTENT)
+    live.node.estimate = live.node.estimate._replace(payload=unknown, status=diagnostics.Status.INCONSISTENT)
+    said = log('trigger_mode:=auto)')
+    assert 'no capture was announced' in said
+    assert 'status INCONSISTENT: ' in said
+
+
+@pytest.mark.parametrize(('changes', 'words'), [
+    ({'outputs': ('joint1/effort', 'link1_bend/position')}, 'not those of a two-link arm'),
+    ({'angles': ()}, 'angles does not name'),
+    ({'inputs': ('joint1/effort',)}, 'effort of both joints'),
+])
+def test_signals_that_give_no_payload_are_explained(changes: dict[str, Any], words: str) -> None:
+    assert words in unobservable_reason(IdentifierParameters(**changes))
+
+
+def test_a_second_capture_without_a_release_is_said_to_add_an_object(ros: Ros) -> None:
+    node = ros.managed(CaptureTrigger(context=ros.context))
+    ros.publisher(JointState, 'joint_states', qos.sensor_output()).publish(joint_state(5))
+    ros.wait(lambda: node._last_ns is not None)
+    answers = [ros.call(Trigger, f'capture_trigger/{kind}') for kind in ('capture', 'capture', 'release', 'capture')]
+    assert [answer.success for answer in answers] == [True] * 4
+    assert ['a second one is added' in answer.message for answer in answers] == [False, True, False, False]
+
+
+def test_the_status_message_alone_says_whether_payload_and_model_are_to_be_trusted(ros: Ros) -> None:
+    live = Live(ros)
+    samples = recording(1500)
+    live.send(*samples[:200])
+    live.events.publish(conversions.header(CAPTURE))
+    ros.wait(lambda: live.node.state.payload.pending)
+    live.send(*samples[200:])
+    live.finish()
+    ros.wait(lambda: len(live.said[messages.STATUS]) >= len(live.said[messages.MODEL])
+             + len(live.said[messages.PAYLOAD_ESTIMATE]))
+    for name, topic in (('payload', messages.PAYLOAD_ESTIMATE), ('model', messages.MODEL)):
+        entries = [item for item in live.said[messages.STATUS] if item.statuses[0].name == name]
+        assert len(entries) == len(live.said[topic])
+        (last,) = entries[-1].statuses
+        assert (last.level, dict(last.values)['status']) == (0, 'TRACKING')
+    payloads = {item.stamp_ns: dict(item.statuses[0].values) for item in live.said[messages.STATUS]
+                if item.statuses[0].name == 'payload'}
+    for body in live.said[messages.PAYLOAD]:
+        assert float(payloads[body.stamp_ns]['mass_kg']) == body.mass
+    unknown = [values for values in payloads.values() if values['mass_kg'] == 'nan']
+    assert unknown
+    assert len(live.said[messages.PAYLOAD_MASS]) == len(payloads) - len(unknown)
+
+
+def event(count: int, change: int) -> SimpleNamespace:
+    return SimpleNamespace(current_count=count, current_count_change=change)
+
+
+def test_publishers_that_come_and_go_are_no_loss_and_each_keeps_its_own_count() -> None:
+    losses = LossCounter()
+    losses.matched(event(1, 1))
+    for number in (1_500_000, 1_500_001):
+        losses.note(number)
+    losses.matched(event(2, 1))
+    for number in (1, 1_500_002, 2, 1_500_003, 3):
+        losses.note(number)
+    assert losses.lost == 0
+    for number in (1_500_006, 5):  # two of the one are missing, one of the other
+        losses.note(number)
+    assert losses.lost == 3
+    losses.matched(event(1, -1))
+    for number in (6, 7):
+        losses.note(number)
+    assert losses.lost == 3
+
+
+def test_a_loss_is_a_warning_for_a_minute_and_stays_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(diagnostics.time, 'monotonic', lambda: now[0])
+    losses = LossCounter()
+    for number in (1, 5):
+        losses.note(number)
+    levels = []
+    for seconds in (0.0, 59.0, 61.0):
+        now[0] = 100.0 + seconds
+        report = Report()
+        losses.report(report, 'lost', 'messages')
+        assert report.values == {'lost': 3}
+        levels.append(report.level)
+    assert levels == [WARN, WARN, diagnostics.OK]
