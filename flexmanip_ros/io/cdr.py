@@ -14,12 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointBlock, JointRecord
+from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, JointRecord
 
 STAMP = struct.Struct('<iI')
 COUNT = struct.Struct('<I')
-_ARRAY, _NUMBERS = struct.Struct('<3I'), 20
-"""Dimensions, data offset and size of a Float64MultiArray, and where its numbers begin if it has no dimension."""
 START = 4
 """Bytes of the encapsulation, after which a message begins. CDR aligns to this place."""
 HEAD = START + STAMP.size
@@ -63,14 +61,6 @@ def capture_event(raw: bytes) -> CaptureEvent:
     stamp = stamp_ns(raw)
     frame, _ = _string(raw, HEAD)
     return CaptureEvent(stamp, EventKind(frame))
-
-
-def doubles(raw: bytes) -> Array:
-    """Return the numbers of a Float64MultiArray without dimensions, as commands are. Raises CdrError."""
-    dimensions, _, count = _ARRAY.unpack_from(raw, START) if len(raw) >= START + _ARRAY.size else (1, 0, 0)
-    if raw[:2] != LITTLE_ENDIAN or dimensions or len(raw) != _NUMBERS + 8 * count:
-        raise CdrError('not a plain array of numbers')
-    return np.frombuffer(raw, '<f8', count, _NUMBERS)
 
 
 def joint_record(raw: bytes, layout: Layout | None) -> tuple[JointRecord, Layout]:

@@ -55,8 +55,16 @@ class JointStateReader:
         try:
             record, self._layout = cdr.joint_record(raw, self._layout)
         except (cdr.CdrError, UnicodeDecodeError, struct.error):
-            return joint_record(_decoded(raw, JointState))
+            return _decoded(raw)
         return record
+
+
+def _decoded(raw: bytes) -> JointRecord:
+    """Return a message through rclpy's own decoder, for bytes of another encoding or shape."""
+    try:
+        return joint_record(deserialize_message(raw, JointState))
+    except (RuntimeError, MemoryError) as error:  # the errors of the middleware
+        raise SignalError('the bytes of a message are no JointState', 'look at its publisher') from error
 
 
 def joint_record(message: JointState) -> JointRecord:
@@ -75,26 +83,6 @@ def joint_state(record: JointRecord) -> JointState:
     message.velocity = doubles(record.velocity)
     message.effort = doubles(record.effort)
     return message
-
-
-def numbers(raw: bytes) -> Array:
-    """Return what a Float64MultiArray from a raw subscription holds.
-
-    Raises SignalError for bytes that are none.
-    """
-    try:
-        return cdr.doubles(raw)
-    except cdr.CdrError:
-        return np.array(_decoded(raw, Float64MultiArray).data, dtype=np.float64)
-
-
-def _decoded(raw: bytes, kind: type[Any]) -> Any:
-    """Return a message through rclpy's own decoder, for bytes of another encoding or shape."""
-    try:
-        return deserialize_message(raw, kind)
-    except (RuntimeError, MemoryError) as error:  # the errors of the middleware
-        raise SignalError(f'the bytes of a message are no {kind.__name__}',
-                          'look at its publisher') from error
 
 
 def capture_event(message: Header) -> CaptureEvent:

@@ -26,7 +26,7 @@ STALE = 3
 _SEVERITY = (OK, WARN, STALE, ERROR)
 """From the least to the most severe: silence hides a warning, and a known error hides silence."""
 RECENT_S = 60.0
-"""A loss is a warning for so long: long enough to be seen by somebody who looks now and then."""
+"""A loss is a warning for so long: somebody who looks at /diagnostics now and then sees it."""
 
 
 @dataclass
@@ -71,14 +71,12 @@ def text(value: Any) -> str:
 
 
 class Meter:
-    """Counts and times the runs of a callback; ``with meter:`` around its body."""
+    """Counts and times the runs of a callback: ``with meter:`` around its body."""
 
     def __init__(self) -> None:
-        self.total = 0
         self._times_ns: list[int] = []
         self._entered_ns = 0
         self._window_ns = time.monotonic_ns()
-        self._worst_p99_us = math.nan
 
     def __enter__(self) -> Meter:
         self._entered_ns = time.perf_counter_ns()
@@ -87,11 +85,6 @@ class Meter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         self._times_ns.append(time.perf_counter_ns() - self._entered_ns)
-        self.total += 1
-
-    def idle_s(self) -> float:
-        """Return the seconds since the callback last began."""
-        return (time.perf_counter_ns() - self._entered_ns) * 1e-9
 
     def window(self) -> Mapping[str, float]:
         """Return rate [Hz] and callback time [us] since the last call, and start a new window."""
@@ -100,19 +93,12 @@ class Meter:
         times_us = np.array(self._times_ns, dtype=np.float64) * 1e-3
         self._times_ns, self._window_ns = [], now
         some = times_us.size > 0
-        p99_us = float(np.percentile(times_us, 99)) if some else math.nan
-        self._worst_p99_us = float(np.fmax(self._worst_p99_us, p99_us))
         return {
             'rate_hz': times_us.size / seconds,
             'callback_p50_us': float(np.percentile(times_us, 50)) if some else math.nan,
-            'callback_p99_us': p99_us,
+            'callback_p99_us': float(np.percentile(times_us, 99)) if some else math.nan,
             'callback_max_us': float(times_us.max()) if some else math.nan,
         }
-
-    def worst_p99_us(self) -> float:
-        """Return the largest p99 [us] of any window, the present one included."""
-        self.window()
-        return self._worst_p99_us
 
 
 class LossCounter:
@@ -146,7 +132,7 @@ class LossCounter:
             self._expected.remove(number)
         elif len(self._expected) >= self._publishers:
             before = max((expected for expected in self._expected if expected < number), default=None)
-            if before is None:  # a publisher began again, and the middleware did not tell
+            if before is None:  # a publisher began again without an event of the middleware
                 self._expected.pop()
             else:
                 self._expected.remove(before)

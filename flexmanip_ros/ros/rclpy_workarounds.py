@@ -79,7 +79,7 @@ def shutdown(context: Context | None = None) -> Iterator[None]:
     A node is part of a reference cycle, so ``destroy_node`` leaves its DDS participant until a garbage collection
     (https://github.com/ros2/rclpy/issues/1710). Without one, the participant goes in C's exit handlers while a thread
     of rmw_fastrtps still waits on its readers, and the process aborts ("malloc_consolidate(): unaligned fastbin chunk
-    detected"). Fast DDS can also wait for ever where a participant is destroyed just as another leaves
+    detected"). Fast DDS can also wait without end where a participant is destroyed just as another leaves
     (https://github.com/eProsima/Fast-DDS/issues/6193): after ``LONGEST_END_S`` the process ends with exit code 1.
     """
     _ignore_signals()

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from contextlib import suppress
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension
+from std_msgs.msg import Header
 
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.messages import Dimension, Inertia, LabelledArray
@@ -76,17 +74,3 @@ def test_a_labelled_array_survives_its_message(data: np.ndarray) -> None:
 def test_an_inertia_survives_its_message() -> None:
     sent = Inertia(1_500_000_001, 'link2_tip', 20.5, (0.1, 0.2, 0.3), (1.0, 2.0, 3.0, 4.0, 5.0, 6.0))
     assert conversions.inertia(conversions.to_message(sent)) == sent
-
-
-@given(st.lists(st.floats(), max_size=4), st.booleans())
-def test_commands_are_read_from_bytes_whatever_their_layout(values: list[float], labelled: bool) -> None:
-    message = Float64MultiArray(data=values)
-    if labelled:
-        message.layout.dim = [MultiArrayDimension(label='joints', size=len(values), stride=len(values))]
-    assert np.array_equal(conversions.numbers(serialize_message(message)), np.array(values), equal_nan=True)
-
-
-@given(st.binary(max_size=60))
-def test_bytes_that_are_no_command_are_an_error_of_ours_or_numbers(raw: bytes) -> None:
-    with suppress(SignalError):
-        assert conversions.numbers(raw).dtype == np.float64

@@ -88,9 +88,8 @@ def _run(config: DemoParameters, folder: Path, console: Console) -> int:
         composition.drain()
         failure, live = composition.recorder.failure, composition.recorder.published
         identifier, plant = composition.identifier.config, composition.plant.config
-        console.print(
-            f'\n{composition.recorder.joint_states} samples in {time.monotonic() - began:.2f} s, {composition.lost} '
-            f'lost; identifier callback p99 {composition.identifier.meter.worst_p99_us():.0f} us')
+        console.print(f'\n{composition.recorder.joint_states} samples in {time.monotonic() - began:.2f} s, '
+                      f'{composition.lost} lost')
     finally:
         with rclpy_workarounds.shutdown():
             if composition is not None:

@@ -97,14 +97,14 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         if not self._client.service_is_ready():
             self.problem = f"service '{self._client.srv_name}' is not there"
             self.log_throttled('service', f'{self.problem}; start the driver, or correct the parameters')
-            self.state = handover.refused(self.state, now)
+            self.state = handover.rejected(self.state, now)
             return
         future = self._client.call_async(self._request(inertia))
         self._asked = future, now
         future.add_done_callback(lambda future: self._answered(future, inertia.m))
 
     def _forget_request(self) -> None:
-        """Wait no more for the answer; the client would keep the request for ever."""
+        """Stop waiting for the answer; the client would keep the request without end."""
         if self._asked is not None:
             future, self._asked = self._asked[0], None
             self._client.remove_pending_request(future)
@@ -123,17 +123,17 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         if reason:
             self.problem = f'{mass:.3f} kg was rejected: {reason}'
             self.log_throttled('rejected', self.problem)
-            self.state = handover.refused(self.state, time.monotonic())
+            self.state = handover.rejected(self.state, time.monotonic())
             return
         self.problem = ''
         self.sent += 1
-        self.state = handover.told(self.state, mass, time.monotonic())
+        self.state = handover.accepted(self.state, mass, time.monotonic())
         self.get_logger().info(f'the driver took {mass:.3f} kg')
 
     def report(self, report: Report) -> None:
         """What was sent, and what went wrong."""
         report.values['sent'] = self.sent
-        report.values['sent_mass_kg'] = 'none' if self.state.told_mass is None else self.state.told_mass
+        report.values['sent_mass_kg'] = 'none' if self.state.sent_mass is None else self.state.sent_mass
         report.values['trusted'] = self.state.trusted_since is not None
         report.values['doubtful'] = self.doubtful
         if self.problem:

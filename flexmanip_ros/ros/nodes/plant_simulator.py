@@ -21,10 +21,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
 from std_srvs.srv import Trigger
 
-from flexmanip_ros.errors import FlexmanipError, SignalError
+from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.conversions import capture_event, joint_state, numbers
+from flexmanip_ros.ros.conversions import capture_event, joint_state
 from flexmanip_ros.ros.diagnostics import ERROR, WARN, LossCounter, Meter, Report
 from flexmanip_ros.ros.node import FlexmanipNode, SampleGrid, run
 from flexmanip_ros.ros.rclpy_workarounds import sequence_number, with_info
@@ -61,7 +61,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         self.joint_states = self.publisher(JointState, 'joint_states', qos.sensor_output())
         self.subscription(
             Float64MultiArray, 'effort_controller/commands', with_info(self._on_command), qos.command(),
-            raw=True, matched=self.lost_commands.matched)
+            matched=self.lost_commands.matched)
         self.subscription(Header, 'capture_event', self._on_event, qos.latched_input())
         self.create_service(Trigger, '~/reset', self._on_reset)
         self._grid = SampleGrid(self, self.config.rate)
@@ -142,13 +142,9 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             change = simulator.attach if event.kind is EventKind.CAPTURE else simulator.release
             self.state = change(self.config, self.state)
 
-    def _on_command(self, raw: bytes, info: object) -> None:
+    def _on_command(self, message: Float64MultiArray, info: object) -> None:
         self.lost_commands.note(sequence_number(info))
-        try:
-            efforts = numbers(raw)
-        except SignalError as error:
-            self._drop(str(error))
-            return
+        efforts = np.array(message.data)
         if efforts.size != 2:
             self._drop(f'a command has {efforts.size} values; send one torque for each of the 2 joints')
         elif not all(map(math.isfinite, efforts.tolist())):
