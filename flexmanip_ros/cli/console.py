@@ -82,6 +82,11 @@ def print_error(prog: str, error: BaseException | str) -> None:
     print(f'{prog}: {" ".join(str(error).split())}', file=sys.stderr)
 
 
+def number(value: float | None, digits: int = 3) -> str:
+    """Return a number as text; '-' where there is none."""
+    return '-' if value is None or math.isnan(value) else f'{value:.{digits}g}'
+
+
 def require_matplotlib() -> None:
     """Raise FlexmanipError before the work when a report is asked for and its figures cannot be drawn."""
     if importlib.util.find_spec('matplotlib') is None:

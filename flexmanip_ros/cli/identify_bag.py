@@ -113,8 +113,8 @@ def describe(result: Result) -> list[str]:
     for words, values in (('simulation', summary.vaf_simulation_percent),
                           ('prediction', summary.vaf_prediction_percent)):
         if values is not None:
-            said = [f'{name} {_text(value)} %' for name, value in zip(result.outputs, values, strict=True)]
-            lines.append(f'VAF {words:8s} {", ".join(said)}')
+            shares = [f'{name} {_text(value)} %' for name, value in zip(result.outputs, values, strict=True)]
+            lines.append(f'VAF {words:8s} {", ".join(shares)}')
     lines += [f'written      {place}' for place in result.written]
     return lines
 

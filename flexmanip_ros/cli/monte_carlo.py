@@ -156,17 +156,14 @@ def describe(rows: Sequence[Row]) -> list[str]:
              f'{"rms/bound":>9s} {"us/sample":>9s}']
     for name in sorted({str(row.get('estimator', '')) for row in rows}):
         made = score([row for row in rows if str(row.get('estimator', '')) == name])
-        held = '-' if math.isnan(made.coverage_percent) else (
+        coverage = '-' if math.isnan(made.coverage_percent) else (
             f'{made.coverage_percent:.1f} % ({made.coverage_low:.1f}..{made.coverage_high:.1f})')
-        lines.append(f'{name or "(failed)":24s} {made.runs:6d} {made.failed:6d} '
-                     f'{_short(made.mean_error_percent, 4):>10s} {_short(made.median_error_percent, 4):>9s} '
-                     f'{_short(made.rms_error_percent, 4):>8s} {_short(made.bias_kg):>9s} {held:>22s} '
-                     f'{_short(made.bound_ratio):>9s} {_short(made.us_per_sample):>9s}')
+        errors = (f'{console.number(value, 4):>{width}s}' for value, width in (
+            (made.mean_error_percent, 10), (made.median_error_percent, 9), (made.rms_error_percent, 8)))
+        lines.append(f'{name or "(failed)":24s} {made.runs:6d} {made.failed:6d} {" ".join(errors)} '
+                     f'{console.number(made.bias_kg):>9s} {coverage:>22s} '
+                     f'{console.number(made.bound_ratio):>9s} {console.number(made.us_per_sample):>9s}')
     return lines
-
-
-def _short(value: float, digits: int = 3) -> str:
-    return '-' if math.isnan(value) else f'{value:.{digits}g}'
 
 
 if __name__ == '__main__':

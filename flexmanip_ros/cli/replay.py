@@ -197,22 +197,22 @@ def _remark(state: pipeline.State, foreign: int) -> str:
 
     foreign: number of messages of other publishers on the same topic, which are left out without a word.
     """
-    counters, line = state.counters, state.payload
+    counters, events = state.counters, state.payload
     left_out = [f'{count} {why}' for count, why in (
         (counters.missing_signal - foreign, 'without a configured signal'),
         (counters.late_stamp, 'with a stamp older than the one before'),
         (counters.repeated_stamp, 'with the stamp of the one before')) if count]
-    said = [f'of {counters.received} messages {", ".join(left_out)} were left out'] if left_out else []
+    parts = [f'of {counters.received} messages {", ".join(left_out)} were left out'] if left_out else []
     if counters.resets:
-        said.append(f'the stamps jumped back or changed their rate {counters.resets} times; '
-                    'the result is of what came after')
-    if line is not None:
-        said += [f'a {event.kind.value} is announced for after the last sample and was not applied'
-                 for event in line.pending if event in line.latest]
-        if line.late_events:
-            said.append(f'{line.late_events} events arrived more than rewind_time after their stamp; '
+        parts.append(f'the stamps jumped back or changed their rate {counters.resets} times; '
+                    'the result is of the samples after that')
+    if events is not None:
+        parts += [f'a {event.kind.value} has a stamp after the last sample and was not applied'
+                 for event in events.pending if event in events.latest]
+        if events.late_events:
+            parts.append(f'{events.late_events} events arrived more than rewind_time after their stamp; '
                         'they were applied on arrival')
-    return '; '.join(said)
+    return '; '.join(parts)
 
 
 def _report(request: Request, summary: Summary, messages: _Messages, kept: list[Estimate], signals: Signals,

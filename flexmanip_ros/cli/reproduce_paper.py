@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -139,17 +138,13 @@ def _results(cases: Sequence[experiments.Case], seeds: Sequence[int], processes:
 
 def describe(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the summary as lines for people."""
-    said = [f'{"case":40s} {"method":12s} {"4-6 s, %":>9s} {"rms 6 s %":>9s} {"bound %":>9s} '
+    shown = [f'{"case":40s} {"method":12s} {"4-6 s, %":>9s} {"rms 6 s %":>9s} {"bound %":>9s} '
             f'{"covered %":>11s} {"us/sample":>10s}']
     for line in lines:
-        error, rms, least, held, cost = (_short(line[name]) for name in SHOWN)
-        said.append(f'{line["case"]:40s} {line["method"]:12s} {error:>9s} {rms:>9s} {least:>9s} {held:>11s} '
+        error, rms, least, coverage, cost = (console.number(line[name]) for name in SHOWN)
+        shown.append(f'{line["case"]:40s} {line["method"]:12s} {error:>9s} {rms:>9s} {least:>9s} {coverage:>11s} '
                     f'{cost:>10s}')
-    return said
-
-
-def _short(value: float | None) -> str:
-    return '-' if value is None or math.isnan(value) else f'{value:.3g}'
+    return shown
 
 
 if __name__ == '__main__':

@@ -7,18 +7,10 @@ import threading
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from rosbags.interfaces import (
-    Connection,
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 from rosbags.rosbag2.storage_mcap import McapWriter
@@ -59,9 +51,7 @@ class BagWriter:
     def __init__(self, path: str | Path, *, storage: StoragePlugin = StoragePlugin.MCAP,
                  flush_period: float | None = FLUSH_PERIOD) -> None:
         self.path = Path(path)
-        self.messages = 0
         self._types = get_typestore(Stores.ROS2_JAZZY)
-        self._convert = _Conversion(self._types.types)
         self._connections: dict[str, tuple[type, Connection]] = {}
         self._lock = threading.Lock()
         self._flush_period = np.inf if flush_period is None else flush_period
@@ -80,14 +70,12 @@ class BagWriter:
         kind = type(value)
         if kind not in KINDS:
             raise TypeError(f'no message for a {kind.__name__}')
-        message = self._convert(value)
-        data = bytes(self._types.serialize_cdr(message, KINDS[kind]))
+        data = bytes(self._types.serialize_cdr(_message(self._types.types, value), KINDS[kind]))
         with self._lock:
             if not self._open:
                 raise BagError(f"bag '{self.path}' is closed", 'write before closing it')
             try:
                 self._writer.write(self._connection(topic, kind, latched), log_ns, data)
-                self.messages += 1
                 if time.monotonic() - self._flushed > self._flush_period:
                     self._flush()
             except OSError as err:
@@ -141,50 +129,32 @@ class BagWriter:
         self.close()
 
 
-class _Stamp(NamedTuple):
-    sec: int
-    nanosec: int
+def _message(classes: Any, value: Value) -> Any:
+    """Convert a value of this package to a message object of the recording library."""
+    def new(kind: str, *fields: Any) -> Any:
+        return classes[kind](*fields)
 
+    def header(stamp_ns: int, frame_id: str = '') -> Any:
+        return new('std_msgs/msg/Header', new('builtin_interfaces/msg/Time', *divmod(stamp_ns, 10**9)), frame_id)
 
-class _Conversion:
-    """Converts the values of this package to message objects of the recording library."""
-
-    def __init__(self, classes: Any) -> None:
-        self._classes = classes
-
-    def __call__(self, value: Value) -> Any:
-        if isinstance(value, JointRecord):
-            arrays = (np.ascontiguousarray(part, dtype=np.float64)
-                      for part in (value.position, value.velocity, value.effort))
-            header = self._header(value.stamp_ns, '')
-            return self._new('sensor_msgs/msg/JointState', header, list(value.names), *arrays)
-        if isinstance(value, CaptureEvent):
-            return self._header(value.stamp_ns, value.kind.value)
-        if isinstance(value, LabelledArray):
-            dimensions = [self._new('std_msgs/msg/MultiArrayDimension', *item) for item in value.dimensions]
-            layout = self._new('std_msgs/msg/MultiArrayLayout', dimensions, 0)
-            data = np.asarray(value.data, dtype=np.float64)
-            return self._new('std_msgs/msg/Float64MultiArray', layout, data)
-        if isinstance(value, Inertia):
-            com = self._new('geometry_msgs/msg/Vector3', *(float(part) for part in value.com))
-            inner = self._new('geometry_msgs/msg/Inertia', float(value.mass), com,
-                              *(float(part) for part in value.inertia))
-            return self._new('geometry_msgs/msg/InertiaStamped', self._header(value.stamp_ns, value.frame_id), inner)
-        if isinstance(value, Diagnostics):
-            return self._diagnostics(value)
-        return self._new('std_msgs/msg/Float64', float(value))
-
-    def _diagnostics(self, value: Diagnostics) -> Any:
-        statuses = []
-        for status in value.statuses:
-            pairs = [self._new('diagnostic_msgs/msg/KeyValue', key, text) for key, text in status.values]
-            statuses.append(self._new('diagnostic_msgs/msg/DiagnosticStatus', status.level, status.name,
-                                      status.message, status.hardware_id, pairs))
-        return self._new('diagnostic_msgs/msg/DiagnosticArray', self._header(value.stamp_ns, ''), statuses)
-
-    def _header(self, stamp_ns: int, frame_id: str) -> Any:
-        stamp = _Stamp(*divmod(stamp_ns, 1_000_000_000))
-        return self._new('std_msgs/msg/Header', self._new('builtin_interfaces/msg/Time', *stamp), frame_id)
-
-    def _new(self, kind: str, *fields: Any) -> Any:
-        return self._classes[kind](*fields)
+    if isinstance(value, JointRecord):
+        arrays = (np.ascontiguousarray(part, dtype=np.float64)
+                  for part in (value.position, value.velocity, value.effort))
+        return new('sensor_msgs/msg/JointState', header(value.stamp_ns), list(value.names), *arrays)
+    if isinstance(value, CaptureEvent):
+        return header(value.stamp_ns, value.kind.value)
+    if isinstance(value, LabelledArray):
+        dimensions = [new('std_msgs/msg/MultiArrayDimension', *item) for item in value.dimensions]
+        layout = new('std_msgs/msg/MultiArrayLayout', dimensions, 0)
+        return new('std_msgs/msg/Float64MultiArray', layout, np.asarray(value.data, dtype=np.float64))
+    if isinstance(value, Inertia):
+        com = new('geometry_msgs/msg/Vector3', *(float(part) for part in value.com))
+        inertia = new('geometry_msgs/msg/Inertia', float(value.mass), com, *(float(part) for part in value.inertia))
+        return new('geometry_msgs/msg/InertiaStamped', header(value.stamp_ns, value.frame_id), inertia)
+    if isinstance(value, Diagnostics):
+        statuses = [
+            new('diagnostic_msgs/msg/DiagnosticStatus', status.level, status.name, status.message, status.hardware_id,
+                [new('diagnostic_msgs/msg/KeyValue', key, text) for key, text in status.values])
+            for status in value.statuses]
+        return new('diagnostic_msgs/msg/DiagnosticArray', header(value.stamp_ns), statuses)
+    return new('std_msgs/msg/Float64', float(value))

@@ -170,8 +170,8 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
     """
     rows = [estimate for estimate in estimates if estimate.payload is not None]
     time = times(rows, start_ns)
-    held = [estimate.payload for estimate in estimates if estimate.payload is not None]
-    table = np.array([(p.mass, p.lower, p.upper) for p in held], dtype=np.float64).reshape(len(held), 3)
+    payloads = [estimate.payload for estimate in estimates if estimate.payload is not None]
+    table = np.array([(p.mass, p.lower, p.upper) for p in payloads], dtype=np.float64).reshape(-1, 3)
     ax.fill_between(time, table[:, 1], table[:, 2], color=PAYLOAD_COLOUR, alpha=0.25, linewidth=0,
                     label='95 % interval')
     ax.plot(time, table[:, 0], color=PAYLOAD_COLOUR, linewidth=1.5, label='estimate')
@@ -179,7 +179,7 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
         ax.plot([begin, end], [mass, mass], color=TRUTH_COLOUR, linestyle=(0, (4, 3)), linewidth=1.2,
                 label='true' if index == 0 else None)
     limit(ax, table, [mass for _, _, mass in truth[-1:]] if zoom else [0.0, *(mass for _, _, mass in truth)])
-    last = table[-1] if len(held) and np.isfinite(table[-1]).all() else None
+    last = table[-1] if len(payloads) and np.isfinite(table[-1]).all() else None
     if last is not None and not zoom:
         width = max(float(last[2] - last[1]), 1e-6)
         digits = min(max(1 - math.floor(math.log10(width)), 0), 6)  # two significant digits of the interval's width
@@ -235,7 +235,7 @@ def _status_look(status: Status) -> dict[str, Any]:
 class Truth:
     """The true values of a simulation, drawn beside the estimates.
 
-    payload: mass held after a capture [kg]; before, after: frequencies [Hz] without and with it.
+    payload: mass of the object [kg]; before, after: frequencies [Hz] without and with it.
     """
 
     payload: float | None = None
@@ -314,12 +314,12 @@ def _stretches(made: Run) -> tuple[list[Known], list[tuple[float, float, float]]
     frequencies: list[Known] = []
     masses: list[tuple[float, float, float]] = []
     changes = [(time, kind is EventKind.CAPTURE) for time, kind in made.events]
-    for (begin, held), (end, _) in pairwise([(0.0, False), *changes, (made.end, False)]):
-        known = made.truth.after if held else made.truth.before
+    for (begin, is_loaded), (end, _) in pairwise([(0.0, False), *changes, (made.end, False)]):
+        known = made.truth.after if is_loaded else made.truth.before
         if known:
             frequencies.append((begin, end, known))
         if made.truth.payload is not None:
-            masses.append((begin, end, made.truth.payload if held else 0.0))
+            masses.append((begin, end, made.truth.payload if is_loaded else 0.0))
     return frequencies, masses
 
 

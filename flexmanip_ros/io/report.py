@@ -77,8 +77,8 @@ def _result(summary: Summary, outputs: Sequence[str], bound: float | None, fault
     for kind, values in (('simulation', summary.vaf_simulation_percent),
                          ('one-step prediction', summary.vaf_prediction_percent)):
         if values is not None:
-            said = [f'{name} {number(value, 4)} %' for name, value in zip(outputs, values, strict=True)]
-            rows.append((f'variance accounted for, {kind}', ', '.join(said)))
+            shares = [f'{name} {number(value, 4)} %' for name, value in zip(outputs, values, strict=True)]
+            rows.append((f'variance accounted for, {kind}', ', '.join(shares)))
     warning = f'<p class="changed">{escape(fault)}</p>' if fault else ''
     return warning + table(['', ''], rows)
 
@@ -139,10 +139,10 @@ def errors(rows: Sequence[Row]) -> Figure | None:
     values = np.array([[row[name] for name in needed] for row in good], dtype=np.float64)
     true, mass, low, high = values.T
     relative = [100.0 * (part - true) / true for part in (mass, low, high)]
-    held = np.array([bool(row['covered']) for row in good])
+    covered = np.array([bool(row['covered']) for row in good])
     drawn, axes = plots.figure([3.4], share_time=False)
-    for chosen, colour, mark, label in ((held, plots.PAYLOAD_COLOUR, 'o', 'truth inside\nthe 95 % interval'),
-                                        (~held, plots.EVENT_COLOUR, 'x', 'truth outside')):
+    for chosen, colour, mark, label in ((covered, plots.PAYLOAD_COLOUR, 'o', 'truth inside\nthe 95 % interval'),
+                                        (~covered, plots.EVENT_COLOUR, 'x', 'truth outside')):
         if chosen.any():
             axes[0].vlines(true[chosen], relative[1][chosen], relative[2][chosen], color=colour, alpha=0.5)
             axes[0].plot(true[chosen], relative[0][chosen], mark, markersize=4, color=colour, label=label)

@@ -91,7 +91,7 @@ def _rows(case: Case, seed: int, found: dict[str, MethodResult], failed: dict[st
         row: trial.Row = {'case': case.name, 'method': method.name, 'seed': seed, 'error': failed.get(method.name, '')}
         if method.name in found:
             reading = found[method.name]
-            tracks[method.name] = follow(reading.estimates)
+            tracks[method.name] = track_of(reading.estimates)
             row.update(_columns(reading.estimates, tracks[method.name], case))
             row['us_per_sample'] = 1e6 * reading.wall / (experiments.WINDOW[1] * PlantParameters().rate)
         rows.append(row)
@@ -112,12 +112,12 @@ def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[
         now = estimate if estimate is not None else pipeline.current(state)  # the last: at the last sample
         if now is None:
             continue
-        held = (now.stamp_ns - state.first_ns) * 1e-9 >= experiments.CAPTURE_TIME
+        captured = (now.stamp_ns - state.first_ns) * 1e-9 >= experiments.CAPTURE_TIME
         for method in found:
             started = time.perf_counter()
             read = now
             if method in configs:
-                read = (_with_block(configs[method], case, state, now) if held else now._replace(payload=None))
+                read = (_with_block(configs[method], case, state, now) if captured else now._replace(payload=None))
             found[method].estimates.append(read)
             walls[method] += time.perf_counter() - started
     shared = time.perf_counter() - begun - sum(walls.values())
@@ -193,11 +193,11 @@ def _columns(estimates: Sequence[Estimate], track: Track, case: Case) -> trial.R
     true = np.array(true_frequencies(case, case.payload))
     relative = 100.0 * np.abs(track.mass - case.payload) / case.payload
     frequency = 100.0 * np.abs(track.frequencies - true) / true
-    held = (track.lower <= case.payload) & (case.payload <= track.upper)
+    covered = (track.lower <= case.payload) & (case.payload <= track.upper)
     row: trial.Row = {
         'payload_true_kg': case.payload, 'payload_mass_kg': _last(track.mass),
         'payload_lower_kg': _last(track.lower), 'payload_upper_kg': _last(track.upper),
-        'covered': bool(held[-1]) if held.size else None,
+        'covered': bool(covered[-1]) if covered.size else None,
         'error_percent': _mean(relative[inside]), 'status': estimates[-1].status.name if estimates else '',
     }
     for k in range(true.size):
@@ -206,15 +206,15 @@ def _columns(estimates: Sequence[Estimate], track: Track, case: Case) -> trial.R
     return row
 
 
-def follow(estimates: Sequence[Estimate]) -> Track:
+def track_of(estimates: Sequence[Estimate]) -> Track:
     """Return estimates as arrays. Missing values are nan, and so is a mass whose standard deviation is infinite."""
     count = len(estimates)
     table = np.full((count, 3), np.nan)
     frequencies = np.full((count, 2), np.nan)
     for k, estimate in enumerate(estimates):
-        held = estimate.payload
-        if held is not None:
-            table[k] = held.mass if math.isfinite(held.std) else np.nan, held.lower, held.upper
+        payload = estimate.payload
+        if payload is not None:
+            table[k] = payload.mass if math.isfinite(payload.std) else np.nan, payload.lower, payload.upper
         found = [mode.frequency_hz for mode in estimate.modes[:2]]
         frequencies[k, :len(found)] = found
     start = estimates[0].stamp_ns if estimates else 0

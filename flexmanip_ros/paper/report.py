@@ -23,7 +23,7 @@ DEVIATIONS = (
     ('Torque 2 acts on link 2 alone and does no work on bending (section 2.1)',
      'kept here, so that the numbers compare. A motor stands on link 1: the package\'s default is a torque '
      'between the links that bends both (torque_convention: joint)'),
-    ('The plant is linear at a frozen working point', 'kept here, and told to the estimators. The angles '
+    ('The plant is linear at a frozen working point', 'kept here, and known to the estimators. The angles '
      'drift by about 3 deg all the same; on an arm that really moves a frozen point does not hold, and the '
      'package\'s default follows the measured angles (payload.dynamics: nonlinear)'),
     ('Rates stay continuous at the capture', 'kept here. The default shares momentum with the object '
@@ -41,7 +41,7 @@ DEVIATIONS = (
      'by a stiff joint), and the two-link run that all others see'),
     ('Least squares: how accelerations come about is not given', 'angles and torques through critically '
      'damped filters below the vibration; the method waits 1.7 s after the capture, until these hold nothing '
-     'from before, and is told the working point of the linear plant'),
+     'from before, and knows the working point of the linear plant'),
     ('Section 4.3 simulates in a commercial program', 'Hermite beam elements, linear at the same '
      'working point; kappa = 3 in structured, 1 in the blocks, whose interval reaches over other modes'),
     ('Fig. 17: position of the middles', 'their deflection, resolved along X and Y'),
@@ -117,13 +117,13 @@ def _response(case: experiments.Case, numbers: str, tracks: Mapping[str, figures
             response = figures.identified_response(case, track)
             if response is not None:
                 found[method] = response
-    said = [f'{method}: {_worst(response.bends, true.bends)} of the bends, '
+    shown = [f'{method}: {_worst(response.bends, true.bends)} of the bends, '
             f'{_worst(response.angles, true.angles)} of the angles' for method, response in found.items()]
     return Planned(
         numbers, f'test response, {case.title}',
         'the responses of the identified and the original model agree in general.',
          'largest error, first run, in per cent of the largest response: '
-        f'{"; ".join(said) or "no model"}.', figures.test_response, (true, found))
+        f'{"; ".join(shown) or "no model"}.', figures.test_response, (true, found))
 
 
 def _worst(found: Array, true: Array) -> str:
@@ -133,9 +133,9 @@ def _worst(found: Array, true: Array) -> str:
 def _frequency_figure(case: experiments.Case, numbers: str, tracks: Mapping[str, figures.Tracks],
                  rows: Sequence[trial.Row]) -> Planned:
     before, after = (case_run.true_frequencies(case, mass) for mass in (0.0, case.payload))
-    said = [f'{line[1]}: {plain(line[2])} and {plain(line[3])} %' for line in summary.frequency_lines(rows, (case,))]
+    shown = [f'{line[1]}: {plain(line[2])} and {plain(line[3])} %' for line in summary.frequency_lines(rows, (case,))]
     return Planned(numbers, f'frequencies, {case.title}', 'the frequencies drop at the capture and are '
-                   'tracked.', f'mean error of the two, 4 to 6 s: {"; ".join(said)}.{RUNS}',
+                   'tracked.', f'mean error of the two, 4 to 6 s: {"; ".join(shown)}.{RUNS}',
                    figures.frequency_tracks, (tracks[case.name], before, after))
 
 
@@ -222,10 +222,10 @@ def report(path: str | Path, done: Study) -> None:
 def _result(done: Study) -> str:
     rows = []
     for line in summary.summary(done.rows, done.bounds):
-        held = f'{number(line["95 % interval holds [%]"], 3)} ({number(line["from [%]"], 3)} to ' \
+        covered = f'{number(line["95 % interval holds [%]"], 3)} ({number(line["from [%]"], 3)} to ' \
                f'{number(line["to [%]"], 3)})'
         rows.append([line['case'], line['method'], *(_short(line[name]) for name in (
-            'mean error [%]', 'rms error at 6 s [%]', 'bound at 6 s [%]')), held,
+            'mean error [%]', 'rms error at 6 s [%]', 'bound at 6 s [%]')), covered,
             *(_short(line[name]) for name in ('half width [%]', 'time per sample [us]')), line['failed']])
     header = ['case', 'method', 'mean error, 4 to 6 s [%]', 'rms error at 6 s [%]', 'bound at 6 s [%]',
               '95 % interval holds (its own 95 %) [%]', 'half width of it [%]', 'time per sample [us]',
@@ -248,8 +248,8 @@ def _arm() -> str:
     rows = []
     for leaf in leaves(type(arm)):
         value = getattr(arm, leaf.name)
-        said = ', '.join(f'{part:g}' for part in value) if isinstance(value, tuple) else str(value)
-        rows.append((leaf.name, said, leaf.unit, leaf.words))
+        shown = ', '.join(f'{part:g}' for part in value) if isinstance(value, tuple) else str(value)
+        rows.append((leaf.name, shown, leaf.unit, leaf.words))
     return table(['parameter', 'value', 'unit', 'meaning'], rows)
 
 

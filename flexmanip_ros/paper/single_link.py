@@ -48,14 +48,14 @@ def motion(arm: ArmParameters, angle: float, payload: float, duration: float, ca
     torques, angles = np.empty(count), np.empty(count)
     x = np.array([angle, 0.0])
     for k in range(count):
-        held = payload if k >= capture else 0.0
+        mass = payload if k >= capture else 0.0
         if k == capture:  # the object is at rest: momentum is shared
-            x[1] *= inertia(arm, 0.0) / inertia(arm, held)
+            x[1] *= inertia(arm, 0.0) / inertia(arm, mass)
         known = (rho * L / 2 + arm.tip_mass) * GRAVITY * L
-        weight = known + held * GRAVITY * L
+        weight = known + mass * GRAVITY * L
         hold = -STIFFNESS * (x[0] - angle) - DAMPING * x[1]
         torques[k], angles[k] = wave[k] + known * math.cos(angle) + hold, x[0]
-        x = _integrated(x, torques[k], weight, inertia(arm, held))
+        x = _integrated(x, torques[k], weight, inertia(arm, mass))
     return torques, angles
 
 

@@ -134,7 +134,7 @@ def scenario(tree: Any) -> Scenario:
             raise ParameterError(f"a scenario has no '{name}'", f'known are {", ".join(sorted(known))}')
     given = dict(tree)
     if not isinstance(given.get('name', ''), (str, int)):
-        raise ParameterError(f"'name' of a scenario is {given['name']!r:.60}", 'give a word')
+        raise _wrong('name', given['name'], 'give a word')
     if 'name' in given:
         given['name'] = str(given['name'])
     for name in ('plant', 'excitation', 'identifier'):
@@ -151,7 +151,7 @@ def scenario(tree: Any) -> Scenario:
     if 'window' in given:
         given['window'] = _pair('window', given['window'])
     if not isinstance(given.get('bound', True), bool):
-        raise ParameterError(f"'bound' of a scenario is {given['bound']!r:.60}", 'give true or false')
+        raise _wrong('bound', given['bound'], 'give true or false')
     return Scenario(**given)
 
 
@@ -165,9 +165,13 @@ def _faults(tree: Any) -> Faults:
     return Faults(**given)
 
 
+def _wrong(name: str, value: Any, remedy: str) -> ParameterError:
+    return ParameterError(f"'{name}' of a scenario is {value!r:.60}", remedy)
+
+
 def _mapping(name: str, value: Any) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
-        raise ParameterError(f"'{name}' of a scenario is {value!r:.60}", 'list names and values below it')
+        raise _wrong(name, value, 'list names and values below it')
     return value
 
 
@@ -181,13 +185,13 @@ def _flat(name: str, tree: Any, prefix: str = '') -> dict[str, Any]:
 
 def _number(name: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise ParameterError(f"'{name}' of a scenario is {value!r:.60}", 'give a finite number')
+        raise _wrong(name, value, 'give a finite number')
     return float(value)
 
 
 def _pair(name: str, value: Any) -> tuple[float, float]:
     if not isinstance(value, (list, tuple)) or len(value) != 2:
-        raise ParameterError(f"'{name}' of a scenario is {value!r:.60}", 'give [from, to] in seconds')
+        raise _wrong(name, value, 'give [from, to] in seconds')
     return _number(name, value[0]), _number(name, value[1])
 
 

@@ -68,7 +68,7 @@ def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_k
             window: tuple[float, float], *, bound: bool = False, settled: float = 0.0) -> Row:
     """Run the identifier and return the columns of a row.
 
-    true_kg: mass held after a capture; None when unknown. window: from and to [s] of the mean error, at the
+    true_kg: mass of the object [kg]; None when unknown. window: from and to [s] of the mean error, at the
     earliest ``settled`` seconds after the event that made it true; bound: add the least standard deviation
     that the samples after the capture allow.
     """
@@ -89,15 +89,15 @@ def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_k
         for k, value in enumerate(row.pop(kind)):
             row[f'{kind.split("_")[0]}_{k + 1}'] = value
     row.update(payload_lower_kg=low, payload_upper_kg=high, us_per_sample=1e6 * wall / max(state.counters.accepted, 1))
-    held = row['capture_time_s'] is not None and (
+    is_loaded = row['capture_time_s'] is not None and (
         row['release_time_s'] is None or row['release_time_s'] < row['capture_time_s'])
-    true = None if true_kg is None else (true_kg if held else 0.0)
+    true = None if true_kg is None else (true_kg if is_loaded else 0.0)
     row['payload_true_kg'] = true
     row['covered'] = None if true is None or low is None or high is None else bool(low <= true <= high)
-    changed = row['capture_time_s'] if held else row['release_time_s']
+    changed = row['capture_time_s'] if is_loaded else row['release_time_s']
     begin = window[0] if changed is None else max(window[0], changed + settled)
     row['error_percent'] = None if true is None else _window_error(state, estimates, true, (begin, window[1]))
-    if bound and held and config.payload_method != 'none':
+    if bound and is_loaded and config.payload_method != 'none':
         mass = row['payload_mass_kg'] if true is None else true
         row['bound_std_kg'] = _bound(config, items, row['capture_time_s'], mass, state.clock.dt)
     return row

@@ -54,7 +54,7 @@ def test_methods_that_share_an_identifier_get_what_a_pass_of_their_own_gives(nam
     shared = case_run.run(case, 0)[1][name]
     made = experiments.scenario(case, next(known for known in experiments.METHODS if known.name == name))
     run = made.configuration(0, name)
-    own = case_run.follow(list(pipeline.run(run.identifier, trial.messages(made, run, 0))))
+    own = case_run.track_of(list(pipeline.run(run.identifier, trial.messages(made, run, 0))))
     held = own.time >= experiments.CAPTURE_TIME
     np.testing.assert_array_equal(own.mass[held], shared.mass[:-1][held])  # the last: at the last sample
     np.testing.assert_array_equal(own.frequencies, shared.frequencies[:-1])
