@@ -44,14 +44,10 @@ def compile_kernels(where: str) -> None:
     path = os.pathsep.join(part for part in (where, os.environ.get('PYTHONPATH')) if part)
     command = [sys.executable, '-m', f'{NAME}.cli.warm_up']
     try:
-        done = subprocess.run(
-            command, env={**os.environ, 'PYTHONPATH': path}, cwd=where, timeout=600,
-            check=False, capture_output=True, text=True, stdin=subprocess.DEVNULL,
-        )
-        words = done.stdout if done.returncode == 0 else done.stderr
+        subprocess.run(command, env={**os.environ, 'PYTHONPATH': path}, cwd=where, timeout=600, check=False,
+                       stdin=subprocess.DEVNULL)
     except (OSError, subprocess.SubprocessError) as problem:
-        words = str(problem)
-    print(f'{NAME}: compiling the kernels: {words.strip().splitlines()[-1:]}')
+        print(f'{NAME}: the kernels compile at first use: {problem}')
 
 
 class InstallAndCompile(install):

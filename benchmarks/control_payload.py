@@ -17,7 +17,7 @@ import numpy as np
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.control import controller
-from flexmanip_ros.control.gate import PayloadEstimate
+from flexmanip_ros.control.handover import PayloadEstimate
 from flexmanip_ros.parameters import (
     ArmParameters,
     ControllerParameters,

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.arm.acceleration import acceleration
-from flexmanip_ros.arm.equations_of_motion import assemble
+from flexmanip_ros.arm.equations_of_motion import acceleration, assemble
 from flexmanip_ros.arm.link_jacobian import link_jacobian, point_jacobian
 from flexmanip_ros.numerics.compiled import inlined, kernel
 

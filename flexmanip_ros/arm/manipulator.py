@@ -26,8 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.arm import linearization
-from flexmanip_ros.arm.acceleration import acceleration, steepen
-from flexmanip_ros.arm.equations_of_motion import assemble, elastic
+from flexmanip_ros.arm.equations_of_motion import acceleration, assemble, elastic, steepen
 from flexmanip_ros.arm.jacobian import acceleration_jacobian, bias_jacobian
 from flexmanip_ros.arm.shape_functions import link_tables, output_matrix, quartic, rotary
 from flexmanip_ros.errors import ModelError

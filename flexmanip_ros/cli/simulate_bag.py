@@ -79,7 +79,7 @@ def configurations(given: argparse.Namespace) -> tuple[PlantParameters, Excitati
 def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.io.bag_writer import BagWriter
     from flexmanip_ros.io.outputs import check_place, write_text
-    from flexmanip_ros.simulation import excitation, excitation_design, simulator
+    from flexmanip_ros.simulation import excitation, simulator
     from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
     plant, torque = configurations(given)
@@ -106,7 +106,7 @@ def _main(given: argparse.Namespace) -> int:
                 progress(k, count)
     write_text(truth_path, json.dumps(truth(plant, torque, events), indent=1) + '\n')
     if given.expected:
-        print(excitation_design.describe(torque))
+        print(excitation.describe(torque))
     print(f"wrote '{target}' ({count} samples, {given.duration:g} s) and '{truth_path}'")
     return console.SUCCESS
 

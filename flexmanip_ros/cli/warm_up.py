@@ -1,60 +1,46 @@
-"""Run every compiled kernel once, so that the cache on disk is full before the first sample comes.
+"""Compile the kernels: run each once, so that the cache on disk is full before the first sample comes.
 
-Use: ``python -m flexmanip_ros.cli.warm_up`` after an installation into a place that is later read-only, or
-just to have the compiler's minute behind you. `make setup` and `colcon build` do it.
+Use: ``python -m flexmanip_ros.cli.warm_up``. `make setup` and `colcon build` do it. Two processes compile side by side,
+the payload's kernels in one and all others in the other: they share no code but the equations of motion.
 """
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from flexmanip_ros import pipeline
-from flexmanip_ros.identification import validation
-from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
-from flexmanip_ros.payload.capture_detection import with_detected
-from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, StateSpace
-
-Item = JointRecord | CaptureEvent
-
 SAMPLES = 1200
-"""Enough for the refinement of the model to begin."""
+"""Enough for the prediction-error fit to begin."""
 PERIOD_NS = 1_000_000
 
 
-def simulation() -> list[Item]:
-    """Return what the simulated arm sends while it catches and lets go; steps it both ways."""
-    config = PlantParameters()
+def simulator_and_identifier() -> None:
+    """Simulate a capture and a release, and identify the model of it; simulate and predict with a model."""
+    from flexmanip_ros import pipeline
+    from flexmanip_ros.identification import validation
+    from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
+    from flexmanip_ros.simulation import excitation, simulator
+    from flexmanip_ros.types import CaptureEvent, EventKind, StateSpace
+
+    plant = PlantParameters()
     efforts = excitation.sequence(ExcitationParameters(), SAMPLES)
     events = (CaptureEvent(SAMPLES // 3 * PERIOD_NS, EventKind.CAPTURE),
               CaptureEvent(SAMPLES // 3 * 2 * PERIOD_NS, EventKind.RELEASE))
-    gauged = replace(config, model='linear', sensors=replace(config.sensors, strain_cutoff=100.0))
+    gauged = replace(plant, model='linear', sensors=replace(plant.sensors, strain_cutoff=100.0))
     simulator.simulate(gauged, efforts[:3])
-    state = simulator.init(config)
+    state = simulator.init(plant)
     for torques in efforts[:3]:
-        state, _ = simulator.step(config, state, torques)
-    return list(simulator.records(simulator.simulate(config, efforts, events), events))
-
-
-def estimation(method: str, items: list[Item]) -> None:
-    """Run the identifier both ways, sample by sample and in blocks."""
-    config = replace(IdentifierParameters(), payload_method=method)
-    for _ in pipeline.run(config, items):
-        pass
-    state = pipeline.init()
-    for item in items[:40]:
-        state, _ = pipeline.step(config, state, item)
-
-
-def validation_scores() -> None:
-    """Run a made-up model over made-up signals in the three ways that a score needs."""
+        state, _ = simulator.step(plant, state, torques)
+    messages = list(simulator.records(simulator.simulate(plant, efforts, events), events))
+    for method in ('none', 'block'):
+        for _ in pipeline.run(replace(IdentifierParameters(), payload_method=method), messages):
+            pass
     column = np.ones((2, 1))
     model = StateSpace(np.eye(2) * 0.5, column, column.T.copy(), np.zeros((1, 1)), column, 1e-3)
     u, y = np.ones((20, 1)), np.ones((20, 1))
@@ -62,15 +48,25 @@ def validation_scores() -> None:
     validation.predict(model, u, y, validation.state_at_end(model, u, y))
 
 
-def recipes() -> Iterator[tuple[str, Callable[[], object]]]:
-    """Yield the parts in the order in which they are wanted."""
-    made: list[Item] = []
-    yield 'plant', lambda: made.extend(simulation())
-    yield 'identifier', lambda: estimation('none', made)
-    yield 'payload from the blocks', lambda: estimation('block', made)
-    yield 'payload from the dynamics', lambda: estimation('structured', made)
-    yield 'detection', lambda: deque(with_detected(IdentifierParameters(), made), maxlen=0)
-    yield 'validation', validation_scores
+def payload() -> None:
+    """Estimate a payload from small random signals, and look for captures in them."""
+    from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
+    from flexmanip_ros.payload import capture_detection, structured
+    from flexmanip_ros.samples.sample_log import log_of
+    from flexmanip_ros.types import CaptureEvent, EventKind
+
+    signals = 1e-4 * np.random.default_rng(0).standard_normal((SAMPLES, 8))
+    stamps = np.arange(SAMPLES) * PERIOD_NS
+    rows = log_of(signals[:, :2], signals[:, 2:6], signals[:, 6:], stamps).rows(0, SAMPLES)
+    config = IdentifierParameters()
+    state = structured.advance(config, structured.init(config), rows.between(0, SAMPLES // 2))
+    state = structured.event(config, state, CaptureEvent(int(stamps[SAMPLES // 2]), EventKind.CAPTURE))
+    structured.estimate(config, structured.advance(config, state, rows.since(SAMPLES // 2)))
+    trigger = TriggerParameters()
+    capture_detection.advance(trigger, capture_detection.init(trigger), rows)
+
+
+PARTS: dict[str, Callable[[], None]] = {'payload': payload, 'simulator and identifier': simulator_and_identifier}
 
 
 def drop_stale(package: Path) -> int:
@@ -79,25 +75,30 @@ def drop_stale(package: Path) -> int:
     numba looks at the file of a function alone, not at those of the functions it calls.
     """
     newest = max(path.stat().st_mtime_ns for path in package.rglob('*.py')
-                 if '@kernel' in (text := path.read_text(encoding='utf-8')) or '@inlined' in text)
+                 if '@kernel' in (text := path.read_text(encoding='utf-8')) or '@inlined' in text or '@merged' in text)
     stale = [path for path in package.rglob('__pycache__/*.nb[ic]') if path.stat().st_mtime_ns < newest]
     for path in stale:
         path.unlink(missing_ok=True)
     return len(stale)
 
 
-def main() -> int:
-    """Compile what can be compiled. Never an error: what fails here says so again where it is used."""
+def main(argv: list[str] | None = None) -> int:
+    """Compile all parts side by side, or the one that is named. A part that fails is compiled at its first use."""
     begin = time.perf_counter()
+    named = (sys.argv[1:] if argv is None else argv)[:1]
+    if named:
+        PARTS[named[0]]()
+        print(f'  compiled: {named[0]} ({time.perf_counter() - begin:.0f} s)', flush=True)
+        return 0
     try:
         drop_stale(Path(__file__).parents[1])
-    except OSError as problem:  # a place that is read-only has no stale files of its own making
+    except OSError as problem:  # the folder is read-only, and so are its compiled functions
         print(f'compiled functions are left as they are: {problem}', file=sys.stderr)
-    for name, recipe in recipes():
-        try:
-            recipe()
-        except Exception as problem:  # whatever it is, an installation does not fail for it
-            print(f'{name} is not compiled yet: {type(problem).__name__}: {problem}', file=sys.stderr)
+    print(f'compiling {len(PARTS)} parts side by side, about a minute the first time: {", ".join(PARTS)}', flush=True)
+    running = {name: subprocess.Popen([sys.executable, '-m', 'flexmanip_ros.cli.warm_up', name]) for name in PARTS}
+    for name, process in running.items():
+        if process.wait() != 0:  # an installation does not fail for it
+            print(f'{name} is not compiled yet; it is compiled at its first use', file=sys.stderr)
     print(f'kernels ready after {time.perf_counter() - begin:.1f} s')
     return 0
 

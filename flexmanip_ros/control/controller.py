@@ -11,7 +11,7 @@ import numpy as np
 
 from flexmanip_ros.control import path
 from flexmanip_ros.control.feedback import Design, design, observation, reference
-from flexmanip_ros.control.gate import PayloadEstimate, Verdict, judge
+from flexmanip_ros.control.handover import PayloadEstimate, Verdict, judge
 from flexmanip_ros.control.path import Path
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ControllerParameters

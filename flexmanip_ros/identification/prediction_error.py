@@ -190,6 +190,11 @@ class Theta(NamedTuple):
     K: Array
     x: Array
 
+    def matrices(self) -> tuple[Array, Array, Array, Array, Array]:
+        """Return A, B, C, D, K in the one memory order that the kernels are compiled for."""
+        A, B, C, D, K = (np.ascontiguousarray(part) for part in self[:5])
+        return A, B, C, D, K
+
 
 class Structure(NamedTuple):
     """What may vary.
@@ -268,7 +273,7 @@ def run(U: Array, Y: Array, theta: Theta) -> tuple[Array, Array]:
     """Innovation covariance (m, m) over the stretch, and the state (n,) after it."""
     m = Y.shape[1]
     moments, end = np.zeros((m, m)), theta.x.copy()
-    residual_moments(U, Y, *theta[:5], end, moments)
+    residual_moments(U, Y, *theta.matrices(), end, moments)
     covariance = moments / len(U)
     if not np.all(np.isfinite(covariance)):
         return covariance, end
@@ -301,7 +306,7 @@ def derivatives(
     end = theta.x.copy()
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     free = structure.names()
-    linearize(U, Y, *theta[:5], end, whiten, int('A' in free), int('K' in free), int('C' in free),
+    linearize(U, Y, *theta.matrices(), end, whiten, int('A' in free), int('K' in free), int('C' in free),
               int('D' in free), N, g, moments, X)
     return P.T @ N @ P, P.T @ g, moments, X @ P, end
 

@@ -23,7 +23,7 @@ from flexmanip_ros.paper.experiments import Case, Method
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, PlantParameters, configure
 from flexmanip_ros.payload import block_extraction, cramer_rao
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.simulation.noise import std_for_snr
+from flexmanip_ros.simulation.sensors import std_for_snr
 from flexmanip_ros.studies import baselines, trial
 from flexmanip_ros.studies.scenario import Run, Scenario
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointRecord, StateSpace, Status

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.arm.acceleration import solve
+from flexmanip_ros.arm.equations_of_motion import solve
 from flexmanip_ros.numerics.compiled import kernel
 from flexmanip_ros.numerics.square_root import factor_information, forward
 from flexmanip_ros.payload.filter_state import EFFECTIVE

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.numerics.compiled import inlined, kernel
+from flexmanip_ros.numerics.compiled import inlined, kernel, merged
 from flexmanip_ros.numerics.square_root import absorb_noise, backward, factor_information, forward, project
 from flexmanip_ros.payload.filter_state import (
     EFFECTIVE,
@@ -44,7 +44,7 @@ FIRST_PASS = 8
 """Samples after an event before the first refit."""
 
 
-@kernel
+@merged
 def begin_pass(m: Memory) -> None:
     """Start a refit at the event, from the best trajectory known."""
     nx = m.x.size
@@ -59,7 +59,7 @@ def begin_pass(m: Memory) -> None:
     m.counts[PASSING] = 1
 
 
-@kernel
+@merged
 def pass_sample(motion: Motion, sensors: Sensors, m: Memory, table: Array) -> bool:
     """Take one sample since the event into the refit; False when numbers left the finite range.
 
@@ -91,7 +91,7 @@ def pass_sample(motion: Motion, sensors: Sensors, m: Memory, table: Array) -> bo
     return True
 
 
-@kernel
+@merged
 def finish_pass(m: Memory) -> bool:
     """Step to the minimum, and hand state and spread at the last sample to the filter."""
     nx = m.x.size
@@ -122,7 +122,7 @@ def finish_pass(m: Memory) -> bool:
     return True
 
 
-@kernel
+@merged
 def refit(motion: Motion, sensors: Sensors, m: Memory, table: Array) -> bool:
     """Note how a sample is corrected, and let the refit behind the filter take up to three."""
     stored = m.counts[STORED]
@@ -162,7 +162,7 @@ def diffuse(sensors: Sensors, m: Memory, duration: float) -> None:
     m.score[NOW] = 0.0
 
 
-@kernel
+@merged
 def take(motion: Motion, sensors: Sensors, m: Memory, table: Array, k: int) -> bool:
     """Take the sample in row k of the table; False when numbers left the finite range.
 

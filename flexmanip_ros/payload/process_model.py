@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.arm.acceleration import acceleration, factor, solve
+from flexmanip_ros.arm.equations_of_motion import acceleration, factor, solve
 from flexmanip_ros.arm.jacobian import acceleration_jacobian
-from flexmanip_ros.numerics.compiled import inlined, kernel
+from flexmanip_ros.numerics.compiled import inlined, kernel, merged
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def payload_mass(motion: Motion, state: float, held: bool) -> float:
     return max(state, motion.least)
 
 
-@inlined
+@merged
 def set_parameters(motion: Motion, x: Array, held: bool) -> None:
     """Write payload, stiffness and damping of the state into the arm."""
     n = motion.q.size
@@ -181,7 +181,7 @@ def predict(motion: Motion, x: Array, S: Array, effort: Array, duration: float, 
     return True
 
 
-@inlined
+@merged
 def exponential_step(motion: Motion, x: Array, effort: Array, h: float, held: bool) -> bool:
     """Advance x by h, exactly where the motion is linear; leaves the linearisation at the start in motion.
 
@@ -220,7 +220,7 @@ def exponential_step(motion: Motion, x: Array, effort: Array, h: float, held: bo
     return largest < 1e6
 
 
-@inlined
+@merged
 def series(motion: Motion, h: float, first: int, scale: float) -> None:
     """Fill total with scale x phi_first(h F) v, F the linearisation, phi_l(z) = sum of z^j / (j + l)!.
 
@@ -245,7 +245,7 @@ def series(motion: Motion, h: float, first: int, scale: float) -> None:
                 total[part, i] += scale * following[part, i]
 
 
-@inlined
+@merged
 def spread(motion: Motion, S: Array, h: float) -> None:
     """S <- F S, F the Taylor series of the linearised flow over h."""
     n = motion.q.size

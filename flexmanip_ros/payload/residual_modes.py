@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from flexmanip_ros.arm import linearization
-from flexmanip_ros.arm.acceleration import solve
+from flexmanip_ros.arm.equations_of_motion import solve
 from flexmanip_ros.arm.shape_functions import output_matrix
 from flexmanip_ros.numerics.compiled import inlined
 from flexmanip_ros.parameters import ArmParameters

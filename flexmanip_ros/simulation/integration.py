@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.arm.acceleration import acceleration, hold
+from flexmanip_ros.arm.equations_of_motion import acceleration, hold
 from flexmanip_ros.arm.outputs import end_loads, measure, shake
 from flexmanip_ros.numerics.compiled import kernel
 

@@ -16,8 +16,7 @@ from scipy.linalg import cho_factor, cho_solve, eigvals
 from flexmanip_ros.arm import manipulator as arm_dynamics
 from flexmanip_ros.arm.capture import body_jacobian, free_object, joined
 from flexmanip_ros.arm.outputs import end_loads
-from flexmanip_ros.arm.residual_modes import slopes_with_tail
-from flexmanip_ros.arm.slope_correction import slopes
+from flexmanip_ros.arm.shape_functions import slopes, slopes_with_tail
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.simulation.finite_elements import finite_element_model

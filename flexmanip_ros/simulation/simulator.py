@@ -16,7 +16,7 @@ import numpy as np
 from flexmanip_ros.arm.capture import Body, free_object, joined, rates_after
 from flexmanip_ros.errors import ModelError, SignalError
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, SensorParameters
-from flexmanip_ros.simulation import excitation, models, noise, sensors
+from flexmanip_ros.simulation import excitation, models, sensors
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointRecord
 
 JOINT_NAMES = ('joint1', 'joint2', 'link1_bend', 'link2_bend')
@@ -75,7 +75,7 @@ def init(config: PlantParameters, start_ns: int = 0, noise_std: Array | None = N
     return PlantState(
         model=model, start_ns=start_ns, index=0, x=model.rest(), payload=np.zeros(4), memory=model.memory(),
         noise_std=_levels(config) if noise_std is None else np.array(noise_std, dtype=np.float64),
-        noise_block=noise.block(config.seed, 0), noise_number=0, gauges=np.zeros((2, 2)),
+        noise_block=sensors.block(config.seed, 0), noise_number=0, gauges=np.zeros((2, 2)),
         commands=np.zeros((config.actuators.command_delay, 2)),
         reported=np.zeros((config.arm.effort_delay, 2)))
 
@@ -95,10 +95,10 @@ def step(
     """
     efforts = _checked(np.asarray(efforts, dtype=np.float64).reshape(1, -1))
     now = stamp(config, state)
-    number = state.index // noise.BLOCK
+    number = state.index // sensors.BLOCK
     if number != state.noise_number:
-        state = replace(state, noise_block=noise.block(config.seed, number), noise_number=number)
-    drawn = state.noise_block[state.index % noise.BLOCK][None]
+        state = replace(state, noise_block=sensors.block(config.seed, number), noise_number=number)
+    drawn = state.noise_block[state.index % sensors.BLOCK][None]
     state, position, velocity, effort = _advance(config, state, efforts)
     if not sensors.arrives(config, drawn)[0]:
         return state, None
@@ -154,8 +154,8 @@ def simulate(
             rows[first:end] = np.hstack(parts)
             first = end
     position, velocity, effort = rows[:, :4].copy(), rows[:, 4:8].copy(), rows[:, 8:].copy()
-    levels = noise.std_for_snr(position, velocity, config.snr_db) if own_levels else state.noise_std
-    drawn = noise.normal(config.seed, 0, count)
+    levels = sensors.std_for_snr(position, velocity, config.snr_db) if own_levels else state.noise_std
+    drawn = sensors.normal(config.seed, 0, count)
     sensors.read(config, position, velocity, levels, drawn)
     kept = sensors.arrives(config, drawn)
     stamps = stamps + sensors.jitter_ns(config, drawn)
@@ -221,7 +221,7 @@ def _levels(config: PlantParameters) -> Array:
     efforts = excitation.sequence(waves, round(REHEARSAL_TIME * config.rate))
     half = round(round(len(efforts) / 2) * 1e9 / config.rate)
     run = simulate(quiet, efforts, (CaptureEvent(half, EventKind.CAPTURE),))
-    return noise.std_for_snr(run.position, run.velocity, config.snr_db)
+    return sensors.std_for_snr(run.position, run.velocity, config.snr_db)
 
 
 def _checked(efforts: Array) -> Array:

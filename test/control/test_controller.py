@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flexmanip_ros.control import controller
-from flexmanip_ros.control.gate import PayloadEstimate, Verdict, judge
+from flexmanip_ros.control.handover import PayloadEstimate, Verdict, judge
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import ArmParameters, ControllerParameters, PlantParameters, configure
 from flexmanip_ros.simulation import simulator

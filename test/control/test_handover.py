@@ -5,7 +5,7 @@ import math
 import pytest
 
 from flexmanip_ros.control import handover
-from flexmanip_ros.control.gate import PayloadEstimate
+from flexmanip_ros.control.handover import PayloadEstimate
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import AdapterParameters
 

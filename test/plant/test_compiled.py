@@ -14,7 +14,7 @@ def test_caches_older_than_a_kernel_are_dropped(tmp_path: Path) -> None:
     kernel, other = tmp_path / 'plant' / 'kernels.py', tmp_path / 'plant' / 'simulator.py'
     old, young = cache / 'a.nbi', cache / 'b.nbc'
     for path, age in ((kernel, 200), (other, 400), (old, 100), (young, 300)):
-        path.touch()
+        path.write_text('@kernel' if path == kernel else '')
         os.utime(path, (age, age))
     assert drop_stale(tmp_path) == 1
     assert not old.exists()

@@ -9,7 +9,7 @@ import pytest
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters
-from flexmanip_ros.simulation import excitation, excitation_design, simulator
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 CONFIG = ExcitationParameters(design_time=2.0, arm=ArmParameters(modes=1, damping_ratio=0.003))
@@ -22,7 +22,7 @@ def test_the_arm_turns_just_less_than_allowed(shape: str, angle: float) -> None:
     peak = excitation.amplitude(config)
     assert peak[0] / peak[1] == pytest.approx(2.0)
     fitted = replace(config, allowed_angle=0.0, amplitude=peak)
-    turned = excitation_design.motion(fitted, excitation_design.plant_of(config))
+    turned = excitation.motion(fitted, excitation.plant_of(config))
     assert 0.96 * angle < turned <= angle
     assert np.array_equal(excitation.sequence(config, 100), excitation.sequence(fitted, 100))
     assert np.array_equal(excitation.torque(config, 7), excitation.sequence(config, 8)[7])
@@ -36,16 +36,16 @@ def test_an_allowed_angle_needs_a_torque() -> None:
 
 
 def test_promised_accuracy_shrinks_with_time_and_grows_with_noise() -> None:
-    std = excitation_design.expected_std(CONFIG)
+    std = excitation.expected_std(CONFIG)
     assert std[0.25] > std[1.0] > 0
     assert 3.0 not in std
-    louder = excitation_design.expected_std(replace(CONFIG, snr_db=20.0))
+    louder = excitation.expected_std(replace(CONFIG, snr_db=20.0))
     assert louder[1.0] == pytest.approx(10 * std[1.0], rel=1e-9)
 
 
 def test_promised_accuracy_follows_the_sensitivity_to_the_payload() -> None:
     """With the state known the bound is the inverse norm of the sensitivity; unknown state can only cost."""
-    plant = replace(excitation_design.plant_of(CONFIG), arm=CONFIG.arm)
+    plant = replace(excitation.plant_of(CONFIG), arm=CONFIG.arm)
     efforts = excitation.sequence(CONFIG, 2000)
     event = (CaptureEvent(1_000_000_000, EventKind.CAPTURE),)
     quiet = replace(plant, capture_impact='continuous')
@@ -55,17 +55,17 @@ def test_promised_accuracy_follows_the_sensitivity_to_the_payload() -> None:
     std = signals[1].std(axis=0) * 0.01
     slope = (signals[2] - signals[0]) / 0.02 / std
     known_state = 1 / np.sqrt(np.sum(slope**2))
-    expected = excitation_design.expected_std(CONFIG)[1.0]
+    expected = excitation.expected_std(CONFIG)[1.0]
     assert known_state < expected < 100 * known_state
 
 
 def test_the_announcement_names_motion_and_accuracy() -> None:
-    words = excitation_design.describe(replace(CONFIG, shape='chirp', allowed_angle=0.02))
+    words = excitation.describe(replace(CONFIG, shape='chirp', allowed_angle=0.02))
     assert 'chirp' in words
     assert '1.1 deg' in words
     assert 'kg in 1 s' in words
 
 
 def test_a_torque_that_tells_nothing_promises_nothing() -> None:
-    std = excitation_design.expected_std(replace(CONFIG, shape='zero'))
+    std = excitation.expected_std(replace(CONFIG, shape='zero'))
     assert all(np.isinf(value) for value in std.values())

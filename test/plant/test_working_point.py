@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexmanip_ros.arm import linearization, manipulator, working_point
+from flexmanip_ros.arm import linearization, manipulator
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
@@ -25,7 +25,7 @@ def moving() -> tuple[Array, Array]:
 
 def test_state_space_is_the_derivative_of_the_motion() -> None:
     q, qd = moving()
-    A, B = working_point.linearize(ARM, PAYLOAD, q, qd, TAU).state_space()
+    A, B = linearization.linearize(ARM, PAYLOAD, q, qd, TAU).state_space()
     h = 1e-5
 
     def motion(x: Array, tau: Array) -> Array:
@@ -41,7 +41,7 @@ def test_state_space_is_the_derivative_of_the_motion() -> None:
 
 def test_each_term_is_the_derivative_it_names() -> None:
     q, qd = moving()
-    point = working_point.linearize(ARM, PAYLOAD, q, qd, TAU)
+    point = linearization.linearize(ARM, PAYLOAD, q, qd, TAU)
     h = 1e-6
     for c, e in enumerate(np.eye(6)):
         def slope(f: object, e: Array = e) -> Array:
@@ -57,8 +57,8 @@ def test_each_term_is_the_derivative_it_names() -> None:
 
 def test_at_rest_without_bending_it_is_the_papers() -> None:
     q = np.concatenate([np.radians([60.0, 45.0]), np.zeros(4)])
-    full = working_point.linearize(ARM, PAYLOAD, q, np.zeros(6), np.zeros(2))
-    simple = working_point.linearize(ARM, PAYLOAD, q, np.zeros(6), np.zeros(2), simplified=True)
+    full = linearization.linearize(ARM, PAYLOAD, q, np.zeros(6), np.zeros(2))
+    simple = linearization.linearize(ARM, PAYLOAD, q, np.zeros(6), np.zeros(2), simplified=True)
     for a, b in zip(full.state_space(), simple.state_space(), strict=True):
         assert np.allclose(a, b, atol=1e-9)
 
@@ -66,7 +66,7 @@ def test_at_rest_without_bending_it_is_the_papers() -> None:
 def test_the_simplified_form_has_the_blocks_vibration_model_inside() -> None:
     point = manipulator.payload_array(20.0)
     q = np.concatenate([np.radians([60.0, 45.0]), np.full(4, 0.01)])
-    A, _ = working_point.linearize(ARM, point, q, np.ones(6), TAU, simplified=True).state_space()
+    A, _ = linearization.linearize(ARM, point, q, np.ones(6), TAU, simplified=True).state_space()
     Ac, _ = linearization.vibration_model(PARAMETERS, q[:2], 20.0)
     assert np.allclose(A[8:][:, [2, 3, 4, 5, 8, 9, 10, 11]], Ac[4:], atol=1e-8)
 
@@ -74,12 +74,12 @@ def test_the_simplified_form_has_the_blocks_vibration_model_inside() -> None:
 def test_motion_changes_the_frequencies_which_the_paper_drops() -> None:
     q = np.concatenate([np.radians([60.0, 45.0]), np.zeros(4)])
     fast = np.array([2.0, 2.0, 0, 0, 0, 0])  # turning as one, 2 rad/s
-    full = working_point.linearize(ARM, PAYLOAD, q, fast, np.zeros(2)).state_space()[0]
-    simple = working_point.linearize(ARM, PAYLOAD, q, fast, np.zeros(2), simplified=True).state_space()[0]
+    full = linearization.linearize(ARM, PAYLOAD, q, fast, np.zeros(2)).state_space()[0]
+    simple = linearization.linearize(ARM, PAYLOAD, q, fast, np.zeros(2), simplified=True).state_space()[0]
     a, b = (linearization.frequencies(matrix)[-4:] for matrix in (full, simple))
     assert not np.allclose(a, b, rtol=1e-4)
 
 
 def test_a_working_point_of_the_wrong_size_is_refused() -> None:
     with pytest.raises(ModelError, match='working point'):
-        working_point.linearize(ARM, PAYLOAD, np.zeros(4), np.zeros(6), TAU)
+        linearization.linearize(ARM, PAYLOAD, np.zeros(4), np.zeros(6), TAU)

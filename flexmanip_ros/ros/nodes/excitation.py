@@ -23,7 +23,7 @@ from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import doubles
 from flexmanip_ros.ros.diagnostics import WARN, Meter, Report
 from flexmanip_ros.ros.node import FlexmanipNode, SampleGrid, run
-from flexmanip_ros.simulation import excitation, excitation_design
+from flexmanip_ros.simulation import excitation
 from flexmanip_ros.types import Array
 
 NAME = 'excitation'
@@ -54,7 +54,7 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
         """Compute one sample, so that the first one is not late; log the payload accuracy that a design will reach."""
         excitation.torque(self.config, 0)
         if self.config.allowed_angle or self.config.shape in ('multisine', 'prbs', 'chirp'):
-            self.get_logger().info(excitation_design.describe(self.config))
+            self.get_logger().info(excitation.describe(self.config))
 
     def summary(self) -> str:
         """Say which torque it is."""

@@ -24,7 +24,7 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros.control import handover
-from flexmanip_ros.control.gate import PayloadEstimate
+from flexmanip_ros.control.handover import PayloadEstimate
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import AdapterParameters
 from flexmanip_ros.ros import qos

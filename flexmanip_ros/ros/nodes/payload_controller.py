@@ -23,7 +23,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros.control import controller
-from flexmanip_ros.control.gate import PayloadEstimate, Verdict
+from flexmanip_ros.control.handover import PayloadEstimate, Verdict
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.parameters import ControllerParameters
 from flexmanip_ros.ros import qos
