@@ -58,6 +58,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             leaf.name: getattr(options, leaf.name) for leaf in leaves(DemoParameters)})
         folder = new_folder(Path(options.output))
         _init([arguments[0], *node_arguments(config), *arguments[1:]], console)
+    except KeyboardInterrupt:
+        return INTERRUPTED
     except OSError as error:
         return _reject(f"'{options.output}' cannot be written: {error.strerror}; give another folder", BAD_INPUT)
     except Exception as error:  # rcl raises types of its C extension for --ros-args and parameter files
