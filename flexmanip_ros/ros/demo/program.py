@@ -293,7 +293,7 @@ def _table(config: DemoParameters, estimates: Sequence[Estimate], items: Sequenc
     held = [e.payload for e in estimates if e.payload is not None]
     if held and truth.payload is not None:
         last, true = held[-1], 0.0 if config.release_time >= 0.0 else truth.payload
-        table.add_row('payload [kg]', f'{last.mass:.3f}', f'{last.lower:.3f} .. {last.upper:.3f}', f'{true:.3f}')
+        table.add_row('payload \\[kg]', f'{last.mass:.3f}', f'{last.lower:.3f} .. {last.upper:.3f}', f'{true:.3f}')
         table.add_row('residual power / noise', f'{last.consistency:.2f}', '', '1')
         table.add_row('status', last.status.value, '', '')
     return table
