@@ -30,14 +30,9 @@ def stamp_ns(stamp: Time) -> int:
     return int(stamp.sec) * SECOND + int(stamp.nanosec)
 
 
-def clamped(nanoseconds: int) -> tuple[int, int]:
-    """Return seconds and nanoseconds of the nearest stamp there is; in their range before 1970 too."""
-    return divmod(min(max(nanoseconds, FIRST_NS), LAST_NS), SECOND)
-
-
 def time_message(nanoseconds: int) -> Time:
     """Return nanoseconds as a stamp, the nearest there is."""
-    sec, nanosec = clamped(nanoseconds)
+    sec, nanosec = divmod(min(max(nanoseconds, FIRST_NS), LAST_NS), SECOND)
     return Time(sec=sec, nanosec=nanosec)
 
 

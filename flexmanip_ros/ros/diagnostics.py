@@ -159,7 +159,7 @@ class LossCounter:
 
 ADVICE = {
     Status.WARMING_UP: 'move the arm; the first estimates take some tenths of a second',
-    Status.TRACKING: 'nothing to do',
+    Status.TRACKING: 'the estimates can be used',
     Status.POORLY_EXCITED: 'move the arm, or raise the torque (node excitation)',
     Status.ILL_CONDITIONED: 'lower order or past_window',
     Status.ORDER_TOO_LOW: 'raise order (suggested_order in /diagnostics)',

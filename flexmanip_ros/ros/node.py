@@ -65,7 +65,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         """Events of the middleware, by topic: missed deadlines, incompatible publishers, ..."""
         self._entities_made = False
         self._logged_at: dict[str, float] = {}
-        self._waited_for: str | None = None
+        self._waits_for = ''
         try:
             self.autostarts = bool(self.declare_parameter(
                 'autostart', True, ParameterDescriptor(
@@ -157,7 +157,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
 
     def _activate(self) -> None:
         self.activated()
-        self.active, self._waited_for = True, None
+        self.active, self._waits_for = True, ''
         self.get_logger().info(f'ready: {self.summary()}' if self.summary() else 'ready')
 
     def _deactivate(self) -> None:
@@ -240,8 +240,8 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
             report.worse(ERROR, 'another node has the same name; stop one, or rename it with __node')
         if not self.active:
             report.words.insert(0, 'not active')
-        elif report.waits_for != self._waited_for and 'rate_hz' in report.values:
-            self._waited_for = report.waits_for
+        elif report.waits_for != self._waits_for:
+            self._waits_for = report.waits_for
             self.get_logger().info(
                 f'waiting for {self.resolve_topic_name(report.waits_for)}' if report.waits_for
                 else f'messages arrive: {report.values["rate_hz"]:.0f} a second')

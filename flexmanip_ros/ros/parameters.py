@@ -148,10 +148,13 @@ def arm_line(node: Any) -> str:
     arm = getattr(node.config, 'arm', None)
     if arm is None:
         return ''
-    given = sorted(name for name in parameter_overrides(node) if name.startswith('arm.'))
+    given = any(name.startswith('arm.') for name in parameter_overrides(node))
+    defaults = flatten(type(arm)())
+    changed = [f'arm.{name}' for name, value in flatten(arm).items() if value != defaults[name]]
     files = [path for option, path in pairwise(sys.argv) if option == '--params-file']
     if given:
-        origin = f'set at start: {", ".join(given)}' + (f' (parameter files: {", ".join(files)})' if files else '')
+        origin = f'set at start: {", ".join(changed) or "the defaults"}'
+        origin += f' (parameter files: {", ".join(files)})' if files else ''
     elif files:
         origin = (f'all defaults: {", ".join(files)} sets no parameter arm.* of {node.get_fully_qualified_name()} '
                   '(write the section /**, or the name of the node)')

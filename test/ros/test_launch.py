@@ -104,6 +104,12 @@ def test_every_argument_is_declared_described_and_used(described: list[Any]) -> 
 
 
 @pytest.mark.parametrize('described', FILES, indirect=True, ids=lambda path: path.name)
+def test_what_the_nodes_log_is_seen_on_the_terminal(described: list[Any]) -> None:
+    """The payload is logged when it is first trusted."""
+    assert {item.kwargs['output'] for item in described if isinstance(item, Node)} == {'screen'}
+
+
+@pytest.mark.parametrize('described', FILES, indirect=True, ids=lambda path: path.name)
 def test_the_identifier_alone_may_be_started_behind_another_command(described: list[Any]) -> None:
     prefixed = [item.kwargs['executable'] for item in described if isinstance(item, Node) and 'prefix' in item.kwargs]
     (default,) = [item.kwargs['default_value'] for item in described

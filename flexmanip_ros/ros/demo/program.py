@@ -58,6 +58,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             leaf.name: getattr(options, leaf.name) for leaf in leaves(DemoParameters)})
         folder = new_folder(Path(options.output))
         _init([arguments[0], *node_arguments(config), *arguments[1:]], console)
+    except KeyboardInterrupt:
+        return INTERRUPTED
     except OSError as error:
         return _reject(f"'{options.output}' cannot be written: {error.strerror}; give another folder", BAD_INPUT)
     except Exception as error:  # rcl raises types of its C extension for --ros-args and parameter files
@@ -291,7 +293,7 @@ def _table(config: DemoParameters, estimates: Sequence[Estimate], items: Sequenc
     held = [e.payload for e in estimates if e.payload is not None]
     if held and truth.payload is not None:
         last, true = held[-1], 0.0 if config.release_time >= 0.0 else truth.payload
-        table.add_row('payload [kg]', f'{last.mass:.3f}', f'{last.lower:.3f} .. {last.upper:.3f}', f'{true:.3f}')
+        table.add_row('payload \\[kg]', f'{last.mass:.3f}', f'{last.lower:.3f} .. {last.upper:.3f}', f'{true:.3f}')
         table.add_row('residual power / noise', f'{last.consistency:.2f}', '', '1')
         table.add_row('status', last.status.value, '', '')
     return table

@@ -118,7 +118,8 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         """Say how events are found."""
         config = self.config
         if config.mode == 'time':
-            return f'mode time, capture after {config.capture_time:g} s, release after {config.release_time:g} s'
+            plan = (('capture', config.capture_time), ('release', config.release_time))
+            return 'mode time' + ''.join(f', {name} after {seconds:g} s' for name, seconds in plan if seconds >= 0.0)
         return f'mode {config.mode}' + (f', signals {", ".join(config.outputs)}' if config.mode == 'auto' else '')
 
     def activated(self) -> None:

@@ -172,7 +172,9 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def _publish(self, estimates: tuple[Estimate, ...]) -> None:
         """Publish what is new in each estimate."""
-        for estimate in estimates if self.context.ok() else ():  # a context that has ended publishes nothing
+        for estimate in estimates:
+            if not self.context.ok():  # a context that has ended publishes nothing
+                return
             values = messages.outgoing_payload(estimate.payload, estimate.stamp_ns, self.config.payload_frame)
             for name, value in (*(values if estimate.payload_is_new else ()), *messages.outgoing_model(estimate)):
                 self.outputs[name].publish(to_message(value))
