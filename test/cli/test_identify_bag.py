@@ -212,7 +212,7 @@ def test_faulty_messages_are_left_out_counted_and_reported(capsys, tmp_path):
     assert json.loads(out)['samples'] == 598
 
 
-def test_a_recording_of_nothing_but_nan_is_refused(capsys, tmp_path):
+def test_a_recording_of_nothing_but_nan_is_rejected(capsys, tmp_path):
     records = _oscillator(50)
     for record in records:
         record.effort[:] = np.nan
