@@ -61,6 +61,19 @@ def parser(prog: str, words: str, epilog: str) -> Parser:
                   formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
+def add_parameters(made: Parser, owner: str, note: str = '') -> None:
+    """Add --params and --set. owner: whose parameters they are; note: what else --set can name."""
+    made.add_argument('--params', metavar='FILE.yaml', help=f'ROS parameter file with the parameters of {owner}')
+    made.add_argument('--set', metavar='name=value', action='append', default=[],
+                      help=f'set one parameter{note}; the value is YAML; may be repeated')
+
+
+def add_workers(made: Parser) -> None:
+    """Add --workers: a count, or None for one per core."""
+    made.add_argument('--workers', type=whole, metavar='N',
+                      help='number of processes; default: one per core; 0: this process alone')
+
+
 @contextmanager
 def progress(words: str, unit: str) -> Iterator[Report]:
     """Show a bar on stderr when that is a terminal; otherwise nothing."""

@@ -35,24 +35,25 @@ parameters (in --params under rpbsid_identifier or /**, or with --set):
 
 def _parser() -> console.Parser:
     made = console.parser(
-        PROG, 'Identify a flexible arm and its payload from a rosbag2 recording. No ROS needs to run.',
+        PROG, 'Identify a flexible arm and its payload from a rosbag2 recording. ROS need not run.',
         EXAMPLES + help_text(IdentifierParameters))
     add = made.add_argument
     add('bag', metavar='BAG', help='rosbag2 directory, or the .mcap or .db3 file itself')
-    add('--params', metavar='FILE.yaml', help='ROS parameter file for rpbsid_identifier')
-    add('--set', metavar='name=value', action='append', default=[], help='override one parameter (YAML value)')
+    console.add_parameters(made, 'rpbsid_identifier')
     add('--validate-from', metavar='SECONDS', type=console.seconds,
-        help='identify before this time from the first stamp, score the model on the rest')
-    add('--output', metavar='OUT', help='estimates: .csv or .npz a table, anything else a rosbag2 recording')
-    add('--report', metavar='REPORT.html', help='one page with pictures and tables')
-    add('--json', action='store_true', help='print the result as JSON, the last line of stdout')
-    add('--joint-states', metavar='TOPIC', default='joint_states', help='default: joint_states, in any namespace')
+        help='identify on the samples before this time [s] from the first stamp; score the model on the rest')
+    add('--output', metavar='OUT',
+        help='write the estimates: a table where the name ends in .csv or .npz, else a rosbag2 recording')
+    add('--report', metavar='REPORT.html', help='write a report: one HTML page with figures and tables')
+    add('--json', action='store_true', help='print the result as JSON in the last line of stdout')
+    add('--joint-states', metavar='TOPIC', default='joint_states',
+        help='topic of the joint states; default: joint_states, in any namespace')
     add('--capture-event', metavar='TOPIC', action='append',
-        help='default: capture_event and capture_detected beside the joint states')
-    add('--detect', action='store_true', help='find captures and releases in the signals')
+        help='topic of events; may be repeated; default: capture_event and capture_detected beside joint_states')
+    add('--detect', action='store_true', help='detect captures and releases from the signals')
     for kind in ('capture', 'release'):
         add(f'--{kind}-time', metavar='SECONDS', type=console.seconds,
-            help=f'add a {kind} at this time from the first stamp')
+            help=f'add a {kind} at this time [s], counted from the first stamp')
     return made
 
 

@@ -38,16 +38,14 @@ def _parser() -> console.Parser:
     made = console.parser(
         PROG, 'Run a scenario with many seeds, or identify every recording in a folder; one row per run.', EXAMPLES)
     add = made.add_argument
-    add('source', metavar='SCENARIO.yaml|FOLDER', help='what to repeat, or where the recordings are')
-    add('--runs', type=int, default=100, metavar='N', help='seeds FIRST .. FIRST+N-1 of the scenario (default 100)')
-    add('--first-seed', type=console.whole, default=0, metavar='FIRST', help='default: 0')
-    add('--output', default='study.csv', metavar='TABLE', help='.csv or .parquet (default study.csv)')
-    add('--report', metavar='REPORT.html', help='one page with scores and pictures')
-    add('--workers', type=console.whole, metavar='N', help='processes; default: one per core; 0: this one only')
-    add('--scheduler', metavar='ADDRESS', help='send the runs to this Dask cluster instead')
-    add('--params', metavar='FILE.yaml', help='parameter file of the identifier, for recordings')
-    add('--set', metavar='name=value', action='append', default=[],
-        help='parameter of the identifier, over whatever the scenario or file says')
+    add('source', metavar='SCENARIO.yaml|FOLDER', help='scenario to repeat, or folder with recordings')
+    add('--runs', type=int, default=100, metavar='N', help='run the seeds FIRST .. FIRST+N-1; default: 100')
+    add('--first-seed', type=console.whole, default=0, metavar='FIRST', help='first seed; default: 0')
+    add('--output', default='study.csv', metavar='TABLE', help='table to write, .csv or .parquet; default: study.csv')
+    add('--report', metavar='REPORT.html', help='write a report: one HTML page with scores and figures')
+    console.add_workers(made)
+    add('--scheduler', metavar='ADDRESS', help='run on the Dask cluster with this scheduler instead')
+    console.add_parameters(made, 'the identifier, for recordings', ' of the identifier, also over a scenario')
     return made
 
 

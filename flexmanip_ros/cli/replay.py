@@ -73,17 +73,20 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
             raise ParameterError(f"--output and --report are both '{request.report}'", 'give two names')
     messages = _Messages(request, progress)
     kept: list[Estimate] = []
-    state = pipeline.init()
+    state, interrupted = pipeline.init(), False
     output = None if request.output is None else open_output(request.output, request.config.payload_frame)
     with output or nullcontext():
-        for now, estimate in pipeline.replay(request.config, messages):
-            state = now
-            if estimate is None:
-                continue
-            if output is not None:
-                output.write(estimate)
-            if request.report is not None:
-                kept.append(estimate)
+        try:
+            for now, estimate in pipeline.replay(request.config, messages):
+                state = now
+                if estimate is None:
+                    continue
+                if output is not None:
+                    output.write(estimate)
+                if request.report is not None:
+                    kept.append(estimate)
+        except KeyboardInterrupt:
+            messages.fault, interrupted = BagError('interrupted', 'the messages until then are reported'), True
         if isinstance(output, TableOutput):
             output.start_ns = messages.first_ns
     if messages.fault is not None and state.counters.accepted == 0:
@@ -102,7 +105,7 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
     return Result(
         summary, () if last is None else last.modes, state.clock.outputs or request.config.outputs,
         tuple(str(place) for place in (request.output, request.report) if place is not None), fault,
-        messages.interrupted, _remark(state, messages.foreign))
+        interrupted, _remark(state, messages.foreign))
 
 
 class _Messages:
@@ -110,7 +113,6 @@ class _Messages:
 
     def __init__(self, request: Request, progress: bag.Progress | None) -> None:
         self.fault: FlexmanipError | None = None
-        self.interrupted = False
         self.foreign = 0
         """Messages that hold none of the configured joints."""
         self.first_ns: int | None = None
@@ -137,9 +139,6 @@ class _Messages:
                 yield from self._event(item) if isinstance(item, CaptureEvent) else self._joint_states(item)
         except BagError as error:
             self.fault = error
-        except KeyboardInterrupt:
-            self.fault = BagError('interrupted', 'what was read until then is reported')
-            self.interrupted = True
 
     def _event(self, event: CaptureEvent) -> Iterator[CaptureEvent]:
         if event.stamp_ns < self._limit_ns():

@@ -36,12 +36,13 @@ def _parser() -> console.Parser:
     made = console.parser(
         PROG, "Reproduce the results of the paper's section 4, with our estimators beside its own.", EXAMPLES)
     add = made.add_argument
-    add('--runs', type=int, default=30, metavar='N', help='runs per case (default 30, as in the paper)')
+    add('--runs', type=int, default=30, metavar='N', help='runs per case; default: 30, as in the paper')
     add('--case', action='append', choices=[case.name for case in experiments.CASES], metavar='NAME',
-        help=f'only this case, may be repeated: {", ".join(case.name for case in experiments.CASES)}')
-    add('--first-seed', type=console.whole, default=0, metavar='SEED', help='default: 0')
-    add('--output', default='paper_reproduction', metavar='DIR', help='default: paper_reproduction')
-    add('--workers', type=console.whole, metavar='N', help='processes; default: one per core; 0: this one only')
+        help=f'run only this case; may be repeated: {", ".join(case.name for case in experiments.CASES)}')
+    add('--first-seed', type=console.whole, default=0, metavar='SEED', help='first seed; default: 0')
+    add('--output', default='paper_reproduction', metavar='DIR',
+        help='folder to write into; default: paper_reproduction')
+    console.add_workers(made)
     return made
 
 

@@ -39,20 +39,20 @@ MORE = f'\n\nparameters of the torque (in --params under excitation, or with --s
 
 def _parser() -> console.Parser:
     made = console.parser(
-        PROG, 'Simulate the flexible arm catching something, into a rosbag2 recording. No ROS needs to run.',
+        PROG, 'Simulate the flexible arm while it catches an object, into a rosbag2 recording. ROS need not run.',
         EXAMPLES + help_text(PlantParameters) + MORE + help_text(ExcitationParameters))
     add = made.add_argument
-    add('bag', metavar='BAG', help='the recording to make; must not exist')
-    add('--duration', metavar='SECONDS', type=console.seconds, default=6.0, help='default: 6')
+    add('bag', metavar='BAG', help='directory of the recording; it must not exist')
+    add('--duration', metavar='SECONDS', type=console.seconds, default=6.0, help='simulated time [s]; default: 6')
     add('--seed', metavar='N', type=int, help='seed of the noise (parameter seed)')
-    add('--payload', metavar='KG', type=float, help='mass of the object (parameter payload_mass)')
-    add('--capture-time', metavar='SECONDS', type=console.seconds, default=3.0, help='default: 3; negative: never')
-    add('--release-time', metavar='SECONDS', type=console.seconds, default=-1.0, help='default: never')
+    add('--payload', metavar='KG', type=float, help='mass of the object [kg] (parameter payload_mass)')
+    add('--capture-time', metavar='SECONDS', type=console.seconds, default=3.0,
+        help='time of the capture [s]; default: 3; negative: never')
+    add('--release-time', metavar='SECONDS', type=console.seconds, default=-1.0,
+        help='time of the release [s]; default: never')
     add('--expected', action='store_true',
-        help='say how accurate a payload estimate from this torque can be (takes some seconds)')
-    add('--params', metavar='FILE.yaml', help='ROS parameter file with plant_simulator and excitation')
-    add('--set', metavar='name=value', action='append', default=[],
-        help=f'override one parameter; {PREFIX}NAME for the torque')
+        help='print how accurate a payload estimate from this torque can be; this takes some seconds')
+    console.add_parameters(made, 'plant_simulator and excitation', f', {PREFIX}NAME for one of the torque')
     return made
 
 

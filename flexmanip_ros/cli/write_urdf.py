@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
-from flexmanip_ros.arm.urdf import urdf
 from flexmanip_ros.cli import console
-from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import PlantParameters
 
@@ -21,28 +19,31 @@ exit status: 0 on success; 2 on bad arguments, with one line on stderr.
 """
 
 
+def _parser() -> console.Parser:
+    made = console.parser(
+        PROG, 'Write the arm as URDF. Its links are chains of segments that bend with the joint states.', EXAMPLES)
+    console.add_parameters(made, 'plant_simulator')
+    made.add_argument('--segments', metavar='N', type=int, default=12, help='segments of each link; default: 12')
+    made.add_argument('--output', metavar='FILE', help='file to write; default: standard output')
+    return made
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the URDF to a file or to the standard output; 2 on bad input."""
-    parser = console.parser(PROG, 'Describe the arm as URDF; its links bend with the joint states.', EXAMPLES)
-    parser.add_argument('--params', metavar='FILE.yaml', help='ROS parameter file with the arm')
-    parser.add_argument('--set', metavar='name=value', action='append', default=[], help='override one parameter')
-    parser.add_argument('--segments', metavar='N', type=int, default=12, help='pieces of each link, default: 12')
-    parser.add_argument('--output', metavar='FILE', help='default: standard output')
-    options = parser.parse_args(arguments)
-    try:
-        config = load(PlantParameters, 'plant_simulator', options.params, options.set)
-        text = urdf(config.arm, options.segments)
-        if options.output:
-            Path(options.output).write_text(text, encoding='utf-8')
-        else:
-            print(text, end='')
-    except FlexmanipError as error:
-        print(f'{PROG}: {error}', file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f'{PROG}: {options.output} cannot be written: {error.strerror}', file=sys.stderr)
-        return 2
-    return 0
+    """Run the program; return its exit status."""
+    given = _parser().parse_args(arguments)
+    return console.run(PROG, lambda: _main(given))
+
+
+def _main(given: argparse.Namespace) -> int:
+    from flexmanip_ros.arm.urdf import urdf
+    from flexmanip_ros.io.outputs import write_text
+
+    text = urdf(load(PlantParameters, 'plant_simulator', given.params, given.set).arm, given.segments)
+    if given.output:
+        write_text(given.output, text)
+    else:
+        print(text, end='')
+    return console.SUCCESS
 
 
 if __name__ == '__main__':

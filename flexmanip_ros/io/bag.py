@@ -195,7 +195,7 @@ class _Recording:
                            'record while the joint states are published')
 
     def _choose(self, there: dict[str, str], *, complete: bool = True) -> bool:
-        """Settle which topics are read; tell whether one of ``there`` is."""
+        """Choose the topics that are read; return whether one of ``there`` is among them."""
         if not self.joint_topic:
             found = _resolve(self.topics.joint_states, there, JOINT_STATE, self.path)
             if found is None and complete:

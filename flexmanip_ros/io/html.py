@@ -59,10 +59,10 @@ def image(data: bytes, words: str) -> str:
     return f'<img alt="{escape(words)}" src="data:image/png;base64,{text}">'
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = '') -> str:
-    """Return a table. Numbers are rounded and right-aligned, texts are escaped."""
+def table(header: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = '', digits: int = 5) -> str:
+    """Return a table. Numbers are rounded to ``digits`` significant ones and right-aligned, texts are escaped."""
     head = ''.join(f'<th>{escape(name)}</th>' for name in header)
-    body = ''.join('<tr>' + ''.join(_cell(value) for value in row) + '</tr>' for row in rows)
+    body = ''.join('<tr>' + ''.join(_cell(value, digits) for value in row) + '</tr>' for row in rows)
     top = f'<caption>{escape(caption)}</caption>' if caption else ''
     return f'<div class="wide"><table>{top}<tr>{head}</tr>{body}</table></div>'
 
@@ -81,9 +81,9 @@ def plain(value: float | None, digits: int = 2) -> str:
     return np.format_float_positional(value, precision=digits, fractional=False, trim='-')
 
 
-def _cell(value: Any) -> str:
+def _cell(value: Any, digits: int) -> str:
     if value is None or isinstance(value, (int, float, np.number)):
-        return f'<td class="n">{number(value)}</td>'
+        return f'<td class="n">{number(value, digits)}</td>'
     return f'<td>{escape(str(value))}</td>'
 
 

@@ -104,7 +104,7 @@ def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[
     A method without settings of its own takes the identifier's estimates; the others read a block payload
     from its model, from the capture on.
     """
-    configs = {method.name: _configured(case, method)[1].identifier for method in readers if method.settings}
+    configs = {method.name: _configured(case, method.name)[1].identifier for method in readers if method.settings}
     found = {method.name: MethodResult([], 0.0) for method in readers}
     walls = dict.fromkeys(found, 0.0)
     begun = time.perf_counter()
@@ -141,7 +141,7 @@ def _with_block(config: IdentifierParameters, case: Case, state: pipeline.State,
 
 def _compare(case: Case, methods: Sequence[Method], items: Sequence[Item]) -> dict[str, MethodResult]:
     """Run methods that are no part of the identifier over the same samples."""
-    config = _configured(case, methods[0])[1].identifier
+    config = _configured(case, methods[0].name)[1].identifier
     begun = time.perf_counter()
     recorded = baselines.recorded(config, items)
     shared = time.perf_counter() - begun
@@ -160,18 +160,14 @@ def _identifier(case: Case, name: str) -> IdentifierParameters:
 
 
 @cache
-def _prepared(case: Case, name: str) -> tuple[Scenario, Run]:
+def _configured(case: Case, name: str) -> tuple[Scenario, Run]:
     """Return the scenario of a method and its configurations for seed 0."""
     made = experiments.scenario(case, next(method for method in experiments.METHODS if method.name == name))
     return made, made.configuration(0, name)
 
 
-def _configured(case: Case, method: Method) -> tuple[Scenario, Run]:
-    return _prepared(case, method.name)
-
-
 def _messages(case: Case, seed: int) -> list[Item]:
-    made, configured = _configured(case, experiments.METHODS[0])
+    made, configured = _configured(case, experiments.METHODS[0].name)
     return trial.messages(made, replace(configured, plant=replace(configured.plant, seed=seed)), seed)
 
 
@@ -185,7 +181,7 @@ def _own_run(case: Case, seed: int) -> list[Item]:
 @cache
 def true_frequencies(case: Case, mass: float) -> tuple[float, ...]:
     """Return the two lowest frequencies of a case's arm with a payload [Hz]."""
-    return tuple(trial.true_frequencies(_configured(case, experiments.METHODS[0])[1].plant, mass))
+    return tuple(trial.true_frequencies(_configured(case, experiments.METHODS[0].name)[1].plant, mass))
 
 
 def _columns(estimates: Sequence[Estimate], track: Track, case: Case) -> trial.Row:
@@ -230,7 +226,7 @@ def bounds(case: Case) -> dict[str, float]:
     """
     if case.model != 'linear':
         return {}
-    run = experiments.scenario(case, experiments.METHODS[0]).configuration(0, experiments.METHODS[0].name)
+    run = _configured(case, experiments.METHODS[0].name)[1]
     quiet = replace(run.plant, noise='none')
     torque = excitation.sequence(run.excitation, round(experiments.WINDOW[1] * quiet.rate))
     clean = simulator.simulate(quiet, torque, (CaptureEvent(round(experiments.CAPTURE_TIME * 1e9), EventKind.CAPTURE),))

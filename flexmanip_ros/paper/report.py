@@ -220,27 +220,19 @@ def report(path: str | Path, done: Study) -> None:
 
 
 def _result(done: Study) -> str:
-    rows = []
-    for line in summary.summary(done.rows, done.bounds):
-        covered = f'{number(line["95 % interval holds [%]"], 3)} ({number(line["from [%]"], 3)} to ' \
-               f'{number(line["to [%]"], 3)})'
-        rows.append([line['case'], line['method'], *(_short(line[name]) for name in (
-            'mean error [%]', 'rms error at 6 s [%]', 'bound at 6 s [%]')), covered,
-            *(_short(line[name]) for name in ('half width [%]', 'time per sample [us]')), line['failed']])
+    shown = ('mean error [%]', 'rms error at 6 s [%]', 'bound at 6 s [%]', 'half width [%]', 'time per sample [us]')
+    rows = [[line['case'], line['method'], *(line[name] for name in shown),
+             ' '.join([number(line['95 % interval holds [%]'], 3),
+                       f'({number(line["from [%]"], 3)} to {number(line["to [%]"], 3)})']), line['failed']]
+            for line in summary.summary(done.rows, done.bounds)]
     header = ['case', 'method', 'mean error, 4 to 6 s [%]', 'rms error at 6 s [%]', 'bound at 6 s [%]',
-              '95 % interval holds (its own 95 %) [%]', 'half width of it [%]', 'time per sample [us]',
-              'failed runs']
-    note = ('<p class="note">Bound: Cramer-Rao, of the knowledge that the method uses. Half width: median, '
-            'in per cent of the payload; an interval that is wide holds the truth easily. Time: everything '
-            'from message to payload; restart, known M_b and structured are read from one identifier run '
-            'once, and each is given the whole of it.</p>')
-    return (note + table(header, rows)
-            + table(['method', 'what it is'],
-                    [(method.name, method.words) for method in experiments.METHODS]))
-
-
-def _short(value: float | None) -> float | None:
-    return None if value is None else float(f'{value:.3g}')
+              'half width of the 95 % interval [%]', 'time per sample [us]',
+              'the interval holds the payload (95 % interval of this) [%]', 'failed runs']
+    note = ('<p class="note">Bound: Cramer-Rao bound for the knowledge that the method uses. Half width: median, in '
+            'per cent of the payload; a wide interval holds the payload easily. Time: from message to payload. '
+            'restart, known M_b and structured share one run of the identifier, and each counts the whole of it.</p>')
+    methods = [(method.name, method.words) for method in experiments.METHODS]
+    return note + table(header, rows, digits=3) + table(['method', 'what it is'], methods)
 
 
 def _arm() -> str:
@@ -256,9 +248,8 @@ def _arm() -> str:
 def _frequencies(rows: Sequence[trial.Row]) -> str:
     note = ('<p class="note">The paper: below 5 %, which it accepts. Here: mean of the runs, 4 to 6 s; our '
             'target is 0.5 %.</p>')
-    lines = summary.frequency_lines(rows, experiments.CONFIGURATIONS)
     return note + table(['configuration', 'method', 'frequency 1 [%]', 'frequency 2 [%]'],
-                        [[*line[:2], *(_short(value) for value in line[2:])] for line in lines])
+                        summary.frequency_lines(rows, experiments.CONFIGURATIONS), digits=3)
 
 
 def _section(planned: Planned, drawn: bytes) -> Section:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.numerics.compiled import Prepared
@@ -103,7 +103,7 @@ def threshold(config: TriggerParameters, dt: float) -> float:
     """
     looks = 3600.0 / dt / INDEPENDENT
     chance = min(0.5, config.false_alarms_per_hour / looks)
-    return float(chi2.isf(chance, kernel.CAUSES))
+    return float(chdtri(kernel.CAUSES, chance))
 
 
 def _start(config: TriggerParameters, state: DetectionState, row: Rows) -> DetectionState:

@@ -56,7 +56,7 @@ def test_signals_that_stand_still_are_never_tracking(capsys, tmp_path, level, se
     assert found['frequencies_hz'] == []
 
 
-def test_messages_that_lose_a_signal_on_the_way_are_counted_aloud(capsys, tmp_path):
+def test_messages_that_lose_a_signal_on_the_way_are_reported_with_their_number(capsys, tmp_path):
     records = _records()
     short = [JointRecord(r.stamp_ns, r.names, r.position, np.empty(0), r.effort) for r in records]
     status, found, err = _run(capsys, _bag(tmp_path / 'bag', records[:200] + short[200:]), PLAIN)
@@ -65,7 +65,7 @@ def test_messages_that_lose_a_signal_on_the_way_are_counted_aloud(capsys, tmp_pa
     assert 'of 300 messages 100 without a configured signal were left out' in err
 
 
-def test_messages_out_of_order_are_counted_aloud(capsys, tmp_path):
+def test_messages_out_of_order_are_reported_with_their_number(capsys, tmp_path):
     records = _records()
     swapped = [records[k ^ 1] for k in range(len(records))]
     _, _, err = _run(capsys, _bag(tmp_path / 'bag', swapped), PLAIN)
@@ -98,7 +98,7 @@ def test_a_capture_after_the_end_is_not_claimed(capsys, tmp_path):
     assert 'not applied' in err
 
 
-def test_an_event_without_a_stamp_is_applied_on_arrival_and_said(capsys, tmp_path):
+def test_an_event_without_a_stamp_is_applied_on_arrival_and_reported(capsys, tmp_path):
     status, _, err = _run(capsys, _bag(tmp_path / 'bag', _records(700), CaptureEvent(0, EventKind.CAPTURE),
                                        at=600), PLAIN)
     assert status == 0
@@ -124,7 +124,7 @@ def test_simulate_bag_wants_times_too(capsys, tmp_path):
 
 
 @pytest.mark.parametrize('value', ['.inf', '-.inf', '.nan'])
-def test_a_parameter_that_is_not_finite_is_refused(capsys, tmp_path, value):
+def test_a_parameter_that_is_not_finite_is_rejected(capsys, tmp_path, value):
     status, _, err = _run(capsys, tmp_path, '--set', f'arm.link_length=[{value}, 3.0]')
     assert status == 2
     assert "'arm.link_length'" in err
@@ -176,7 +176,7 @@ def test_simulate_bag_wants_a_name_to_make(capsys, bag):
 
 
 @pytest.mark.parametrize('program', [monte_carlo, reproduce_paper])
-def test_a_seed_that_is_none_is_refused_before_the_runs(capsys, program):
+def test_a_seed_that_is_none_is_rejected_before_the_runs(capsys, program):
     with pytest.raises(SystemExit) as ended:
         program.main([*(['scenario.yaml'] if program is monte_carlo else []), '--first-seed=-5'])
     assert ended.value.code == 2

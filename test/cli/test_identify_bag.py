@@ -104,6 +104,23 @@ def test_a_table_holds_what_the_pipeline_says(recording, capsys, tmp_path):
     assert rows[-1]['status'] == estimates[-1].status.name
 
 
+def test_an_interrupt_reports_and_writes_what_was_identified_until_then(recording, capsys, tmp_path, monkeypatch):
+    whole = pipeline.replay
+
+    def interrupted(*arguments):
+        for count, found in enumerate(whole(*arguments), start=1):
+            yield found
+            if count == 100:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, 'replay', interrupted)
+    status, out, err = _run(capsys, recording, *SETTINGS, '--output', tmp_path / 'out.csv')
+    assert status == 130
+    assert 'samples' in out
+    assert 'interrupted' in err
+    assert len((tmp_path / 'out.csv').read_text(encoding='utf-8').splitlines()) == 1 + 100
+
+
 def test_a_recording_of_the_estimates_holds_what_the_node_would_publish(recording, capsys, tmp_path):
     assert _run(capsys, recording, *SETTINGS, '--output', tmp_path / 'out')[0] == 0
     estimates = pipeline.run(configure(IdentifierParameters, OTHER), bag.read(recording))
@@ -212,7 +229,7 @@ def test_faulty_messages_are_left_out_counted_and_reported(capsys, tmp_path):
     assert json.loads(out)['samples'] == 598
 
 
-def test_a_recording_of_nothing_but_nan_is_refused(capsys, tmp_path):
+def test_a_recording_of_nothing_but_nan_is_rejected(capsys, tmp_path):
     records = _oscillator(50)
     for record in records:
         record.effort[:] = np.nan

@@ -68,7 +68,7 @@ def test_a_kill_between_the_rows_of_a_run_loses_none_of_them(scenario_file, tmp_
     (lambda lines: lines[0] + lines[1] + b'\xff\xfe\n', 'damaged in line 3'),
     (lambda lines: b'5\n', 'another study'),
 ])
-def test_a_damaged_journal_is_refused_and_kept(scenario_file, tmp_path, capsys, damage, words):
+def test_a_damaged_journal_is_rejected_and_kept(scenario_file, tmp_path, capsys, damage, words):
     out, journal = tmp_path / 'out.csv', tmp_path / 'out.csv.journal'
     assert run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
     capsys.readouterr()
@@ -81,7 +81,7 @@ def test_a_damaged_journal_is_refused_and_kept(scenario_file, tmp_path, capsys, 
     assert journal.read_bytes() == damaged
 
 
-def test_a_journal_torn_in_its_head_begins_anew(scenario_file, tmp_path):
+def test_a_journal_without_its_first_line_begins_again(scenario_file, tmp_path):
     out = tmp_path / 'out.csv'
     (tmp_path / 'out.csv.journal').write_text('{"study": {"para', encoding='utf-8')
     assert run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0

@@ -141,7 +141,7 @@ def test_whatever_the_bytes_only_our_error_comes_out(small, tmp_path, data, stor
             assert isinstance(item, (JointRecord, CaptureEvent))
 
 
-def test_a_foreign_database_is_refused(tmp_path):
+def test_a_foreign_database_is_rejected(tmp_path):
     with sqlite3.connect(tmp_path / 'other.db3') as database:
         database.execute('CREATE TABLE cats (name TEXT)')
     database.close()

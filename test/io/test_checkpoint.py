@@ -86,7 +86,7 @@ def test_a_checkpoint_of_another_version_says_so(tmp_path: Path) -> None:
         checkpoint.load(tmp_path / 'old')
 
 
-def test_a_checkpoint_of_the_old_format_is_refused_with_the_reason(tmp_path: Path) -> None:
+def test_a_checkpoint_of_the_old_format_is_rejected_with_the_reason(tmp_path: Path) -> None:
     (tmp_path / 'old').write_bytes(b'flexmanip_ros checkpoint 1\n' + bytes(100))
     with pytest.raises(CheckpointError, match='another format'):
         checkpoint.load(tmp_path / 'old')
@@ -127,7 +127,7 @@ WHOLE = checkpoint.encode(stepped(pipeline.init(), items(40))[0])
 
 @settings(max_examples=150, deadline=None)
 @given(st.integers(0, len(WHOLE) - 1), st.integers(1, 255), st.booleans())
-def test_any_damage_is_refused(at: int, change: int, cut: bool) -> None:
+def test_any_damage_is_rejected(at: int, change: int, cut: bool) -> None:
     data = WHOLE[:at] if cut else WHOLE[:at] + bytes([WHOLE[at] ^ change]) + WHOLE[at + 1:]
     with pytest.raises(CheckpointError):
         checkpoint.decode(data)

@@ -89,7 +89,7 @@ def test_missing_and_unreadable_files_are_named(tmp_path):
 
 
 @pytest.mark.parametrize('item', ['order', '=4', ''])
-def test_an_override_without_a_name_or_value_is_refused(item):
+def test_an_override_without_a_name_or_value_is_rejected(item):
     with pytest.raises(ParameterError, match='name=value'):
         parse_overrides([item])
 

@@ -93,6 +93,6 @@ def test_a_late_event_a_gap_and_swapped_neighbours():
     {'vary': {'plant.nothing': {'uniform': [0, 1]}}},
     {'vary': {'plant.seed': {'uniform': [0]}}}, {'faults': {'loss': 0.1}}, {'plant': {'arm': 3}},
     {'identifier': {'order': -1}}, {'estimators': {'a': 3}}])
-def test_a_scenario_that_makes_no_sense_is_refused(tree):
+def test_a_scenario_that_makes_no_sense_is_rejected(tree):
     with pytest.raises(ParameterError):
         scenario(tree)
