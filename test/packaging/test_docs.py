@@ -71,6 +71,27 @@ def test_a_file_that_is_named_exists(page: str) -> None:
 
 
 @pytest.mark.parametrize('page', ALL)
+def test_a_function_that_is_named_exists(page: str) -> None:
+    """As `folder/file.py` (`function`), `module.function` or `Class.attribute`."""
+    files = {path.stem: path.read_text(encoding='utf-8') for path in (ROOT / 'flexmanip_ros').rglob('*.py')}
+    everything = '\n'.join(files.values())
+    text = text_of(page)
+    for file, name in re.findall(r'`(?:[\w/]*/)?(\w+)\.py` \(`([\w.]+)`\)', text):
+        assert re.search(rf'\b(?:def|class) {name.split(".")[-1]}\b', files[file]), f'{page}: {name} of {file}.py'
+    for module, name in re.findall(r'`(\w+)\.(\w+)`', text):
+        known = rf'\b(?:def|class) {name}\b|^ *{name}\b.*[:=]'
+        if module in files and not re.search(r'^(?:py|md|yaml|xml|NAME)$', name) and module not in parameter_groups():
+            assert re.search(known, files[module], re.MULTILINE), f'{page}: {module}.{name}'
+        elif re.match(r'[A-Z][a-z]+\w*$', module) and f'class {module}' in everything:
+            assert re.search(known, everything, re.MULTILINE), f'{page}: {module}.{name}'
+
+
+def parameter_groups() -> set[str]:
+    """Return the groups of parameters, some of which have the name of a module: ``arm``, ``payload``."""
+    return {name.split('.')[0] for name in PARAMETERS if '.' in name} | {'plant', 'excitation', 'identifier'}
+
+
+@pytest.mark.parametrize('page', ALL)
 def test_a_folder_that_is_named_exists(page: str) -> None:
     for name in re.findall(r'`((?:[\w.-]+/)+)`', text_of(page)):
         made = name.startswith('demo_output/')  # by the demo
