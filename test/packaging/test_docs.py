@@ -22,6 +22,8 @@ OF_EVERY_NODE = {'autostart', 'use_sim_time'}
 PARAMETERS = {leaf.name for declared in NODES.values() for leaf in leaves(declared)}
 FOLDERS = ('flexmanip_ros', 'config', 'docs', 'test', 'benchmarks', 'requirements', 'launch')
 FILE = re.compile(r'`((?:[\w.-]+/)*[\w.-]+\.(?:py|md|yaml|xml|rst|toml))\b')
+ENDINGS = ('py', 'md', 'yaml', 'xml', 'html', 'csv')
+"""What stands behind the point in the name of a file."""
 STARTED = re.compile(r"(?:^\.venv/bin/|^ros2 run (?:--prefix '[^']*' )?flexmanip_ros )([a-z]\w+)")
 REMOVED = (
     'PM QoS', 'wake_latency', 'SCHED_FIFO', 'thread_priority', 'cpu_affinity', 'cpu_dma_latency', 'garbage collector',
@@ -68,6 +70,27 @@ def test_a_file_that_is_named_exists(page: str) -> None:
             assert (ROOT / name).is_file() or (ROOT / 'flexmanip_ros' / name).is_file(), f'{page} names {name}'
         elif name.endswith('.py'):
             assert name in known or (ROOT / name).is_file(), f'{page} names {name}'
+
+
+@pytest.mark.parametrize('page', ALL)
+def test_a_function_that_is_named_exists(page: str) -> None:
+    """As `folder/file.py` (`function`), `module.function` or `Class.attribute`."""
+    files = {path.stem: path.read_text(encoding='utf-8') for path in (ROOT / 'flexmanip_ros').rglob('*.py')}
+    everything = '\n'.join(files.values())
+    text = text_of(page)
+    for file, name in re.findall(r'`(?:[\w/]*/)?(\w+)\.py` \(`([\w.]+)`\)', text):
+        assert re.search(rf'\b(?:def|class) {name.split(".")[-1]}\b', files[file]), f'{page}: {name} of {file}.py'
+    for module, name in re.findall(r'`(\w+)\.(\w+)`', text):
+        known = rf'\b(?:def|class) {name}\b|^ *{name}\b.*[:=]'
+        if module in files and module not in parameter_groups() and name not in ENDINGS:
+            assert re.search(known, files[module], re.MULTILINE), f'{page}: {module}.{name}'
+        elif re.match(r'[A-Z][a-z]+\w*$', module) and f'class {module}' in everything:
+            assert re.search(known, everything, re.MULTILINE), f'{page}: {module}.{name}'
+
+
+def parameter_groups() -> set[str]:
+    """Return the groups of parameters, some of which have the name of a module: ``arm``, ``payload``."""
+    return {name.split('.')[0] for name in PARAMETERS if '.' in name} | {'plant', 'excitation', 'identifier'}
 
 
 @pytest.mark.parametrize('page', ALL)
