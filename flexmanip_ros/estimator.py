@@ -14,7 +14,7 @@ from flexmanip_ros.identification.factor import FILLED, REJECTED
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.numerics.background import Background
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload import block_extraction, model_check, structured
+from flexmanip_ros.payload import block_extraction, frequency, model_check, structured
 from flexmanip_ros.payload.block_extraction import NOWHERE
 from flexmanip_ros.payload.model_check import Verdict
 from flexmanip_ros.samples.sample_log import Rows
@@ -133,6 +133,8 @@ class ModelRequest:
         if found is None:
             return Estimate(self.stamp_ns, without, None, (), payload, model_status=without), None
         oscillations = modes(found)
+        if config.payload_method == 'frequency':
+            payload = frequency.estimate(config, oscillations, identifier.angles, identifier.configuration_range)
         verdict = None
         if self.compare and held is not None:
             alone = structured.estimate(config, held)

@@ -321,8 +321,12 @@ def _due_rows(state: State, payload: EventReplay[PayloadEstimator]) -> list[int]
     cursor = payload.cursor
     stamps = state.log.rows(cursor, state.log.end).stamp_ns
     instants = ((stamps - state.first_ns) * state.config.publish_rate * 1e-9 + ROUNDING).astype(np.int64)
-    due = np.flatnonzero(np.diff(instants, prepend=state.published) > 0) + cursor
-    return [int(row) for row in due]
+    if not len(instants) or instants[-1] <= state.published:
+        return []
+    new = np.empty(len(instants), dtype=np.bool_)
+    new[0] = instants[0] > state.published
+    new[1:] = instants[1:] > instants[:-1]
+    return [int(row) for row in np.flatnonzero(new) + cursor]
 
 
 def _estimate(state: State, background: Background) -> tuple[State, list[Estimate]]:

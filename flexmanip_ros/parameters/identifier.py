@@ -98,7 +98,10 @@ class IdentifierParameters:
         'times (set direct_feedthrough with it)', low=1, high=1000)
     restart_on_event: bool = parameter(
         True, 'restart the covariances of the least squares at a capture or release', live=True)
-    payload_method: str = parameter('structured', 'estimator of the payload', choices=('none', 'block', 'structured'))
+    payload_method: str = parameter(
+        'structured', "estimator of the payload: from the arm's equations (structured), or from the identified "
+        'model, by its matrices (block) or its frequencies (frequency)',
+        choices=('none', 'block', 'frequency', 'structured'))
     publish_rate: float = parameter(
         50.0, 'estimates a second, on the grid of the stamps', unit='Hz', low=0.01, high=10000.0, live=True)
     model_rate: float = parameter(

@@ -221,11 +221,12 @@ def estimate(config: IdentifierParameters, identified: Identified, angles: Array
 def sweep(config: IdentifierParameters, before: Array, rows: Rows) -> Array:
     """Return the smallest and largest cosine between the links (2,), after more rows.
 
-    Kept only where it matters: M_b is taken from the arm (it varies with that cosine) and the arm moves.
+    Kept only where it matters: the method takes M_b or the frequencies from the arm (they vary with that cosine), and
+    the arm moves.
     """
     payload = config.payload
-    if (config.payload_method != 'block' or not payload.known_coupling or payload.dynamics == 'linear'
-            or rows.angles.shape[1] != 2):
+    wanted = config.payload_method == 'frequency' or (config.payload_method == 'block' and payload.known_coupling)
+    if not wanted or payload.dynamics == 'linear' or rows.angles.shape[1] != 2:
         return before
     theta = np.array([chords(config.arm, angles) for angles in rows.angles])
     cosines = np.concatenate([before, np.cos(theta[:, 1] - theta[:, 0])])

@@ -1,7 +1,8 @@
-"""Payload from the identified frequencies alone (the paper's future work), with a profile interval.
+"""Payload from the identified frequencies alone (``payload_method: frequency``; the paper's future work).
 
-The frequencies of the arm at its working point fall as the payload grows, ever more slowly: the interval is
-where the weighted misfit stays within 3.84 of its least, so it may reach to infinity on one side.
+The frequencies f_i(m) of the arm at its working point fall as the payload m grows, ever more slowly. The payload is
+where the misfit sum_i ((f_i(m) - f_i) / std_i)^2 is least. Its 95 % interval is the profile-likelihood interval: the
+payloads whose misfit is at most 3.84 above the least, so it may reach to infinity on one side.
 """
 
 from __future__ import annotations
@@ -13,8 +14,7 @@ import numpy as np
 
 from flexmanip_ros.arm.linearization import blocks
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
-from flexmanip_ros.payload.block_extraction import unknown
-from flexmanip_ros.payload.structured_model import chords
+from flexmanip_ros.payload.block_extraction import NOWHERE, unknown, working_point
 from flexmanip_ros.types import Array, Mode, Payload, Status
 
 GRID = 400
@@ -39,10 +39,13 @@ def frequencies(arm: ArmParameters, theta: Array, payloads: Array, count: int) -
     return np.asarray(1.0 / np.sqrt(periods[:, :count]) / (2 * np.pi))
 
 
-def estimate(config: IdentifierParameters, modes: Sequence[Mode], angles: Array) -> Payload:
-    """Return the payload that fits the lowest two identified modes; angles: (2,) as measured; never a NaN.
+def estimate(config: IdentifierParameters, modes: Sequence[Mode], angles: Array, configuration_range: Array = NOWHERE
+             ) -> Payload:
+    """Return the payload that fits the lowest two identified modes; never a NaN.
 
-    Modes without a standard deviation give no interval, hence no estimate.
+    angles: (2,) as measured [rad]; configuration_range: (2,) or (0,) smallest and largest cosine between the links
+    since the last event. The modes are means over that range, so the interval covers what they mean at either end of
+    it. Modes without a standard deviation give no interval, hence no estimate.
     """
     if angles.shape != (2,):
         return unknown(Status.UNOBSERVABLE)
@@ -50,12 +53,19 @@ def estimate(config: IdentifierParameters, modes: Sequence[Mode], angles: Array)
                     and mode.frequency_std_hz > 0.0 and abs(mode.damping_ratio) < 1.0)[:2]
     if not usable:
         return unknown(Status.WARMING_UP)
-    arm = config.arm
+    found = _at(config.arm, working_point(config, angles), usable)
+    for turn in np.arccos(np.clip(configuration_range, -1.0, 1.0)):  # frequencies depend on the angle between the links
+        other = _at(config.arm, np.array([0.0, turn]), usable)
+        found = found._replace(lower=min(found.lower, other.lower), upper=max(found.upper, other.upper))
+    return found
+
+
+def _at(arm: ArmParameters, theta: Array, usable: Sequence[Mode]) -> Payload:
+    """Return the payload that modes mean at chords theta (2,) [rad]."""
     lightest = arm.tip_mass + arm.linear_density[1] * arm.link_length[1] / 3
     payloads = lightest * LARGEST * np.linspace(0.0, 1.0, GRID) ** 3
     natural = np.array([mode.frequency_hz / math.sqrt(1.0 - mode.damping_ratio ** 2) for mode in usable])
     std = np.array([mode.frequency_std_hz for mode in usable])
-    theta = chords(arm, angles)
     misfit = _misfit(frequencies(arm, theta, payloads, len(usable)), natural, std)
     best = int(np.argmin(misfit))
     near = np.linspace(payloads[max(best - 1, 0)], payloads[min(best + 1, GRID - 1)], GRID)

@@ -6,10 +6,18 @@ import numpy as np
 import pytest
 from recording import config
 
+from flexmanip_ros import pipeline
 from flexmanip_ros.arm import linearization
-from flexmanip_ros.parameters import ArmParameters
+from flexmanip_ros.parameters import (
+    ArmParameters,
+    ExcitationParameters,
+    IdentifierParameters,
+    PlantParameters,
+    configure,
+)
 from flexmanip_ros.payload import frequency
-from flexmanip_ros.types import Mode, Status
+from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, Mode, Status
 
 ARM = ArmParameters(angle_convention='chord')
 ANGLES = np.radians([60.0, 45.0])
@@ -52,3 +60,29 @@ def test_no_modes_or_angles_give_a_status():
     assert frequency.estimate(config(ARM), (), ANGLES).status is Status.WARMING_UP
     assert frequency.estimate(config(ARM), modes(20.0), np.empty(0)).status is Status.UNOBSERVABLE
     assert frequency.estimate(config(ARM), (Mode(5.0, 0.01),), ANGLES).status is Status.WARMING_UP
+
+
+def identified(payload: float, seed: int, model: str, **values: object) -> list[Estimate]:
+    """Estimates of a simulated capture at 1.5 s, from one second after it on."""
+    plant = configure(PlantParameters, {'payload_mass': payload, 'seed': seed, 'model': model})
+    capture = CaptureEvent(1_500_000_000, EventKind.CAPTURE)
+    run = simulator.simulate(plant, excitation.sequence(ExcitationParameters(), 4000), (capture,))
+    settings = configure(IdentifierParameters, {'payload_method': 'frequency', **values})
+    return [one for one in pipeline.run(settings, simulator.records(run, (capture,))) if one.stamp_ns > 2.5e9]
+
+
+@pytest.mark.parametrize('payload', [5.0, 20.0, 60.0])
+@pytest.mark.parametrize('seed', [1, 2])
+def test_a_linear_arm_is_weighed_by_its_frequencies_to_one_percent(payload, seed):
+    point = list(PlantParameters().initial_angles)
+    found = identified(payload, seed, 'linear', **{'payload.dynamics': 'linear', 'payload.working_point': point})
+    assert all(one.status is Status.TRACKING for one in found)
+    assert all(one.payload.lower <= payload <= one.payload.upper for one in found)
+    assert found[-1].payload.mass == pytest.approx(payload, rel=0.01)
+
+
+@pytest.mark.parametrize('payload', [5.0, 20.0, 60.0])
+def test_on_a_moving_arm_the_interval_reckons_with_the_way_it_went(payload):
+    found = identified(payload, 3, 'nonlinear')
+    assert all(one.payload.lower <= payload <= one.payload.upper for one in found)
+    assert all(one.payload.upper - one.payload.lower > 0.1 * payload for one in found)
