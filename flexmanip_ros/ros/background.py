@@ -35,9 +35,12 @@ class Background:
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(THREADS, 'background')
         self._solved: dict[Request, Future[Any]] = {}
+        self._closed = False
 
     def start(self, request: Request) -> None:
-        """Begin to solve a request; the oldest one beyond ``KEPT`` is dropped."""
+        """Begin to solve a request; the oldest one beyond ``KEPT`` is dropped. After ``close`` do nothing."""
+        if self._closed:
+            return
         self._solved[request] = self._pool.submit(request.solve)
         if len(self._solved) > KEPT:
             self._solved.pop(next(iter(self._solved))).cancel()
@@ -51,7 +54,8 @@ class Background:
         return future.result()
 
     def close(self) -> None:
-        """Drop every request; wait for those that are being solved."""
+        """Drop every request; wait for those that are being solved. Results are solved in place from here on."""
+        self._closed = True
         self._solved.clear()
         self._pool.shutdown(cancel_futures=True)
 

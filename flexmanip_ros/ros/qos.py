@@ -25,7 +25,7 @@ def command() -> QoSProfile:
 
 
 def latched() -> QoSProfile:
-    """Events, models and payloads: who comes late still gets the last one."""
+    """Events, models and payloads: a subscriber that comes late still gets the last one."""
     return _profile(1, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -35,7 +35,7 @@ def latched_input() -> QoSProfile:
 
 
 def output() -> QoSProfile:
-    """Everything else an identifier says."""
+    """Everything else that the identifier publishes."""
     return _profile(10, ReliabilityPolicy.RELIABLE)
 
 

@@ -136,3 +136,10 @@ def test_requests_whose_result_nobody_takes_do_not_pile_up() -> None:
     assert len(background._solved) == KEPT
     background.close()
     assert not background._solved
+
+
+def test_what_is_asked_for_after_the_end_is_solved_in_place() -> None:
+    background, request = Background(), Sum(1, 2)
+    background.close()
+    background.start(request)
+    assert background.result(request) == 3

@@ -1,4 +1,4 @@
-"""Node ``payload_adapter``: hands a trusted payload to a robot driver.
+"""Node ``payload_adapter``: sends a trusted payload to a robot driver.
 
 subscribes  rpbsid_identifier/payload_estimate  std_msgs/Float64MultiArray   whether to trust it
             rpbsid_identifier/payload           geometry_msgs/InertiaStamped what to send
@@ -179,7 +179,7 @@ def fill(request: Any, inertia: Inertia) -> Any:
 
 
 def rejection(response: Any) -> str:
-    """Return why a driver or a node said no; empty when it said yes."""
+    """Return why a driver or a node rejected a request; empty when it accepted it."""
     results = getattr(response, 'results', None)
     answer = results[0] if results else response
     good = getattr(answer, 'success', getattr(answer, 'successful', True))

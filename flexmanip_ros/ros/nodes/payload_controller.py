@@ -59,7 +59,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._places: list[int] = []
 
     def make_entities(self) -> None:
-        """Publisher, subscriptions, and the timer that notices silence."""
+        """Publisher, subscriptions, and the timer that notices that they cease."""
         self._commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.command())
         self._message = Float64MultiArray()
         self.subscription(JointState, 'joint_states', self._on_joint_states, qos.sensor_input(), raw=True)

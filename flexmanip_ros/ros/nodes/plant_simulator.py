@@ -33,7 +33,7 @@ from flexmanip_ros.types import CaptureEvent, EventKind
 
 NAME = 'plant_simulator'
 CATCH_UP = 5
-"""Samples made in one run of the timer at most, so that commands get their turn between them."""
+"""Samples made in one run of the timer at most, so that commands are taken between them."""
 MOST_EVENTS = 100
 """Events that wait for their stamps at most."""
 
