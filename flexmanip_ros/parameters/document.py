@@ -80,9 +80,7 @@ def _comment(leaf: Leaf) -> str:
 
 
 def yaml_text(node: str, values: Mapping[str, Any] | None = None, heading: str = '') -> str:
-    """Return a ROS parameter file of a node: every parameter with its words, unit and range.
-
-    Its section is ``/**``, so it holds in any namespace and for a node that was renamed.
+    """Return a ROS parameter file of a node, for any name and namespace: each parameter with words, unit and range.
 
     values: dotted names that differ from the defaults. With ``values`` only those are written.
     """
