@@ -25,8 +25,7 @@ class PayloadParameters:
     working_point: tuple[float, ...] = parameter(
         (), 'chord angles of the working point of dynamics linear; []: the first measured ones', unit='rad')
     stiffness_std: float = parameter(
-        0.03, 'prior relative standard deviation of the bending stiffnesses; the empty arm refines them', low=0.0,
-        high=1.0)
+        0.03, 'prior relative standard deviation of the stiffnesses; the empty arm refines them', low=0.0, high=1.0)
     damping_std: float = parameter(
         0.005, 'prior standard deviation of the damping ratios; the empty arm refines them', low=0.0, high=1.0)
     capture_speed: float = parameter(
@@ -99,9 +98,8 @@ class IdentifierParameters:
     restart_on_event: bool = parameter(
         True, 'restart the covariances of the least squares at a capture or release', live=True)
     payload_method: str = parameter(
-        'structured', "estimator of the payload: from the arm's equations (structured), or from the identified "
-        'model, by its matrices (block) or its frequencies (frequency)',
-        choices=('none', 'block', 'frequency', 'structured'))
+        'structured', "estimator of the payload: structured, the arm's equations; block or frequency, the matrices or "
+        'frequencies of the model; none', choices=('none', 'block', 'frequency', 'structured'))
     publish_rate: float = parameter(
         50.0, 'estimates a second, on the grid of the stamps', unit='Hz', low=0.01, high=10000.0, live=True)
     model_rate: float = parameter(
@@ -123,8 +121,7 @@ class IdentifierParameters:
     checkpoint_period: float = parameter(
         5.0, 'time between two saves; one more is made at deactivation', unit='s', low=0.1, high=86400.0)
     checkpoint_max_age: float = parameter(
-        60.0, 'a saved state is used when the first sample is at most this far from its last one', unit='s', low=0.0,
-        high=1e9)
+        60.0, 'longest time from the last saved sample to the first new one', unit='s', low=0.0, high=1e9)
     arm: ArmParameters = field(default_factory=ArmParameters)
     payload: PayloadParameters = field(default_factory=PayloadParameters)
 
@@ -138,8 +135,8 @@ class IdentifierParameters:
         if self.angles and len(self.angles) != 2:
             raise ParameterError(f"parameter 'angles' names {len(self.angles)} signals", "name two, or [''] for none")
         if self.state_basis == 'tracked' and self.estimator != 'paper':
-            raise ParameterError(
-                "parameter 'state_basis' is 'tracked'", "set estimator to 'paper', or choose singular or fixed")
+            raise ParameterError("parameter 'state_basis' is 'tracked'",
+                                 "set estimator to 'paper', or choose singular or fixed")
         if self.future_window > self.past_window:
             raise ParameterError(f"parameter 'future_window' is {self.future_window}",
                                  f'it cannot exceed past_window ({self.past_window})')
@@ -153,7 +150,7 @@ def _check_signals(group: str, names: tuple[str, ...]) -> None:
     for name in names:
         joint, _, what = name.rpartition('/')
         if not joint or what not in FIELDS:
-            raise ParameterError(
-                f"parameter '{group}' names '{name}'", f'write NAME/FIELD with FIELD one of {", ".join(FIELDS)}')
+            raise ParameterError(f"parameter '{group}' names '{name}'",
+                                 f'write NAME/FIELD with FIELD one of {", ".join(FIELDS)}')
     if len(set(names)) != len(names):
         raise ParameterError(f"parameter '{group}' names a signal twice", 'name each signal once')
