@@ -7,8 +7,17 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
-from flexmanip_ros.arm import manipulator as dynamics
+from flexmanip_ros.arm import dynamics
 from flexmanip_ros.arm.jacobian import bias_jacobian, steep_jacobian
+from flexmanip_ros.arm.manipulator import (
+    Manipulator,
+    damping,
+    root_slopes,
+    stiffness,
+    tip_slopes,
+    torque_matrix,
+    workspace,
+)
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
@@ -40,7 +49,7 @@ class Linearization(NamedTuple):
 
 
 def linearize(
-    arm: dynamics.Manipulator, payload: Array, q: Array, qd: Array, effort: Array, simplified: bool = False,
+    arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array, simplified: bool = False,
 ) -> Linearization:
     """Linearize at coordinates q (n,), rates qd (n,) and joint torques effort (2,) [N m].
 
@@ -59,7 +68,7 @@ def linearize(
         return Linearization(
             M=dynamics.mass_matrix(arm, payload, straight), C_E=zero, K_M=zero, K_E=zero,
             K=np.diag(arm.stiffness), D=np.diag(arm.damping), B=arm.torque.copy(), acceleration=qdd)
-    work = dynamics.workspace(arm.kappa)
+    work = workspace(arm.kappa)
     both, rates = np.empty((n, n)), np.empty((n, n))
     bias_jacobian(arm, payload, q, qd, qdd, both, rates, work)
     K = dynamics.elastic_tangent(arm, q)
@@ -84,19 +93,6 @@ class Blocks(NamedTuple):
     Kc: Array
     B_theta: Array
     B_eta: Array
-
-
-def root_slopes(arm: ArmParameters, kappa: int) -> Array:
-    """Slopes phi'(0) of each link's sine shapes, (2, kappa) [1/m]."""
-    j = np.arange(1, kappa + 1)
-    slopes: Array = np.pi * j / np.asarray(arm.link_length)[:, None]
-    return slopes
-
-
-def tip_slopes(arm: ArmParameters, kappa: int) -> Array:
-    """Slopes phi'(L) of each link's sine shapes, (2, kappa) [1/m]."""
-    j = np.arange(1, kappa + 1)
-    return root_slopes(arm, kappa) * np.where(j % 2, -1.0, 1.0)
 
 
 def blocks(arm: ArmParameters, theta: Array, payload_mass: float = 0.0, kappa: int | None = None) -> Blocks:
@@ -130,45 +126,6 @@ def blocks(arm: ArmParameters, theta: Array, payload_mass: float = 0.0, kappa: i
 
     B = torque_matrix(arm, k)
     return Blocks(Ma, Mb, Mc, np.diag(stiffness(arm, k)), B[:2], B[2:])
-
-
-def stiffness(arm: ArmParameters, kappa: int) -> Array:
-    """Diagonal of Kc, (2 kappa,) [N/m]."""
-    j = np.pi * np.arange(1, kappa + 1)
-    return np.concatenate([
-        EI * j**4 / (2 * L**3) for EI, L in zip(arm.bending_stiffness, arm.link_length, strict=True)])
-
-
-def damping(arm: ArmParameters, kappa: int) -> Array:
-    """Diagonal of the modal damping matrix Dc, (2 kappa,) [N s/m].
-
-    ``stiffness``: Dc = (2 zeta / omega_i1) Kc; ``modal``: 2 zeta omega_ij Mc, with the pinned link's
-    omega_ij = (j pi / L_i)^2 sqrt(EI_i / rho_i).
-    """
-    j = np.arange(1, kappa + 1)
-    growth = j**4 if arm.damping_model == 'stiffness' else j**2
-    rows = []
-    for L, rho, EI in zip(arm.link_length, arm.linear_density, arm.bending_stiffness, strict=True):
-        first = (np.pi / L) ** 2 * np.sqrt(EI / rho)
-        rows.append(2 * arm.damping_ratio * first * (rho * L / 2) * growth)
-    return np.concatenate(rows)
-
-
-def torque_matrix(arm: ArmParameters, kappa: int) -> Array:
-    """Generalized force of the two joint torques, (2 + 2 kappa, 2): rows theta, eta_1, eta_2.
-
-    ``paper``: torque 2 acts on link 2's chord alone. ``joint``: it reacts on link 1's tip, and both
-    torques do work through the slopes of the shapes.
-    """
-    B = np.zeros((2 + 2 * kappa, 2))
-    B[:2] = np.eye(2)
-    if arm.torque_convention == 'joint':
-        root, tip = root_slopes(arm, kappa), tip_slopes(arm, kappa)
-        B[0, 1] = -1.0
-        B[2:2 + kappa, 0] = root[0]
-        B[2:2 + kappa, 1] = -tip[0]
-        B[2 + kappa:, 1] = root[1]
-    return B
 
 
 def vibration_model(

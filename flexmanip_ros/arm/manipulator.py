@@ -1,22 +1,13 @@
-"""The nonlinear two-link flexible arm: M(q) q'' + E(q, q') + D q' + K q = B tau (paper eq. 7).
+"""Constants of the nonlinear two-link flexible arm M(q) q'' + E(q, q') + D q' + K q = B tau (paper eq. 7).
 
 q = [theta1, theta2, eta_11.., eta_21..], n = 2 + 2 kappa; theta are the chords' absolute angles.
 Payload arrays are (4,): mass [kg], inertia about its centre of mass [kg m^2], centre of mass x, y [m]
 in the tip tangent frame (x along the tangent).
 
-What others build on (compiled functions run inside other compiled functions, without allocation):
-
-* ``manipulator(arm, kappa)`` -> Manipulator, a NamedTuple of scalars and float64 arrays. Its
-  ``stiffness`` and ``damping`` (n,) may be overwritten by whoever made it (calibration).
-* ``workspace(kappa)`` -> Workspace, scratch for one thread; ``payload_array(mass, ...)``.
-* ``kernels.assemble(arm, payload, q, qd, M, E, work)``: lower triangle of M and the bias E.
-* ``acceleration_kernel.acceleration(arm, payload, q, qd, effort, qdd, work) -> bool``; ``factor``, ``solve``.
-* ``jacobian_kernel.acceleration_jacobian(arm, payload, q, qd, effort, qdd, dq, dqd, dp, work) -> bool``:
-  qdd and its derivatives by q (n, n), qd (n, n) and p = [mass, inertia, EI1, EI2] (n, 4).
-* outputs are linear: positions = ``arm.output @ q``, rates = ``arm.output @ qd`` (4, n), joint1, joint2,
-  link1_bend, link2_bend, so ``arm.output`` is their Jacobian too (``output_kernel`` for the slopes of
-  the truncated modes).
-* in Python: ``mass_matrix``, ``bias``, ``coriolis_matrix``, ``energy``, ``accelerations``.
+The compiled functions of ``equations_of_motion`` and ``jacobian`` take a ``Manipulator`` (constants) and a
+``Workspace`` (scratch for one thread), and allocate nothing. ``dynamics`` evaluates the same functions from Python.
+Outputs are linear: positions = ``arm.output @ q``, rates = ``arm.output @ qd``, (4,) joint1, joint2, link1_bend,
+link2_bend.
 """
 
 from __future__ import annotations
@@ -25,9 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.arm import linearization
-from flexmanip_ros.arm.equations_of_motion import acceleration, assemble, elastic, steepen
-from flexmanip_ros.arm.jacobian import acceleration_jacobian, bias_jacobian
 from flexmanip_ros.arm.shape_functions import link_tables, output_matrix, quartic, rotary
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
@@ -132,10 +120,10 @@ def manipulator(arm: ArmParameters, kappa: int | None = None) -> Manipulator:
         raise ModelError(f'kappa is {k}', 'use at least one mode a link')
     length = np.asarray(arm.link_length)
     density = np.asarray(arm.linear_density)
-    root, tip = linearization.root_slopes(arm, k), linearization.tip_slopes(arm, k)
+    root, tip = root_slopes(arm, k), tip_slopes(arm, k)
     tables = [link_tables(L, rho, k, arm.shortening) for L, rho in zip(length, density, strict=True)]
     j = np.pi * np.arange(1, k + 1)
-    stiffness = np.concatenate([np.zeros(2), linearization.stiffness(arm, k)])
+    diagonal = np.concatenate([np.zeros(2), stiffness(arm, k)])
     per_stiffness = np.concatenate([np.zeros(2), *(j**4 / (2 * L**3) for L in length)])
     stretch = j**2 / (2 * length[:, None]) if arm.shortening else np.zeros((2, k))
     return Manipulator(
@@ -147,91 +135,59 @@ def manipulator(arm: ArmParameters, kappa: int | None = None) -> Manipulator:
         C2=np.stack([t[2] for t in tables]), S1=np.stack([t[3] for t in tables]),
         W=np.stack([t[4] for t in tables]), Q=np.stack([t[5] for t in tables]),
         quartic=np.stack([quartic(L, k, arm.shortening) for L in length]),
-        rotary=rotary(arm, root, tip), stiffness=stiffness,
-        damping=np.concatenate([np.zeros(2), linearization.damping(arm, k)]),
-        unit_stiffness=per_stiffness, torque=linearization.torque_matrix(arm, k),
+        rotary=rotary(arm, root, tip), stiffness=diagonal,
+        damping=np.concatenate([np.zeros(2), damping(arm, k)]),
+        unit_stiffness=per_stiffness, torque=torque_matrix(arm, k),
         output=output_matrix(arm, root, tip))
 
 
-def mass_matrix(arm: Manipulator, payload: Array, q: Array) -> Array:
-    """Return M(q), (n, n)."""
-    M, _ = _assembled(arm, payload, q, np.zeros_like(q))
-    return M
+def root_slopes(arm: ArmParameters, kappa: int) -> Array:
+    """Slopes phi'(0) of each link's sine shapes, (2, kappa) [1/m]."""
+    j = np.arange(1, kappa + 1)
+    slopes: Array = np.pi * j / np.asarray(arm.link_length)[:, None]
+    return slopes
 
 
-def bias(arm: Manipulator, payload: Array, q: Array, qd: Array) -> Array:
-    """Return E(q, qd), the centripetal and Coriolis forces, (n,)."""
-    return _assembled(arm, payload, q, qd)[1]
+def tip_slopes(arm: ArmParameters, kappa: int) -> Array:
+    """Slopes phi'(L) of each link's sine shapes, (2, kappa) [1/m]."""
+    j = np.arange(1, kappa + 1)
+    return root_slopes(arm, kappa) * np.where(j % 2, -1.0, 1.0)
 
 
-def coriolis_matrix(arm: Manipulator, payload: Array, q: Array, qd: Array) -> Array:
-    """Return C(q, qd) of the Christoffel symbols, (n, n): E = C qd and dM/dt - 2 C is skew.
+def stiffness(arm: ArmParameters, kappa: int) -> Array:
+    """Diagonal of Kc, (2 kappa,) [N/m]."""
+    j = np.pi * np.arange(1, kappa + 1)
+    return np.concatenate([
+        EI * j**4 / (2 * L**3) for EI, L in zip(arm.bending_stiffness, arm.link_length, strict=True)])
 
-    E is quadratic in the rates with the symmetric Christoffel symbols, hence C = dE/dqd / 2.
+
+def damping(arm: ArmParameters, kappa: int) -> Array:
+    """Diagonal of the modal damping matrix Dc, (2 kappa,) [N s/m].
+
+    ``stiffness``: Dc = (2 zeta / omega_i1) Kc; ``modal``: 2 zeta omega_ij Mc, with the pinned link's
+    omega_ij = (j pi / L_i)^2 sqrt(EI_i / rho_i).
     """
-    work = workspace(arm.kappa)
-    bias_jacobian(arm, payload, q, qd, np.zeros_like(q), work.left, work.right, work)
-    return work.right / 2
+    j = np.arange(1, kappa + 1)
+    growth = j**4 if arm.damping_model == 'stiffness' else j**2
+    rows = []
+    for L, rho, EI in zip(arm.link_length, arm.linear_density, arm.bending_stiffness, strict=True):
+        first = (np.pi / L) ** 2 * np.sqrt(EI / rho)
+        rows.append(2 * arm.damping_ratio * first * (rho * L / 2) * growth)
+    return np.concatenate(rows)
 
 
-def torque_at(arm: Manipulator, q: Array) -> Array:
-    """Return the generalized forces of unit joint torques at q, (n, 2)."""
-    B = arm.torque.copy()
-    if arm.shortening:
-        for i, unit in enumerate(np.eye(2)):
-            column = B[:, i].copy()
-            steepen(arm.root_slope, arm.tip_slope, arm.torque, np.asarray(q, float), unit, column)
-            B[:, i] = column
+def torque_matrix(arm: ArmParameters, kappa: int) -> Array:
+    """Generalized force of the two joint torques, (2 + 2 kappa, 2): rows theta, eta_1, eta_2.
+
+    ``paper``: torque 2 acts on link 2's chord alone. ``joint``: it reacts on link 1's tip, and both
+    torques do work through the slopes of the shapes.
+    """
+    B = np.zeros((2 + 2 * kappa, 2))
+    B[:2] = np.eye(2)
+    if arm.torque_convention == 'joint':
+        root, tip = root_slopes(arm, kappa), tip_slopes(arm, kappa)
+        B[0, 1] = -1.0
+        B[2:2 + kappa, 0] = root[0]
+        B[2:2 + kappa, 1] = -tip[0]
+        B[2 + kappa:, 1] = root[1]
     return B
-
-
-def energy(arm: Manipulator, payload: Array, q: Array, qd: Array) -> float:
-    """Kinetic plus elastic energy [J]."""
-    M = mass_matrix(arm, payload, q)
-    fourth = 0.0
-    for i in range(2):
-        part = slice(2 + i * arm.kappa, 2 + (i + 1) * arm.kappa)
-        EI = arm.stiffness[part][0] / arm.unit_stiffness[part][0]
-        eta = q[part]
-        fourth += EI / 2 * np.einsum('jklm,j,k,l,m', arm.quartic[i], eta, eta, eta, eta)
-    return float(qd @ M @ qd + q @ (arm.stiffness * q) + fourth) / 2
-
-
-def elastic_forces(arm: Manipulator, q: Array) -> Array:
-    """Return the elastic forces dV/dq (n,): K q, and of third order when shortening is kept."""
-    work = workspace(arm.kappa)
-    elastic(arm, np.asarray(q, float), work)
-    return work.elastic
-
-
-def elastic_tangent(arm: Manipulator, q: Array) -> Array:
-    """Return the derivative (n, n) of the elastic forces by q."""
-    work = workspace(arm.kappa)
-    elastic(arm, np.asarray(q, float), work)
-    K = np.diag(arm.stiffness)
-    for i in range(2):
-        part = slice(2 + i * arm.kappa, 2 + (i + 1) * arm.kappa)
-        K[part, part] += work.tangent[part]
-    return K
-
-
-def accelerations(arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array) -> Array:
-    """Return q'' (n,) for joint torques (2,) [N m]; ModelError when the mass matrix is not positive."""
-    qdd = np.empty_like(q)
-    if not acceleration(arm, payload, q, qd, effort, qdd, workspace(arm.kappa)):
-        raise ModelError('the mass matrix is not positive definite', 'check the state for non-finite numbers')
-    return qdd
-
-
-def _assembled(arm: Manipulator, payload: Array, q: Array, qd: Array) -> tuple[Array, Array]:
-    work = workspace(arm.kappa)
-    assemble(arm, payload, np.asarray(q, float), np.asarray(qd, float), work.M, work.E, work)
-    lower = np.tril(work.M)
-    return lower + np.tril(lower, -1).T, work.E
-
-
-__all__ = [
-    'Manipulator', 'Workspace', 'acceleration', 'acceleration_jacobian', 'accelerations', 'bias',
-    'coriolis_matrix', 'elastic_forces', 'energy', 'manipulator', 'mass_matrix',
-    'payload_array', 'workspace',
-]

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve, solve_discrete_are
 
-from flexmanip_ros.arm.linearization import blocks, damping, discretize, root_slopes, tip_slopes
+from flexmanip_ros.arm.linearization import blocks, discretize
+from flexmanip_ros.arm.manipulator import damping, root_slopes, tip_slopes
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ControllerParameters
 from flexmanip_ros.types import Array

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from flexmanip_ros.arm import linearization
+from flexmanip_ros.arm import linearization, manipulator
 from flexmanip_ros.arm.equations_of_motion import solve
 from flexmanip_ros.arm.shape_functions import output_matrix
 from flexmanip_ros.numerics.compiled import inlined
@@ -41,14 +41,14 @@ def tail(arm: ArmParameters, theta: Array, kappa: int, rows: Integers, rate: NDA
     chosen, kept = _split(kappa, MODES)
     M = _mass(arm, theta, total)
     coupled = np.linalg.solve(M[np.ix_(kept, kept)], M[np.ix_(kept, chosen)])
-    K = linearization.stiffness(arm, total)[chosen - 2]
-    D = linearization.damping(arm, total)[chosen - 2]
+    K = manipulator.stiffness(arm, total)[chosen - 2]
+    D = manipulator.damping(arm, total)[chosen - 2]
     # what the kept coordinates leave them of inertia: they give way at once
     square, V = eigh(np.diag(K), M[np.ix_(chosen, chosen)] - M[np.ix_(chosen, kept)] @ coupled)
     omega = np.sqrt(square)
     damping = np.clip(np.einsum('ja,j,ja->a', V, D, V), 2.0 * LEAST_DAMPING * omega, 1.9 * omega)
-    B = linearization.torque_matrix(arm, total)
-    C = output_matrix(arm, linearization.root_slopes(arm, total), linearization.tip_slopes(arm, total))
+    B = manipulator.torque_matrix(arm, total)
+    C = output_matrix(arm, manipulator.root_slopes(arm, total), manipulator.tip_slopes(arm, total))
     output = (C[:, chosen] - C[:, kept] @ coupled) @ V
     return Tail(square=square, damping=damping, load=V.T @ (B[chosen] - coupled.T @ B[kept]),
                 output=np.ascontiguousarray(output[rows]), row=rate.astype(np.int64), push=_push(arm, kappa))
@@ -58,8 +58,8 @@ def _push(arm: ArmParameters, kappa: int) -> Array:
     """Momentum M_rt K_t^-1 B_t, as ``Tail.push``."""
     total = kappa + HELD_MODES
     chosen, kept = _split(kappa, HELD_MODES)
-    held = linearization.torque_matrix(arm, total)[chosen]
-    held /= linearization.stiffness(arm, total)[chosen - 2, None]
+    held = manipulator.torque_matrix(arm, total)[chosen]
+    held /= manipulator.stiffness(arm, total)[chosen - 2, None]
     across, along = (_mass(arm, np.array([0.0, angle]), total)[np.ix_(kept, chosen)] @ held
                      for angle in (np.pi / 2, 0.0))
     return np.array([across, along - across])

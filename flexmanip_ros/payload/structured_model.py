@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.arm.capture import body_jacobian
-from flexmanip_ros.arm.manipulator import manipulator, mass_matrix, workspace
+from flexmanip_ros.arm.dynamics import mass_matrix
+from flexmanip_ros.arm.manipulator import manipulator, workspace
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.measurement_update import Sensors

@@ -1,4 +1,4 @@
-"""Torques that excite the arm: square waves, multisines, and their design from the arm."""
+"""Torques that excite the arm, and their design: the largest that keep it within an angle, and what they would tell."""
 
 from __future__ import annotations
 
@@ -12,99 +12,8 @@ from scipy.optimize import brentq
 from flexmanip_ros.arm.manipulator import manipulator
 from flexmanip_ros.errors import ModelError, ParameterError
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters
-from flexmanip_ros.simulation import models, sensors, simulator
+from flexmanip_ros.simulation import models, sensors, simulator, waveforms
 from flexmanip_ros.types import Array
-
-CREST_PASSES = 200
-"""Passes of the crest-factor optimization; a further one changes the peak by less than 0.1 %."""
-
-
-def torque(config: ExcitationParameters, k: int) -> Array:
-    """Torque (2,) [N m] held from sample k on."""
-    peak = amplitude(config)
-    return np.array([config.offset[i] + peak[i] * _unit(config, i, k) for i in range(2)])
-
-
-def sequence(config: ExcitationParameters, n: int) -> Array:
-    """Torques (n, 2) [N m] of samples 0 .. n - 1: the same numbers as ``torque``."""
-    columns = []
-    peak = amplitude(config)
-    for i in range(2):
-        table = _table(config.rate, config.shape, config.period[i], config.band, config.repeat_time,
-                       config.bit_time, config.seed, i)
-        columns.append(config.offset[i] + peak[i] * table[np.arange(n) % table.size])
-    return np.stack(columns, axis=1)
-
-
-def amplitude(config: ExcitationParameters) -> tuple[float, ...]:
-    """Peak torques (2,) [N m]: as given, or scaled to the allowed angle."""
-    if not config.allowed_angle:
-        return config.amplitude
-    return fitted_amplitude(config)
-
-
-def crest_factor(signal: Array) -> float:
-    """Peak over root mean square of one period."""
-    return float(np.max(np.abs(signal)) / np.sqrt(np.mean(signal**2)))
-
-
-def _unit(config: ExcitationParameters, joint: int, k: int) -> float:
-    table = _table(config.rate, config.shape, config.period[joint], config.band, config.repeat_time,
-                   config.bit_time, config.seed, joint)
-    return float(table[k % table.size])
-
-
-@lru_cache(maxsize=64)
-def _table(
-    rate: float, shape: str, period: float, band: tuple[float, float], repeat: float, bit: float,
-    seed: int, joint: int,
-) -> Array:
-    """One period of the unit signal of a joint, (samples,); read only."""
-    if shape == 'square':
-        n = max(round(period * rate), 2)
-        table = np.where(np.arange(n) < n / 2, 1.0, -1.0)
-    elif shape == 'multisine':
-        table = _multisine(rate, band, repeat, seed, joint)
-    elif shape == 'prbs':
-        n = max(round(repeat * rate), 2)
-        hold = max(round(bit * rate), 1)
-        bits = np.random.default_rng((seed, joint)).integers(0, 2, -(-n // hold)) * 2.0 - 1.0
-        table = np.repeat(bits, hold)[:n]
-    elif shape == 'chirp':
-        t = np.arange(max(round(repeat * rate), 2)) / rate
-        low, high = band if joint == 0 else band[::-1]  # down where the other goes up
-        table = np.sin(2 * np.pi * (low + (high - low) * t / (2 * repeat)) * t)
-    else:
-        table = np.zeros(1)
-    table.flags.writeable = False
-    return table
-
-
-def _multisine(rate: float, band: tuple[float, float], repeat: float, seed: int, joint: int) -> Array:
-    """Flat spectrum over the band, phases optimized for a low peak; joints share no line.
-
-    Clipping algorithm of Van der Ouderaa, Schoukens and Renneboog (IEEE Trans. IM 37, 1988): clip in
-    time, keep the phases of the clipped signal and the amplitudes wanted, repeat.
-    """
-    n = max(round(repeat * rate), 2)
-    lines = np.arange(int(np.ceil(band[0] * repeat)), int(band[1] * repeat) + 1)
-    if lines.size > 1:
-        lines = lines[joint::2]
-    phases = -np.pi * np.arange(lines.size) ** 2 / lines.size  # Schroeder's phases to start with
-    phases = phases + np.random.default_rng((seed, joint)).uniform(-0.1, 0.1, lines.size)
-    best = np.zeros(n)
-    lowest = np.inf
-    for step in range(CREST_PASSES):
-        spectrum = np.zeros(n // 2 + 1, dtype=np.complex128)
-        spectrum[lines] = np.exp(1j * phases)
-        signal = np.fft.irfft(spectrum, n)
-        peak = float(np.max(np.abs(signal)))
-        if peak < lowest:
-            lowest, best = peak, signal / peak
-        level = peak * (0.75 + 0.2 * step / CREST_PASSES)
-        phases = np.angle(np.fft.rfft(np.clip(signal, -level, level))[lines])
-    return best
-
 
 TIMES = (0.25, 1.0, 3.0)
 """Seconds after the capture for which the accuracy is told."""
@@ -114,6 +23,24 @@ CLOSE = 0.02
 """The fitted motion ends within this share below the allowed angle."""
 BEYOND = 10.0
 """Logarithm that stands for an arm that diverges."""
+
+
+def torque(config: ExcitationParameters, k: int) -> Array:
+    """Torque (2,) [N m] held from sample k on."""
+    peak, tables = amplitude(config), [waveforms.unit(config, i) for i in range(2)]
+    return np.array([config.offset[i] + peak[i] * tables[i][k % tables[i].size] for i in range(2)])
+
+
+def sequence(config: ExcitationParameters, n: int) -> Array:
+    """Torques (n, 2) [N m] of samples 0 .. n - 1: the same numbers as ``torque``."""
+    return waveforms.scaled(config, amplitude(config), n)
+
+
+def amplitude(config: ExcitationParameters) -> tuple[float, ...]:
+    """Peak torques (2,) [N m]: as given, or scaled to the allowed angle."""
+    if not config.allowed_angle:
+        return config.amplitude
+    return fitted_amplitude(config)
 
 
 def plant_of(config: ExcitationParameters) -> PlantParameters:

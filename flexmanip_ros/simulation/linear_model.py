@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, null_space
 
+from flexmanip_ros.arm import dynamics
 from flexmanip_ros.arm import manipulator as arm_dynamics
 from flexmanip_ros.arm.capture import body_jacobian
 from flexmanip_ros.arm.linearization import discretize
@@ -101,6 +102,6 @@ def linear_model(config: PlantParameters) -> LinearModel:
     q = np.zeros(2 + 2 * arm.kappa)
     q[:2] = config.initial_angles
     return LinearModel(
-        M0=arm_dynamics.mass_matrix(arm, np.zeros(4), q), D=np.diag(arm.damping), K=np.diag(arm.stiffness),
+        M0=dynamics.mass_matrix(arm, np.zeros(4), q), D=np.diag(arm.damping), K=np.diag(arm.stiffness),
         B=arm.torque, C=arm.output, rest_output=arm.output @ q, dt=1.0 / config.rate,
         tip=lambda com: body_jacobian(arm, q, com), locked=config.locked)

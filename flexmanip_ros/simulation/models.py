@@ -13,10 +13,10 @@ from typing import Protocol
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, eigvals
 
+from flexmanip_ros.arm import dynamics
 from flexmanip_ros.arm import manipulator as arm_dynamics
 from flexmanip_ros.arm.capture import body_jacobian, free_object, joined
-from flexmanip_ros.arm.outputs import end_loads
-from flexmanip_ros.arm.shape_functions import slopes, slopes_with_tail
+from flexmanip_ros.arm.outputs import end_loads, slopes, slopes_with_tail
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.simulation.finite_elements import finite_element_model
@@ -103,7 +103,7 @@ class NonlinearModel:
 
     def mass_matrix(self, x: Array, payload: Array) -> Array:
         """See Model."""
-        return arm_dynamics.mass_matrix(self.arm, payload, x[:x.size // 2])
+        return dynamics.mass_matrix(self.arm, payload, x[:x.size // 2])
 
     def body_jacobian(self, x: Array, com: tuple[float, float]) -> Array:
         """See Model."""
@@ -148,7 +148,7 @@ def _fastest(arm: arm_dynamics.Manipulator, spread: float) -> float:
     n = 2 + 2 * arm.kappa
     q = np.zeros(n)
     q[1] = spread
-    M = cho_factor(arm_dynamics.mass_matrix(arm, np.zeros(4), q))
+    M = cho_factor(dynamics.mass_matrix(arm, np.zeros(4), q))
     rows = cho_solve(M, np.hstack([-np.diag(arm.stiffness), -np.diag(arm.damping)]))
     poles = eigvals(np.block([[np.zeros((n, n)), np.eye(n)], [rows]]))
     return float(np.max(np.abs(poles)))

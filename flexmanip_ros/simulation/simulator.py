@@ -16,7 +16,7 @@ import numpy as np
 from flexmanip_ros.arm.capture import Body, free_object, joined, rates_after
 from flexmanip_ros.errors import ModelError, SignalError
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, SensorParameters
-from flexmanip_ros.simulation import excitation, models, sensors
+from flexmanip_ros.simulation import models, sensors, waveforms
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointRecord
 
 JOINT_NAMES = ('joint1', 'joint2', 'link1_bend', 'link2_bend')
@@ -218,7 +218,7 @@ def _levels(config: PlantParameters) -> Array:
     gauges_only = SensorParameters(strain_cutoff=config.sensors.strain_cutoff)
     quiet = replace(config, noise='none', sensors=gauges_only)
     waves = ExcitationParameters(rate=config.rate, amplitude=config.rehearsal_torque)
-    efforts = excitation.sequence(waves, round(REHEARSAL_TIME * config.rate))
+    efforts = waveforms.scaled(waves, waves.amplitude, round(REHEARSAL_TIME * config.rate))
     half = round(round(len(efforts) / 2) * 1e9 / config.rate)
     run = simulate(quiet, efforts, (CaptureEvent(half, EventKind.CAPTURE),))
     return sensors.std_for_snr(run.position, run.velocity, config.snr_db)

@@ -84,6 +84,16 @@ def test_imports_point_from_doors_to_leaves(path: Path) -> None:
     assert not upward, f'{here} imports {upward}, which are built on it'
 
 
+def test_no_files_import_each_other_in_a_circle() -> None:
+    known = {name_of(path): path for path in MODULES}
+    graph = {name: {there for there in imports_of(path) if there in known and there != name}
+             for name, path in known.items()}
+    while free := [name for name, needs in graph.items() if not needs & graph.keys()]:
+        for name in free:
+            del graph[name]
+    assert not graph, f'these import each other, or what is in the circle: {sorted(graph)}'
+
+
 @pytest.mark.parametrize('path', MODULES, ids=without)
 def test_only_ros_imports_ros_and_only_io_imports_rosbags(path: Path) -> None:
     part = part_of(name_of(path))

@@ -9,7 +9,7 @@ import pytest
 from recording import ARM, config, event, record
 from scipy.linalg import expm
 
-from flexmanip_ros.arm import linearization
+from flexmanip_ros.arm import linearization, manipulator
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured, structured_model
 from flexmanip_ros.payload.interval import TAIL_SHARE, misjudged
@@ -92,7 +92,7 @@ def test_a_step_of_the_torque_leaves_the_momentum_of_all_modes():
     M = np.block([[b.Ma, b.Mb], [b.Mb.T, b.Mc]])
     chosen = np.r_[5:202, 205:402]
     kept = np.setdiff1d(np.arange(402), chosen)
-    stiffness, load = linearization.stiffness(ARM, 200), linearization.torque_matrix(ARM, 200)
+    stiffness, load = manipulator.stiffness(ARM, 200), manipulator.torque_matrix(ARM, 200)
     held = load[chosen] @ effort / stiffness[chosen - 2]
     expected = -np.linalg.solve(M[np.ix_(kept, kept)], M[np.ix_(kept, chosen)] @ held)
     moving.work.M[:] = np.linalg.cholesky(M[np.ix_(kept, kept)])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexmanip_ros.arm import capture, manipulator
+from flexmanip_ros.arm import capture, dynamics
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import Array
@@ -86,9 +86,9 @@ def test_energy_is_lost_unless_the_object_moves_with_the_tip() -> None:
     before = moving(CONFIG)
     half = before.x.size // 2
     arm = before.model.arm
-    energy = manipulator.energy(arm, before.payload, before.x[:half], before.x[half:])
+    energy = dynamics.energy(arm, before.payload, before.x[:half], before.x[half:])
     after = simulator.attach(CONFIG, before)
-    lost = energy - manipulator.energy(arm, after.payload, after.x[:half], after.x[half:])
+    lost = energy - dynamics.energy(arm, after.payload, after.x[:half], after.x[half:])
     assert lost > 0
     vx, vy, spin = before.model.body_jacobian(before.x, (0.0, 0.0)) @ before.x[half:]
     matched = replace(CONFIG, object_velocity=(vx, vy), object_spin=spin)

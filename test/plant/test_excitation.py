@@ -38,7 +38,7 @@ def test_square_waves_are_the_papers() -> None:
 def test_a_multisine_has_a_flat_band_and_a_low_peak() -> None:
     rows = excitation.sequence(ExcitationParameters(shape='multisine', band=(1.0, 10.0)), 4000)
     for i in range(2):
-        assert excitation.crest_factor(rows[:, i]) < 1.6
+        assert np.max(np.abs(rows[:, i])) / np.sqrt(np.mean(rows[:, i] ** 2)) < 1.6, 'crest factor'
         lines = np.abs(np.fft.rfft(rows[:, i]))
         inside = lines[4:41]
         assert np.abs(lines[41:]).max() < 1e-9 * inside.max()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexmanip_ros.arm import linearization, manipulator
+from flexmanip_ros.arm import dynamics, linearization, manipulator
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
 
@@ -29,7 +29,7 @@ def test_blocks_are_the_nonlinear_matrices_without_bending(arm: ArmParameters, k
     b = linearization.blocks(arm, POINT, 20.0, kappa)
     full = manipulator.manipulator(arm, kappa)
     q = np.concatenate([POINT, np.zeros(2 * kappa)])
-    M = manipulator.mass_matrix(full, manipulator.payload_array(20.0), q)
+    M = dynamics.mass_matrix(full, manipulator.payload_array(20.0), q)
     assert np.allclose(M, np.block([[b.Ma, b.Mb], [b.Mb.T, b.Mc]]), rtol=1e-13, atol=1e-12)
     assert np.array_equal(np.diag(full.stiffness[2:]), b.Kc)
     assert np.array_equal(full.torque, np.vstack([b.B_theta, b.B_eta]))
@@ -48,7 +48,7 @@ def test_vibration_model_eliminates_the_chords() -> None:
 @pytest.mark.parametrize('model', ['stiffness', 'modal'])
 def test_damping_ratio_is_that_of_the_first_pinned_mode(model: str) -> None:
     arm = ArmParameters(damping_ratio=0.02, damping_model=model)
-    D, K = linearization.damping(arm, 3), linearization.stiffness(arm, 3)
+    D, K = manipulator.damping(arm, 3), manipulator.stiffness(arm, 3)
     mass = np.repeat(np.array(arm.linear_density) * np.array(arm.link_length) / 2, 3)
     ratios = D / (2 * np.sqrt(K * mass))
     growth = np.array([1, 4, 9]) if model == 'stiffness' else np.ones(3)

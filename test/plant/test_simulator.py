@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexmanip_ros.arm import manipulator
+from flexmanip_ros.arm import dynamics
 from flexmanip_ros.errors import ModelError, ParameterError, SignalError
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
@@ -81,7 +81,7 @@ def test_energy_is_conserved_without_torque(shortening: bool) -> None:
     half = state.x.size // 2
 
     def energy(now: simulator.PlantState) -> float:
-        return manipulator.energy(model.arm, now.payload, now.x[:half], now.x[half:])
+        return dynamics.energy(model.arm, now.payload, now.x[:half], now.x[half:])
 
     before = energy(state)
     assert before > 1.0
@@ -99,7 +99,7 @@ def test_damping_only_takes_energy() -> None:
     energies = []
     for _ in range(300):
         state, _ = simulator.step(config, state, np.zeros(2))
-        energies.append(manipulator.energy(state.model.arm, state.payload, state.x[:half], state.x[half:]))
+        energies.append(dynamics.energy(state.model.arm, state.payload, state.x[:half], state.x[half:]))
     assert np.all(np.diff(energies) < 0)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexmanip_ros.arm import shape_functions
+from flexmanip_ros.arm import outputs
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import Array, CaptureEvent, EventKind
@@ -57,7 +57,7 @@ def test_square_waves_need_the_tail(many: dict[str, simulator.Trajectory]) -> No
 def test_flexibility_is_that_of_the_static_beam() -> None:
     """Without retained modes: L / 3 EI and L / 6 EI at the ends of a simply supported beam."""
     arm = ArmParameters(link_length=(2.0, 3.0), bending_stiffness=(1000.0, 5000.0))
-    R = shape_functions.flexibility(arm, 0)
+    R = outputs.flexibility(arm, 0)
     assert R[0, :2] == pytest.approx([2 / 3000, -2 / 6000], rel=1e-6)
     assert R[1, :4] == pytest.approx([2 / 6000, -2 / 3000, 3 / 15000, -3 / 30000], rel=1e-6)
     # mid-span deflection by an end moment, M L^2 / 16 EI
@@ -70,11 +70,11 @@ def test_flexibility_is_that_of_the_static_beam() -> None:
 
 
 def test_chord_angles_and_the_papers_torques_are_not_corrected_by_torques() -> None:
-    chord = shape_functions.flexibility(ArmParameters(angle_convention='chord'), 2)
+    chord = outputs.flexibility(ArmParameters(angle_convention='chord'), 2)
     assert not chord[:2].any()
-    paper = shape_functions.slopes(ArmParameters(torque_convention='paper'), 2)
+    paper = outputs.slopes(ArmParameters(torque_convention='paper'), 2)
     assert not paper.moments.any()
-    assert not shape_functions.slopes(ArmParameters(slope_correction=False), 2).active
+    assert not outputs.slopes(ArmParameters(slope_correction=False), 2).active
 
 
 def test_a_jump_of_the_torque_shows_one_sample_later() -> None:
@@ -86,8 +86,8 @@ def test_a_jump_of_the_torque_shows_one_sample_later() -> None:
 
 
 def test_the_tail_takes_over_from_the_quasi_static_part() -> None:
-    few = shape_functions.slopes_with_tail(ARM, CONFIG.initial_angles, 3, 5, 1e-3)
+    few = outputs.slopes_with_tail(ARM, CONFIG.initial_angles, 3, 5, 1e-3)
     static = few.output / np.array([np.linalg.solve(np.eye(2) - s, g + h)[0] for s, g, h in zip(
         few.step, few.start, few.end, strict=True)]) ** -1 @ few.load
-    total = shape_functions.slopes(ARM, 3).flexibility
+    total = outputs.slopes(ARM, 3).flexibility
     assert static + few.flexibility == pytest.approx(total, rel=1e-6, abs=1e-9 * np.abs(total).max())

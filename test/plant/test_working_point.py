@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexmanip_ros.arm import linearization, manipulator
+from flexmanip_ros.arm import dynamics, linearization, manipulator
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
@@ -29,7 +29,7 @@ def test_state_space_is_the_derivative_of_the_motion() -> None:
     h = 1e-5
 
     def motion(x: Array, tau: Array) -> Array:
-        return np.concatenate([x[6:], manipulator.accelerations(ARM, PAYLOAD, x[:6], x[6:], tau)])
+        return np.concatenate([x[6:], dynamics.accelerations(ARM, PAYLOAD, x[:6], x[6:], tau)])
 
     x = np.concatenate([q, qd])
     for matrix, f, start in ((A, lambda x: motion(x, TAU), x), (B, lambda tau: motion(x, tau), TAU)):
@@ -47,10 +47,10 @@ def test_each_term_is_the_derivative_it_names() -> None:
         def slope(f: object, e: Array = e) -> Array:
             return (f(h * e) - f(-h * e)) / (2 * h)
 
-        C_E = slope(lambda d: manipulator.bias(ARM, PAYLOAD, q, qd + d))
-        K_E = slope(lambda d: manipulator.bias(ARM, PAYLOAD, q + d, qd))
-        K_M = slope(lambda d: manipulator.mass_matrix(ARM, PAYLOAD, q + d) @ point.acceleration)
-        K = slope(lambda d: manipulator.elastic_forces(ARM, q + d) - manipulator.torque_at(ARM, q + d) @ TAU)
+        C_E = slope(lambda d: dynamics.bias(ARM, PAYLOAD, q, qd + d))
+        K_E = slope(lambda d: dynamics.bias(ARM, PAYLOAD, q + d, qd))
+        K_M = slope(lambda d: dynamics.mass_matrix(ARM, PAYLOAD, q + d) @ point.acceleration)
+        K = slope(lambda d: dynamics.elastic_forces(ARM, q + d) - dynamics.torque_at(ARM, q + d) @ TAU)
         for got, want in ((point.C_E, C_E), (point.K_E, K_E), (point.K_M, K_M), (point.K, K)):
             assert got[:, c] == pytest.approx(want, rel=1e-5, abs=1e-6 * max(np.abs(got).max(), 1.0))
 
