@@ -72,7 +72,7 @@ def test_what_is_no_list_is_not_taken_for_an_empty_one(ros: Ros, given: object) 
     ('arm.link_length', [3.0, -1.0], "'arm.link_length' is -1.0 m"),
     ('arm.link_length', [3.0], "'arm.link_length' has 1 elements; give 2"),
     ('arm.joint_mass', math.nan, "'arm.joint_mass'"),
-    ('payload_method', 'magic', 'choose one of none, block, structured'),
+    ('payload_method', 'magic', 'choose one of none, block, frequency, structured'),
     ('ordr', 4, "unknown parameter 'ordr'; did you mean 'order'?"),
     ('publish_rate', 100, "'publish_rate' is of type integer; give a number with a decimal point"),
     ('future_window', 11, 'cannot exceed past_window (10)'),
