@@ -120,10 +120,10 @@ def follow(config: IdentifierParameters, seen: Signals, capture: int = CAPTURE
                 if after >= 0.1:
                     found.append(Seen(after, structured.estimate(config, held), estimate.payload,
                                       estimate.modes_deviation))
-    return found, believed(config, state)
+    return found, residual_probability(config, state)
 
 
-def believed(config: IdentifierParameters, state: pipeline.State) -> np.ndarray:
+def residual_probability(config: IdentifierParameters, state: pipeline.State) -> np.ndarray:
     """Standard deviations of the outputs' noise: structured's white noise, RPBSID's innovations."""
     line = state.timeline
     assert line is not None

@@ -29,7 +29,7 @@ class PayloadEstimator(NamedTuple):
     structured: structured.StructuredState | None
     """None where the payload is read out of the model, or not at all."""
     configuration_range: Array = NOWHERE
-    """What the configuration went through since the last event, see ``model_check.sweep``."""
+    """What the configuration went through since the last event, see ``model_check.extend_range``."""
     since_ns: int = 0
     """Stamp of the last event; 0 before the first."""
 
@@ -43,7 +43,7 @@ class PayloadEstimator(NamedTuple):
             return self
         held, turned = structured.advance(config, self.structured, rows), self.configuration_range
         if held.model is not None:
-            turned = model_check.sweep(turned, rows, config.arm.angle_convention == 'encoder')
+            turned = model_check.extend_range(turned, rows, config.arm.angle_convention == 'encoder')
         return PayloadEstimator(held, turned, self.since_ns)
 
     def event(self, config: IdentifierParameters, event: CaptureEvent, background: Background) -> PayloadEstimator:
@@ -68,7 +68,7 @@ class ModelEstimator(NamedTuple):
     angles: Array = NO_ANGLES
     """The latest measured configuration: (2,) [rad], or (0,) when there is none."""
     configuration_range: Array = NO_ANGLES
-    """What the configuration went through since the last event, see ``block_extraction.sweep``."""
+    """What the configuration went through since the last event, see ``block_extraction.extend_range``."""
 
     def first_needed(self, cursor: int) -> int:
         """Return the first row of the sample log that will be read again."""
@@ -77,7 +77,7 @@ class ModelEstimator(NamedTuple):
     def advance(self, config: IdentifierParameters, rows: Rows, background: Background) -> ModelEstimator:
         """Take the next rows of the log. One call with N rows gives the bits of N calls with one."""
         return ModelEstimator(rpbsid.advance(config, self.rpbsid, rows, background), rows.angles[-1].copy(),
-                              block_extraction.sweep(config, self.configuration_range, rows))
+                              block_extraction.extend_range(config, self.configuration_range, rows))
 
     def event(self, config: IdentifierParameters, event: CaptureEvent, background: Background) -> ModelEstimator:
         """The arm caught or let go of something before the next row."""

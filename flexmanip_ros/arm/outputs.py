@@ -166,7 +166,7 @@ def _moments(arm: ArmParameters) -> Array:
     return np.array([[1.0, 0.0], [0.0, -1.0], [0.0, 1.0], [0.0, 0.0]])
 
 
-def slopes_with_tail(
+def slopes_with_residual_modes(
     arm: ArmParameters, theta: tuple[float, ...], kappa: int, tail: int, dt: float,
 ) -> Slopes:
     """Correction of an arm with kappa modes a link whose next ``tail`` modes follow as oscillators."""

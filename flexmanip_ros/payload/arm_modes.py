@@ -136,7 +136,7 @@ def _mass(parts: Blocks) -> Array:
     return np.asarray(np.block([[parts.Ma, parts.Mb], [parts.Mb.T, parts.Mc]]))
 
 
-def drive(identified: Identified, chosen: Array, rows: Array, rates: Array, weights: Array
+def modal_participation(identified: Identified, chosen: Array, rows: Array, rates: Array, weights: Array
           ) -> tuple[Array, Array]:
     """Return a sum over modes and outputs of (what an output sees of a mode) x (what an input does to it).
 

@@ -185,14 +185,15 @@ def extract(
 
 
 NOWHERE: Array = np.empty(0)
-"""A sweep of which nothing is known."""
+"""A extend_range of which nothing is known."""
 
 
-def estimate(config: IdentifierParameters, identified: Identified, angles: Array, swept: Array = NOWHERE
+def estimate(config: IdentifierParameters, identified: Identified, angles: Array, configuration_range: Array = NOWHERE
              ) -> Payload:
     """Return the payload of an identified model with its 95 % interval; never a NaN.
 
-    angles: (2,) measured, by the arm's convention; swept: from ``sweep``. The interval comes from models
+    angles: (2,) measured, by the arm's convention; configuration_range: from ``extend_range``. The interval is that
+    of models
     drawn from the covariance of the identified one (``block_interval``), and reaches over what a model of
     kappa modes at one configuration cannot know: further modes, and with a known M_b how the arm moved.
     """
@@ -210,7 +211,7 @@ def estimate(config: IdentifierParameters, identified: Identified, angles: Array
     def doubts_of(Ac: Array, Bc: Array, mass: float) -> list[tuple[float, float]]:
         excess = _excess(config, theta, kappa, mass_of, mass)
         moved = [0.0]
-        for turn in np.arccos(swept):  # the blocks depend on the angle between the links alone
+        for turn in np.arccos(configuration_range):  # the blocks depend on the angle between the links alone
             there = blocks(config.arm, np.array([0.0, turn]), kappa=kappa)
             moved.append(float(masses(config.arm, there, Ac, Bc, known)) - mass)
         return [(min(0.0, -2.0 * excess), max(0.0, -2.0 * excess)), (min(moved), max(moved))]
@@ -218,7 +219,7 @@ def estimate(config: IdentifierParameters, identified: Identified, angles: Array
     return payload(identified, *seen, mass_of, doubts_of)
 
 
-def sweep(config: IdentifierParameters, before: Array, rows: Rows) -> Array:
+def extend_range(config: IdentifierParameters, before: Array, rows: Rows) -> Array:
     """Return the smallest and largest cosine between the links (2,), after more rows.
 
     Kept only where it matters: the method takes M_b or the frequencies from the arm (they vary with that cosine), and

@@ -28,7 +28,7 @@ INDEPENDENT = 0.5
 """Samples a look that is as good as independent, over all onsets of the window (for the false alarms)."""
 SPEED, ACCELERATION, JERK = 0.3, 5.0, 200.0
 """Prior deviations of what the tip's light mass would gain: impulse [m/s], step [m/s^2], ramp [m/s^3]."""
-watch_samples = Prepared(kernel.watch_samples, 2)
+detect_samples = Prepared(kernel.detect_samples, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class DetectionState:
     filter: structured.StructuredState
     kept: tuple[int, ...]
     """Outputs that are looked at."""
-    watch: kernel.Watch | None = None
+    glr: kernel.GlrState | None = None
     dt: float = 0.0
     since: int | None = None
     """Row of the sample log with which it started, or after the last gap; an onset is not dated before it."""
@@ -61,7 +61,7 @@ def first_needed(state: DetectionState) -> int:
     first = structured.first_needed(state.filter)
     if state.since is None:
         return first
-    window = state.filter.cursor if state.watch is None else state.watch.trace.shape[0]
+    window = state.filter.cursor if state.glr is None else state.glr.trace.shape[0]
     return min(first, max(state.since, state.filter.cursor - window))
 
 
@@ -73,7 +73,7 @@ def advance(
     rows = rows.with_outputs(state.kept)
     while len(rows) and state.filter.model is not None:
         one = rows.between(rows.first, rows.first + 1)
-        if state.watch is None or state.filter.memory is None:
+        if state.glr is None or state.filter.memory is None:
             state = _start(config, state, one)
             rows = rows.since(one.until)
         elif rows.gap[0]:
@@ -89,9 +89,9 @@ def advance(
 
 def statistic(state: DetectionState) -> tuple[float, float]:
     """Return the latest statistic and its threshold (0 and infinite before there are any)."""
-    if state.watch is None:
+    if state.glr is None:
         return 0.0, float('inf')
-    level = state.watch.level
+    level = state.glr.level
     return float(level[0]), float(max(level[3], kernel.CALM * level[2]))
 
 
@@ -116,31 +116,31 @@ def _start(config: TriggerParameters, state: DetectionState, row: Rows) -> Detec
     w = max(kernel.SHORTEST + 2, round(config.detection_window / dt))
     n2 = 2 * state.filter.model.motion.q.size
     m = len(state.filter.model.roles)
-    watch = kernel.Watch(
+    glr = kernel.GlrState(
         trace=np.zeros((w, m, kernel.CAUSES)), factors=np.zeros((w, kernel.CAUSES, kernel.CAUSES)),
         scores=np.zeros((w, kernel.CAUSES)), past=np.zeros((w, m)), clock=np.zeros(6, dtype=np.int64),
         level=np.array([0.0, 0.0, 0.0, threshold(config, dt)]), history=np.zeros(2 * w),
         statistic=np.zeros(w), flow=np.zeros((n2, n2)), state=np.zeros((2, n2, 2)))
-    return replace(state, watch=watch, dt=dt)
+    return replace(state, glr=glr, dt=dt)
 
 
 def _watch(
     config: TriggerParameters, state: DetectionState, rows: Rows,
 ) -> tuple[DetectionState, CaptureEvent | None]:
     """Take rows without a gap until an alarm; return the event."""
-    filtered, watch = state.filter, state.watch
+    filtered, glr = state.filter, state.glr
     assert filtered.model is not None
     assert filtered.memory is not None
     assert filtered.sensors is not None
-    assert watch is not None
+    assert glr is not None
     assert state.since is not None
     m = mem.copy(filtered.memory)
-    watch = kernel.Watch._make(part.copy() for part in watch)
+    glr = kernel.GlrState._make(part.copy() for part in glr)
     table, first = structured.input_table(filtered, rows)
     confirm = round(CONFIRM / state.dt)
     light = filtered.model.motion.scale
-    taken = watch_samples(
-        filtered.model.motion, filtered.sensors, m, watch, light * np.array([SPEED, ACCELERATION, JERK]),
+    taken = detect_samples(
+        filtered.model.motion, filtered.sensors, m, glr, light * np.array([SPEED, ACCELERATION, JERK]),
         state.dt, float(np.exp(-state.dt / PEAK_MEMORY)), round(SETTLE / state.dt), confirm, table, first,
         np.zeros(kernel.CAUSES))
     cursor = rows.first + abs(taken) - first
@@ -149,10 +149,10 @@ def _watch(
         return replace(fresh, filter=fresh.filter._replace(cursor=cursor)), None
     last = rows.between(cursor - 1, cursor)
     filtered = filtered._replace(memory=m, cursor=cursor, last_ns=int(last.stamp_ns[0]), effort=last.u[0].copy())
-    state = replace(state, filter=filtered, watch=watch)
-    if watch.clock[kernel.ALARMED] <= confirm:
+    state = replace(state, filter=filtered, glr=glr)
+    if glr.clock[kernel.ALARMED] <= confirm:
         return state, None
-    lag = min(int(watch.level[1]), cursor - 1 - state.since, watch.trace.shape[0] - 1)
+    lag = min(int(glr.level[1]), cursor - 1 - state.since, glr.trace.shape[0] - 1)
     kind = EventKind.RELEASE if m.counts[mem.HELD] else EventKind.CAPTURE
     event = CaptureEvent(int(rows.between(cursor - 1 - lag, cursor).stamp_ns[0]), kind)
     return _after(state, event), event
@@ -160,23 +160,23 @@ def _watch(
 
 def _after(state: DetectionState, event: CaptureEvent) -> DetectionState:
     """Let the filter know; the samples since the onset misled it, so it looks at the motion anew."""
-    assert state.watch is not None
+    assert state.glr is not None
     now = event._replace(stamp_ns=state.filter.last_ns)
     filtered = structured.event(state.identifier, state.filter, now)
     filtered = structured.reopen(state.identifier, filtered)
-    return replace(state, filter=filtered, watch=_quiet(state.watch))
+    return replace(state, filter=filtered, glr=_quiet(state.glr))
 
 
 def _resume(config: TriggerParameters, state: DetectionState, row: Rows) -> DetectionState:
     """After a gap: filter anew, test anew."""
-    assert state.watch is not None
+    assert state.glr is not None
     filtered = structured.advance(state.identifier, state.filter, row)
-    return replace(state, filter=filtered, watch=_quiet(state.watch), since=row.first)
+    return replace(state, filter=filtered, glr=_quiet(state.glr), since=row.first)
 
 
-def _quiet(watch: kernel.Watch) -> kernel.Watch:
+def _quiet(glr: kernel.GlrState) -> kernel.GlrState:
     """Forget what was gathered; wait before the next alarm. What the model always misses stays known."""
-    fresh = kernel.Watch._make(part.copy() for part in watch)
+    fresh = kernel.GlrState._make(part.copy() for part in glr)
     fresh.clock[:] = 0
     fresh.level[:2] = 0.0
     fresh.history[:] = 0.0

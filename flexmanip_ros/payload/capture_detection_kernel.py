@@ -22,9 +22,9 @@ from flexmanip_ros.payload.process_model import linearize, set_parameters
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
-    from flexmanip_ros.payload.filter_state import Memory
-    from flexmanip_ros.payload.measurement_update import Sensors
-    from flexmanip_ros.payload.process_model import Motion
+    from flexmanip_ros.payload.filter_state import FilterState
+    from flexmanip_ros.payload.measurement_update import MeasurementModel
+    from flexmanip_ros.payload.process_model import ProcessModel
 
 CAUSES = 6
 """Impulse, step and ramp of the force at the tip, along x and y."""
@@ -42,7 +42,7 @@ DATING = 3.0
 NEWEST, FILLED, SINCE_TRACES, QUIET, HISTORY, ALARMED = range(6)
 
 
-class Watch(NamedTuple):
+class GlrState(NamedTuple):
     """What the detector remembers; w onsets in the window, m sensors."""
 
     trace: Array
@@ -69,14 +69,15 @@ class Watch(NamedTuple):
 
 @kernel
 def traces(
-    motion: Motion, sensors: Sensors, m: Memory, watch: Watch, prior: Array, effort: Array, dt: float,
+    motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr: GlrState, prior: Array, effort: Array,
+    dt: float,
 ) -> None:
     """Compute the traces of an onset for the present state; prior: (3,) deviations of the causes."""
     n = motion.q.size
-    w, sensors_count = watch.trace.shape[0], watch.trace.shape[1]
+    w, sensors_count = glr.trace.shape[0], glr.trace.shape[1]
     set_parameters(motion, m.x, False)
     linearize(motion, m.x[:n], m.x[n:2 * n], effort, motion.k[7], False)
-    flow, state = watch.flow, watch.state
+    flow, state = glr.flow, glr.state
     for i in range(2 * n):
         for c in range(2 * n):
             flow[i, c] = 0.0
@@ -115,14 +116,14 @@ def traces(
                 value = 0.0
                 for j in range(n):
                     value += sensors.H[i, j] * state[0, offset + j, c]
-                watch.trace[lag, i, c] = value * prior[0]
-                before = watch.trace[lag - 1] if lag > 0 else watch.trace[lag]
+                glr.trace[lag, i, c] = value * prior[0]
+                before = glr.trace[lag - 1] if lag > 0 else glr.trace[lag]
                 step, ramp = 0.0, 0.0
                 if lag > 0:
                     step = before[i, 2 + c] / prior[1] + dt * before[i, c] / prior[0]
                     ramp = before[i, 4 + c] / prior[2] + dt * before[i, 2 + c] / prior[1]
-                watch.trace[lag, i, 2 + c] = step * prior[1]
-                watch.trace[lag, i, 4 + c] = ramp * prior[2]
+                glr.trace[lag, i, 2 + c] = step * prior[1]
+                glr.trace[lag, i, 4 + c] = ramp * prior[2]
         for i in range(2 * n):
             for c in range(2):
                 value = 0.0
@@ -132,96 +133,97 @@ def traces(
         for i in range(2 * n):
             for c in range(2):
                 state[0, i, c] = state[1, i, c]
-    information(m, watch)
-    rescore(watch)
+    information(m, glr)
+    rescore(glr)
 
 
 @kernel
-def rescore(watch: Watch) -> None:
+def rescore(glr: GlrState) -> None:
     """Gather every onset's score anew: scores and information must come from the same traces."""
-    w = watch.trace.shape[0]
-    newest = watch.clock[NEWEST]
-    for lag in range(watch.clock[FILLED]):
+    w = glr.trace.shape[0]
+    newest = glr.clock[NEWEST]
+    for lag in range(glr.clock[FILLED]):
         onset = (newest - lag) % w
-        score = watch.scores[onset]
+        score = glr.scores[onset]
         for a in range(CAUSES):
             score[a] = 0.0
         for since in range(lag + 1):
-            for i in range(watch.trace.shape[1]):
-                e = watch.past[(onset + since) % w, i]
+            for i in range(glr.trace.shape[1]):
+                e = glr.past[(onset + since) % w, i]
                 for a in range(CAUSES):
-                    score[a] += watch.trace[since, i, a] * e
+                    score[a] += glr.trace[since, i, a] * e
 
 
 @kernel
-def information(m: Memory, watch: Watch) -> None:
+def information(m: FilterState, glr: GlrState) -> None:
     """Factor the information of every lag."""
-    for lag in range(watch.trace.shape[0]):
+    for lag in range(glr.trace.shape[0]):
         for a in range(CAUSES):
             for b in range(a + 1):
                 value = 0.0
-                for i in range(watch.trace.shape[1]):
-                    value += watch.trace[lag, i, a] * watch.trace[lag, i, b] / m.noise[i, EFFECTIVE]
-                watch.factors[lag, a, b] = value
+                for i in range(glr.trace.shape[1]):
+                    value += glr.trace[lag, i, a] * glr.trace[lag, i, b] / m.noise[i, EFFECTIVE]
+                glr.factors[lag, a, b] = value
     # sums over the lags, then factors: the sums would be lost if each were factored at once
-    for lag in range(1, watch.trace.shape[0]):
+    for lag in range(1, glr.trace.shape[0]):
         for a in range(CAUSES):
             for b in range(a + 1):
-                watch.factors[lag, a, b] += watch.factors[lag - 1, a, b]
-    for lag in range(watch.trace.shape[0]):
-        factor_information(watch.factors[lag])
+                glr.factors[lag, a, b] += glr.factors[lag - 1, a, b]
+    for lag in range(glr.trace.shape[0]):
+        factor_information(glr.factors[lag])
 
 
 @kernel
-def look(m: Memory, watch: Watch, scratch: Array) -> None:
+def update_glr(m: FilterState, glr: GlrState, scratch: Array) -> None:
     """Take the latest innovations into the score of every onset, and find the largest statistic."""
-    w = watch.trace.shape[0]
-    clock = watch.clock
+    w = glr.trace.shape[0]
+    clock = glr.clock
     clock[NEWEST] = (clock[NEWEST] + 1) % w
     clock[FILLED] = min(clock[FILLED] + 1, w)
     for a in range(CAUSES):
-        watch.scores[clock[NEWEST], a] = 0.0
-    for i in range(watch.trace.shape[1]):
+        glr.scores[clock[NEWEST], a] = 0.0
+    for i in range(glr.trace.shape[1]):
         variance = max(m.innovation[i, 1], m.noise[i, EFFECTIVE])
         limit = 5.0 * np.sqrt(variance)
-        watch.past[clock[NEWEST], i] = min(max(m.innovation[i, 0], -limit), limit) / variance
+        glr.past[clock[NEWEST], i] = min(max(m.innovation[i, 0], -limit), limit) / variance
     best, best_lag = 0.0, 0
     for lag in range(clock[FILLED]):
         onset = (clock[NEWEST] - lag) % w
-        score = watch.scores[onset]
-        for i in range(watch.trace.shape[1]):
-            e = watch.past[clock[NEWEST], i]
+        score = glr.scores[onset]
+        for i in range(glr.trace.shape[1]):
+            e = glr.past[clock[NEWEST], i]
             for a in range(CAUSES):
-                score[a] += watch.trace[lag, i, a] * e
+                score[a] += glr.trace[lag, i, a] * e
         if lag + 1 < SHORTEST:
             continue
         for a in range(CAUSES):
             scratch[a] = score[a]
-        forward(watch.factors[lag], scratch)
+        forward(glr.factors[lag], scratch)
         statistic = 0.0
         for a in range(CAUSES):
             statistic += scratch[a] * scratch[a]
-        watch.statistic[lag] = statistic
+        glr.statistic[lag] = statistic
         best = max(best, statistic)
     for lag in range(clock[FILLED] - 1, SHORTEST - 2, -1):
-        if watch.statistic[lag] > best - DATING:
+        if glr.statistic[lag] > best - DATING:
             best_lag = lag
-    watch.level[0], watch.level[1] = best, best_lag
+    glr.level[0], glr.level[1] = best, best_lag
 
 
 @kernel
-def remember(watch: Watch, fade: float) -> None:
+def remember(glr: GlrState, fade: float) -> None:
     """Let a statistic that is older than the window raise the recent peak."""
-    clock, history = watch.clock, watch.history
+    clock, history = glr.clock, glr.history
     clock[HISTORY] = (clock[HISTORY] + 1) % history.size
     old = history[clock[HISTORY]]
-    history[clock[HISTORY]] = watch.level[0]
-    watch.level[2] = max(watch.level[2] * fade, old)
+    history[clock[HISTORY]] = glr.level[0]
+    glr.level[2] = max(glr.level[2] * fade, old)
 
 
 @kernel
-def watch_samples(
-    motion: Motion, sensors: Sensors, m: Memory, watch: Watch, prior: Array, dt: float, fade: float,
+def detect_samples(
+    motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr: GlrState, prior: Array, dt: float,
+    fade: float,
     hold: int, confirm: int, table: Array, first: int, scratch: Array,
 ) -> int:
     """Run the filter and the test; return the row of the table after the last one taken before an alarm.
@@ -233,19 +235,19 @@ def watch_samples(
     for k in range(first, table.shape[0]):
         if not take(motion, sensors, m, table, k):
             return -k - 1
-        clock = watch.clock
+        clock = glr.clock
         if clock[SINCE_TRACES] == 0:
-            traces(motion, sensors, m, watch, prior, table[k, 1:3], dt)
+            traces(motion, sensors, m, glr, prior, table[k, 1:3], dt)
         clock[SINCE_TRACES] = (clock[SINCE_TRACES] + 1) % REFRESH
-        look(m, watch, scratch)
+        update_glr(m, glr, scratch)
         clock[QUIET] += 1
         if clock[ALARMED] > 0:
             clock[ALARMED] += 1
             if clock[ALARMED] > confirm:
                 return k + 1
         elif clock[QUIET] > hold:
-            if watch.level[0] > max(watch.level[3], CALM * watch.level[2]):
+            if glr.level[0] > max(glr.level[3], CALM * glr.level[2]):
                 clock[ALARMED] = 1
-            remember(watch, fade)
+            remember(glr, fade)
     taken: int = table.shape[0]
     return taken

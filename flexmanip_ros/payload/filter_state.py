@@ -10,19 +10,20 @@ from numpy.typing import NDArray
 from flexmanip_ros.types import Array
 
 HORIZON = 512
-"""Samples after an event that are kept and fitted again and again from the event on."""
+"""Samples after an event that the moving-horizon estimation reads again."""
 
-# columns of ``noise``, one row a sensor: variance used; of the innovations; slow part of it; two sums of
-# this block; least one; of what no motion explains (fourth differences); share in what the payload rests on
+# Columns of ``noise``, one row a sensor: variance used by the filter; variance of the innovations; its slow part;
+# sum and sum of squares of the residuals in this block; least variance assumed; variance of the fourth differences
+# (white noise only); information on the payload that came from this sensor.
 EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT = range(8)
-# elements of ``count``
-HELD, STORED, PASSED, PASSING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN = range(11)
-# elements of ``score``
-MOVE, VARIANCE, DRIFT, NOW, SEEMED, BEYOND, SHOWN, TOLD, ODDS = range(9)
+# Elements of ``counts``.
+HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN = range(11)
+# Elements of ``score``.
+MOVE, VARIANCE, DRIFT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, SHOWN, INFORMATION, ODDS = range(9)
 
 
-class Memory(NamedTuple):
-    """The filter and the fit that runs behind it; nx states, m sensors."""
+class FilterState(NamedTuple):
+    """State of the square-root Kalman filter and of the moving-horizon estimation; nx states, m sensors."""
 
     x: Array
     """(nx,) mean."""
@@ -35,11 +36,11 @@ class Memory(NamedTuple):
     counts: NDArray[np.int64]
     """(11,) counters."""
     score: Array
-    """(9,) move of the payload in this batch, its variance; mean squared normalised move; time to diffuse;
-    what the arm seemed to hold before the event, when it was empty, in standard deviations, then in those
-    that the error to reckon with in its inertia adds to; how much the innovations have in common with the
-    ringing of modes beyond kappa, and how much of it they could show (variance of the former), and the odds
-    of such modes beforehand (logarithm)."""
+    """(9,) MOVE: sum of the payload's updates in this batch, VARIANCE: the variance they should have; DRIFT: mean of
+    MOVE^2 / VARIANCE; NOW: time since process noise was added [s]; EMPTY_ARM_BIAS: payload of the arm before the event,
+    when it was empty, in standard deviations, EXCESS_BIAS: in those left when the inertia error is allowed for; SHOWN:
+    correlation of the innovations with the output of the residual modes, INFORMATION: its variance; ODDS: logarithm
+    of the prior odds of residual modes."""
     x0: Array
     """(nx,) mean just after the last event."""
     S0: Array
@@ -49,14 +50,14 @@ class Memory(NamedTuple):
     corrections: Array
     """(HORIZON, m) what the residual modes were taken to add to the measurements since the event."""
     xr: Array
-    """(nx,) reference trajectory of the running pass."""
+    """(nx,) reference trajectory of the present Gauss-Newton iteration."""
     Sr: Array
     """(nx, nx) its sensitivity to xi."""
     N: Array
-    """(nx, nx) information gathered in the pass."""
+    """(nx, nx) information gathered in the iteration."""
     g: Array
-    """(nx,) gradient gathered in the pass."""
-    tail: Array
+    """(nx,) gradient gathered in the iteration."""
+    residual: Array
     """(2, a) modes beyond kappa: departure from where the torque holds them, its rate."""
     torque: Array
     """(2,) held before the latest sample."""
@@ -68,30 +69,31 @@ class Memory(NamedTuple):
     """(m,) mean squared normalised innovation of each sensor since the event, slowly forgotten."""
 
 
-def memory(nx: int, m: int, a: int = 0) -> Memory:
+def memory(nx: int, m: int, a: int = 0) -> FilterState:
     """Allocate for nx states, m sensors, a modes beyond kappa."""
-    return Memory(
+    return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 8)), recent=np.zeros((m, 4)),
         counts=np.zeros(11, dtype=np.int64),
         score=np.zeros(9), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx),
         corrections=np.zeros((HORIZON, m)), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
-        g=np.zeros(nx), tail=np.zeros((2, a)), torque=np.zeros(2), torque0=np.zeros(2),
+        g=np.zeros(nx), residual=np.zeros((2, a)), torque=np.zeros(2), torque0=np.zeros(2),
         innovation=np.zeros((m, 2)), power=np.ones(m))
 
 
-def copy(state: Memory, *, refit: bool = True) -> Memory:
+def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
     """Return the same values in arrays of their own.
 
-    All but the corrections, the largest part, once they are complete: nothing writes them any more. refit
-    False: nor what belongs to the refit, which only an event writes then.
+    Once the corrections are complete, nothing writes them any more, and they are shared. horizon False: what belongs to
+    the moving horizon is shared too; then only an event writes it.
     """
-    (x, S, noise, recent, counts, score, x0, S0, xi, corrections, xr, Sr, N, g, tail, torque, torque0, innovation,
-     power) = state
+    (x, S, noise, recent, counts, score, x0, S0, xi, corrections, xr, Sr, N, g, residual, torque, torque0,
+     innovation, power) = state
     complete = counts[STORED] >= HORIZON
     if not complete:
         corrections = corrections.copy()
-    if refit or not complete:
+    if horizon or not complete:
         x0, S0, xi, xr, Sr = x0.copy(), S0.copy(), xi.copy(), xr.copy(), Sr.copy()
         N, g, torque0 = N.copy(), g.copy(), torque0.copy()
-    return Memory(x.copy(), S.copy(), noise.copy(), recent.copy(), counts.copy(), score.copy(), x0, S0, xi,
-                  corrections, xr, Sr, N, g, tail.copy(), torque.copy(), torque0, innovation.copy(), power.copy())
+    return FilterState(
+        x.copy(), S.copy(), noise.copy(), recent.copy(), counts.copy(), score.copy(), x0, S0, xi, corrections, xr, Sr,
+        N, g, residual.copy(), torque.copy(), torque0, innovation.copy(), power.copy())

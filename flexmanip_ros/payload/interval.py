@@ -11,9 +11,9 @@ from flexmanip_ros.numerics.compiled import kernel
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.filter_state import BATCHES, BLOCKS, DRIFT, EFFECTIVE, FLOOR, POWER, WEIGHT, WHITE
-from flexmanip_ros.payload.measurement_update import Sensors
+from flexmanip_ros.payload.measurement_update import MeasurementModel
 from flexmanip_ros.payload.process_model import PARAMETERS
-from flexmanip_ros.payload.residual_modes import believed
+from flexmanip_ros.payload.residual_modes import residual_probability
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import Array, Payload, Status
 
@@ -35,7 +35,8 @@ SETTLED = 1000
 """Samples after which a restart is forgotten."""
 
 
-def judge(config: IdentifierParameters, model: Model | None, sensors: Sensors | None, m: mem.Memory | None,
+def judge(config: IdentifierParameters, model: Model | None, sensors: MeasurementModel | None,
+          m: mem.FilterState | None,
           restarts: int) -> Payload:
     """Return the payload; never a NaN."""
     if model is None:
@@ -51,8 +52,8 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Sensors | 
     if math.isnan(consistency):
         consistency = plain_misfit(sensors, m)
     restless = math.sqrt(drift * max(1.0, consistency / POWER_LIMIT))
-    widening, doubt = (restless * max(1.0, abs(float(m.score[seemed])) / SEEMED_FREE)
-                       for seemed in (mem.SEEMED, mem.BEYOND))
+    widening, doubt = (restless * max(1.0, abs(float(m.score[empty_arm_bias])) / SEEMED_FREE)
+                       for empty_arm_bias in (mem.EMPTY_ARM_BIAS, mem.EXCESS_BIAS))
     std = widening * deviation
     status = Status.TRACKING
     if consistency > POWER_LIMIT or doubt > WIDENING_LIMIT:
@@ -75,7 +76,7 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Sensors | 
 
 
 def rotary(
-    model: Model, m: mem.Memory, widening: float, status: Status,
+    model: Model, m: mem.FilterState, widening: float, status: Status,
 ) -> tuple[tuple[float, float, float, float, float, float], Status]:
     """Return the payload's inertia about its centre of mass, refused with a status where it is not known.
 
@@ -104,7 +105,7 @@ def empty(seeming: float, std: float, consistency: float, status: Status) -> Pay
     return Payload(0.0, std, 0.0, upper, consistency, status)
 
 
-def inexact(config: IdentifierParameters, model: Model, m: mem.Memory, mass: float) -> float:
+def inexact(config: IdentifierParameters, model: Model, m: mem.FilterState, mass: float) -> float:
     """Deviation [kg] of a payload by the error to reckon with in the arm's inertia; 0 for an exact arm."""
     return misjudged(m.noise, m.score, m.counts) * inertia_error(config, model, mass)
 
@@ -119,13 +120,13 @@ def inertia_error(config: IdentifierParameters, model: Model, mass: float) -> fl
     return config.payload.model_error * coarse * (mass + model.motion.scale)
 
 
-def plain_misfit(sensors: Sensors, m: mem.Memory) -> float:
+def plain_misfit(sensors: MeasurementModel, m: mem.FilterState) -> float:
     """Innovation power over white noise of the sensors of displacements, before any tells of the payload."""
     ratio = m.noise[:, mem.POWER] / np.maximum(m.noise[:, mem.WHITE], m.noise[:, mem.FLOOR])
     return float(np.median(ratio[~sensors.rate]))
 
 
-TAIL_SHARE = 0.5
+RESIDUAL_SHARE = 0.5
 """Of the error to reckon with, what is left where nothing misfits but the modes beyond kappa, allowed for."""
 
 Integers = NDArray[np.int64]
@@ -169,14 +170,14 @@ def drift(score: Array, counts: Integers) -> float:
 def misjudged(noise: Array, score: Array, counts: Integers) -> float:
     """How far one has to reckon with an arm that is not quite the model, 0 to 1.
 
-    1 where a sensor shows more than its white noise; else ``TAIL_SHARE`` as far as the arm is believed to
-    have more modes: seen ringing, or not to be told as no torque stepped.
+    1 where a sensor shows more than its white noise; else ``RESIDUAL_SHARE`` times the probability that the arm is
+    have more modes: seen residual_output, or not to be told as no torque stepped.
     """
     chance = 2.5 * math.sqrt(2.0 / max(counts[BLOCKS], 1))
     for i in range(noise.shape[0]):
         if noise[i, EFFECTIVE] >= (1.0 + chance) * max(noise[i, WHITE], noise[i, FLOOR]):
             return 1.0
-    return TAIL_SHARE * believed(score)
+    return RESIDUAL_SHARE * residual_probability(score)
 
 
 @kernel

@@ -19,25 +19,25 @@ from flexmanip_ros.payload.filter_state import (
     FLOOR,
     IN_BATCH,
     IN_BLOCK,
+    INFORMATION,
     MOVE,
     POWER,
     SEEN,
     SHOWN,
     SINCE_EVENT,
     SLOW,
-    TOLD,
     VARIANCE,
     WEIGHT,
     WHITE,
 )
 from flexmanip_ros.payload.process_model import PARAMETERS
-from flexmanip_ros.payload.residual_modes import amplitude, ringing
+from flexmanip_ros.payload.residual_modes import residual_amplitude, residual_output
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
-    from flexmanip_ros.payload.filter_state import Memory
-    from flexmanip_ros.payload.process_model import Motion
-    from flexmanip_ros.payload.residual_modes import Tail
+    from flexmanip_ros.payload.filter_state import FilterState
+    from flexmanip_ros.payload.process_model import ProcessModel
+    from flexmanip_ros.payload.residual_modes import ResidualModes
 
 OUTLIER = 4.0
 """Innovations beyond this many standard deviations count less (Huber)."""
@@ -47,7 +47,7 @@ BATCH_MEMORY = 20
 """Batches over which the moves of the payload are averaged."""
 
 
-class Sensors(NamedTuple):
+class MeasurementModel(NamedTuple):
     """How the signals follow from the state."""
 
     H: Array
@@ -56,7 +56,7 @@ class Sensors(NamedTuple):
     """(m,) whether H reads qd."""
     feed: Array
     """(m, 2) direct effect of the torque."""
-    tail: Tail
+    residual: ResidualModes
     """What rings beyond kappa."""
     block: int
     """Samples in a block: a tenth of the slowest vibration."""
@@ -71,16 +71,16 @@ class Sensors(NamedTuple):
 
 
 @inlined
-def measure(motion: Motion, sensors: Sensors, m: Memory, effort: Array, y: Array) -> None:
+def measure(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, effort: Array, y: Array) -> None:
     """Update the filter with one sample and gather what its innovations say of noise and payload."""
     payload = m.x.size - PARAMETERS
     x, S, f = m.x, m.S, sensors.f
     n = motion.q.size
-    share = amplitude(m.score)
+    share = residual_amplitude(m.score)
     for i in range(y.size):
         r = m.noise[i, EFFECTIVE]
         predicted = project(x, S, sensors.H[i], n if sensors.rate[i] else 0, f)
-        more = ringing(sensors.tail, m, i)
+        more = residual_output(sensors.residual, m, i)
         e = y[i] - predicted - sensors.feed[i, 0] * effort[0] - sensors.feed[i, 1] * effort[1] - share * more
         spread = 0.0
         for c in range(f.size):
@@ -91,7 +91,7 @@ def measure(motion: Motion, sensors: Sensors, m: Memory, effort: Array, y: Array
         m.power[i] += (min(square, 25.0) - m.power[i]) / min(m.counts[SINCE_EVENT] + 100, 1000)
         more /= np.sqrt(variance)
         m.score[SHOWN] += more * min(max(e / np.sqrt(variance) + share * more, -5.0), 5.0)
-        m.score[TOLD] += more * more
+        m.score[INFORMATION] += more * more
         residual = min(max(e / np.sqrt(variance), -5.0), 5.0) * np.sqrt(r)
         m.noise[i, BLOCK_SUM] += residual
         m.noise[i, BLOCK_POWER] += residual * residual
@@ -111,7 +111,7 @@ def measure(motion: Motion, sensors: Sensors, m: Memory, effort: Array, y: Array
 
 
 @inlined
-def white_noise(m: Memory, i: int, y: float) -> None:
+def white_noise(m: FilterState, i: int, y: float) -> None:
     """Variance of sensor i's white noise, from fourth differences, in which slow motion has no part."""
     recent = m.recent[i]
     if m.counts[SEEN] >= 4:
@@ -126,7 +126,7 @@ def white_noise(m: Memory, i: int, y: float) -> None:
 
 
 @inlined
-def learn_noise(sensors: Sensors, m: Memory) -> None:
+def learn_noise(sensors: MeasurementModel, m: FilterState) -> None:
     """At the end of a block: the variance of each sensor, and its slow part when that is not white."""
     m.counts[IN_BLOCK] += 1
     if m.counts[IN_BLOCK] < sensors.block:
@@ -147,7 +147,7 @@ def learn_noise(sensors: Sensors, m: Memory) -> None:
 
 
 @inlined
-def judge_payload(sensors: Sensors, m: Memory) -> None:
+def judge_payload(sensors: MeasurementModel, m: FilterState) -> None:
     """At the end of a batch: see whether the payload moved farther than its variance allows."""
     m.counts[IN_BATCH] += 1
     if m.counts[IN_BATCH] < 8 * sensors.block:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
-from flexmanip_ros.payload.arm_modes import ArmModes, arm_modes, drive
+from flexmanip_ros.payload.arm_modes import ArmModes, arm_modes, modal_participation
 from flexmanip_ros.payload.interval import QUANTILE
 from flexmanip_ros.payload.process_model import PARAMETERS
 from flexmanip_ros.payload.structured import StructuredState
@@ -88,10 +88,11 @@ class Known(NamedTuple):
         return deviations
 
 
-def compare(config: IdentifierParameters, model: Model, m: mem.Memory, payload: Payload, swept: Array,
+def compare(config: IdentifierParameters, model: Model, m: mem.FilterState, payload: Payload,
+            configuration_range: Array,
             identified: Identified, modes: Sequence[Mode]) -> Verdict | None:
     """Compare frequencies and drives; None where the identified model has not the modes for it."""
-    known = _known(config, model, m, payload, swept)
+    known = _known(config, model, m, payload, configuration_range)
     nearest = _matched(known.arm.frequency[0], modes)
     if nearest is None:
         return None
@@ -104,22 +105,22 @@ def compare(config: IdentifierParameters, model: Model, m: mem.Memory, payload: 
                    clears=whole and deviation < AGREES)
 
 
-def _known(config: IdentifierParameters, model: Model, m: mem.Memory, payload: Payload, swept: Array
+def _known(config: IdentifierParameters, model: Model, m: mem.FilterState, payload: Payload, configuration_range: Array
            ) -> Known:
     """Gather what is known of the arm."""
     learned = m.x.size - PARAMETERS + np.arange(3)
-    cosines = _configurations(config, model, m, swept)
+    cosines = _configurations(config, model, m, configuration_range)
     arm = _predicted(config, model, m, np.append(cosines, cosines[:1].repeat(3)),
                      np.vstack([np.zeros((cosines.size, 3)), STEP * np.eye(3)]))
     spread = m.S[learned].copy()
     deviation = float(np.linalg.norm(spread[0]))
     if m.counts[mem.HELD] and deviation > 0.0 and payload.mass > 0.0:
         spread[0] *= max(1.0, payload.std / payload.mass / deviation)
-    turned = math.acos(max(swept[0], -1.0)) - math.acos(min(swept[1], 1.0))
-    return Known(arm, cosines, spread, max(turned, float(swept[3] - swept[2])))
+    turned = math.acos(max(configuration_range[0], -1.0)) - math.acos(min(configuration_range[1], 1.0))
+    return Known(arm, cosines, spread, max(turned, float(configuration_range[3] - configuration_range[2])))
 
 
-def _frequencies(config: IdentifierParameters, model: Model, m: mem.Memory, known: Known,
+def _frequencies(config: IdentifierParameters, model: Model, m: mem.FilterState, known: Known,
                  modes: Sequence[Mode]) -> tuple[float, float, float]:
     """Return by how much the lowest two frequencies disagree, and between which payloads they would not."""
     here = known.arm.frequency[0, :2]
@@ -148,7 +149,7 @@ def _drives(config: IdentifierParameters, model: Model, known: Known, identified
     weights = seen[0] / np.maximum((seen[0] ** 2).sum(axis=0), np.finfo(float).tiny)
     sums = (weights * seen).sum(axis=1)
     cancelled = (np.abs(weights) * np.abs(parts[0]).sum(axis=1)).sum(axis=0)  # 1: no part against another
-    value, noise = drive(identified, nearest, index, rates, weights)
+    value, noise = modal_participation(identified, nearest, index, rates, weights)
     off = known.off(value, sums)
     tolerated = DRIVE + DRIVE_MOVED * max(0.0, known.moved - STILL)
     allowed = cancelled * tolerated + DEVIATIONS * known.uncertain(sums, noise)
@@ -157,23 +158,24 @@ def _drives(config: IdentifierParameters, model: Model, known: Known, identified
     return float(excess.max()), doubt, bool(np.all(noise < VAGUE))
 
 
-def _configurations(config: IdentifierParameters, model: Model, m: mem.Memory, swept: Array) -> Array:
+def _configurations(config: IdentifierParameters, model: Model, m: mem.FilterState, configuration_range: Array
+                    ) -> Array:
     """Return cosines between the links: now, and those between which the arm was since the event."""
     point = config.payload.working_point
     if model.motion.frozen and len(point) == 2:
         return np.array([math.cos(point[1] - point[0])])
-    between = [0.0] if swept[0] < 0.0 < swept[1] else []  # frequencies depend on the square
-    return np.array([math.cos(m.x[1] - m.x[0]), swept[0], swept[1], *between])
+    between = [0.0] if configuration_range[0] < 0.0 < configuration_range[1] else []  # frequencies depend on the square
+    return np.array([math.cos(m.x[1] - m.x[0]), configuration_range[0], configuration_range[1], *between])
 
 
-def _predicted(config: IdentifierParameters, model: Model, m: mem.Memory, cosines: Array, steps: Array,
+def _predicted(config: IdentifierParameters, model: Model, m: mem.FilterState, cosines: Array, steps: Array,
                masses: Array | None = None) -> ArmModes:
     """Return the modes of the arm as learned; steps: (j, 3) away from what is known, as logarithms."""
     n, h = model.motion.q.size, model.motion.q.size - 2
     p = m.x.size - PARAMETERS
-    uneven = np.zeros((2, h // 2))
-    uneven[:, 1:] = m.x[2 * n:p].reshape(2, -1)
-    stiffness = np.exp((m.x[p + 1:p + 3] + steps[:, 1:])[:, :, None] + uneven).reshape(len(steps), h)
+    deviations = np.zeros((2, h // 2))
+    deviations[:, 1:] = m.x[2 * n:p].reshape(2, -1)
+    stiffness = np.exp((m.x[p + 1:p + 3] + steps[:, 1:])[:, :, None] + deviations).reshape(len(steps), h)
     held = bool(m.counts[mem.HELD])
     if masses is None:
         here = m.x[p] + steps[:, 0] * (1.0 if held else model.motion.scale)
@@ -198,7 +200,7 @@ def _matched(frequency: Array, modes: Sequence[Mode]) -> list[int] | None:
     return [usable[i], usable[j]]
 
 
-def _payloads(config: IdentifierParameters, model: Model, m: mem.Memory, cosines: Array, found: Array,
+def _payloads(config: IdentifierParameters, model: Model, m: mem.FilterState, cosines: Array, found: Array,
               allowed: Array, which: NDArray[np.int64]) -> tuple[float, float]:
     """Return between which payloads the arm has the frequencies found, each mode by itself."""
     masses = model.motion.scale * PAYLOADS
@@ -234,7 +236,7 @@ LEAST = 1000.0
 BELIEVED = (Status.TRACKING, Status.POORLY_EXCITED, Status.INCONSISTENT)
 
 
-def sweep(before: Array, rows: Rows, relative: bool) -> Array:
+def extend_range(before: Array, rows: Rows, relative: bool) -> Array:
     """Return where the arm was since the event, after more rows; relative: angle 2 is from link 1 on.
 
     (5,) smallest and largest cosine of the angle between the links, then angle of joint 1 [rad]; samples.
@@ -266,21 +268,23 @@ def remember(verdicts: tuple[Verdict, ...], new: Verdict | None, reach: int) -> 
     return (*kept, new)
 
 
-def check(config: IdentifierParameters, state: StructuredState | None, payload: Payload | None, swept: Array,
+def check(config: IdentifierParameters, state: StructuredState | None, payload: Payload | None,
+          configuration_range: Array,
           identified: Identified, modes: Sequence[Mode], at: int = 0, since: int = 0) -> Verdict | None:
     """Compare an identified model with the arm as ``structured`` knows it; None where nothing can be said.
 
-    payload: as estimated without the model; swept: see ``sweep``; modes: of the identified model; at, since:
+    payload: as estimated without the model; configuration_range: see ``extend_range``; modes: of the identified model;
+    at, since:
     stamps now and of the last event [ns]. Only a refined fit of some length is compared, and only with an
     estimate that claims something.
     """
-    if state is None or state.model is None or state.memory is None or payload is None or swept.size == 0:
+    if state is None or state.model is None or state.memory is None or payload is None or configuration_range.size == 0:
         return None
     if (identified.status is not Status.TRACKING or not identified.refined or identified.samples < LEAST
             or payload.status not in BELIEVED):
         return None
     try:
-        found = compare(config, state.model, state.memory, payload, swept, identified, modes)
+        found = compare(config, state.model, state.memory, payload, configuration_range, identified, modes)
     except np.linalg.LinAlgError:
         return None
     return found if found is None else found._replace(at=at, since=since)

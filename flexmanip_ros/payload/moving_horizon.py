@@ -1,9 +1,10 @@
-"""Compiled loop of the structured estimator: filter every sample, refit behind it all since the last event.
+"""Compiled loop of the structured estimator: a Kalman filter, and moving-horizon estimation since the last event.
 
-The filter alone would linearise the first samples after an event at a poor guess and never take that
-back. So the samples since the event are read again (``HORIZON``), and a Gauss-Newton pass over them runs three
-samples for each new one; when it catches up, its result replaces the filter's state, and the next pass
-starts there.
+An extended Kalman filter linearizes each sample once. The first samples after an event are linearized at a poor guess
+of the payload, and that error would remain. Moving-horizon estimation mends it: a Gauss-Newton iteration reads the
+samples since the event again (at most ``HORIZON``), three for each new sample. When it has caught up with the filter,
+its minimum replaces the filter's state, and the next iteration is linearized there. The arrival cost is the state at
+the event, with mean x0 and covariance S0 S0'.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from flexmanip_ros.payload.filter_state import (
     HELD,
     HORIZON,
     IN_BATCH,
+    ITERATED,
+    ITERATING,
     MOVE,
     NOW,
-    PASSED,
-    PASSING,
     SINCE_EVENT,
     SINCE_NOISE,
     STORED,
@@ -30,23 +31,29 @@ from flexmanip_ros.payload.filter_state import (
 )
 from flexmanip_ros.payload.measurement_update import OUTLIER, judge_payload, learn_noise, measure
 from flexmanip_ros.payload.process_model import PARAMETERS, predict
-from flexmanip_ros.payload.residual_modes import amplitude, believed, push, ring, ringing
+from flexmanip_ros.payload.residual_modes import (
+    excite_residual,
+    propagate_residual,
+    residual_amplitude,
+    residual_output,
+    residual_probability,
+)
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
-    from flexmanip_ros.payload.filter_state import Memory
-    from flexmanip_ros.payload.measurement_update import Sensors
-    from flexmanip_ros.payload.process_model import Motion
+    from flexmanip_ros.payload.filter_state import FilterState
+    from flexmanip_ros.payload.measurement_update import MeasurementModel
+    from flexmanip_ros.payload.process_model import ProcessModel
 
 NOISE_EVERY = 50
 """Samples between additions of process noise."""
-FIRST_PASS = 8
-"""Samples after an event before the first refit."""
+FIRST_ITERATION = 8
+"""Samples after an event before the first Gauss-Newton iteration: fewer tell less than the prior."""
 
 
 @merged
-def begin_pass(m: Memory) -> None:
-    """Start a refit at the event, from the best trajectory known."""
+def begin_iteration(m: FilterState) -> None:
+    """Start a Gauss-Newton iteration at the event, from the trajectory of the last one."""
     nx = m.x.size
     for i in range(nx):
         m.xr[i] = m.x0[i]
@@ -55,17 +62,17 @@ def begin_pass(m: Memory) -> None:
             m.xr[i] += m.S0[i, c] * m.xi[c]
             m.Sr[i, c] = m.S0[i, c]
             m.N[i, c] = 0.0
-    m.counts[PASSED] = 0
-    m.counts[PASSING] = 1
+    m.counts[ITERATED] = 0
+    m.counts[ITERATING] = 1
 
 
 @merged
-def pass_sample(motion: Motion, sensors: Sensors, m: Memory, table: Array) -> bool:
-    """Take one sample since the event into the refit; False when numbers left the finite range.
+def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array) -> bool:
+    """Take one sample since the event into the iteration: N += f f' / r, g += f e / r. False when not finite.
 
     table: (N, 3 + m), its first row is the first sample after the event.
     """
-    passed = m.counts[PASSED]
+    passed = m.counts[ITERATED]
     sample = table[passed]
     n, nx = motion.q.size, m.x.size
     effort, f = sample[1:3], sensors.f
@@ -73,7 +80,7 @@ def pass_sample(motion: Motion, sensors: Sensors, m: Memory, table: Array) -> bo
         return False
     if sample[0] > 0.0:
         before = m.torque0 if passed == 0 else table[passed - 1, 1:3]
-        push(motion, sensors.tail, m.xr, before, effort, believed(m.score))
+        excite_residual(motion, sensors.residual, m.xr, before, effort, residual_probability(m.score))
     for i in range(m.noise.shape[0]):
         r = m.noise[i, EFFECTIVE]
         predicted = project(m.xr, m.Sr, sensors.H[i], n if sensors.rate[i] else 0, f)
@@ -87,12 +94,12 @@ def pass_sample(motion: Motion, sensors: Sensors, m: Memory, table: Array) -> bo
             m.g[a] += scaled * e
             for b in range(a + 1):
                 m.N[a, b] += scaled * f[b]
-    m.counts[PASSED] += 1
+    m.counts[ITERATED] += 1
     return True
 
 
 @merged
-def finish_pass(m: Memory) -> bool:
+def finish_iteration(m: FilterState) -> bool:
     """Step to the minimum, and hand state and spread at the last sample to the filter."""
     nx = m.x.size
     payload = nx - PARAMETERS
@@ -118,37 +125,37 @@ def finish_pass(m: Memory) -> bool:
         forward(m.N, m.Sr[i])
         for c in range(nx):
             m.S[i, c] = m.Sr[i, c]
-    m.counts[PASSING] = 0
+    m.counts[ITERATING] = 0
     return True
 
 
 @merged
-def refit(motion: Motion, sensors: Sensors, m: Memory, table: Array) -> bool:
-    """Note how a sample is corrected, and let the refit behind the filter take up to three."""
+def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array) -> bool:
+    """Store the correction of the newest sample, and let the Gauss-Newton iteration take up to three samples."""
     stored = m.counts[STORED]
     if stored >= HORIZON:
         return True
-    share = amplitude(m.score)
+    share = residual_amplitude(m.score)
     for i in range(m.corrections.shape[1]):
-        m.corrections[stored, i] = share * ringing(sensors.tail, m, i)
+        m.corrections[stored, i] = share * residual_output(sensors.residual, m, i)
     m.counts[STORED] = stored + 1
-    if m.counts[PASSING] == 0:
-        if stored + 1 < FIRST_PASS or 3 * (stored + 1) > 2 * HORIZON:
+    if m.counts[ITERATING] == 0:
+        if stored + 1 < FIRST_ITERATION or 3 * (stored + 1) > 2 * HORIZON:
             return True
-        begin_pass(m)
+        begin_iteration(m)
     for _ in range(3):
-        if m.counts[PASSED] < m.counts[STORED] and not pass_sample(motion, sensors, m, table):
+        if m.counts[ITERATED] < m.counts[STORED] and not iterate_sample(motion, sensors, m, table):
             return False
-    if m.counts[PASSED] == m.counts[STORED]:
+    if m.counts[ITERATED] == m.counts[STORED]:
         m.counts[IN_BATCH] = 0
         m.score[MOVE] = 0.0
         m.score[VARIANCE] = 0.0
-        return finish_pass(m)
+        return finish_iteration(m)
     return True
 
 
 @inlined
-def diffuse(sensors: Sensors, m: Memory, duration: float) -> None:
+def diffuse(sensors: MeasurementModel, m: FilterState, duration: float) -> None:
     """Add the process noise of a while, so that the memory stays finite."""
     m.score[NOW] += duration
     m.counts[SINCE_NOISE] += 1
@@ -163,7 +170,7 @@ def diffuse(sensors: Sensors, m: Memory, duration: float) -> None:
 
 
 @merged
-def take(motion: Motion, sensors: Sensors, m: Memory, table: Array, k: int) -> bool:
+def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array, k: int) -> bool:
     """Take the sample in row k of the table; False when numbers left the finite range.
 
     table: (N, 3 + m), see ``advance``.
@@ -172,15 +179,15 @@ def take(motion: Motion, sensors: Sensors, m: Memory, table: Array, k: int) -> b
     if not predict(motion, m.x, m.S, effort, duration, m.counts[HELD] != 0):
         return False
     if duration > 0.0:
-        push(motion, sensors.tail, m.x, m.torque, effort, believed(m.score))
-        ring(sensors.tail, m, duration, effort)
+        excite_residual(motion, sensors.residual, m.x, m.torque, effort, residual_probability(m.score))
+        propagate_residual(sensors.residual, m, duration, effort)
         m.torque[0], m.torque[1] = effort[0], effort[1]
     measure(motion, sensors, m, effort, y)
     if not abs(m.x[m.x.size - PARAMETERS]) < 1e9:
         return False
     m.counts[SINCE_EVENT] += 1
     learn_noise(sensors, m)
-    if not refit(motion, sensors, m, table):
+    if not iterate(motion, sensors, m, table):
         return False
     judge_payload(sensors, m)
     diffuse(sensors, m, duration)
@@ -188,7 +195,7 @@ def take(motion: Motion, sensors: Sensors, m: Memory, table: Array, k: int) -> b
 
 
 @kernel
-def advance(motion: Motion, sensors: Sensors, m: Memory, table: Array, first: int) -> int:
+def advance(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array, first: int) -> int:
     """Take the samples in the rows of the table from ``first`` on.
 
     table: (N, 3 + m) duration since the sample before, torques held meanwhile, measurements. While the horizon

@@ -1,9 +1,9 @@
-"""Compiled motion of the structured filter: the arm's equations carry the mean, their Jacobian the spread.
+"""Process model of the structured filter: the arm's equations carry the mean, their Jacobian the covariance.
 
-The state is [q (n), qd (n), unevenness (n - 4), parameters (6)], parameters = [payload, ln stiffness factor
-1, 2, damping ratio 1, 2, ln rotary inertia]; unevenness = how much stiffer each mode beyond a link's first is
-than that factor says (logarithm), link 1, then link 2. The spread is a square root S (nx, nx), covariance =
-S S'; it moves as S <- F S.
+The state is x = [q (n), qd (n), d (n - 4), p (6)]. d: modal stiffness deviation, the logarithm of the stiffness of
+each mode beyond a link's first over what the link's stiffness factor gives, link 1 first. p = [payload, logarithm of
+the stiffness factors of links 1 and 2, damping ratios 1 and 2, logarithm of the rotary inertia]. The covariance is S S' with
+the square root S (nx, nx), which moves as S <- F S, F the Jacobian of the flow.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SPREAD_SERIES = 6
 """Terms of the spread's: it weighs, and need not be exact."""
 
 
-class Motion(NamedTuple):
+class ProcessModel(NamedTuple):
     """The arm as the filter integrates it; stiffness and damping in ``arm`` are set from the state."""
 
     arm: Manipulator
@@ -66,7 +66,7 @@ class Motion(NamedTuple):
 
 
 @inlined
-def payload_mass(motion: Motion, state: float, held: bool) -> float:
+def payload_mass(motion: ProcessModel, state: float, held: bool) -> float:
     """Payload [kg] from its state: scale exp(state) > 0 when something is held, else the state itself."""
     if held:
         return motion.scale * float(np.exp(min(state, 12.0)))
@@ -74,7 +74,7 @@ def payload_mass(motion: Motion, state: float, held: bool) -> float:
 
 
 @merged
-def set_parameters(motion: Motion, x: Array, held: bool) -> None:
+def set_parameters(motion: ProcessModel, x: Array, held: bool) -> None:
     """Write payload, stiffness and damping of the state into the arm."""
     n = motion.q.size
     k = (n - 2) // 2
@@ -95,7 +95,7 @@ def set_parameters(motion: Motion, x: Array, held: bool) -> None:
 
 
 @inlined
-def accelerate(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array) -> bool:
+def accelerate(motion: ProcessModel, q: Array, qd: Array, effort: Array, qdd: Array) -> bool:
     """Fill qdd (n,); leaves the factor of M in work.M."""
     if not motion.frozen:
         return acceleration(motion.arm, motion.payload, q, qd, effort, qdd, motion.work)
@@ -115,11 +115,11 @@ def accelerate(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array) -
 
 
 @kernel
-def linearize(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array, held: bool) -> bool:
-    """Fill qdd and its derivatives: motion.dq, motion.dqd (n, n), motion.G by unevenness and parameters."""
+def linearize(motion: ProcessModel, q: Array, qd: Array, effort: Array, qdd: Array, held: bool) -> bool:
+    """Fill qdd and its derivatives: motion.dq, motion.dqd (n, n), motion.G by d and p."""
     n = q.size
     k = (n - 2) // 2
-    uneven = motion.G.shape[1] - PARAMETERS
+    deviations = motion.G.shape[1] - PARAMETERS
     arm, M, a, G = motion.arm, motion.work.M, motion.a, motion.G
     if motion.frozen:
         if not accelerate(motion, q, qd, effort, qdd):
@@ -148,9 +148,9 @@ def linearize(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array, he
     rate = motion.payload[0] if held else 1.0
     for r in range(n):
         for c in range(1, 5):
-            G[r, uneven + c] = 0.0
-        G[r, uneven] = motion.dp[r, 0] * rate
-        G[r, uneven + 5] = motion.dp[r, 1] * motion.payload[1]
+            G[r, deviations + c] = 0.0
+        G[r, deviations] = motion.dp[r, 0] * rate
+        G[r, deviations + 5] = motion.dp[r, 1] * motion.payload[1]
     for link in range(2):
         for mode in range(k):
             j = 2 + link * k + mode
@@ -160,15 +160,15 @@ def linearize(motion: Motion, q: Array, qd: Array, effort: Array, qdd: Array, he
             solve(M, a)
             for r in range(n):
                 by_stiffness = -arm.stiffness[j] * q[j] * a[r]
-                G[r, uneven + 1 + link] += by_stiffness
-                G[r, uneven + 3 + link] -= motion.damping[j] * qd[j] * a[r]
+                G[r, deviations + 1 + link] += by_stiffness
+                G[r, deviations + 3 + link] -= motion.damping[j] * qd[j] * a[r]
                 if mode > 0:
                     G[r, link * (k - 1) + mode - 1] = by_stiffness
     return True
 
 
 @kernel
-def predict(motion: Motion, x: Array, S: Array, effort: Array, duration: float, held: bool) -> bool:
+def predict(motion: ProcessModel, x: Array, S: Array, effort: Array, duration: float, held: bool) -> bool:
     """Carry x and S over a time [s] with the torque held; False when numbers left the finite range."""
     if duration <= 0.0:
         return True
@@ -182,7 +182,7 @@ def predict(motion: Motion, x: Array, S: Array, effort: Array, duration: float, 
 
 
 @merged
-def exponential_step(motion: Motion, x: Array, effort: Array, h: float, held: bool) -> bool:
+def exponential_step(motion: ProcessModel, x: Array, effort: Array, h: float, held: bool) -> bool:
     """Advance x by h, exactly where the motion is linear; leaves the linearisation at the start in motion.
 
     Exponential Rosenbrock method of third order: x1 = x + h phi_1(h F) f(x), then x1 + 2 h phi_3(h F) of what
@@ -221,7 +221,7 @@ def exponential_step(motion: Motion, x: Array, effort: Array, h: float, held: bo
 
 
 @merged
-def series(motion: Motion, h: float, first: int, scale: float) -> None:
+def series(motion: ProcessModel, h: float, first: int, scale: float) -> None:
     """Fill total with scale x phi_first(h F) v, F the linearisation, phi_l(z) = sum of z^j / (j + l)!.
 
     v / first! stands in rows 4, 5 of motion.k (positions, rates) and is used up; total: rows 1, 2.
@@ -246,7 +246,7 @@ def series(motion: Motion, h: float, first: int, scale: float) -> None:
 
 
 @merged
-def spread(motion: Motion, S: Array, h: float) -> None:
+def spread(motion: ProcessModel, S: Array, h: float) -> None:
     """S <- F S, F the Taylor series of the linearised flow over h."""
     n = motion.q.size
     nx = S.shape[1]

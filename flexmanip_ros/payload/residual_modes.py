@@ -13,12 +13,12 @@ from flexmanip_ros.arm.equations_of_motion import solve
 from flexmanip_ros.arm.shape_functions import output_matrix
 from flexmanip_ros.numerics.compiled import inlined
 from flexmanip_ros.parameters import ArmParameters
-from flexmanip_ros.payload.filter_state import ODDS, SHOWN, TOLD
+from flexmanip_ros.payload.filter_state import INFORMATION, ODDS, SHOWN
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
-    from flexmanip_ros.payload.filter_state import Memory
-    from flexmanip_ros.payload.process_model import Motion
+    from flexmanip_ros.payload.filter_state import FilterState
+    from flexmanip_ros.payload.process_model import ProcessModel
 
 Integers = NDArray[np.int64]
 
@@ -32,8 +32,9 @@ LEAST_DAMPING = 0.02
 """Damping ratio at least: after that many turns their phase is not known."""
 
 
-def tail(arm: ArmParameters, theta: Array, kappa: int, rows: Integers, rate: NDArray[np.bool_]) -> Tail:
-    """Return the tail of an arm with kappa modes at chords theta (2,), nothing held.
+def residual_modes(arm: ArmParameters, theta: Array, kappa: int, rows: Integers, rate: NDArray[np.bool_]
+                   ) -> ResidualModes:
+    """Return the residual modes of an arm with kappa modes at chords theta (2,), nothing held.
 
     rows: (m,) which of joint1, joint2, link1_bend, link2_bend each sensor reads; rate: (m,) or its rate.
     """
@@ -50,12 +51,12 @@ def tail(arm: ArmParameters, theta: Array, kappa: int, rows: Integers, rate: NDA
     B = manipulator.torque_matrix(arm, total)
     C = output_matrix(arm, manipulator.root_slopes(arm, total), manipulator.tip_slopes(arm, total))
     output = (C[:, chosen] - C[:, kept] @ coupled) @ V
-    return Tail(square=square, damping=damping, load=V.T @ (B[chosen] - coupled.T @ B[kept]),
+    return ResidualModes(square=square, damping=damping, load=V.T @ (B[chosen] - coupled.T @ B[kept]),
                 output=np.ascontiguousarray(output[rows]), row=rate.astype(np.int64), push=_push(arm, kappa))
 
 
 def _push(arm: ArmParameters, kappa: int) -> Array:
-    """Momentum M_rt K_t^-1 B_t, as ``Tail.push``."""
+    """Momentum M_rt K_t^-1 B_t, as ``ResidualModes.push``."""
     total = kappa + HELD_MODES
     chosen, kept = _split(kappa, HELD_MODES)
     held = manipulator.torque_matrix(arm, total)[chosen]
@@ -77,7 +78,7 @@ def _mass(arm: ArmParameters, theta: Array, modes: int) -> Array:
     return np.block([[b.Ma, b.Mb], [b.Mb.T, b.Mc]])
 
 
-class Tail(NamedTuple):
+class ResidualModes(NamedTuple):
     """a oscillators z'' + damping z' + square z = load . torque, read by m sensors; n kept coordinates."""
 
     square: Array
@@ -96,55 +97,58 @@ class Tail(NamedTuple):
 
 
 @inlined
-def ring(tail: Tail, m: Memory, duration: float, effort: Array) -> None:
-    """Carry the departure of each oscillator from where the torque holds it over a time, exactly."""
+def propagate_residual(modes: ResidualModes, m: FilterState, duration: float, effort: Array) -> None:
+    """Advance the departure of each oscillator from its static deflection over a time, exactly."""
     first, second = effort[0] - m.torque[0], effort[1] - m.torque[1]
-    for i in range(tail.square.size):
-        z = m.tail[0, i] - (tail.load[i, 0] * first + tail.load[i, 1] * second) / tail.square[i]
-        v = m.tail[1, i]
-        half = tail.damping[i] / 2.0
-        omega = np.sqrt(tail.square[i] - half * half)
+    for i in range(modes.square.size):
+        z = m.residual[0, i] - (modes.load[i, 0] * first + modes.load[i, 1] * second) / modes.square[i]
+        v = m.residual[1, i]
+        half = modes.damping[i] / 2.0
+        omega = np.sqrt(modes.square[i] - half * half)
         shrink = np.exp(-half * duration)
         c = shrink * np.cos(omega * duration)
         s = shrink * np.sin(omega * duration) / omega
-        m.tail[0, i] = z * c + (v + half * z) * s
-        m.tail[1, i] = v * c - (half * v + tail.square[i] * z) * s
+        m.residual[0, i] = z * c + (v + half * z) * s
+        m.residual[1, i] = v * c - (half * v + modes.square[i] * z) * s
 
 
 @inlined
-def ringing(tail: Tail, m: Memory, i: int) -> float:
-    """What sensor i would read more if the arm had these modes; where the torque holds them is known."""
+def residual_output(modes: ResidualModes, m: FilterState, i: int) -> float:
+    """What the vibration of the residual modes adds to sensor i; their static deflection is in the feedthrough."""
     value = 0.0
-    for a in range(tail.square.size):
-        value += tail.output[i, a] * m.tail[tail.row[i], a]
+    for a in range(modes.square.size):
+        value += modes.output[i, a] * m.residual[modes.row[i], a]
     return value
 
 
 @inlined
-def believed(score: Array) -> float:
-    """Probability that the arm has modes beyond kappa that matter.
+def residual_probability(score: Array) -> float:
+    """Probability that the arm has modes beyond the kappa integrated ones that the sensors see.
 
-    Either their amplitude a is 0, or it is of the prior N(0, 1); SHOWN ~ N(a TOLD, TOLD): the Bayes factor.
+    Bayes factor of two hypotheses: their amplitude a is 0, or it has the prior N(0, 1). SHOWN has the distribution
+    N(a INFORMATION, INFORMATION).
     """
-    told = score[TOLD]
+    information = score[INFORMATION]
     shown = max(score[SHOWN], 0.0)
-    evidence = score[ODDS] + 0.5 * (shown * shown / (1.0 + told) - np.log(1.0 + told))
+    evidence = score[ODDS] + 0.5 * (shown * shown / (1.0 + information) - np.log(1.0 + information))
     return float(1.0 / (1.0 + np.exp(-min(max(evidence, -50.0), 50.0))))
 
 
 @inlined
-def amplitude(score: Array) -> float:
-    """How much of the ringing to expect: 0 of none, 1 of all. Frequencies a little off show less of it."""
-    shown: float = max(score[SHOWN], 0.0) / (1.0 + score[TOLD])
-    return believed(score) * min(shown, 1.0)
+def residual_amplitude(score: Array) -> float:
+    """Expected amplitude of the residual modes, from 0 (none) to 1 (as in the equations of the arm)."""
+    shown: float = max(score[SHOWN], 0.0) / (1.0 + score[INFORMATION])
+    return residual_probability(score) * min(shown, 1.0)
 
 
 @inlined
-def push(motion: Motion, tail: Tail, x: Array, before: Array, effort: Array, share: float) -> None:
-    """Set the kept coordinates aside at a step of the torque from ``before``, by a share of what a tail does.
+def excite_residual(
+    motion: ProcessModel, modes: ResidualModes, x: Array, before: Array, effort: Array, share: float,
+) -> None:
+    """Move the integrated coordinates at a torque step from ``before``, by a share of the residual modes' reaction.
 
-    Seen from the slow motion, the tail goes at once where the torque holds it, and no momentum comes from
-    outside: M_rr dq_r = -M_rt deta_t. Right after ``predict``, which leaves the factor of M_rr.
+    On the time scale of the integrated modes, the residual modes follow the torque at once. The momentum is conserved:
+    M_rr dq_r = -M_rt deta_t. Right after ``predict``, which leaves the factor of M_rr.
     """
     first, second = share * (effort[0] - before[0]), share * (effort[1] - before[1])
     if first == 0.0 and second == 0.0:
@@ -152,8 +156,8 @@ def push(motion: Motion, tail: Tail, x: Array, before: Array, effort: Array, sha
     c = np.cos(x[1] - x[0])
     moved = motion.a
     for i in range(moved.size):
-        moved[i] = -((tail.push[0, i, 0] + c * tail.push[1, i, 0]) * first
-                     + (tail.push[0, i, 1] + c * tail.push[1, i, 1]) * second)
+        moved[i] = -((modes.push[0, i, 0] + c * modes.push[1, i, 0]) * first
+                     + (modes.push[0, i, 1] + c * modes.push[1, i, 1]) * second)
     solve(motion.work.M, moved)
     for i in range(moved.size):
         x[i] += moved[i]

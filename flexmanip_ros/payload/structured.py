@@ -1,6 +1,6 @@
 """Payload from the arm's own equations of motion, in any configuration, moving or not.
 
-A filter and a refit behind it (``structured_kernel``). States are never written to. See docs/payload.md.
+A Kalman filter with moving-horizon estimation (``moving_horizon``). States are never written to. See docs/payload.md.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import residual_modes, structured_model
 from flexmanip_ros.payload.interval import inexact, judge
-from flexmanip_ros.payload.measurement_update import Sensors
+from flexmanip_ros.payload.measurement_update import MeasurementModel
 from flexmanip_ros.payload.moving_horizon import advance as run_kernel
 from flexmanip_ros.payload.process_model import PARAMETERS, predict
-from flexmanip_ros.payload.residual_modes import believed, push, ring
+from flexmanip_ros.payload.residual_modes import excite_residual, propagate_residual, residual_probability
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload
@@ -34,8 +34,8 @@ class StructuredState(NamedTuple):
 
     model: Model | None
     """None when the configured signals cannot give a payload."""
-    sensors: Sensors | None = None
-    memory: mem.Memory | None = None
+    sensors: MeasurementModel | None = None
+    memory: mem.FilterState | None = None
     begin: int | None = None
     """Row of the sample log with which it starts, while there are not enough rows to start."""
     early: tuple[tuple[int, CaptureEvent], ...] = ()
@@ -108,8 +108,9 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     ahead, held = max(event.stamp_ns - state.last_ns, 0), bool(m.counts[mem.HELD])
     predict(state.model.motion, m.x, m.S, state.effort, min(ahead * 1e-9, LONGEST_S), held)
     if ahead > 0:
-        push(state.model.motion, state.sensors.tail, m.x, m.torque, state.effort, believed(m.score))
-        ring(state.sensors.tail, m, ahead * 1e-9, state.effort)
+        excite_residual(state.model.motion, state.sensors.residual, m.x, m.torque, state.effort,
+                        residual_probability(m.score))
+        propagate_residual(state.sensors.residual, m, ahead * 1e-9, state.effort)
         m.torque[:] = state.effort
     _change(config, state.model, m, event.kind)
     last_ns = state.last_ns + ahead
@@ -121,7 +122,7 @@ def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
     return judge(config, state.model, state.sensors, state.memory, state.restarts)
 
 
-def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: EventKind) -> None:
+def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, kind: EventKind) -> None:
     """Reopen what an event changes: the rates, and what is held."""
     payload = m.x.size - PARAMETERS
     held = bool(m.counts[mem.HELD])
@@ -130,7 +131,7 @@ def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: Eve
     opened = np.zeros((m.x.size, 2))
     if kind is EventKind.CAPTURE:
         if not held:
-            _forget_payload(config, model, m)  # the arm was empty: what it seemed to hold were its errors
+            _forget_payload(config, model, m)  # the arm was empty: what it empty_arm_bias to hold were its errors
         opened[payload, 0] = structured_model.PAYLOAD_STD
         opened[-1, 1] = structured_model.PAYLOAD_STD if config.payload.rotary_inertia else 0.0
         m.counts[mem.HELD] = 1
@@ -140,10 +141,10 @@ def _change(config: IdentifierParameters, model: Model, m: mem.Memory, kind: Eve
         m.counts[mem.HELD] = 0
     m.S[:] = structured_model.widen(m.S, np.hstack([columns, opened]))
     structured_model.shake(model, m)
-    _anchor(m)
+    _set_arrival_cost(m)
 
 
-def _forget_payload(config: IdentifierParameters, model: Model, m: mem.Memory) -> None:
+def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterState) -> None:
     """Condition an empty arm on holding exactly nothing; drop what is known of a payload that is let go."""
     payload = m.x.size - PARAMETERS
     if not m.counts[mem.HELD]:
@@ -151,8 +152,8 @@ def _forget_payload(config: IdentifierParameters, model: Model, m: mem.Memory) -
         square = float(f @ f)
         if square > 0.0:
             if m.counts[mem.SINCE_EVENT] > mem.HORIZON:
-                m.score[mem.SEEMED] = m.x[payload] / np.sqrt(square)
-                m.score[mem.BEYOND] = m.x[payload] / np.hypot(np.sqrt(square), inexact(config, model, m, 0.0))
+                m.score[mem.EMPTY_ARM_BIAS] = m.x[payload] / np.sqrt(square)
+                m.score[mem.EXCESS_BIAS] = m.x[payload] / np.hypot(np.sqrt(square), inexact(config, model, m, 0.0))
             gain = m.S @ f / square
             m.x[:] -= gain * m.x[payload]
             m.S[:] -= np.outer(gain, f)
@@ -161,16 +162,16 @@ def _forget_payload(config: IdentifierParameters, model: Model, m: mem.Memory) -
         m.S[gone] = 0.0
 
 
-def _anchor(m: mem.Memory) -> None:
-    """Begin a new horizon of refits here."""
+def _set_arrival_cost(m: mem.FilterState) -> None:
+    """Begin a new moving horizon here: the present state is its arrival cost."""
     m.x0[:], m.S0[:] = m.x, m.S
     m.xi[:] = 0.0
     m.torque0[:] = m.torque
-    for counter in (mem.STORED, mem.PASSED, mem.PASSING, mem.SINCE_EVENT, mem.SINCE_NOISE, mem.IN_BATCH,
+    for counter in (mem.STORED, mem.ITERATED, mem.ITERATING, mem.SINCE_EVENT, mem.SINCE_NOISE, mem.IN_BATCH,
                     mem.BATCHES):
         m.counts[counter] = 0
     m.counts[mem.BLOCKS] = min(m.counts[mem.BLOCKS], 40)
-    m.score[:mem.SEEMED] = 0.0
+    m.score[:mem.EMPTY_ARM_BIAS] = 0.0
     m.score[mem.DRIFT] = 1.0
     m.noise[:, mem.WEIGHT] = 0.0
     m.power[:] = 1.0
@@ -188,9 +189,9 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     structured_model.first(config, model, m, Y[0])
     structured_model.freeze(config, model, np.mean(rows.angles, axis=0))
     m.torque[:] = rows.u[0]
-    _anchor(m)
+    _set_arrival_cost(m)
     seen = sensors(config, model, dt, structured_model.diffusion(config, model, m), m.x[:2])
-    m.score[mem.ODDS] = 0.0 if seen.tail.push.any() else residual_modes.UNBENT_ODDS
+    m.score[mem.ODDS] = 0.0 if seen.residual.push.any() else residual_modes.UNBENT_ODDS
     events = state.early
     first_ns, effort = int(rows.stamp_ns[0]), rows.u[0].copy()
     state = state._replace(
@@ -226,11 +227,11 @@ def reopen(
     n = state.model.motion.q.size
     parameters, spread = m.x[2 * n:].copy(), m.S[2 * n:].copy()
     structured_model.first(config, state.model, m, m.recent[:, 0] if y is None else y)
-    m.tail[:] = 0.0
+    m.residual[:] = 0.0
     m.x[2 * n:] = parameters
     m.S[2 * n:] = 0.0
     m.S[2 * n:, 2 * n:] = np.linalg.qr(spread.T)[1].T
-    _anchor(m)
+    _set_arrival_cost(m)
     assert state.effort is not None
     return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.effort))
 
@@ -240,7 +241,7 @@ def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> St
     assert state.model is not None
     assert state.memory is not None
     assert state.sensors is not None
-    m = mem.copy(state.memory, refit=False)
+    m = mem.copy(state.memory, horizon=False)
     table, first = input_table(state, rows)
     taken = run(state.model.motion, state.sensors, m, table, first)
     if taken < len(table):

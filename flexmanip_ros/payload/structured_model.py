@@ -14,9 +14,9 @@ from flexmanip_ros.arm.dynamics import mass_matrix
 from flexmanip_ros.arm.manipulator import manipulator, workspace
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
-from flexmanip_ros.payload.measurement_update import Sensors
-from flexmanip_ros.payload.process_model import PARAMETERS, Motion, set_parameters
-from flexmanip_ros.payload.residual_modes import believed, tail
+from flexmanip_ros.payload.measurement_update import MeasurementModel
+from flexmanip_ros.payload.process_model import PARAMETERS, ProcessModel, set_parameters
+from flexmanip_ros.payload.residual_modes import residual_modes, residual_probability
 from flexmanip_ros.types import Array
 
 
@@ -105,7 +105,7 @@ STEP_ANGLE = 1.0
 class Model(NamedTuple):
     """Constants of the estimator; what ends up as scratch inside holds nothing between calls."""
 
-    motion: Motion
+    motion: ProcessModel
     roles: tuple[Role, ...]
     """Of every measurement: the outputs, then the angles that are not among them."""
     extra: tuple[int, ...]
@@ -132,7 +132,7 @@ def pinned_frequencies(arm: ArmParameters) -> tuple[float, ...]:
         for L, EI, rho in zip(arm.link_length, arm.bending_stiffness, arm.linear_density, strict=True))
 
 
-def motion(config: IdentifierParameters) -> Motion:
+def motion(config: IdentifierParameters) -> ProcessModel:
     """Allocate the arm for the compiled functions; its mass matrices are set at the working point later."""
     nominal = manipulator(config.arm)
     n = 2 + 2 * nominal.kappa
@@ -143,7 +143,7 @@ def motion(config: IdentifierParameters) -> Motion:
     lightest = config.arm.tip_mass + config.arm.linear_density[1] * config.arm.link_length[1] / 3
     rotary = lightest if config.payload.rotary_inertia else 0.0
     fastest = max(pinned_frequencies(config.arm)) * 2 * np.pi * (nominal.kappa + 0.25) ** 2
-    return Motion(
+    return ProcessModel(
         arm=arm, work=workspace(nominal.kappa), frozen=config.payload.dynamics == 'linear',
         M0=np.zeros((n, n)), Mp=np.zeros((n, n)), Mi=np.zeros((n, n)), stiffness=nominal.stiffness,
         damping=unit,
@@ -156,7 +156,7 @@ def motion(config: IdentifierParameters) -> Motion:
 
 def sensors(
     config: IdentifierParameters, model: Model, dt: float, diffusion: Array, theta: Array,
-) -> Sensors:
+) -> MeasurementModel:
     """Return how each measurement follows from the state; dt: sample time [s], theta: first chords (2,)."""
     output = model.motion.arm.output
     direct = truncated_feedthrough(config.arm, model.motion.arm.kappa)
@@ -172,9 +172,9 @@ def sensors(
             feed[i] = direct[row]
     nx = diffusion.size
     block = max(2, round(0.1 / (model.slowest * dt)))
-    more = tail(config.arm, theta, model.motion.arm.kappa, rows, rate)
-    return Sensors(H=H, rate=rate, feed=feed, tail=more, block=block, diffusion=diffusion,
-                   deviation=np.zeros(nx), f=np.zeros(nx), W=np.zeros((nx, 2 * nx)))
+    more = residual_modes(config.arm, theta, model.motion.arm.kappa, rows, rate)
+    return MeasurementModel(H=H, rate=rate, feed=feed, residual=more, block=block, diffusion=diffusion,
+                            deviation=np.zeros(nx), f=np.zeros(nx), W=np.zeros((nx, 2 * nx)))
 
 
 def truncated_feedthrough(arm: ArmParameters, kappa: int) -> Array:
@@ -223,7 +223,7 @@ FLOORS = {Quantity.ANGLE: 1e-6, Quantity.ANGLE_RATE: 1e-5, Quantity.BEND: 1e-7, 
 
 
 def noise(model: Model, Y: Array) -> Array:
-    """First guess of every sensor's noise from its first samples Y (N, m), as ``Memory.noise``."""
+    """First guess of every sensor's noise from its first samples Y (N, m), as ``FilterState.noise``."""
     differences = np.diff(Y, n=4, axis=0)
     white = (1.4826 * np.median(np.abs(differences), axis=0)) ** 2 / 70
     rows = np.zeros((len(model.roles), 8))
@@ -236,7 +236,7 @@ def noise(model: Model, Y: Array) -> Array:
     return rows
 
 
-def first(config: IdentifierParameters, model: Model, m: mem.Memory, y: Array) -> None:
+def first(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Array) -> None:
     """Fill x and S from the first measurement; the arm is empty and may move."""
     n = model.motion.q.size
     k = (n - 2) // 2
@@ -262,8 +262,8 @@ def first(config: IdentifierParameters, model: Model, m: mem.Memory, y: Array) -
         std[n + part.start:n + part.stop] = BEND_STD * L * (np.pi / L) ** 2 * np.sqrt(EI / rho)
     std[p] = EMPTY_STD * model.motion.scale
     # shear, rotary inertia and coarse elements all move a mode the farther the higher it is, as j^2 or faster
-    uneven = config.payload.model_error * (np.arange(2, k + 1) ** 2 - 1) / 3
-    std[2 * n:p] = np.maximum(np.tile(uneven, 2), CERTAIN)
+    deviations = config.payload.model_error * (np.arange(2, k + 1) ** 2 - 1) / 3
+    std[2 * n:p] = np.maximum(np.tile(deviations, 2), CERTAIN)
     std[p + 1:p + 3] = max(config.payload.stiffness_std, CERTAIN)
     std[p + 3:p + 5] = max(config.payload.damping_std, CERTAIN)
     m.S[:] = np.diag(std)
@@ -285,7 +285,7 @@ def widen(S: Array, columns: Array) -> Array:
     return root
 
 
-def jump(config: IdentifierParameters, model: Model, m: mem.Memory) -> Array:
+def jump(config: IdentifierParameters, model: Model, m: mem.FilterState) -> Array:
     """Columns (nx, c) of the rate jump at an event: an impulse at the tip, and what it leaves open."""
     n = model.motion.q.size
     held = bool(m.counts[mem.HELD])
@@ -309,15 +309,15 @@ def jump(config: IdentifierParameters, model: Model, m: mem.Memory) -> Array:
     return columns
 
 
-def shake(model: Model, m: mem.Memory) -> None:
+def shake(model: Model, m: mem.FilterState) -> None:
     """An event rings modes beyond kappa, and rates show it; by how much nobody knows, unlike at a torque."""
     for i, role in enumerate(model.roles):
         if role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE):
-            shaken = m.noise[i, mem.WHITE] * (1.0 + (RATE_NOISE - 1.0) * min(1.0, 2.0 * believed(m.score)))
+            shaken = m.noise[i, mem.WHITE] * (1.0 + (RATE_NOISE - 1.0) * min(1.0, 2.0 * residual_probability(m.score)))
             m.noise[i, mem.EFFECTIVE] = max(m.noise[i, mem.EFFECTIVE], shaken)
 
 
-def diffusion(config: IdentifierParameters, model: Model, m: mem.Memory) -> Array:
+def diffusion(config: IdentifierParameters, model: Model, m: mem.FilterState) -> Array:
     """Standard deviation (nx,) each state gains in the square root of a second, so that memory is finite."""
     n = model.motion.q.size
     T = config.payload.memory_time

@@ -16,7 +16,7 @@ from scipy.linalg import cho_factor, cho_solve, eigvals
 from flexmanip_ros.arm import dynamics
 from flexmanip_ros.arm import manipulator as arm_dynamics
 from flexmanip_ros.arm.capture import body_jacobian, free_object, joined
-from flexmanip_ros.arm.outputs import end_loads, slopes, slopes_with_tail
+from flexmanip_ros.arm.outputs import end_loads, slopes, slopes_with_residual_modes
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.simulation.finite_elements import finite_element_model
@@ -64,7 +64,7 @@ class NonlinearModel:
 
     def __init__(self, config: PlantParameters) -> None:
         self.arm = arm_dynamics.manipulator(config.arm)
-        self.slopes = slopes_with_tail(
+        self.slopes = slopes_with_residual_modes(
             config.arm, config.initial_angles, self.arm.kappa, config.tail_modes, 1.0 / config.rate)
         if config.locked:  # the joints' reactions are loads of their own; clamped roots need more modes
             self.slopes = slopes(replace(config.arm, slope_correction=False), self.arm.kappa)

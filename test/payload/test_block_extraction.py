@@ -17,7 +17,7 @@ from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
 from flexmanip_ros.payload import block_extraction
 from flexmanip_ros.payload.arm_modes import to_modal
-from flexmanip_ros.payload.block_extraction import estimate, extract, sweep
+from flexmanip_ros.payload.block_extraction import estimate, extend_range, extract
 from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.types import StateSpace, Status
 
@@ -140,10 +140,11 @@ def test_known_coupling_doubts_as_far_as_the_arm_moved():
     config = _config(payload__known_coupling=True)
     model = _sharp(vibration_model(config.arm, path[0], 20.0, 1))
     rows = log_of(np.zeros((3, 2)), np.zeros((3, 4)), path).rows(0, 3)
-    swept = sweep(config, np.empty(0), rows)
-    np.testing.assert_allclose(swept, [np.cos(np.radians(21.0)), np.cos(np.radians(15.0))])
-    np.testing.assert_array_equal(swept, sweep(config, sweep(config, np.empty(0), rows.between(0, 1)), rows.since(1)))
-    found = estimate(config, model, path[-1], swept)
+    configuration_range = extend_range(config, np.empty(0), rows)
+    np.testing.assert_allclose(configuration_range, [np.cos(np.radians(21.0)), np.cos(np.radians(15.0))])
+    one = extend_range(config, np.empty(0), rows.between(0, 1))
+    np.testing.assert_array_equal(configuration_range, extend_range(config, one, rows.since(1)))
+    found = estimate(config, model, path[-1], configuration_range)
     assert found.lower <= 20.0 + 1e-6
     assert found.upper >= 20.0 - 1e-6
     assert found.status is Status.INCONSISTENT

@@ -20,7 +20,7 @@ from flexmanip_ros.parameters import (
     PlantParameters,
 )
 from flexmanip_ros.payload import model_check, structured
-from flexmanip_ros.payload.arm_modes import arm_modes, drive
+from flexmanip_ros.payload.arm_modes import arm_modes, modal_participation
 from flexmanip_ros.payload.model_check import Verdict
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, StateSpace, Status
@@ -55,8 +55,9 @@ def holding_20_kg() -> tuple[IdentifierParameters, structured.StructuredState]:
 def compared(identified: Identified) -> tuple[Verdict, Payload, Payload]:
     settings, state = holding_20_kg()
     alone = structured.estimate(settings, state)
-    swept = np.array([*np.repeat(np.cos(THETA[1] - THETA[0]), 2), THETA[0], THETA[0], 0.0])
-    found = model_check.check(settings, state, alone, swept, identified, uncertainty.modes(identified), 2500, EVENT)
+    configuration_range = np.array([*np.repeat(np.cos(THETA[1] - THETA[0]), 2), THETA[0], THETA[0], 0.0])
+    found = model_check.check(
+        settings, state, alone, configuration_range, identified, uncertainty.modes(identified), 2500, EVENT)
     assert found is not None
     return found, alone, model_check.apply(state, alone, (found,), EVENT)
 
@@ -85,7 +86,7 @@ def test_an_exact_model_is_driven_as_the_arm_is(rates):
     arm = replace(ARM, modes=1, damping_ratio=0.0)
     known = arm_modes(arm, np.cos(THETA[1:] - THETA[0]), np.array([20.0]), np.zeros(1), np.ones((1, 2)))
     rows = np.array([2, 3] if rates else [0, 1])
-    value, _ = drive(model_of(arm, 20.0), np.arange(2), rows, np.full(2, rates), np.ones((2, 2)))
+    value, _ = modal_participation(model_of(arm, 20.0), np.arange(2), rows, np.full(2, rates), np.ones((2, 2)))
     assert value == pytest.approx(known.drive[0].sum(axis=(0, 1)), rel=1e-4)
 
 
@@ -94,14 +95,14 @@ def test_the_deviation_of_a_drive_is_that_of_models_drawn_from_the_spread():
     rng = np.random.default_rng(0)
     spread = 1e-6 * rng.standard_normal((64, 20))
     args = np.arange(2), np.arange(2), np.zeros(2, dtype=bool), np.ones((2, 2))
-    _, std = drive(exact._replace(spread=spread), *args)
+    _, std = modal_participation(exact._replace(spread=spread), *args)
     drawn = []
     for _ in range(400):
         change = spread @ rng.standard_normal(20)
         dA, dB, dC = change[:16].reshape(4, 4), change[16:24].reshape(4, 2), change[24:40].reshape(4, 4)
         model = exact.model
         moved = replace(model, A=model.A + dA, B=model.B + dB, C=model.C + dC)
-        drawn.append(drive(exact._replace(model=moved, spread=spread), *args)[0])
+        drawn.append(modal_participation(exact._replace(model=moved, spread=spread), *args)[0])
     assert std == pytest.approx(np.std(drawn, axis=0), rel=0.15)
 
 
@@ -187,11 +188,11 @@ def test_few_verdicts_are_kept_and_that_of_the_empty_arm_among_them():
 @pytest.mark.parametrize('sizes', [(1,), (7,), (250,), (3, 64, 1)])
 def test_where_the_arm_was_does_not_depend_on_how_samples_are_grouped(sizes):
     samples = record(0.5)
-    whole = model_check.sweep(np.empty(0), samples, True)
+    whole = model_check.extend_range(np.empty(0), samples, True)
     at, k, found = 0, 0, np.empty(0)
     while at < len(samples):
         size = sizes[k % len(sizes)]
-        found = model_check.sweep(found, samples.between(at, min(at + size, len(samples))), True)
+        found = model_check.extend_range(found, samples.between(at, min(at + size, len(samples))), True)
         at, k = at + size, k + 1
     assert found.tobytes() == whole.tobytes()
 

@@ -86,7 +86,7 @@ def test_a_jump_of_the_torque_shows_one_sample_later() -> None:
 
 
 def test_the_tail_takes_over_from_the_quasi_static_part() -> None:
-    few = outputs.slopes_with_tail(ARM, CONFIG.initial_angles, 3, 5, 1e-3)
+    few = outputs.slopes_with_residual_modes(ARM, CONFIG.initial_angles, 3, 5, 1e-3)
     static = few.output / np.array([np.linalg.solve(np.eye(2) - s, g + h)[0] for s, g, h in zip(
         few.step, few.start, few.end, strict=True)]) ** -1 @ few.load
     total = outputs.slopes(ARM, 3).flexibility

@@ -12,8 +12,16 @@ from scipy.linalg import expm
 from flexmanip_ros.arm import linearization, manipulator
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured, structured_model
-from flexmanip_ros.payload.interval import TAIL_SHARE, misjudged
-from flexmanip_ros.payload.residual_modes import MODES, amplitude, believed, push, ring, ringing, tail
+from flexmanip_ros.payload.interval import RESIDUAL_SHARE, misjudged
+from flexmanip_ros.payload.residual_modes import (
+    MODES,
+    excite_residual,
+    propagate_residual,
+    residual_amplitude,
+    residual_modes,
+    residual_output,
+    residual_probability,
+)
 from flexmanip_ros.payload.structured_model import motion
 from flexmanip_ros.types import Status
 
@@ -22,7 +30,7 @@ ROWS = np.arange(4)
 
 
 def beyond(rate=False):
-    return tail(ARM, THETA, 3, ROWS, np.full(4, rate))
+    return residual_modes(ARM, THETA, 3, ROWS, np.full(4, rate))
 
 
 def remembered(modes):
@@ -43,42 +51,42 @@ def of_six():
 
 
 def test_an_arm_of_more_modes_is_told_from_one_of_just_these_though_neither_misfits(of_three, of_six):
-    assert believed(of_six.score) > 0.999
-    assert amplitude(of_six.score) > 0.5
-    assert believed(of_three.score) < 0.2
-    assert amplitude(of_three.score) < 0.05
+    assert residual_probability(of_six.score) > 0.999
+    assert residual_amplitude(of_six.score) > 0.5
+    assert residual_probability(of_three.score) < 0.2
+    assert residual_amplitude(of_three.score) < 0.05
 
 
 def test_the_interval_reckons_with_an_error_only_where_modes_beyond_kappa_are_seen(of_three, of_six):
-    assert misjudged(of_three.noise, of_three.score, of_three.counts) < 0.1 * TAIL_SHARE
-    assert misjudged(of_six.noise, of_six.score, of_six.counts) >= 0.999 * TAIL_SHARE
+    assert misjudged(of_three.noise, of_three.score, of_three.counts) < 0.1 * RESIDUAL_SHARE
+    assert misjudged(of_six.noise, of_six.score, of_six.counts) >= 0.999 * RESIDUAL_SHARE
 
 
 def test_nothing_told_is_an_even_chance_and_nothing_seen_speaks_against():
     score = np.zeros(9)
-    assert believed(score) == pytest.approx(0.5)
-    score[mem.TOLD] = 1e6  # much could have been seen, and nothing was
-    assert believed(score) < 0.01
+    assert residual_probability(score) == pytest.approx(0.5)
+    score[mem.INFORMATION] = 1e6  # much could have been seen, and nothing was
+    assert residual_probability(score) < 0.01
 
 
 def test_ringing_is_the_exact_motion_under_held_torques():
     more = beyond()
     m = mem.memory(1, 4, 2 * MODES)
     effort = np.array([3.0, -2.0])
-    ring(more, m, 0.7e-3, effort)
+    propagate_residual(more, m, 0.7e-3, effort)
     m.torque[:] = effort
-    ring(more, m, 0.5e-3, effort)
+    propagate_residual(more, m, 0.5e-3, effort)
     for i, (square, damping) in enumerate(zip(more.square, more.damping, strict=True)):
         held = more.load[i] @ effort / square
         flow = expm(1.2e-3 * np.array([[0.0, 1.0], [-square, -damping]]))
-        assert m.tail[:, i] == pytest.approx(flow @ [-held, 0.0], rel=1e-9, abs=1e-18)
+        assert m.residual[:, i] == pytest.approx(flow @ [-held, 0.0], rel=1e-9, abs=1e-18)
 
 
 def test_sensors_read_the_departure_or_its_rate():
     m = mem.memory(1, 4, 2 * MODES)
-    m.tail[0], m.tail[1] = 1.0, 2.0
+    m.residual[0], m.residual[1] = 1.0, 2.0
     for row in range(4):
-        slow, fast = ringing(beyond(), m, row), ringing(beyond(rate=True), m, row)
+        slow, fast = residual_output(beyond(), m, row), residual_output(beyond(rate=True), m, row)
         assert fast == pytest.approx(2.0 * slow)
 
 
@@ -97,13 +105,13 @@ def test_a_step_of_the_torque_leaves_the_momentum_of_all_modes():
     expected = -np.linalg.solve(M[np.ix_(kept, kept)], M[np.ix_(kept, chosen)] @ held)
     moving.work.M[:] = np.linalg.cholesky(M[np.ix_(kept, kept)])
     np.fill_diagonal(moving.work.M, 1.0 / np.diag(moving.work.M))  # as ``factor`` leaves it
-    push(moving, beyond(), x, np.zeros(2), effort, 1.0)
+    excite_residual(moving, beyond(), x, np.zeros(2), effort, 1.0)
     assert x[:8] - np.r_[THETA, np.zeros(6)] == pytest.approx(expected, rel=2e-3, abs=1e-12)
 
 
 def test_an_arm_whose_torques_do_not_bend_pushes_nothing():
     paper = replace(ARM, torque_convention='paper', angle_convention='chord')
-    assert not tail(paper, THETA, 3, ROWS, np.zeros(4, bool)).push.any()
+    assert not residual_modes(paper, THETA, 3, ROWS, np.zeros(4, bool)).push.any()
 
 
 def test_an_event_shakes_the_rates_of_an_arm_of_more_modes(of_three, of_six):
