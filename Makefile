@@ -79,6 +79,7 @@ bench: setup $(VENV)/.benchmark
 
 docs: setup
 	@$(BIN)/python -m flexmanip_ros.cli.write_parameters
+	@$(BIN)/python benchmarks/tables.py
 
 lock: $(VENV)/.python
 	@$(PIP) install uv

@@ -15,6 +15,7 @@ from parts import payload_trials as trials
 
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters, TriggerParameters
 from flexmanip_ros.payload import capture_detection
+from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
@@ -24,20 +25,19 @@ NOISE = (1e-4, 2e-4, 2e-5, 2e-5, 1e-3, 1e-3, 7e-4, 9e-4)
 SQUARES = excitation.sequence(ExcitationParameters(), 10_000)
 
 
-def samples_of(efforts: np.ndarray, seed: int, event: CaptureEvent | None = None) -> list:
+def samples_of(efforts: np.ndarray, seed: int, event: CaptureEvent | None = None) -> Rows:
     """The plant under torques, with noise of 40 dB in the reference run."""
     plant = PlantParameters(arm=ARM, noise='std', noise_std=NOISE, seed=seed, payload_mass=20.0)
     record = simulator.simulate(plant, efforts, (event,) if event else ())
     return trials.as_samples(record.position, record.velocity, record.effort, 1e-3, trials.BENDS)
 
 
-def told(samples: list) -> list[tuple[CaptureEvent, int]]:
+def told(samples: Rows) -> list[tuple[CaptureEvent, int]]:
     """Events and the stamps at which they were told."""
     state, found = capture_detection.init(CONFIG), []
-    for sample in samples:
-        state, event = capture_detection.step(CONFIG, state, sample)
-        if event is not None:
-            found.append((event, sample.stamp_ns))
+    for row in range(len(samples)):
+        state, events = capture_detection.advance(CONFIG, state, samples.between(row, row + 1))
+        found += [(event, int(samples.stamp_ns[row])) for event in events]
     return found
 
 

@@ -1,7 +1,7 @@
 """Claim: the whole identifier takes 5 us a sample at p = 10, r = 2, m = 4, n = 4 in the offline loop.
 
 Beside it, in the same run: a bare compiled covariance update of the least-squares size (60 x 60, rank one),
-the least-squares extend_range alone, the paper's recursion, and how all of it grows with p and m.
+the Givens update alone, the paper's recursion, and how all of it grows with p and m.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def bare_update(P: np.ndarray, rows: np.ndarray, gain: np.ndarray, beta: float) 
 
 @njit(cache=True)
 def sweeps(R: np.ndarray, rows: np.ndarray, root: float) -> None:
-    """The least-squares step of the identifier alone: one Givens extend_range a row."""
+    """The least-squares step of the identifier alone: one Givens rotation of the factor a row."""
     row = np.empty(R.shape[1])
     for k in range(rows.shape[0]):
         row[:] = rows[k]

@@ -110,25 +110,25 @@ def follow(config: IdentifierParameters, seen: Signals, capture: int = CAPTURE
         if k == capture:
             items.insert(0, CaptureEvent(k * 1_000_000, EventKind.CAPTURE))
         for item in items:
-            state, due = pipeline.take(config, state, item, pipeline.BLOCK)
-            for one in due:
-                state, estimate = pipeline.read(state, one)
-                held = one.core.structured
-                if held is None or held.memory is None or estimate.payload is None:
+            state, estimates = pipeline.step(config, state, item)
+            for estimate in estimates:
+                held = None if state.payload is None else state.payload.estimator.structured
+                if held is None or held.memory is None or estimate.payload is None or not estimate.payload_is_new:
                     continue
-                after = one.stamp_ns * 1e-9 - 1e-3 * capture
+                after = estimate.stamp_ns * 1e-9 - 1e-3 * capture
                 if after >= 0.1:
                     found.append(Seen(after, structured.estimate(config, held), estimate.payload,
                                       estimate.modes_deviation))
-    return found, residual_probability(config, state)
+    return found, noise_ratio(config, state)
 
 
-def residual_probability(config: IdentifierParameters, state: pipeline.State) -> np.ndarray:
+def noise_ratio(config: IdentifierParameters, state: pipeline.State) -> np.ndarray:
     """Standard deviations of the outputs' noise: structured's white noise, RPBSID's innovations."""
-    line = state.timeline
-    assert line is not None
-    recursion = line.core.rpbsid.refined.recursion if line.core.rpbsid.refined is not None else None
-    held = line.core.structured
+    assert state.payload is not None
+    assert state.identifier is not None
+    refined = state.identifier.estimator.rpbsid.refined
+    recursion = refined.recursion if refined is not None else None
+    held = state.payload.estimator.structured
     if recursion is None or held is None or held.memory is None:
         return np.full((2, len(config.outputs)), np.nan)
     r, m = len(config.inputs), len(config.outputs)

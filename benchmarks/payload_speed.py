@@ -34,9 +34,9 @@ def timed(kappa: int) -> dict[str, float]:
         record = simulator.simulate(PlantParameters(arm=arm), efforts, (event,))
         best['plant_us'] = min(best['plant_us'], (time.perf_counter() - start) / 4000 * 1e6)
         samples = trials.as_samples(record.position, record.velocity, record.effort, 1e-3)
-        state = structured.advance(config, structured.init(config), samples[:2000])
+        state = structured.advance(config, structured.init(config), samples.between(0, 2000))
         state = structured.event(config, state, event)
-        for name, part in (('refit_us', samples[2000:2500]), ('filter_us', samples[2500:])):
+        for name, part in (('refit_us', samples.between(2000, 2500)), ('filter_us', samples.since(2500))):
             start = time.perf_counter()
             state = structured.advance(config, state, part)
             best[name] = min(best[name], (time.perf_counter() - start) / len(part) * 1e6)

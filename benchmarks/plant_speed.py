@@ -20,6 +20,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from flexmanip_ros.arm import manipulator
+from flexmanip_ros.arm.equations_of_motion import acceleration
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
@@ -56,7 +57,7 @@ def with_scipy(config: PlantParameters, efforts: np.ndarray) -> np.ndarray:
         def motion(
             _: float, y: np.ndarray, torque: np.ndarray = torque, load: np.ndarray = payload,
         ) -> np.ndarray:
-            manipulator.acceleration(arm, load, y[:n], y[n:], torque, qdd, work)
+            acceleration(arm, load, y[:n], y[n:], torque, qdd, work)
             return np.concatenate([y[n:], qdd])
 
         times = np.arange(last - first + 1) * 1e-3

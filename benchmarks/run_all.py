@@ -1,7 +1,8 @@
-"""Run every benchmark of this folder and gather what they measured in one table and one JSON file.
+"""Run benchmarks, compare what they measured with what they claim, and print the table of claims.
 
 Use: ``python benchmarks/run_all.py [PART_OF_A_NAME ...]``. Each benchmark is a program of its own that prints
-a table and writes ``results/<name>.json``; one that fails is reported and does not stop the others.
+a table and writes ``results/<name>.json``. One that fails does not stop the others. Exit code 1: a benchmark failed, or
+a claim (``claims.py``) falls short.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ import sys
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import claims
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / 'results'
@@ -69,11 +72,22 @@ def table(outcomes: list[Outcome]) -> str:
     return '\n'.join(rows) + '\n'
 
 
+def claims_table(names: list[str]) -> tuple[str, bool]:
+    """Return one row a claim as Markdown, and whether all of them hold."""
+    rows, good = ['| benchmark | claim | value | bounds | holds |', '|---|---|---|---|---|'], True
+    for name in names:
+        for claim in claims.recorded(name):
+            good = good and claim.holds
+            rows.append(f'| {name} | {claim.name} | {claim.value:.4g} {claim.unit} | {claim.bounds} | '
+                        f'{"yes" if claim.holds else "NO"} |')
+    return '\n'.join(rows) + '\n', good
+
+
 def main() -> int:
-    """Run those whose names contain an argument (all without one); exit 1 when one failed."""
+    """Run those whose names contain an argument (all without one); exit 1 when one failed or a claim falls short."""
     chosen = [
         path for path in sorted(HERE.glob('*.py'))
-        if path.stem != 'run_all' and not path.stem.startswith('_')
+        if path.stem not in ('run_all', 'tables') and not path.stem.startswith('_')
         and (len(sys.argv) == 1 or any(part in path.stem for part in sys.argv[1:]))
         and "__name__ == '__main__'" in path.read_text(encoding='utf-8')
     ]
@@ -81,8 +95,9 @@ def main() -> int:
     outcomes = [run(path) for path in chosen]
     (RESULTS / 'all.json').write_text(json.dumps(gather(outcomes), indent=1) + '\n', encoding='utf-8')
     (RESULTS / 'all.md').write_text(table(outcomes), encoding='utf-8')
-    print('\n' + table(outcomes))
-    return 0 if outcomes and all(outcome.passed for outcome in outcomes) else 1
+    claimed, good = claims_table([outcome.name for outcome in outcomes])
+    print('\n' + table(outcomes) + '\n' + claimed)
+    return 0 if good and outcomes and all(outcome.passed for outcome in outcomes) else 1
 
 
 if __name__ == '__main__':

@@ -11,7 +11,8 @@ import numpy as np
 
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, PayloadParameters
 from flexmanip_ros.payload import structured
-from flexmanip_ros.types import CaptureEvent, EventKind, Payload, Sample
+from flexmanip_ros.samples.sample_log import Rows, log_of
+from flexmanip_ros.types import CaptureEvent, EventKind, Payload
 
 RESULTS = Path(__file__).resolve().parents[1] / 'results'
 BENDS = ('link1_bend/position', 'link2_bend/position')
@@ -33,23 +34,24 @@ def configuration(
 
 
 def as_samples(position: np.ndarray, velocity: np.ndarray, effort: np.ndarray, dt: float,
-               outputs: tuple[str, ...] = BENDS + RATES) -> list[Sample]:
-    """Rows (N, 4) of joint1, joint2, link1_bend, link2_bend as samples of the outputs."""
+               outputs: tuple[str, ...] = BENDS + RATES) -> Rows:
+    """Rows (N, 4) of joint1, joint2, link1_bend, link2_bend as rows of a sample log with these outputs."""
     parts = [position[:, 2:]] if BENDS[0] in outputs else []
     parts += [velocity[:, 2:]] if RATES[0] in outputs else []
     Y = np.hstack(parts)
-    return [Sample(round(k * dt * 1e9), effort[k, :2], Y[k], position[k, :2]) for k in range(len(Y))]
+    stamps = np.round(np.arange(len(Y)) * dt * 1e9).astype(np.int64)
+    return log_of(effort[:, :2], Y, position[:, :2], stamps).rows(0, len(Y))
 
 
 def follow(
-    config: IdentifierParameters, samples: Sequence[Sample], capture: int, marks: Sequence[int], truth: float,
+    config: IdentifierParameters, samples: Rows, capture: int, marks: Sequence[int], truth: float,
 ) -> Trial:
     """Run with the capture before sample ``capture``; estimates after each of ``marks`` samples from it."""
-    state = structured.advance(config, structured.init(config), samples[:capture])
-    state = structured.event(config, state, CaptureEvent(samples[capture].stamp_ns, EventKind.CAPTURE))
+    state = structured.advance(config, structured.init(config), samples.between(0, capture))
+    state = structured.event(config, state, CaptureEvent(int(samples.stamp_ns[capture]), EventKind.CAPTURE))
     found, start = [], capture
     for mark in marks:
-        state = structured.advance(config, state, samples[start:capture + mark])
+        state = structured.advance(config, state, samples.between(start, capture + mark))
         start = capture + mark
         found.append(structured.estimate(config, state))
     return Trial(truth, tuple(found))

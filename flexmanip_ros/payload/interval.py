@@ -29,7 +29,7 @@ POWER_LIMIT = 2.0
 """Innovation power over white noise beyond which the model does not fit."""
 WIDENING_LIMIT = 4.0
 """Factor on the standard deviation, the model error apart, beyond which the model does not fit."""
-SEEMED_FREE = 2.0
+FREE_BIAS = 2.0
 """Standard deviations that an empty arm may seem to hold without a doubt of the model."""
 SETTLED = 1000
 """Samples after which a restart is forgotten."""
@@ -52,8 +52,8 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     if math.isnan(consistency):
         consistency = plain_misfit(sensors, m)
     restless = math.sqrt(drift * max(1.0, consistency / POWER_LIMIT))
-    widening, doubt = (restless * max(1.0, abs(float(m.score[empty_arm_bias])) / SEEMED_FREE)
-                       for empty_arm_bias in (mem.EMPTY_ARM_BIAS, mem.EXCESS_BIAS))
+    widening, doubt = (restless * max(1.0, abs(float(m.score[bias])) / FREE_BIAS)
+                       for bias in (mem.EMPTY_ARM_BIAS, mem.EXCESS_BIAS))
     std = widening * deviation
     status = Status.TRACKING
     if consistency > POWER_LIMIT or doubt > WIDENING_LIMIT:
@@ -168,10 +168,10 @@ def drift(score: Array, counts: Integers) -> float:
 
 @kernel
 def misjudged(noise: Array, score: Array, counts: Integers) -> float:
-    """How far one has to reckon with an arm that is not quite the model, 0 to 1.
+    """Share of the model-error allowance that the interval carries, 0 to 1.
 
-    1 where a sensor shows more than its white noise; else ``RESIDUAL_SHARE`` times the probability that the arm is
-    have more modes: seen residual_output, or not to be told as no torque stepped.
+    1 where the innovations of a sensor exceed its white noise; else ``RESIDUAL_SHARE`` times the probability of
+    residual modes.
     """
     chance = 2.5 * math.sqrt(2.0 / max(counts[BLOCKS], 1))
     for i in range(noise.shape[0]):

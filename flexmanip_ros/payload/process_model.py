@@ -1,9 +1,9 @@
 """Process model of the structured filter: the arm's equations carry the mean, their Jacobian the covariance.
 
-The state is x = [q (n), qd (n), d (n - 4), p (6)]. d: modal stiffness deviation, the logarithm of the stiffness of
-each mode beyond a link's first over what the link's stiffness factor gives, link 1 first. p = [payload, logarithm of
-the stiffness factors of links 1 and 2, damping ratios 1 and 2, logarithm of the rotary inertia]. The covariance is S S' with
-the square root S (nx, nx), which moves as S <- F S, F the Jacobian of the flow.
+The state is x = [q (n), qd (n), d (n - 4), p (6)]. d: modal stiffness deviation, the logarithm of the stiffness of each
+mode beyond a link's first over what the link's stiffness factor gives, link 1 first. p = [payload, logarithm of the
+stiffness factors of links 1 and 2, damping ratios 1 and 2, logarithm of the rotary inertia]. The covariance is S S'
+with the square root S (nx, nx), which moves as S <- F S, F the Jacobian of the flow.
 """
 
 from __future__ import annotations

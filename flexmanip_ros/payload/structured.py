@@ -131,7 +131,7 @@ def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, kind
     opened = np.zeros((m.x.size, 2))
     if kind is EventKind.CAPTURE:
         if not held:
-            _forget_payload(config, model, m)  # the arm was empty: what it empty_arm_bias to hold were its errors
+            _forget_payload(config, model, m)  # the arm was empty: its payload was the bias of the model
         opened[payload, 0] = structured_model.PAYLOAD_STD
         opened[-1, 1] = structured_model.PAYLOAD_STD if config.payload.rotary_inertia else 0.0
         m.counts[mem.HELD] = 1

@@ -1,0 +1,50 @@
+"""Write docs/how_well.md: what every benchmark claims, and what it measured last.
+
+Use: ``python benchmarks/tables.py`` (``make docs``). The values come from ``benchmarks/results``, the bounds from
+``benchmarks/claims.py``.
+"""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+
+import claims
+
+TARGET = Path(__file__).resolve().parents[1] / 'docs' / 'how_well.md'
+SUBJECTS = {
+    'payload': 'The payload', 'identification': 'The identified model', 'detection': 'Captures found in the signals',
+    'control': 'The controller', 'plant': 'The simulated arm', 'replay': 'Replay', 'ros': 'The nodes',
+    'io': 'Recordings', 'study': 'Studies', 'setup': 'Set-up'}
+
+
+def page() -> str:
+    """Return the page."""
+    parts = ['# How well it works\n',
+             'Each row is a claim: a value that a benchmark measured, and the bounds it is compared with. `make bench` '
+             'measures again and ends with exit code 1 when a claim falls short; `make docs` writes this page. A '
+             'share of n runs has bounds that are two binomial deviations wider than the claim.\n']
+    for prefix, title in SUBJECTS.items():
+        rows = []
+        for name, function in claims.CLAIMS.items():
+            if name.split('_')[0] == prefix:
+                found = claims.recorded(name)
+                words = inspect.getdoc(function) or ''
+                rows.append(f'`{name}`: {words}\n')
+                rows.append(table(found) if found else 'Not measured yet.\n')
+        if rows:
+            parts += [f'## {title}\n', *rows]
+    return '\n'.join(parts)
+
+
+def table(found: list[claims.Claim]) -> str:
+    """Return the claims of a benchmark as Markdown."""
+    rows = ['| value | measured | claimed | holds |', '|---|---|---|---|']
+    rows += [f'| {claim.name} | {claim.value:.4g} {claim.unit}'.rstrip()
+             + f' | {claim.bounds} | {"yes" if claim.holds else "no"} |' for claim in found]
+    return '\n'.join(rows) + '\n'
+
+
+if __name__ == '__main__':
+    TARGET.write_text(page(), encoding='utf-8')
+    print(f'wrote {TARGET.name}')
