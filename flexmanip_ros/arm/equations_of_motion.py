@@ -185,15 +185,16 @@ def assemble(
             M[2 + k + j, 1] += slope
             for t in range(j + 1):
                 M[2 + k + j, 2 + k + t] += slope * arm.tip_slope[1, t]
-    add_link(arm, 0, q, qd, M, E, work)
-    add_link(arm, 1, q, qd, M, E, work)
-    add_point(arm.joint_mass + arm.tip_mass + 2.0 * arm.half_mass[1] + payload[0], 0.0, 0.0,
-              arm, 0, q, qd, M, E, moments)
-    if payload[2] == 0.0 and payload[3] == 0.0:
-        add_point(arm.tip_mass + payload[0], 0.0, 0.0, arm, 1, q, qd, M, E, moments)
-    else:
-        add_point(arm.tip_mass, 0.0, 0.0, arm, 1, q, qd, M, E, moments)
-        add_point(payload[0], payload[2], payload[3], arm, 1, q, qd, M, E, moments)
+    for i in range(2):  # with a constant in place of i, numba compiles a version for each
+        add_link(arm, i, q, qd, M, E, work)
+    at_tip = payload[2] == 0.0 and payload[3] == 0.0
+    for i in range(2):
+        mass = arm.tip_mass + payload[0] if at_tip else arm.tip_mass
+        if i == 0:
+            mass = arm.joint_mass + arm.tip_mass + 2.0 * arm.half_mass[1] + payload[0]
+        add_point(mass, 0.0, 0.0, arm, i, q, qd, M, E, moments)
+        if i == 1 and not at_tip:
+            add_point(payload[0], payload[2], payload[3], arm, i, q, qd, M, E, moments)
 
     c = np.cos(q[1] - q[0])
     s = np.sin(q[1] - q[0])

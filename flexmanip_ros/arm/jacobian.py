@@ -57,16 +57,20 @@ def force_jacobian(
     base_n = c * pn - s * pe
 
     mass = arm.tip_mass + payload[0]
-    link_jacobian(arm, 0, 0.0, 0.0, q, qd, qdd, left, right, work)
-    link_jacobian(arm, 1, base_e, base_n, q, qd, qdd, left, right, work)
-    point_jacobian(mass + arm.joint_mass + 2.0 * arm.half_mass[1], 0.0, 0.0,
-                   arm, 0, 0.0, 0.0, q, qd, qdd, left, right, work)
-    if payload[2] == 0.0 and payload[3] == 0.0:
-        point_jacobian(mass, 0.0, 0.0, arm, 1, base_e, base_n, q, qd, qdd, left, right, work)
-    else:
-        point_jacobian(arm.tip_mass, 0.0, 0.0, arm, 1, base_e, base_n, q, qd, qdd, left, right, work)
-        point_jacobian(payload[0], payload[2], payload[3], arm, 1, base_e, base_n, q, qd, qdd,
-                       left, right, work)
+    for i in range(2):  # with a constant in place of i, numba compiles a version for each
+        e = base_e if i == 1 else 0.0
+        f = base_n if i == 1 else 0.0
+        link_jacobian(arm, i, e, f, q, qd, qdd, left, right, work)
+    at_tip = payload[2] == 0.0 and payload[3] == 0.0
+    for i in range(2):
+        e = base_e if i == 1 else 0.0
+        f = base_n if i == 1 else 0.0
+        lumped = mass if at_tip else arm.tip_mass
+        if i == 0:
+            lumped = mass + arm.joint_mass + 2.0 * arm.half_mass[1]
+        point_jacobian(lumped, 0.0, 0.0, arm, i, e, f, q, qd, qdd, left, right, work)
+        if i == 1 and not at_tip:
+            point_jacobian(payload[0], payload[2], payload[3], arm, i, e, f, q, qd, qdd, left, right, work)
 
     # Coupling: rows of link 1 see P_q . F'', rows of link 2 see F_q . P''.
     moments = work.moments

@@ -76,7 +76,8 @@ def traces(
     n = motion.q.size
     w, sensors_count = glr.trace.shape[0], glr.trace.shape[1]
     set_parameters(motion, m.x, False)
-    linearize(motion, m.x[:n], m.x[n:2 * n], effort, motion.k[7], False)
+    # the arm counts as empty; with a constant for that, numba would compile another version of the equations
+    linearize(motion, m.x[:n], m.x[n:2 * n], effort, motion.k[7], n < 0)
     flow, state = glr.flow, glr.state
     for i in range(2 * n):
         for c in range(2 * n):

@@ -263,9 +263,14 @@ def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
         before_ns, effort = horizon.before_ns, horizon.effort
     reach = rows.since(begin)
     assert effort is not None
-    steps = np.maximum(np.diff(reach.stamp_ns, prepend=np.int64(before_ns)), 0) * 1e-9
-    efforts = np.vstack([effort, reach.u[:-1]])
-    return np.column_stack([steps, efforts, measurements(state.model, reach)]), rows.first - begin
+    stamps, y = reach.stamp_ns, measurements(state.model, reach)
+    table = np.empty((len(y), 3 + y.shape[1]))
+    table[0, 0], table[0, 1:3] = stamps[0] - before_ns, effort
+    table[1:, 0], table[1:, 1:3] = stamps[1:] - stamps[:-1], reach.u[:-1]
+    np.maximum(table[:, 0], 0.0, out=table[:, 0])
+    table[:, 0] *= 1e-9
+    table[:, 3:] = y
+    return table, rows.first - begin
 
 
 def _restart(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
