@@ -142,7 +142,7 @@ def _wanted(config: ControllerParameters, state: ControllerState, way: Path) -> 
 
 
 def _scheduled(config: ControllerParameters, state: ControllerState, between: float) -> ControllerState:
-    """Let the payload follow the trusted one, design anew when it or the configuration changed enough."""
+    """Follow the trusted payload; design the gains again when it or the configuration changed enough."""
     reach = config.payload_rate / config.rate
     payload = state.payload + float(np.clip(state.trusted - state.payload, -reach, reach))
     share = 1.0 / (config.blend_time * config.rate) if config.blend_time > 0.0 else 1.0

@@ -43,8 +43,8 @@ class Recursion(NamedTuple):
     deviations from the scatter of the gradients; gain: (n, m) published K, theta's own unless that is held;
     singular_values, condition: of the subspace model the fit began with; lost: the state is unknown;
     drift: logarithm of the factor by which variances grow from block to block, as the plant itself moves;
-    went: (k,) how far the coordinates went of late in a block; going: the share of that which is no chance,
-    that far may they go again; behind: the times it that they may have gone since what the fit rests on.
+    trend: (k,) mean step of the coordinates in a block, over the last blocks; trend_share: the part of it that chance
+    does not explain (0 to 1); trend_lag: steps of ``trend`` by which the fit may lag behind the arm.
     """
 
     theta: Theta
@@ -59,11 +59,11 @@ class Recursion(NamedTuple):
     gain: Array
     singular_values: Array
     condition: float
-    went: Array
+    trend: Array
     lost: bool = False
     drift: float = 0.0
-    going: float = 0.0
-    behind: float = 0.0
+    trend_share: float = 0.0
+    trend_lag: float = 0.0
 
 
 class Attempt(NamedTuple):
@@ -198,18 +198,18 @@ def _recursion(samples: Array, attempt: Attempt) -> Recursion:
         alone = structure._replace(free_gain=True, only_gain=True)
         gain = _gain_alone(U, Y, fit.theta, attempt.begin, alone)
     root, blocks = arrive(covariance_root(fit.information), fit.arrival), len(U) / BLOCK
-    went, going = np.zeros(fit.directions.shape[1]), 0.0
+    trend, trend_share = np.zeros(fit.directions.shape[1]), 0.0
     widening = _widening(U, Y, fit, structure)
     drift = drift_of(U, Y, fit, structure, widening)
     if drift is not None:  # the fit is of an earlier arm
         root = triangle(np.hstack([root, drift.ahead[:, None]]).T).T
-        went, going = drift.rate / blocks, 1.0
+        trend, trend_share = drift.rate / blocks, 1.0
     return Recursion(
         theta=fit.theta._replace(x=fit.end), structure=structure, scale=attempt.scale, P=fit.directions,
         root=root,
         covariance=fit.covariance + CLEAN * np.diag(np.mean(Y ** 2, axis=0)), weight=float(len(U)),
         widening=widening, strikes=0, gain=fit.theta.K if gain is None else gain,
-        singular_values=np.zeros(0), condition=float('nan'), went=went, going=going)
+        singular_values=np.zeros(0), condition=float('nan'), trend=trend, trend_share=trend_share)
 
 
 def _gain_alone(U: Array, Y: Array, theta: Theta, begin: Array, structure: Structure) -> Array | None:

@@ -41,7 +41,7 @@ def restart(decimator: Decimator) -> Decimator:
 def decimate(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimator, Array, list[int]]:
     """Take samples (k, r + m); return the filtered ones (0.., r + m), and which sample each is due with.
 
-    A sample that is not finite starts the filter anew and is handed on as it is, so that the identifier
+    A sample that is not finite restarts the filter and is handed on as it is, so that the identifier
     sees the break.
     """
     kept: list[Array] = []

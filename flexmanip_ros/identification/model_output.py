@@ -89,7 +89,7 @@ def from_fit(
     su, sy = np.where(su > 0.0, su, 1.0), np.where(sy > 0.0, sy, 1.0)
     k = P.shape[1] - n
     known = recursion.widening * np.exp(0.5 * recursion.drift) * recursion.root[:k]
-    spread = (P[:-n, :k] @ np.hstack([known, recursion.behind * recursion.went[:k, None]])).T
+    spread = (P[:-n, :k] @ np.hstack([known, recursion.trend_lag * recursion.trend[:k, None]])).T
     free = (True, True, structure.free_gain, structure.free_output, structure.free_direct)
     shapes = ((n, n), (n, r), (n, m), (m, n), (m, r))
     sizes = [a * b if is_free else 0 for (a, b), is_free in zip(shapes, free, strict=True)]

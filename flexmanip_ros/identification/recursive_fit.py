@@ -217,7 +217,7 @@ def break_window(refined: Refined) -> Refined:
 
 MEMORY = 1_000_000.0
 """Samples after which parameters may have drifted by their own standard deviation."""
-NOISE_BLOCKS, DRIFT_BLOCKS, WENT_BLOCKS = 16, 4, 8
+NOISE_BLOCKS, DRIFT_BLOCKS, TREND_BLOCKS = 16, 4, 8
 """Blocks over which the noise is remembered, how fast the parameters move, and where they go."""
 SURPRISE = 4.0
 """Standard deviations beyond which a block says that the parameters have gone elsewhere."""
@@ -251,9 +251,9 @@ def _stretch(request: FitRequest, R: Array, scale: Array) -> Recursion | None:
         request.rows.u_y, [realized for realized, _, _ in starts if realized is not None],
         [fit for fit in (request.old, request.older) if fit is not None],
         starts[0][2], config.direct_feedthrough, 'sensor' if config.refinement == 'output_error' else 'any')
-    if found is None or found.going == 0.0:
+    if found is None or found.trend_share == 0.0:
         return found
-    return found._replace(behind=request.later / BLOCK + 1.0)  # the arm goes on until it is read
+    return found._replace(trend_lag=request.later / BLOCK + 1.0)  # the arm goes on until it is read
 
 
 def _block(old: Recursion, samples: Array) -> Recursion | None:
@@ -263,8 +263,8 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
     Y = np.ascontiguousarray(samples[:, r:] * old.scale[r:])
     k = old.root.shape[0]
     kept = old.root * np.sqrt(1.0 + len(U) / MEMORY) * np.exp(0.5 * old.drift)
-    if old.going > 0.0:
-        kept = triangle(np.hstack([kept, old.going * old.went[:, None]]).T).T
+    if old.trend_share > 0.0:
+        kept = triangle(np.hstack([kept, old.trend_share * old.trend[:, None]]).T).T
     noise = old.covariance
     if not old.lost:  # what the model leaves (a moving arm is not linear) is noise to it
         before, _ = run(U, Y, old.theta)
@@ -301,15 +301,15 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
     step = kept @ zeta
     step[k - len(end):] = 0.0  # the state moves anyway
     moving = old.drift + further if further > 0.0 else 0.0
-    went = old.went if old.lost else old.went + (step - old.went) / WENT_BLOCKS
-    lasting, behind = going(went[:k - len(end)], kept[:k - len(end)], root[:k - len(end)])
+    trend = old.trend if old.lost else old.trend + (step - old.trend) / TREND_BLOCKS
+    lasting, lag = trend_of(trend[:k - len(end)], kept[:k - len(end)], root[:k - len(end)])
     return old._replace(
         theta=theta._replace(x=end), root=arrive(root, arrival), strikes=strikes,
         gain=theta.K if old.structure.free_gain else old.gain, lost=False,
         covariance=(1.0 - share) * old.covariance + share * covariance,
         weight=min(old.weight + len(U), MEMORY),
         drift=old.drift + (moving - old.drift) / DRIFT_BLOCKS,
-        went=went, going=lasting, behind=behind)
+        trend=trend, trend_share=lasting, trend_lag=lag)
 
 
 def is_surprising(size: float, H: Array, widening: float) -> bool:
@@ -336,25 +336,25 @@ def drift(H: Array, g: Array, widening: float) -> float:
     return low
 
 
-def going(went: Array, before: Array, after: Array) -> tuple[float, float]:
-    """Share of the mean step ``went`` (a,) that is no chance, 0..1, how many steps the fit is behind.
+def trend_of(trend: Array, before: Array, after: Array) -> tuple[float, float]:
+    """Return the share of the mean step ``trend`` (a,) that chance does not explain (0 to 1), and the lag in steps.
 
     before, after: (a, k) roots of the covariance around a block. Estimates of parameters that stay where they
     are move too, by what a block teaches: T = 1 - after after', in units of the covariance before. Their mean
-    over the blocks has the size tr T / (2 WENT_BLOCKS - 1), with the deviation sqrt(2) |T| / (..). T is also
+    over the blocks has the size tr T / (2 TREND_BLOCKS - 1), with the deviation sqrt(2) |T| / (..). T is also
     the share of an error that a block takes away: a steady drift stays (1 - T) / T steps ahead of the fit.
     """
     L = triangle(before.T).T
-    step = solve_triangular(L, went, lower=True, check_finite=False)
+    step = solve_triangular(L, trend, lower=True, check_finite=False)
     size = float(step @ step)
     if not size > 0.0:
         return 0.0, 0.0
     left = solve_triangular(L, after, lower=True, check_finite=False)
-    T = np.eye(len(went)) - left @ left.T
+    T = np.eye(len(trend)) - left @ left.T
     likely = float(np.trace(T)) + CHANCE * np.sqrt(2.0) * float(np.linalg.norm(T))
-    share = float(np.sqrt(max(1.0 - likely / (2.0 * WENT_BLOCKS - 1.0) / size, 0.0)))
+    share = float(np.sqrt(max(1.0 - likely / (2.0 * TREND_BLOCKS - 1.0) / size, 0.0)))
     gain = float(step @ T @ step) / size
-    lag = min((1.0 - gain) / max(gain, 1e-9), float(WENT_BLOCKS))
+    lag = min((1.0 - gain) / max(gain, 1e-9), float(TREND_BLOCKS))
     return share, share * (AGE + lag)
 
 

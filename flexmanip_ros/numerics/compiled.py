@@ -54,7 +54,7 @@ class Prepared:
     """
 
     def __init__(self, function: Callable[..., Any], fixed: int) -> None:
-        """fixed: how many of the first arguments are looked at anew when they are other objects."""
+        """fixed: how many of the first arguments are examined again when they are other objects."""
         self._function: Any = function
         self._fixed = fixed if hasattr(function, 'compile') else 0  # numba may be switched off
         self._known: tuple[tuple[object, ...], Callable[..., Any]] = ((), function)

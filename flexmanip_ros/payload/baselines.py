@@ -112,7 +112,7 @@ def _rigid_advance(config: IdentifierParameters, state: BaselineState, rows: Row
 
 
 def _rigid_event(config: IdentifierParameters, state: BaselineState, event: CaptureEvent) -> BaselineState:
-    """Begin the least squares, and the filters, anew."""
+    """Restart the least squares."""
     held = event.kind is EventKind.CAPTURE
     return replace(state, sums=np.zeros(5), held=held)
 
@@ -179,7 +179,7 @@ def _algebraic_advance(config: IdentifierParameters, state: BaselineState, rows:
 
 
 def _algebraic_event(config: IdentifierParameters, state: BaselineState, event: CaptureEvent) -> BaselineState:
-    """Time begins anew."""
+    """Restart the integrals: their time counts from the event."""
     return replace(state, x=np.zeros(11), sums=np.zeros(7), held=event.kind is EventKind.CAPTURE)
 
 

@@ -159,7 +159,7 @@ def _watch(
 
 
 def _after(state: DetectionState, event: CaptureEvent) -> DetectionState:
-    """Let the filter know; the samples since the onset misled it, so it looks at the motion anew."""
+    """Apply the event to the filter, and restart its motion: the samples since the onset misled it."""
     assert state.glr is not None
     now = event._replace(stamp_ns=state.filter.last_ns)
     filtered = structured.event(state.identifier, state.filter, now)
@@ -168,7 +168,7 @@ def _after(state: DetectionState, event: CaptureEvent) -> DetectionState:
 
 
 def _resume(config: TriggerParameters, state: DetectionState, row: Rows) -> DetectionState:
-    """After a gap: filter anew, test anew."""
+    """After a gap: restart the motion of the filter, and the test."""
     assert state.glr is not None
     filtered = structured.advance(state.identifier, state.filter, row)
     return replace(state, filter=filtered, glr=_quiet(state.glr), since=row.first)

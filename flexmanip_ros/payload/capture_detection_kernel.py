@@ -140,7 +140,7 @@ def traces(
 
 @kernel
 def rescore(glr: GlrState) -> None:
-    """Gather every onset's score anew: scores and information must come from the same traces."""
+    """Compute every onset's score again: scores and information must come from the same traces."""
     w = glr.trace.shape[0]
     newest = glr.clock[NEWEST]
     for lag in range(glr.clock[FILLED]):

@@ -25,7 +25,7 @@ from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload
 FIRST_LOOK = 24
 """Samples looked at before the filter starts: they tell its noise."""
 LONGEST_S = 10.0
-"""An event this long after the last sample finds a motion nobody knows; the next sample starts anew."""
+"""An event this long after the last sample [s]: the motion is unknown by then, and the next sample starts it again."""
 run = Prepared(run_kernel, 2)
 
 
@@ -220,7 +220,7 @@ def _resume(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
 def reopen(
     config: IdentifierParameters, state: StructuredState, y: Array | None = None,
 ) -> StructuredState:
-    """Keep what is known of arm, payload and noise, look at the motion anew, from measurements y (m,)."""
+    """Keep what is known of arm, payload and noise; start the motion again from measurements y (m,)."""
     assert state.model is not None
     assert state.memory is not None
     m = mem.copy(state.memory)

@@ -87,7 +87,7 @@ def test_measured_arm_is_simulated_to_98_percent(order, future):
     assert scores['prediction'][0] >= 98.0
 
 
-def test_long_fit_recursion_tracks_and_an_event_starts_it_anew():
+def test_long_fit_recursion_tracks_and_an_event_restarts_it():
     rng = np.random.default_rng(6)
     system = random_system(2, 1, 2, rng)
     u, y = record(system, 3500, 0.0, rng)
