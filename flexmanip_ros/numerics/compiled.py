@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from numba import njit, typeof
+from numba import njit
 
 Function = TypeVar('Function', bound=Callable[..., Any])
 
@@ -43,28 +43,3 @@ def _compiled(function: Function, **more: Any) -> Function:
     options: dict[str, Any] = {'cache': True, 'nogil': True, '_nrt': False, **more}
     compiled: Function = njit(**options)(function)
     return compiled
-
-
-class Prepared:
-    """A kernel called again and again with the same first arguments, whose types are looked at only once.
-
-    numba looks at the type of every argument at every call. For tuples of sixty arrays that takes five times
-    as long as the call itself (8 us against 1.5), and nothing of it is in a cache when a sample comes.
-    The other arguments must keep their types: arrays their dimensions, kind of number and memory order.
-    """
-
-    def __init__(self, function: Callable[..., Any], fixed: int) -> None:
-        """fixed: how many of the first arguments are examined again when they are other objects."""
-        self._function: Any = function
-        self._fixed = fixed if hasattr(function, 'compile') else 0  # numba may be switched off
-        self._known: tuple[tuple[object, ...], Callable[..., Any]] = ((), function)
-
-    def __call__(self, *arguments: Any) -> Any:
-        """Call the kernel."""
-        known, entry = self._known
-        if len(known) != self._fixed or any(a is not b for a, b in zip(known, arguments, strict=False)):
-            types = tuple(typeof(argument) for argument in arguments)
-            self._function.compile(types)
-            entry = self._function.get_overload(types)
-            self._known = arguments[:self._fixed], entry
-        return entry(*arguments)

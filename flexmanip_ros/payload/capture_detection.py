@@ -9,7 +9,6 @@ import numpy as np
 from scipy.special import chdtri
 
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.numerics.compiled import Prepared
 from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
 from flexmanip_ros.payload import capture_detection_kernel as kernel
 from flexmanip_ros.payload import filter_state as mem
@@ -28,7 +27,6 @@ INDEPENDENT = 0.5
 """Samples a look that is as good as independent, over all onsets of the window (for the false alarms)."""
 SPEED, ACCELERATION, JERK = 0.3, 5.0, 200.0
 """Prior deviations of what the tip's light mass would gain: impulse [m/s], step [m/s^2], ramp [m/s^3]."""
-detect_samples = Prepared(kernel.detect_samples, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +137,7 @@ def _watch(
     table, first = structured.input_table(filtered, rows)
     confirm = round(CONFIRM / state.dt)
     light = filtered.model.motion.scale
-    taken = detect_samples(
+    taken = kernel.detect_samples(
         filtered.model.motion, filtered.sensors, m, glr, light * np.array([SPEED, ACCELERATION, JERK]),
         state.dt, float(np.exp(-state.dt / PEAK_MEMORY)), round(SETTLE / state.dt), confirm, table, first,
         np.zeros(kernel.CAUSES))
@@ -152,6 +150,7 @@ def _watch(
     state = replace(state, filter=filtered, glr=glr)
     if glr.clock[kernel.ALARMED] <= confirm:
         return state, None
+    assert state.since is not None
     lag = min(int(glr.level[1]), cursor - 1 - state.since, glr.trace.shape[0] - 1)
     kind = EventKind.RELEASE if m.counts[mem.HELD] else EventKind.CAPTURE
     event = CaptureEvent(int(rows.between(cursor - 1 - lag, cursor).stamp_ns[0]), kind)

@@ -9,13 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.numerics.compiled import Prepared
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
-from flexmanip_ros.payload import residual_modes, structured_model
+from flexmanip_ros.payload import moving_horizon, residual_modes, structured_model
 from flexmanip_ros.payload.interval import inexact, judge
 from flexmanip_ros.payload.measurement_update import MeasurementModel
-from flexmanip_ros.payload.moving_horizon import advance as run_kernel
 from flexmanip_ros.payload.process_model import PARAMETERS, predict
 from flexmanip_ros.payload.residual_modes import excite_residual, propagate_residual, residual_probability
 from flexmanip_ros.payload.structured_model import Model, build, sensors
@@ -26,7 +24,6 @@ FIRST_LOOK = 24
 """Samples looked at before the filter starts: they tell its noise."""
 LONGEST_S = 10.0
 """An event this long after the last sample [s]: the motion is unknown by then, and the next sample starts it again."""
-run = Prepared(run_kernel, 2)
 
 
 class StructuredState(NamedTuple):
@@ -243,7 +240,7 @@ def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> St
     assert state.sensors is not None
     m = mem.copy(state.memory, horizon=False)
     table, first = input_table(state, rows)
-    taken = run(state.model.motion, state.sensors, m, table, first)
+    taken = moving_horizon.advance(state.model.motion, state.sensors, m, table, first)
     if taken < len(table):
         return _restart(config, state, rows.since(rows.first + taken - first))
     return state._replace(memory=m, cursor=rows.until, last_ns=int(rows.stamp_ns[-1]), effort=rows.u[-1].copy())

@@ -10,6 +10,7 @@ from recording import ARM, BENDS, RATES, altered, config, event, joined, record
 
 from flexmanip_ros.parameters import ArmParameters, PayloadParameters
 from flexmanip_ros.payload import structured
+from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.types import EventKind, Status
 
 
@@ -263,3 +264,10 @@ def test_rotary_inertia_is_refused_where_the_signals_do_not_tell_it():
     found = structured.estimate(asked, run(asked, samples, (event(1.5),)))
     assert found.inertia == (0.0,) * 6
     assert found.status is not Status.TRACKING
+
+
+def test_no_samples_are_a_table_without_rows() -> None:
+    model = structured.init(config()).model
+    assert model is not None
+    rows = log_of(np.zeros((0, 2)), np.zeros((0, 4)), np.zeros((0, 2))).rows(0, 0)
+    assert structured.measurements(model, rows).shape == (0, len(model.roles))
