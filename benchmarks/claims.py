@@ -1,12 +1,16 @@
 """What each benchmark claims: values out of its results, with the bounds that the documentation states.
 
 ``claims_of(name, result)`` compares the content of ``results/<name>.json`` with the bounds. ``run_all.py`` prints the
-table and exits 1 when a claim falls short; ``tables.py`` writes the same table into docs/how_well.md. A share of n runs
-may fall below its claim by chance: its bound is widened by two binomial standard deviations.
+table and exits 1 when a claim falls short; ``tables.py`` writes the same table into docs/how_well.md.
+
+A bound is what the first lines of the benchmark promise. Where they promise no number, it is the figure of the lab
+notebook (docs/lab), up to the rounding of its last digit: every run is seeded, so the figure repeats. Times and memory
+differ between machines; a bound of theirs that no document states has its reason beside it.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Callable, Iterator
@@ -42,85 +46,115 @@ class Claim(NamedTuple):
 Claims = Iterator[Claim]
 
 
-def by_chance(share: float, runs: float) -> float:
-    """Return two standard deviations of a share of independent runs."""
-    return 2.0 * math.sqrt(share * (1.0 - share) / runs)
+def rounded(figure: float, digits: int) -> float:
+    """Return the largest value that is printed as a figure with so many digits behind the point."""
+    return figure + 0.5 * 10.0 ** -digits
 
 
-def covers(name: str, share: float, runs: float, low: float = 0.93, high: float = 0.97) -> Claim:
-    """Claim the coverage of 95 % intervals."""
-    return Claim(name, share, low - by_chance(0.95, runs), min(1.0, high + by_chance(0.95, runs)))
+def covers(name: str, share: float, runs: float) -> Claim:
+    """Claim that 95 % intervals cover 93 to 97 %: of 1000 runs, or as near to 95 % as chance lets fewer runs come."""
+    chance = 2.0 * math.sqrt(0.95 * 0.05 / runs)  # two standard deviations of a share of independent runs
+    return Claim(name, share, min(0.93, 0.95 - chance), max(0.97, min(1.0, 0.95 + chance)))
 
 
 def control_payload(rows: list[dict[str, Any]]) -> Claims:
-    """The controller that knows the estimate settles sooner, and bends the links no more."""
+    """With the payload estimate a move settles sooner than without, and bends the links no more."""
     for mass in sorted({row['mass_kg'] for row in rows}):
         by = {row['knows']: row for row in rows if row['mass_kg'] == mass}
+        yield Claim(f'{mass:.0f} kg: settled with the estimate', by['estimate']['settled'], 1.0)
         yield Claim(f'{mass:.0f} kg: settling with the estimate over without',
                     by['estimate']['settling_s'] / by['nothing']['settling_s'], high=1.0)
+        yield Claim(f'{mass:.0f} kg: settling with the estimate after that with the true payload',
+                    by['estimate']['settling_s'] - by['truth']['settling_s'], high=rounded(0.0, 1), unit='s')
         yield Claim(f'{mass:.0f} kg: peak bend of the move with the estimate over without',
-                    by['estimate']['peak_bend_move_mm'] / by['nothing']['peak_bend_move_mm'], high=1.02)
+                    by['estimate']['peak_bend_move_mm'] / by['nothing']['peak_bend_move_mm'], high=1.0)
 
 
 def detection_delay(rows: list[dict[str, Any]]) -> Claims:
     """20 kg is found within 50 ms with probability 0.95, at rest within 100 ms of torque; no false alarm."""
-    for row in rows:
-        if 'within_50_ms' in row:
-            yield Claim('found within 50 ms', row['within_50_ms'], 0.95 - by_chance(0.95, row['runs']))
-        if 'within_100_ms' in row:
-            yield Claim('at rest, found within 100 ms of torque', row['within_100_ms'],
-                        0.95 - by_chance(0.95, row['runs']))
-        if 'alarms' in row:
-            yield Claim(f'false alarms in {row["hours"]} h', row['alarms'], high=0.0)
+    moving, rest, empty = rows
+    yield Claim('found within 50 ms', moving['within_50_ms'], 0.95)
+    yield Claim('error of the instant, median', moving['median_dating_error_ms'], high=rounded(2.0, 0), unit='ms')
+    yield Claim('alarms before the capture', moving['early_alarms'], high=0)
+    yield Claim('at rest, found within 100 ms of torque', rest['within_100_ms'], 0.95)
+    yield Claim(f'false alarms in {empty["hours"]} h', empty['alarms'], high=0)
 
 
 def identification_coverage(rows: list[dict[str, Any]]) -> Claims:
     """95 % intervals of frequencies, damping ratios and payload cover 93-97 %; widths are the Cramer-Rao bound."""
     for row in rows:
         for name, percent, width in zip(row['names'], row['coverage_percent'], row['claimed_over_bound'], strict=True):
-            yield covers(f'{row["snr_db"]:.0f} dB: coverage, {name}', percent / 100, row['runs'])
-            yield Claim(f'{row["snr_db"]:.0f} dB: width over bound, {name}', width, high=1.1)
+            yield covers(f'{row["snr_db"]:.0f} dB: coverage, {name}', round(percent / 100, 6), row['runs'])
+            # docs/lab/identification.md: "the claimed deviations are the bound to 0.5 %"
+            yield Claim(f'{row["snr_db"]:.0f} dB: width over bound, {name}', width, 0.995, 1.005)
 
 
 def identification_measured_arms(table: dict[str, Any]) -> Claims:
-    """On the measured DaISy arm one recursive pass simulates the unseen half to 98 % or more."""
-    for label, scores in table.get('daisy_robot_arm', {}).items():
-        if label.startswith('ours'):
-            yield Claim(f'DaISy arm, {label}: simulation VAF', scores['simulation'][0], 98.0, unit='%')
+    """On the measured DaISy arm one recursive pass simulates the unseen half to 98 % or more, n = 4, 6."""
+    ours = {label: scores for label, scores in table['daisy_robot_arm'].items() if label.startswith('ours')}
+    for label, scores in ours.items():
+        yield Claim(f'DaISy arm, {label}: simulation', scores['simulation'][0], 98.0, unit='%')
+    # docs/lab/identification.md: "one-step prediction 100.0, 100.0, 100.0, 100.0 %; simulation 99.1, 0, 79.0, 76.3 %"
+    rig = table['quanser_2dsfl_first_half']['ours order=8 past_window=20 future_window=10']
+    yield Claim('Quanser rig: prediction, worst of four outputs', min(rig['prediction']), 99.95, unit='%')
+    for output, figure in ((0, 99.1), (2, 79.0), (3, 76.3)):
+        yield Claim(f'Quanser rig: simulation, output {output + 1}', rig['simulation'][output], figure - 0.05, unit='%')
 
 
 def identification_moving_arm(rows: list[dict[str, Any]]) -> Claims:
-    """Default settings follow both frequencies of the moving arm."""
-    for row in rows:
-        if row['truth'] == 'lately' and row['case'] != 'all':
-            yield Claim(f'{row["case"]}, f{row["frequency"]}: median error', row['median_error_percent'], high=0.2,
-                        unit='%')
+    """Default settings follow both frequencies of the moving nonlinear arm, and say how sure they are."""
+    by = {(row['case'], row['frequency'], row['truth']): row for row in rows}
+    # docs/lab/identification.md, "An arm that moves"
+    for i, ninety, inside in ((1, 0.3, 97.0), (2, 0.2, 84.0)):
+        row = by['all', i, 'lately']
+        yield Claim(f'f{i}: median error', row['median_error_percent'], high=rounded(0.05, 2), unit='%')
+        yield Claim(f'f{i}: error of nine in ten', row['ninety_error_percent'], high=rounded(ninety, 1), unit='%')
+        yield Claim(f'f{i}: bands that hold the frequency of the last half second', row['inside_percent'],
+                    inside - 0.5, unit='%')
+    yield Claim('f2: bands that hold the frequency of the instant', by['all', 2, 'now']['inside_percent'], 62.5,
+                unit='%')
+    for case, found in (('0/0 deg', 100.0), ('60/45 deg', 95.0)):
+        yield Claim(f'{case}: readings with both modes', by[case, 1, 'lately']['found_percent'], found - 0.5, unit='%')
 
 
 def identification_paper_settings(rows: list[dict[str, Any]]) -> Claims:
-    """The paper's settings leave the payload tens of percent off; restart and long memory make it a few percent."""
-    yield Claim("paper's settings: mean error", rows[0]['mean_percent'], 20.0, unit='%')
-    yield Claim('one factor, long memory, restart: mean error', rows[-1]['mean_percent'], high=4.0, unit='%')
+    """The paper's settings leave the payload 30 % off; restart and long memory make it a few percent."""
+    mean = {row['settings']: row['mean_percent'] for row in rows}
+    yield Claim("paper's settings: mean error", mean["paper's three least squares, beta 0.99"], 30.0, unit='%')
+    # docs/lab/identification.md, "Memory"
+    yield Claim("paper's recursion, long memory, restart: mean error",
+                mean["paper's three least squares, beta 0.9995, restart"], high=rounded(3.2, 1), unit='%')
+    for beta in ('beta 0.9995, restart', 'beta 1, restart, alpha 1e-6'):
+        yield Claim(f'refined, {beta}: mean error', mean[f'one factor, {beta}'], high=rounded(1.7, 1), unit='%')
 
 
 def identification_soak(rows: list[dict[str, Any]]) -> Claims:
-    """Millions of samples with silences, saturation and faults: finite, bounded."""
-    yield Claim('samples', max(row['samples'] for row in rows), 10_000_000)
+    """10 million samples with silences, saturation and faults: finite, bounded, back at once."""
+    default = rows[0]
+    yield Claim('samples', default['samples'], 10_000_000)
     yield Claim('states that are not finite', sum(row['not_finite'] for row in rows), high=0)
-    yield Claim('worst error of a pole (factor, innovation forgetting)', rows[0]['worst_pole_error'], high=1e-4)
+    # docs/lab/identification.md: "pole error 100 samples after motion returns at most 8.3e-6"
+    yield Claim('error of a pole, 100 samples after motion returns', default['worst_pole_error'], high=8.35e-6)
+    # "memory constant": an allocator keeps a few pages; 10 million rows of six numbers would be 480 MB
+    yield Claim('growth of memory after the first cycle', default['grown_mb'], high=2.0, unit='MB')
 
 
 def identification_speed(result: dict[str, Any]) -> Claims:
-    """The identifier's update costs a few times a bare covariance update of the same size."""
+    """The whole identifier takes 5 us a sample at p = 10, r = 2, m = 4, n = 4 in the offline loop."""
     us = result['microseconds']
+    yield Claim('update', us['identifier, update'], high=5.0, unit='us')
+    # 5 us over the 0.68 us that docs/lab/identification.md gives for the bare update
     yield Claim('update over a bare covariance update', us['identifier, update'] / us['bare 60 x 60 covariance update'],
-                high=8.0)
+                high=7.4)
 
 
 def io_bag_reading(result: dict[str, Any]) -> Claims:
-    """Our decoder is faster than the library's."""
-    for name, ratio in (result['ratio'].items() if isinstance(result['ratio'], dict) else [('ratio', result['ratio'])]):
-        yield Claim(f'library over ours: {name}', ratio, 1.0)
+    """Reading a recording costs less than the identifier spends on its samples."""
+    us = result['us_per_message']
+    yield Claim('reading in blocks over the identifier', us['read a recording in blocks'] / us['identifier, update'],
+                high=1.0)
+    for name in ('decode one by one', 'decode in blocks'):  # own decoders have a reason only while they are faster
+        yield Claim(f'library over ours: {name}', us['decode, library'] / us[name], 1.0)
 
 
 def payload_block(rows: list[dict[str, Any]]) -> Claims:
@@ -138,74 +172,136 @@ def payload_coverage(rows: list[dict[str, Any]]) -> Claims:
 
 
 def payload_elements(rows: list[dict[str, Any]]) -> Claims:
-    """On nine in ten arms of finite elements `structured` is within 1 % after a second."""
+    """On nine in ten arms of finite elements, damped or not, `structured` is within 1 % after a second."""
     for row in rows:
-        second = row['samples_after_capture'].index(1000)
-        yield Claim('share beyond 1 % after 1 s', row['share_beyond_1_percent'][second],
-                    high=0.1 + by_chance(0.1, row['runs']))
-        yield Claim('coverage after 1 s', row['coverage'][second], 0.93 - by_chance(0.95, row['runs']))
+        marks = {1: row['samples_after_capture'].index(1000), 3: row['samples_after_capture'].index(2990)}
+        yield Claim('share beyond 1 % after 1 s', row['share_beyond_1_percent'][marks[1]], high=0.1)
+        # docs/lab/payload.md, "Arms that are not the model"
+        for second, untold, median in ((1, 0.02, 0.12), (3, 0.0, 0.07)):
+            k = marks[second]
+            yield Claim(f'share beyond 1 % and TRACKING after {second} s', row['beyond_1_percent_and_tracking'][k],
+                        high=rounded(untold, 2))
+            yield Claim(f'median error after {second} s', row['median_percent'][k], high=rounded(median, 2), unit='%')
+            yield Claim(f'coverage after {second} s', row['coverage'][k], 0.965)
 
 
 def payload_linear(rows: list[dict[str, Any]]) -> Claims:
-    """On the paper's linear plant `structured` is within 1.5 x the Cramer-Rao bound."""
-    for arm in ('known', 'learned'):
-        ratios = [row['ratio'] for row in rows if row['arm'] == arm]
-        runs = sum(row.get('runs', 10) for row in rows if row['arm'] == arm)
-        chance = 2.0 / math.sqrt(2.0 * runs)  # two deviations of a root mean square of so many runs
-        for mark, column in enumerate(zip(*ratios, strict=True)):
-            yield Claim(f'arm {arm}, instant {mark + 1}: mean error over bound', sum(column) / len(column),
-                        high=1.5 * (1.0 + chance))
+    """On the paper's linear plant `structured` is within 1.5 x the Cramer-Rao bound at 0.25, 1 and 3 s.
+
+    With stiffness and damping learned from the empty arm: within 2.4 x at 3 s.
+    """
+    limits = {'known': (1.5, 1.5, 1.5), 'learned': (1.5, 1.5, 2.4)}  # docs/lab/payload.md: "up to a factor of 2.4"
+    for arm, most in limits.items():
+        of_arm = [row for row in rows if row['arm'] == arm]
+        for k, (after, high) in enumerate(zip(('0.25', '1', '3'), most, strict=True)):
+            yield Claim(f'arm {arm}, {after} s: error over bound, worst of {len(of_arm)} cases',
+                        max(row['ratio'][k] for row in of_arm), high=high)
+    # docs/lab/payload.md: "at most 0.04 % (100 kg at 0/0 degrees: 0.066 %)"
+    known = {(*row['degrees'], row['payload']): row['mean_relative_percent_4_to_6_s'] for row in rows
+             if row['arm'] == 'known'}
+    heavy = known.pop((0.0, 0.0, 100.0))
+    yield Claim('mean error from 4 to 6 s', max(known.values()), high=rounded(0.04, 2), unit='%')
+    yield Claim('mean error from 4 to 6 s, 100 kg at 0/0 degrees', heavy, high=rounded(0.066, 3), unit='%')
+
+
+WORST_PERCENT = {
+    'physics_20kg': (0.08, 0.06), 'physics_100kg': (0.04, 0.25), 'finite elements': (0.23, 0.10),
+    'elements': (0.23, 0.10), 'chain, turning': (0.64, 0.37), 'chain 0/0': (0.42, 0.38), 'chain, stiff': (0.15, 0.06)}
+"""docs/lab/payload.md, "Arms that are not the model": worst error 1 and 3 s after the capture, by kind of arm [%]."""
 
 
 def payload_mismatched(rows: list[dict[str, Any]]) -> Claims:
-    """On arms that are not the model the 95 % intervals cover."""
-    runs = sum(row['runs'] for row in rows)
-    share = sum(row['runs'] * row['coverage'][-1] for row in rows) / runs
-    yield Claim('coverage of all cases, 3 s', share, 0.95 - by_chance(0.95, runs))
+    """On arms that are not the model `structured` stays within the targets, and its 95 % intervals cover."""
+    for kind, figures in WORST_PERCENT.items():
+        of_kind = [row for row in rows if row['case'].startswith(kind)]
+        for k, figure in enumerate(figures if of_kind else ()):
+            yield Claim(f'{kind}, {(1, 3)[k]} s: worst error', max(row['worst_percent'][k] for row in of_kind),
+                        high=rounded(figure, 2), unit='%')
+    # "all TRACKING, all truths inside"
+    yield Claim('truths inside, worst case', min(min(row['coverage']) for row in rows), 1.0)
+    yield Claim('cases that are not TRACKING at 3 s', sum(row['status'] != ['TRACKING'] for row in rows), high=0)
+
+
+UNTOLD_PERCENT = {
+    'length 1 +10 %': 0, 'densities -10 %': 0, 'density 2 +10 %': 32, 'joint mass +20 %': 3, 'encoder 2 reversed': 2,
+    'torques +5 %': 0, 'torques +10 %': 0, 'torques -5 %': 14, 'torque 1 +10 %': 0, 'torque 2 +10 %': 11}
+"""docs/lab/payload.md, "Model check": estimates at 25 dB whose interval misses the truth untold, with the check [%]."""
 
 
 def payload_model_check(rows: list[dict[str, Any]]) -> Claims:
-    """No interval of an arm that is as told changes because of the model check."""
+    """A payload that the identified model contradicts is told so, its interval widens; no other changes."""
     told = [row for row in rows if row['group'] == 'as told']
-    yield Claim('runs of arms as told whose interval changed', sum(row['runs_changed'] for row in told), high=0)
+    yield Claim('runs of arms as configured whose interval changed', sum(row['runs_changed'] for row in told), high=0)
+    yield Claim('largest deviation over what is tolerated, arms as configured',
+                max(row['largest_deviation'] for row in told), high=rounded(0.77, 2))
+    clear = [row for row in rows if row['group'] == 'otherwise, 40 dB']
+    yield Claim('estimates that are INCONSISTENT at 40 dB, worst case',
+                min(row['published']['inconsistent'] for row in clear), 100.0, unit='%')
+    noisy = {row['case']: row['published']['outside_untold'] for row in rows if row['group'] == 'otherwise, 25 dB'}
+    for case, figure in UNTOLD_PERCENT.items():
+        yield Claim(f'outside untold at 25 dB, {case}', noisy[case], high=rounded(figure, 0), unit='%')
+    # "The fourth differences are within 2 %"
+    white = next(row for row in rows if row['case'] == 'structured, white')
+    yield Claim('noise of bends and rates over the true one, farthest from 1',
+                max(abs(ratio - 1.0) for ratio in white['bends'] + white['rates']), high=rounded(0.02, 3))
 
 
 def payload_speed(rows: list[dict[str, Any]]) -> Claims:
-    """The payload's filter costs about as much as a step of the simulated plant."""
+    """`structured` takes 60 us or less a sample at kappa = 3; its ratio to the bare plant is shown."""
     for row in rows:
+        if row['kappa'] == 3:
+            for name, part in (('filter', 'filter_us'), ('with moving-horizon estimation', 'refit_us')):
+                yield Claim(f'kappa 3, {name}', row[part], high=60.0, unit='us')
+        # docs/lab/payload.md: 12 over 9 us at kappa 3; above twice that the code has changed, not the machine
         yield Claim(f'kappa {row["kappa"]}: filter over a step of the plant', row['ratio_filter_to_plant'], high=3.0)
 
 
 def plant_convergence(result: dict[str, Any]) -> Claims:
-    """Assumed modes converge to the finite-element plant as kappa grows."""
-    first, last = result['rows'][0], result['rows'][-1]
-    yield Claim('worst response at the largest kappa over that of kappa 1',
-                max(last['response']) / max(first['response']), high=0.5)
+    """Assumed modes converge to the finite element plant as kappa grows: frequencies, bends and encoder angles."""
+    rows = result['rows']
+    steps = [after / before for one, two in itertools.pairwise(rows)
+             for before, after in zip(one['response'], two['response'], strict=True)]
+    yield Claim('bends and angles: difference over that of the kappa before, worst', max(steps), high=1.0)
+    yield Claim('encoder angles: difference at kappa 12 over that at kappa 6', max(
+        late / early for late, early in zip(rows[-1]['response'][:2], rows[4]['response'][:2], strict=True)),
+        high=0.55)  # docs/lab/plant.md: they fall with 1/kappa, a half; with a tenth of it for what is of higher order
+    # docs/lab/plant.md: "Frequencies level off at the elements' own error", which is below 1e-5 in four modes
+    yield Claim('frequencies at the largest kappa: worst relative difference', max(rows[-1]['frequency']), high=1e-5)
 
 
 def plant_hour(result: dict[str, Any]) -> Claims:
-    """Memory stays flat over an hour of simulated time."""
-    yield Claim(f'growth of memory in {result["minutes"]} min', result['grown_mb'], high=5.0, unit='MB')
+    """Memory stays flat over an hour of simulated time at 1 kHz, sample by sample."""
+    yield Claim('minutes simulated', result['minutes'], 60)
+    # a page of 4 kB more or less is no growth; one number kept of each sample would be 26 MB
+    yield Claim('growth of memory', result['grown_mb'], high=0.1, unit='MB')
 
 
 def plant_live(result: dict[str, Any]) -> Claims:
-    """The plant node keeps 1 kHz with no stamp lost."""
+    """The plant node keeps 1 kHz for 60 s with no stamp lost, its ticks as regular as a bare timer's."""
+    yield Claim('time', result['seconds'], 60.0, unit='s')
+    yield Claim('samples a second', result['published'] / result['seconds'], 999.0)
     yield Claim('stamps lost', result['stamps_lost_between'], high=0)
     yield Claim('stamps out of order', result['stamps_out_of_order'], high=0)
+    for name in ('p99', 'p99.9'):  # the tails; the two processes run one after the other, a tenth is chance
+        yield Claim(f'jitter over that of a bare timer, {name}',
+                    result['jitter_us'][name] / result['jitter_bare_timer_us'][name], high=1.1)
 
 
 def plant_segment_chain(rows: list[dict[str, Any]]) -> Claims:
-    """Kappa = 3 with shortening and slope correction follows a chain of 40 segments within 0.5 %."""
-    full = [row for row in rows if row['second_order_and_slopes'] and row['tail_modes'] > 0]
-    yield Claim('worst relative difference, residual modes included',
-                max(max(row['relative_rms_percent'].values()) for row in full), high=0.5, unit='%')
+    """Kappa = 3 with shortening, slope correction and tail follows a chain of 40 segments a link within 0.5 %."""
+    for row in rows:
+        if row['second_order_and_slopes'] and row['tail_modes'] > 0:
+            yield Claim(f'{row["case"]}: worst difference of four signals', max(row['relative_rms_percent'].values()),
+                        high=0.5, unit='%')
 
 
 def plant_speed(rows: list[dict[str, Any]]) -> Claims:
-    """The compiled plant is faster than scipy's integrator."""
+    """One sample of 1 ms takes at most 10 us at kappa = 1 and 25 us at kappa = 3, far below scipy's time."""
     for row in rows:
-        if row.get('times_faster_than_scipy'):
-            yield Claim(f'{row["plant"]}: times faster than scipy', row['times_faster_than_scipy'], 1.0)
+        if row.get('target_us'):
+            yield Claim(row['plant'], row['us_per_sample'], high=row['target_us'], unit='us')
+        if row.get('times_faster_than_scipy'):  # docs/lab/plant.md: 5 to 8 times; "far below" is at least 4
+            yield Claim(f'{row["plant"]}: times faster than scipy', row['times_faster_than_scipy'], 4.0)
 
 
 def replay_speed(result: dict[str, Any]) -> Claims:
@@ -217,22 +313,27 @@ def replay_speed(result: dict[str, Any]) -> Claims:
 
 
 def ros_fuzz(rows: list[dict[str, Any]]) -> Claims:
-    """No message ends a node."""
+    """No message ends a node, makes it say NaN, or fills its memory."""
     yield Claim('nodes that failed', sum(bool(row['problem']) for row in rows), high=0)
+    yield Claim('messages, fewest to a node', min(row['messages'] for row in rows), 3000)
+    # no document states a number; in November 2026 the most was 45 MB in 5000 messages, and twice that is growth
+    yield Claim('growth of memory, worst node', max(row['grown_mb'] for row in rows), high=100.0, unit='MB')
 
 
 def ros_latency(result: dict[str, Any]) -> Claims:
-    """What a controller needs: the payload within 3 ms, nothing lost, a fifth of a core."""
+    """Live at 1 kHz: 3 ms from sample to payload in 99 of 100 cases, nothing lost, at most 20 % of a core."""
     limits = {'sample to payload, 99 of 100 [ms]': 3.0, 'samples lost at 1 kHz': 0.0,
               'identifier at 1 kHz [% of a core]': 20.0, 'samples lost at 4 kHz by the identifier alone': 0.0}
     for name, most in limits.items():
-        if name in result:
-            yield Claim(name, result[name], high=most)
+        yield Claim(name, result[name], high=most)
+    # nothing can be lost where nothing comes: payloads are due at 50 Hz, one may be under way at either end
+    yield Claim('payloads a second at 4 kHz', result['payloads at 4 kHz'] / result['seconds a case'], 49.0)
 
 
 def ros_signals(rows: list[dict[str, Any]]) -> Claims:
-    """Every program ends at a signal without a problem."""
-    yield Claim('programs that did not end well', sum(bool(row['problem']) for row in rows), high=0)
+    """SIGINT, SIGTERM and SIGKILL at any moment leave whole files, no orphan, and no traceback."""
+    yield Claim('programs tried', len({row['program'] for row in rows}), 13)
+    yield Claim('trials that did not end well', sum(bool(row['problem']) for row in rows), high=0)
 
 
 def setup_time(result: dict[str, Any]) -> Claims:
@@ -241,8 +342,12 @@ def setup_time(result: dict[str, Any]) -> Claims:
 
 
 def study_scaling(result: dict[str, Any]) -> Claims:
-    """Two processes run a study almost twice as fast as one."""
-    yield Claim('two processes over one', result['processes']['ratio'], 1.7)
+    """A study uses the cores it is given, by processes or by Dask, and one collector serves thousands."""
+    for name in ('processes', 'dask'):
+        if name in result:  # docs/studies.md: 1.95 and 1.87 times; the rest of both cores is the collector's
+            yield Claim(f'two workers over one, {name}', result[name]['ratio'], 1.8)
+    yield Claim('workers that one collector serves',
+                1.0 / (result['keeping_a_run_s'] * result['processes']['runs_per_second']['1']), 1000)
 
 
 CLAIMS: dict[str, Callable[[Any], Claims]] = {

@@ -39,6 +39,12 @@ def motion(
     return u, y + 0.01 * np.std(y, axis=0) * rng.standard_normal(y.shape)
 
 
+def resident_mb() -> float:
+    """Return the memory that this process has now [MB]."""
+    pages = int(Path('/proc/self/statm').read_text(encoding='ascii').split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
 def soak(settings: dict[str, object], samples: int) -> dict[str, object]:
     arm = ArmParameters(torque_convention='paper', damping_ratio=0.01)
     A, B = discretize(*vibration_model(arm, np.radians([60.0, 45.0]), 20.0, kappa=1), DT)
@@ -48,7 +54,7 @@ def soak(settings: dict[str, object], samples: int) -> dict[str, object]:
     level = motion(A, B, 20_000, rng, (20_000, 20_000))
     config = configure(IdentifierParameters, {'arm.torque_convention': 'paper', **settings})
     hush = 1e-4 * np.abs(y).max(axis=0)
-    state, done, errors, lost = rpbsid.init(config), 0, [], 0
+    state, done, errors, memory, lost = rpbsid.init(config), 0, [], [], 0
     log = SampleLog(Width(2, 4, 0))
 
     def take(state: rpbsid.RpbsidState, torque: np.ndarray, output: np.ndarray) -> rpbsid.RpbsidState:
@@ -73,10 +79,12 @@ def soak(settings: dict[str, object], samples: int) -> dict[str, object]:
         found = rpbsid.identified(config, state, DT)
         assert found is not None
         errors.append(float(np.abs(np.sort_complex(np.linalg.eigvals(found.model.A)) - true).max()))
+        memory.append(resident_mb())
     return {
         'settings': settings, 'samples': done, 'cycles': len(errors), 'not_finite': lost,
         'first_pole_error': errors[0], 'worst_pole_error': max(errors), 'last_pole_error': errors[-1],
         'us_per_sample': 1e6 * (time.perf_counter() - begin) / done,
+        'grown_mb': memory[-1] - memory[0],
         'peak_memory_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
 
 
@@ -89,7 +97,7 @@ def main() -> None:
         error = '/'.join(f'{row[f"{which}_pole_error"]:.1e}' for which in ('first', 'worst', 'last'))
         print(f'{row["settings"]}: {row["samples"]} samples, pole error first/worst/last {error}, '
               f'not finite {row["not_finite"]}, '
-              f'{row["us_per_sample"]:.2f} us, peak {row["peak_memory_mb"]:.0f} MB', flush=True)
+              f'{row["us_per_sample"]:.2f} us, peak {row["peak_memory_mb"]:.0f} MB, grown {row["grown_mb"]:.2f} MB', flush=True)
         samples = min(samples, 1_000_000)  # the default in full, the others for comparison
     target = Path(__file__).parent / 'results' / 'identification_soak.json'
     target.parent.mkdir(exist_ok=True)

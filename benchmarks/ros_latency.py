@@ -137,7 +137,8 @@ def measure(seconds: float = SECONDS) -> dict[str, float]:
 
 def main() -> None:
     """Measure, print and write JSON."""
-    values = measure(*(float(text) for text in sys.argv[1:2]))
+    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else SECONDS
+    values = {'seconds a case': seconds, **measure(seconds)}
     for name, value in values.items():
         print(f'{name}: {value:.4g}')
     target = HERE / 'results' / 'ros_latency.json'
