@@ -8,6 +8,7 @@ a claim (``claims.py``) falls short.
 from __future__ import annotations
 
 import ast
+import datetime
 import json
 import os
 import platform
@@ -43,22 +44,24 @@ def run(path: Path) -> Outcome:
     print(f'\n=== {path.stem}: {claim_of(path)}', flush=True)
     begin = time.perf_counter()
     done = subprocess.run([sys.executable, str(path)], cwd=HERE.parent, stdin=subprocess.DEVNULL, check=False)
+    if done.returncode == 0:
+        claims.record_run(path.stem, date=datetime.datetime.now(datetime.UTC).date().isoformat(), **machine())
     return Outcome(path.stem, claim_of(path), done.returncode == 0, time.perf_counter() - begin)
+
+
+def machine() -> dict[str, Any]:
+    """Return the kind of machine that measures."""
+    return {'cores': os.cpu_count(), 'processor': platform.machine(), 'python': platform.python_version()}
 
 
 def gather(outcomes: list[Outcome]) -> dict[str, Any]:
     """Return everything measured, with the kind of machine that measured it."""
     results = {}
     for path in sorted(RESULTS.glob('*.json')):
-        if path.stem != 'all':
+        if path.name not in ('all.json', claims.RUNS):
             results[path.stem] = json.loads(path.read_text(encoding='utf-8'))
-    machine = {
-        'cores': os.cpu_count(),
-        'processor': platform.machine(),
-        'python': platform.python_version(),
-    }
     return {
-        'machine': machine,
+        'machine': machine(),
         'runs': [outcome._asdict() for outcome in outcomes],
         'results': results,
     }
@@ -73,10 +76,19 @@ def table(outcomes: list[Outcome]) -> str:
 
 
 def claims_table(names: list[str]) -> tuple[str, bool]:
-    """Return one row a claim as Markdown, and whether all of them hold."""
+    """Return one row a claim as Markdown, and whether all of them hold; what cannot be compared does not hold."""
     rows, good = ['| benchmark | claim | value | bounds | holds |', '|---|---|---|---|---|'], True
     for name in names:
-        for claim in claims.recorded(name):
+        try:
+            found = claims.recorded(name)
+        except (LookupError, ValueError, TypeError) as error:
+            found, problem = [], f'{type(error).__name__}: {error}'
+        else:
+            problem = '' if found else 'nothing is recorded'
+        if problem:
+            good = False
+            rows.append(f'| {name} | cannot be compared: {problem} | | | NO |')
+        for claim in found:
             good = good and claim.holds
             rows.append(f'| {name} | {claim.name} | {claim.value:.4g} {claim.unit} | {claim.bounds} | '
                         f'{"yes" if claim.holds else "NO"} |')

@@ -22,19 +22,28 @@ def page() -> str:
     """Return the page."""
     parts = ['# How well it works\n',
              'Each row is a claim: a value that a benchmark measured, and the bounds it is compared with. `make bench` '
-             'measures again and ends with exit code 1 when a claim falls short; `make docs` writes this page. A '
-             'share of n runs has bounds that are two binomial deviations wider than the claim.\n']
+             'measures again and ends with exit code 1 when a claim falls short; `make docs` writes this page. '
+             '`benchmarks/claims.py` says where each bound comes from. Values without a date are older than the '
+             'records of dates.\n']
     for prefix, title in SUBJECTS.items():
         rows = []
         for name, function in claims.CLAIMS.items():
             if name.split('_')[0] == prefix:
                 found = claims.recorded(name)
-                words = inspect.getdoc(function) or ''
-                rows.append(f'`{name}`: {words}\n')
+                words = ' '.join((inspect.getdoc(function) or '').split())
+                rows.append(f'`{name}`: {words}{when(name)}\n')
                 rows.append(table(found) if found else 'Not measured yet.\n')
         if rows:
             parts += [f'## {title}\n', *rows]
     return '\n'.join(parts)
+
+
+def when(name: str) -> str:
+    """Return a sentence with date and machine of a result; empty where they are not recorded."""
+    run = claims.run_of(name)
+    if run is None:
+        return ''
+    return f' Measured on {run["date"]}, {run["cores"]} cores ({run["processor"]}), Python {run["python"]}.'
 
 
 def table(found: list[claims.Claim]) -> str:

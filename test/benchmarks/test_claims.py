@@ -25,10 +25,25 @@ def test_a_value_outside_its_bounds_falls_short(claims, value, low, high, holds)
     assert claims.Claim('value', value, low, high).holds is holds
 
 
-def test_a_coverage_that_is_too_low_by_more_than_chance_falls_short(claims):
-    rows = [{'outputs': 'all', 'runs': 1000, 'samples_after_capture': [100], 'coverage': [share]}
-            for share in (0.95, 0.90)]
-    assert [claims.claims_of('payload_coverage', [row])[0].holds for row in rows] == [True, False]
+@pytest.mark.parametrize(('runs', 'low', 'high'), [(1000, 0.93, 0.97), (100, 0.9064, 0.9936), (4, 0.7321, 1.0)])
+def test_a_coverage_has_the_bounds_of_the_documents_or_of_chance_in_fewer_runs(claims, runs, low, high):
+    claim = claims.covers('coverage', 0.95, runs)
+    assert (claim.low, claim.high) == pytest.approx((low, high), abs=1e-4)
+
+
+@pytest.mark.parametrize(('share', 'holds'), [(0.93, True), (0.929, False), (0.97, True), (0.971, False)])
+def test_a_coverage_of_a_thousand_runs_outside_93_to_97_percent_falls_short(claims, share, holds):
+    row = {'outputs': 'all', 'runs': 1000, 'samples_after_capture': [100], 'coverage': [share]}
+    assert claims.claims_of('payload_coverage', [row])[0].holds is holds
+
+
+@pytest.mark.parametrize('name', sorted(path.stem for path in (ROOT / 'benchmarks' / 'results').glob('*.json')
+                                        if path.stem not in ('all', 'runs')))
+def test_every_recorded_result_is_compared_and_every_claim_has_a_bound(claims, name):
+    found = claims.recorded(name)
+    assert found
+    assert all(claim.low is not None or claim.high is not None for claim in found)
+    assert len({claim.name for claim in found}) == len(found)
 
 
 def test_every_benchmark_claims_something(claims):
@@ -44,6 +59,40 @@ def test_a_run_with_a_claim_that_falls_short_is_no_success(claims, monkeypatch, 
     text, good = run_all.claims_table(['setup_time'])
     assert not good
     assert 'NO' in text
+
+
+@pytest.mark.parametrize('content', [None, '{}', 'no JSON'])
+def test_a_run_whose_result_cannot_be_compared_is_no_success(claims, monkeypatch, tmp_path, content):
+    run_all = importlib.import_module('run_all')
+    monkeypatch.setattr(claims, 'RESULTS', tmp_path)
+    if content is not None:
+        (tmp_path / 'setup_time.json').write_text(content)
+    text, good = run_all.claims_table(['setup_time'])
+    assert not good
+    assert 'cannot be compared' in text
+
+
+@pytest.mark.parametrize(('script', 'code'), [('print("measured")', 1), ('raise SystemExit(3)', 1)])
+def test_the_program_ends_with_exit_code_1(claims, monkeypatch, tmp_path, script, code):
+    """For a claim that falls short, and for a benchmark that fails."""
+    run_all = importlib.import_module('run_all')
+    (tmp_path / 'setup_time.py').write_text(f"if __name__ == '__main__':\n    {script}\n")
+    (tmp_path / 'setup_time.json').write_text('{"seconds": 1000.0}' if 'print' in script else '{"seconds": 1.0}')
+    for module, name in ((claims, 'RESULTS'), (run_all, 'RESULTS'), (run_all, 'HERE')):
+        monkeypatch.setattr(module, name, tmp_path)
+    monkeypatch.setattr('sys.argv', ['run_all.py'])
+    assert run_all.main() == code
+
+
+def test_a_date_is_shown_for_the_result_that_it_was_recorded_with(claims, monkeypatch, tmp_path):
+    tables = importlib.import_module('tables')
+    monkeypatch.setattr(claims, 'RESULTS', tmp_path)
+    (tmp_path / 'setup_time.json').write_text('{"seconds": 40.0}')
+    assert tables.when('setup_time') == ''
+    claims.record_run('setup_time', date='2026-11-21', cores=2, processor='x86_64', python='3.12.0')
+    assert tables.when('setup_time') == ' Measured on 2026-11-21, 2 cores (x86_64), Python 3.12.0.'
+    (tmp_path / 'setup_time.json').write_text('{"seconds": 41.0}')
+    assert tables.when('setup_time') == ''
 
 
 def test_the_documentation_has_the_values_measured_last(claims):
