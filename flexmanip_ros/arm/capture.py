@@ -1,8 +1,9 @@
 """What taking an object does: bodies joined at the tip, momentum conserved.
 
-With p the momentum conjugate to q, an impulse at the tip leaves p of arm and object together unchanged:
-(M + J' W J) qd+ = M qd- + J' W v, W = diag(m, m, J_c), v the object's velocity and spin, J (3, n) the
-Jacobian of its centre of mass and angle. Inelastic: afterwards the object moves with the tip.
+An impulse at the tip leaves the momentum of arm and object together unchanged: (M + J' W J) v+ = M v- + J' W v_o,
+W = diag(m, m, I_c), v_o the object's velocity and spin, J (3, n) the Jacobian of its centre of mass and angle.
+Inelastic: afterwards the object moves with the tip. A floating base takes its part: its translation is two more
+coordinates here. Velocities are then those seen from the centre of mass of the arm and its base.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, null_space
 
-from flexmanip_ros.arm.manipulator import Manipulator
+from flexmanip_ros.arm.equations_of_motion import assemble
+from flexmanip_ros.arm.manipulator import Manipulator, payload_array, workspace
 from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.types import Array
 
@@ -32,6 +34,11 @@ class Body(NamedTuple):
         """A fraction of the object, as a soft gripper takes it."""
         return self._replace(mass=self.mass * fraction, inertia=self.inertia * fraction)
 
+    @property
+    def payload(self) -> Array:
+        """Inertial parameters (4,), see ``manipulator.payload_array``; those of two bodies held together add."""
+        return payload_array(self.mass, self.inertia, self.com)
+
 
 def free_object(config: PlantParameters) -> Body:
     """Return the object the parameters describe."""
@@ -39,47 +46,58 @@ def free_object(config: PlantParameters) -> Body:
     return Body(config.payload_mass, config.payload_inertia, (x, y), (vx, vy), config.object_spin)
 
 
-def joined(payload: Array, body: Body) -> Array:
-    """Payload (4,) after body is fixed to it: masses add, inertias by the parallel-axis theorem."""
-    mass = payload[0] + body.mass
-    if mass == 0.0:
-        return np.array([0.0, payload[1] + body.inertia, body.com[0], body.com[1]])
-    com = (payload[0] * payload[2:] + body.mass * np.asarray(body.com)) / mass
-    spread = (payload[0] * np.sum((payload[2:] - com) ** 2)
-              + body.mass * np.sum((np.asarray(body.com) - com) ** 2))
-    return np.array([mass, payload[1] + body.inertia + spread, com[0], com[1]])
+def tip_jacobian(arm: Manipulator, payload: Array, q: Array) -> Array:
+    """Jacobian (3, n) of the tip: inertial x, y [m] and angle of its cross-section [rad].
 
-
-def body_jacobian(arm: Manipulator, q: Array, com: tuple[float, float]) -> Array:
-    """Jacobian (3, n) of a point fixed in the tip's frame: inertial x, y [m] and angle [rad]."""
-    k = arm.kappa
-    eta1, eta2 = q[2:2 + k], q[2 + k:]
-    e1, e2 = (np.array([np.cos(a), np.sin(a)]) for a in q[:2])
-    n1, n2 = (np.array([-e[1], e[0]]) for e in (e1, e2))
-    slope = arm.tip_slope[1]
-    alpha = slope @ eta2
-    px = com[0] * np.cos(alpha) - com[1] * np.sin(alpha)
-    py = com[0] * np.sin(alpha) + com[1] * np.cos(alpha)
-    reach1, reach2 = (
-        arm.length[i] - arm.tip_stretch[i] @ eta**2 / 2 for i, eta in enumerate((eta1, eta2)))
+    Of a floating base relative to the centre of mass of base, arm and payload.
+    """
+    work = workspace(arm)
+    assemble(arm, payload, np.asarray(q, float), np.zeros_like(q), work.M, work.E, work)
+    links = arm.length.size
     J = np.zeros((3, q.size))
-    J[:2, 0] = reach1 * n1
-    J[:2, 1] = (reach2 + px) * n2 - py * e2
-    J[:2, 2:2 + k] = -np.outer(e1, arm.tip_stretch[0] * eta1)
-    J[:2, 2 + k:] = np.outer(e2, -arm.tip_stretch[1] * eta2 - py * slope) + np.outer(n2, px * slope)
-    J[2, 1] = 1.0
-    J[2, 2 + k:] = slope
+    J[:2] = work.J[links]
+    if arm.floating:
+        J[:2] -= work.P / work.F[2]
+    J[2, links - 1] = 1.0
+    J[2, modal_of(arm, links - 1)] = arm.tip_slope[-1]
     return J
 
 
-def rates_after(M: Array, J: Array, qd: Array, body: Body, held: Array | None = None) -> Array:
+def modal_of(arm: Manipulator, link: int) -> slice:
+    """Return where the modal coordinates of a link stand in q."""
+    links = arm.length.size
+    return slice(links + link * arm.kappa, links + (link + 1) * arm.kappa)
+
+
+def rates_after(M: Array, J: Array, qd: Array, body: Body, mass: float = np.inf, held: Array | None = None) -> Array:
     """Rates (n,) just after the body is caught; M (n, n) is the mass matrix before.
 
-    held: (m, n) rows of locked joints, whose reaction takes part of the impulse.
+    J: (3, n) of the body's centre and angle; mass: of all that floats together before [kg] (inf: the base is fixed); of
+    a floating base M and J are those relative to its centre of mass. held: (m, n) rows of locked joints, whose reaction
+    takes part of the impulse.
     """
-    weight = np.array([body.mass, body.mass, body.inertia])
     slip = np.array([*body.velocity, body.spin]) - J @ qd
-    after = M + J.T @ (weight[:, None] * J)
+    # the body meets the arm's mobility J M^-1 J' at its centre, and that of all as one mass
     free = np.eye(qd.size) if held is None or not len(held) else null_space(held)
-    jump: Array = free @ cho_solve(cho_factor(free.T @ after @ free), free.T @ (J.T @ (weight * slip)))
-    return qd + jump
+    response = free @ cho_solve(cho_factor(free.T @ M @ free), (J @ free).T)
+    yielding = J @ response + np.diag([1.0 / mass, 1.0 / mass, 0.0])
+    weight = np.diag([body.mass, body.mass, body.inertia])
+    # impulse p: weight (slip - yielding p) = p
+    impulse = np.linalg.solve(np.eye(3) + weight @ yielding, weight @ slip)
+    jumped: Array = qd + response @ impulse
+    return jumped
+
+
+def body_jacobian(tip: Array, turn: float, com: tuple[float, float]) -> Array:
+    """Jacobian (3, n) of a point of the tip's frame, from the tip's own and the angle of its cross-section [rad]."""
+    c, s = np.cos(turn), np.sin(turn)
+    J = tip.copy()
+    J[0] -= (s * com[0] + c * com[1]) * tip[2]
+    J[1] += (c * com[0] - s * com[1]) * tip[2]
+    return J
+
+
+def tip_angle(arm: Manipulator, q: Array) -> float:
+    """Angle of the tip's cross-section [rad]."""
+    last = arm.length.size - 1
+    return float(q[last] + arm.tip_slope[last] @ q[modal_of(arm, last)])

@@ -1,4 +1,10 @@
-"""Equations of motion of the arm: forces, mass matrix, accelerations (paper eqs. 1-19)."""
+"""Equations of motion of the arm: mass matrix, forces, accelerations (paper eqs. 1-19; symbols in docs/notation.md).
+
+A link is a set of point masses (``Manipulator.mass``). In the frame of its chord, point p is at
+(a, b) = (x - eta' G(x) eta / 2, phi(x)' eta). With its Jacobian J and its acceleration A = J q'' + a(q, q'), the
+forces of inertia are the sum of m J' A: M collects m J' J, E collects m J' a. Inertial quantities of the next link
+follow from its root, the tip of the link before.
+"""
 
 from __future__ import annotations
 
@@ -12,252 +18,216 @@ if TYPE_CHECKING:
     from flexmanip_ros.arm.manipulator import Manipulator, Workspace
     from flexmanip_ros.types import Array
 
-@inlined
-def add_point(
-    m: float, cx: float, cy: float, arm: Manipulator, i: int, q: Array, qd: Array,
-    M: Array, E: Array, moments: Array,
-) -> None:
-    """Add a point mass m [kg] at (cx, cy) [m] in the tip tangent frame of link i, base at rest.
-
-    Adds its mass to M, its bias to E and, for link 2, its first moments to moments (see assemble).
-    """
-    k = arm.kappa
-    o = 2 + i * k
-    w = qd[i]
-    length = arm.length[i]
-    alpha = 0.0
-    alpha_d = 0.0
-    for j in range(k):
-        length -= 0.5 * arm.tip_stretch[i, j] * q[o + j] * q[o + j]
-        alpha += arm.tip_slope[i, j] * q[o + j]
-        alpha_d += arm.tip_slope[i, j] * qd[o + j]
-    px = 0.0
-    py = 0.0
-    if cx != 0.0 or cy != 0.0:
-        px = cx * np.cos(alpha) - cy * np.sin(alpha)
-        py = cx * np.sin(alpha) + cy * np.cos(alpha)
-    a = length + px
-    b = py
-    ad = 0.0
-    bd = px * alpha_d
-    add = -px * alpha_d * alpha_d
-    bdd = -py * alpha_d * alpha_d
-    for j in range(k):
-        ad -= (arm.tip_stretch[i, j] * q[o + j] + py * arm.tip_slope[i, j]) * qd[o + j]
-        add -= arm.tip_stretch[i, j] * qd[o + j] * qd[o + j]
-    X = add - 2.0 * bd * w - a * w * w
-    Y = bdd + 2.0 * ad * w - b * w * w
-    M[i, i] += m * (a * a + b * b)
-    E[i] += m * (a * Y - b * X)
-    for j in range(k):
-        aj = -arm.tip_stretch[i, j] * q[o + j] - py * arm.tip_slope[i, j]
-        bj = px * arm.tip_slope[i, j]
-        M[o + j, i] += m * (a * bj - b * aj)
-        E[o + j] += m * (aj * X + bj * Y)
-        for t in range(j + 1):
-            al = -arm.tip_stretch[i, t] * q[o + t] - py * arm.tip_slope[i, t]
-            bl = px * arm.tip_slope[i, t]
-            M[o + j, o + t] += m * (aj * al + bj * bl)
-        if i == 1:
-            moments[0, 3 + j] += m * aj
-            moments[1, 3 + j] += m * bj
-    if i == 1:
-        moments[0, 0] += m * a
-        moments[1, 0] += m * b
-        moments[0, 1] += m * ad
-        moments[1, 1] += m * bd
-        moments[0, 2] += m * add
-        moments[1, 2] += m * bdd
+STICTION_RATE = 2e-3
+"""Rate [rad/s] at which the Coulomb friction reaches 76 % of its value: F tanh(rate / STICTION_RATE)."""
 
 
 @inlined
-def add_link(
+def assemble_link(
     arm: Manipulator, i: int, q: Array, qd: Array, M: Array, E: Array, work: Workspace,
 ) -> None:
-    """Add link i's distributed mass, its base at rest; for link 2 also its first moments."""
+    """Add link i with what is mounted at its end to M, E, work.P and work.F; set station i + 1 (its tip)."""
     k = arm.kappa
-    o = 2 + i * k
-    w = qd[i]
-    n0 = arm.half_mass[i]
-    inertia = arm.inertia[i]
-    e_theta = 0.0
-    if not arm.shortening:
+    links = arm.length.size
+    n = q.size
+    o = links + i * k
+    c, s, w = np.cos(q[i]), np.sin(q[i]), qd[i]
+    J, a = work.J[i], work.a[i]
+    re, rn = c * a[0] + s * a[1], c * a[1] - s * a[0]
+    Je, Jn, Se, Sn, own = work.own[0], work.own[1], work.own[2], work.own[3], work.own[4]
+    block = work.block
+    for r in range(k + 1):
+        Se[r], Sn[r], own[r] = 0.0, 0.0, 0.0
+        for t in range(k + 1):
+            block[r, t] = 0.0
+    total, fe, fn = 0.0, 0.0, 0.0
+    for p in range(arm.mass.shape[1]):
+        m = arm.mass[i, p]
+        x, y, xd, yd, xdd = arm.place[i, p], 0.0, 0.0, 0.0, 0.0
         for j in range(k):
-            inertia += n0 * q[o + j] * q[o + j]
-            e_theta += 2.0 * n0 * q[o + j] * qd[o + j]
-            M[o + j, i] += arm.rigid_shape[i, j]
-            M[o + j, o + j] += n0
-            E[o + j] -= w * w * n0 * q[o + j]
-        M[i, i] += inertia
-        E[i] += w * e_theta
-    else:
-        Z, Y = work.Z, work.Y
-        gyro = 0.0
-        for j in range(k):
-            # Y_jm = (W_j eta)_m, Z_jmp = sum_t Q_jtmp eta_t, and Q_jtmp = Q_mpjt lies in order
-            c2 = 0.0
-            for m in range(k):
-                y = 0.0
-                for p in range(k):
-                    y += arm.W[i, j, m, p] * q[o + p]
-                    z = 0.0
-                    for t in range(k):
-                        z += arm.Q[i, m, p, j, t] * q[o + t]
-                    Z[i, j, m, p] = z
-                Y[i, j, m] = y
-                c2 += arm.C2[i, j, m] * q[o + m]
-            work.stretch[i, j] = c2
-        for j in range(k):
-            quad = 0.0
-            h = arm.rigid_shape[i, j]
-            n_eta = 0.0
-            r = 0.0
-            coriolis = 0.0
-            for m in range(k):
-                quad += Y[i, j, m] * q[o + m]
-                h += q[o + m] * Y[i, m, j]
-                coriolis += (Y[i, m, j] - Y[i, j, m]) * qd[o + m]
-                n2 = 0.0
-                k3 = 0.0
-                wd = 0.0
-                for p in range(k):
-                    n2 += Z[i, j, m, p] * q[o + p]
-                    k3 += Z[i, j, m, p] * qd[o + p]
-                    wd += arm.W[i, j, m, p] * qd[o + p]
-                if m <= j:
-                    M[o + j, o + m] += n2
-                n_eta += n2 * q[o + m]
-                r += k3 * qd[o + m]
-                gyro += q[o + j] * qd[o + m] * wd
-            M[o + j, o + j] += n0
-            M[o + j, i] += h - 0.5 * quad
-            c2 = work.stretch[i, j]
-            inertia += q[o + j] * (c2 + 0.25 * n_eta)
-            slope = 2.0 * c2 + n_eta
-            work.stretch[i, j] = slope
-            e_theta += slope * qd[o + j]
-            E[o + j] += r + 2.0 * w * coriolis - 0.5 * w * w * slope
-        M[i, i] += inertia
-        E[i] += w * e_theta + gyro
-    if i == 1:
-        moments = work.moments
-        moments[0, 0] += arm.moment[i]
-        for j in range(k):
-            moments[1, 0] += arm.mean_shape[i, j] * q[o + j]
-            moments[1, 1] += arm.mean_shape[i, j] * qd[o + j]
-            moments[1, 3 + j] += arm.mean_shape[i, j]
-            if arm.shortening:
-                s = 0.0
-                sd = 0.0
-                for m in range(k):
-                    s += arm.S1[i, j, m] * q[o + m]
-                    sd += arm.S1[i, j, m] * qd[o + m]
-                moments[0, 0] -= 0.5 * s * q[o + j]
-                moments[0, 1] -= s * qd[o + j]
-                moments[0, 2] -= sd * qd[o + j]
-                moments[0, 3 + j] -= s
+            g, h = 0.0, 0.0
+            for t in range(k):
+                g += arm.G[i, p, j, t] * q[o + t]
+                h += arm.G[i, p, j, t] * qd[o + t]
+            x -= 0.5 * g * q[o + j]
+            xd -= g * qd[o + j]
+            xdd -= h * qd[o + j]
+            y += arm.phi[i, p, j] * q[o + j]
+            yd += arm.phi[i, p, j] * qd[o + j]
+            Je[1 + j] = -g
+            Jn[1 + j] = arm.phi[i, p, j]
+        Je[0] = -y
+        Jn[0] = x
+        Ae = m * (xdd - 2.0 * yd * w - x * w * w + re)
+        An = m * (2.0 * xd * w - y * w * w + rn)
+        total += m
+        fe += Ae
+        fn += An
+        for r in range(k + 1):
+            own[r] += Je[r] * Ae + Jn[r] * An
+            me, mn = m * Je[r], m * Jn[r]
+            Se[r] += me
+            Sn[r] += mn
+            for t in range(r + 1):
+                block[r, t] += me * Je[t] + mn * Jn[t]
+    S = work.first[i]
+    for r in range(n):
+        S[0, r] = 0.0
+        S[1, r] = 0.0
+    for r in range(k + 1):
+        row = i if r == 0 else o + r - 1
+        S[0, row] = c * Se[r] - s * Sn[r]
+        S[1, row] = s * Se[r] + c * Sn[r]
+        E[row] += own[r]
+        for t in range(r + 1):
+            M[row, i if t == 0 else o + t - 1] += block[r, t]
+    fx, fy = c * fe - s * fn, s * fe + c * fn
+    for r in range(n):
+        E[r] += J[0, r] * fx + J[1, r] * fy
+        for t in range(r + 1):
+            M[r, t] += (total * (J[0, r] * J[0, t] + J[1, r] * J[1, t])
+                        + J[0, r] * S[0, t] + J[1, r] * S[1, t] + S[0, r] * J[0, t] + S[1, r] * J[1, t])
+        work.P[0, r] += total * J[0, r] + S[0, r]
+        work.P[1, r] += total * J[1, r] + S[1, r]
+    work.F[0] += fx
+    work.F[1] += fy
+    work.F[2] += total
+    x, xd, xdd = arm.length[i], 0.0, 0.0
+    tip, b = work.J[i + 1], work.a[i + 1]
+    for r in range(n):
+        tip[0, r] = J[0, r]
+        tip[1, r] = J[1, r]
+    for j in range(k):
+        g, h = 0.0, 0.0
+        for t in range(k):
+            g += arm.tip_shortening[i, j, t] * q[o + t]
+            h += arm.tip_shortening[i, j, t] * qd[o + t]
+        x -= 0.5 * g * q[o + j]
+        xd -= g * qd[o + j]
+        xdd -= h * qd[o + j]
+        tip[0, o + j] -= c * g
+        tip[1, o + j] -= s * g
+    tip[0, i] -= s * x
+    tip[1, i] += c * x
+    b[0] = a[0] + c * (xdd - x * w * w) - s * (2.0 * xd * w)
+    b[1] = a[1] + s * (xdd - x * w * w) + c * (2.0 * xd * w)
 
 
 @inlined
+def assemble_payload(arm: Manipulator, payload: Array, q: Array, qd: Array, M: Array, E: Array, work: Workspace
+                     ) -> None:
+    """Add the body that is held at the tip."""
+    k = arm.kappa
+    links = arm.length.size
+    n = q.size
+    m, hx, hy, inertia = payload[0], payload[1], payload[2], payload[3]
+    last = links - 1
+    o = links + last * k
+    turn, spin = q[last], qd[last]
+    g = work.frame[0]
+    for r in range(n):
+        g[r] = 0.0
+    g[last] = 1.0
+    for j in range(k):
+        g[o + j] = arm.tip_slope[last, j]
+        turn += g[o + j] * q[o + j]
+        spin += g[o + j] * qd[o + j]
+    c, s = np.cos(turn), np.sin(turn)
+    dx, dy = -hx * s - hy * c, hx * c - hy * s
+    J, a = work.J[links], work.a[links]
+    fx = m * a[0] - spin * spin * dy
+    fy = m * a[1] + spin * spin * dx
+    moment = dx * a[0] + dy * a[1]
+    for r in range(n):
+        E[r] += J[0, r] * fx + J[1, r] * fy + g[r] * moment
+        work.P[0, r] += m * J[0, r] + dx * g[r]
+        work.P[1, r] += m * J[1, r] + dy * g[r]
+        across = dx * J[0, r] + dy * J[1, r]
+        for t in range(r + 1):
+            M[r, t] += (m * (J[0, r] * J[0, t] + J[1, r] * J[1, t]) + across * g[t]
+                        + g[r] * (dx * J[0, t] + dy * J[1, t]) + inertia * g[r] * g[t])
+    work.F[0] += fx
+    work.F[1] += fy
+    work.F[2] += m
+
+
+@kernel
 def assemble(
     arm: Manipulator, payload: Array, q: Array, qd: Array, M: Array, E: Array, work: Workspace,
 ) -> None:
-    """Fill the lower triangle of M(q) (n, n) and the bias E(q, qd) (n,): M qdd + E + D qd + K q = B tau.
+    """Fill the lower triangle of M(q) (n, n) and the bias E(q, qd) (n,): M qdd + E + D qd + dV/dq = B tau.
 
-    payload: (4,) mass [kg], inertia about its centre of mass [kg m^2], centre of mass x, y [m] in the
-    tip tangent frame. work.moments afterwards holds rows [A, A', A'' at qdd = 0, dA/deta2] and the
-    same of B.
+    payload: (4,) inertial parameters. A floating base may still translate here: see ``eliminate_translation``.
     """
-    k = arm.kappa
-    n = 2 + 2 * k
+    n = q.size
     for r in range(n):
         E[r] = 0.0
-        for c in range(r + 1):
-            M[r, c] = arm.rotary[r, c]
-    moments = work.moments
-    for r in range(2):
-        for c in range(3 + k):
-            moments[r, c] = 0.0
-    if payload[1] != 0.0:
-        M[1, 1] += payload[1]
-        for j in range(k):
-            slope = payload[1] * arm.tip_slope[1, j]
-            M[2 + k + j, 1] += slope
-            for t in range(j + 1):
-                M[2 + k + j, 2 + k + t] += slope * arm.tip_slope[1, t]
-    for i in range(2):  # with a constant in place of i, numba compiles a version for each
-        add_link(arm, i, q, qd, M, E, work)
-    at_tip = payload[2] == 0.0 and payload[3] == 0.0
-    for i in range(2):
-        mass = arm.tip_mass + payload[0] if at_tip else arm.tip_mass
-        if i == 0:
-            mass = arm.joint_mass + arm.tip_mass + 2.0 * arm.half_mass[1] + payload[0]
-        add_point(mass, 0.0, 0.0, arm, i, q, qd, M, E, moments)
-        if i == 1 and not at_tip:
-            add_point(payload[0], payload[2], payload[3], arm, i, q, qd, M, E, moments)
+        for t in range(r + 1):
+            M[r, t] = arm.rotary[r, t]
+        for side in range(2):
+            work.J[0, side, r] = 0.0
+            work.P[side, r] = 0.0
+    work.F[0], work.F[1], work.F[2] = 0.0, 0.0, arm.base[0]
+    work.a[0, 0], work.a[0, 1] = -arm.gravity[0], -arm.gravity[1]
+    if arm.floating:
+        c, s = np.cos(q[n - 1]), np.sin(q[n - 1])
+        x, y = c * arm.base[1] - s * arm.base[2], s * arm.base[1] + c * arm.base[2]
+        work.J[0, 0, n - 1] = -y
+        work.J[0, 1, n - 1] = x
+        work.a[0, 0] = -x * qd[n - 1] * qd[n - 1]
+        work.a[0, 1] = -y * qd[n - 1] * qd[n - 1]
+    for i in range(arm.length.size):
+        assemble_link(arm, i, q, qd, M, E, work)
+    if payload[0] != 0.0 or payload[3] != 0.0:
+        assemble_payload(arm, payload, q, qd, M, E, work)
 
-    c = np.cos(q[1] - q[0])
-    s = np.sin(q[1] - q[0])
-    A, Ad, Add = moments[0, 0], moments[0, 1], moments[0, 2]
-    B, Bd, Bdd = moments[1, 0], moments[1, 1], moments[1, 2]
-    w1, w2 = qd[0], qd[1]
-    length = arm.length[0]
-    rate = 0.0
-    drift = 0.0
-    for j in range(k):
-        stretch = arm.tip_stretch[0, j]
-        length -= 0.5 * stretch * q[2 + j] * q[2 + j]
-        rate -= stretch * q[2 + j] * qd[2 + j]
-        drift -= stretch * qd[2 + j] * qd[2 + j]
-    fe = Add - 2.0 * Bd * w2 - A * w2 * w2
-    fn = Bdd + 2.0 * Ad * w2 - B * w2 * w2
-    pe = drift - length * w1 * w1
-    pn = 2.0 * rate * w1
-    base_e = c * pe + s * pn
-    base_n = c * pn - s * pe
-    E[0] += length * (s * fe + c * fn)
-    E[1] += A * base_n - B * base_e
-    M[1, 0] += length * (A * c - B * s)
-    for j in range(k):
-        v = arm.tip_stretch[0, j] * q[2 + j]
-        aj, bj = moments[0, 3 + j], moments[1, 3 + j]
-        E[2 + j] -= v * (c * fe - s * fn)
-        E[2 + k + j] += aj * base_e + bj * base_n
-        M[2 + j, 1] += v * (A * s + B * c)
-        M[2 + k + j, 0] += length * (aj * s + bj * c)
-        if arm.shortening:
-            for t in range(k):
-                M[2 + k + j, 2 + t] -= arm.tip_stretch[0, t] * q[2 + t] * (aj * c - bj * s)
+
+@inlined
+def eliminate_translation(M: Array, E: Array, work: Workspace) -> None:
+    """Leave out the translation of a floating base, which keeps the momentum: Schur complement of its mass."""
+    mass = work.F[2]
+    for r in range(E.size):
+        x, y = work.P[0, r] / mass, work.P[1, r] / mass
+        E[r] -= x * work.F[0] + y * work.F[1]
+        for t in range(r + 1):
+            M[r, t] -= x * work.P[0, t] + y * work.P[1, t]
 
 
 @inlined
 def elastic(arm: Manipulator, q: Array, work: Workspace) -> None:
-    """Fill work.elastic (n,) with dV/dq and, link by link, work.tangent (n, k) with its part from V4.
+    """Fill work.elastic (n,) with dV/dq and, link by link, work.tangent (k, k) with the derivative of V4's part.
 
-    V4 (``shape_integrals.quartic``) is of the same order as the kinetic energy of the shortening. The
-    stiffness EI is read back from arm.stiffness, so that a calibrated one counts.
+    V = K q^2 / 2 + V4, V4 the integral of EI w''^2 w'^2 / 2: the curvature of an inextensible beam is
+    w'' (1 + w'^2 / 2). EI is read back from arm.stiffness, so that an estimated one counts.
     """
     k = arm.kappa
+    links = arm.length.size
     for r in range(q.size):
         work.elastic[r] = arm.stiffness[r] * q[r]
-    if arm.shortening:
-        for i in range(2):
-            o = 2 + i * k
-            EI = arm.stiffness[o] / arm.unit_stiffness[o]
+    for i in range(links):
+        o = links + i * k
+        EI = arm.stiffness[o] / arm.unit_stiffness[o]
+        for j in range(k):
+            for t in range(k):
+                work.tangent[i, j, t] = 0.0
+        for p in range(arm.along.shape[1]):
+            weight = EI * arm.along[i, p]
+            if weight == 0.0:
+                continue
+            bend, slope = 0.0, 0.0
             for j in range(k):
-                for m in range(j + 1):
-                    bend = 0.0
-                    for p in range(k):
-                        row = 0.5 * arm.quartic[i, j, m, p, p] * q[o + p]
-                        for t in range(p):
-                            row += arm.quartic[i, j, m, p, t] * q[o + t]
-                        bend += row * q[o + p]
-                    bend *= 2.0 * EI
-                    work.tangent[o + j, m] = 3.0 * bend
-                    work.tangent[o + m, j] = 3.0 * bend
-                    work.elastic[o + j] += bend * q[o + m]
-                    if m != j:
-                        work.elastic[o + m] += bend * q[o + j]
+                bend += arm.curvature[i, p, j] * q[o + j]
+                slope += arm.slope[i, p, j] * q[o + j]
+            for j in range(k):
+                K, s = weight * arm.curvature[i, p, j], weight * arm.slope[i, p, j]
+                work.elastic[o + j] += bend * slope * (slope * K + bend * s)
+                first = slope * slope * K + 2.0 * bend * slope * s
+                second = 2.0 * bend * slope * K + bend * bend * s
+                for t in range(j + 1):
+                    work.tangent[i, j, t] += first * arm.curvature[i, p, t] + second * arm.slope[i, p, t]
+        for j in range(k):
+            for t in range(j):
+                work.tangent[i, t, j] = work.tangent[i, j, t]
 
 
 @inlined
@@ -329,46 +299,64 @@ def hold(L: Array, held: Array, qdd: Array, columns: Array) -> None:
 
 
 @inlined
-def steepen(
-    root_slope: Array, tip_slope: Array, torque: Array, q: Array, effort: Array, force: Array,
-) -> None:
-    """Add to force (n,) what torques gain where a link is steep, of the order of V4.
-
-    A joint turns by the angle asin(w') of the tangent, so that its torque works on eta through
-    w' (1 + w'^2 / 2). Nothing in the paper's convention, whose torques bend nothing. The arrays are the
-    Manipulator's; passing it whole would cost more than the arithmetic.
-    """
-    k = root_slope.shape[1]
-    root1, tip1, root2 = 0.0, 0.0, 0.0
-    for j in range(k):
-        root1 += root_slope[0, j] * q[2 + j]
-        tip1 += tip_slope[0, j] * q[2 + j]
-        root2 += root_slope[1, j] * q[2 + k + j]
-    first = 0.5 * root1 * root1 * effort[0]
-    second = 0.5 * tip1 * tip1 * effort[1]
-    third = 0.5 * root2 * root2 * effort[1]
-    for j in range(k):
-        force[2 + j] += torque[2 + j, 0] * first + torque[2 + j, 1] * second
-        force[2 + k + j] += torque[2 + k + j, 1] * third
+def net_torques(B: Array, arm: Manipulator, qd: Array, effort: Array, net: Array) -> None:
+    """Fill net (3, L): torques less friction, rates of the joints, derivative of the friction by them; B (n, L)."""
+    for i in range(arm.length.size):
+        rate = 0.0
+        for r in range(qd.size):
+            rate += B[r, i] * qd[r]
+        share = np.tanh(rate / STICTION_RATE)
+        net[0, i] = effort[i] - arm.viscous[i] * rate - arm.coulomb[i] * share
+        net[1, i] = rate
+        net[2, i] = arm.viscous[i] + arm.coulomb[i] * (1.0 - share * share) / STICTION_RATE
 
 
 @inlined
+def torque_matrix(arm: Manipulator, q: Array, B: Array) -> None:
+    """Fill B (n, L), generalized forces of unit torques at q.
+
+    Where a link is steep, a joint turns by the angle asin(w') of the tangent, so that its torque works on eta through
+    w' (1 + w'^2 / 2), of the order of V4. Nothing in the paper's convention, whose torques bend nothing.
+    """
+    k = arm.kappa
+    links = arm.length.size
+    for r in range(q.size):
+        for i in range(links):
+            B[r, i] = arm.torque[r, i]
+    if arm.along[0, 0] == 0.0:
+        return
+    for i in range(links):
+        o = links + i * k
+        root, tip = 0.0, 0.0
+        for j in range(k):
+            root += arm.root_slope[i, j] * q[o + j]
+            tip += arm.tip_slope[i, j] * q[o + j]
+        for j in range(k):
+            B[o + j, i] *= 1.0 + 0.5 * root * root
+            if i + 1 < links:
+                B[o + j, i + 1] *= 1.0 + 0.5 * tip * tip
+
+
+@kernel
 def acceleration(
     arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array, qdd: Array, work: Workspace,
 ) -> bool:
-    """Fill qdd (n,) for joint torques effort (2,) [N m]; payload as in ``kernels.assemble``.
+    """Fill qdd (n,) for joint torques effort (L,) [N m]; payload: (4,) inertial parameters.
 
-    Leaves the Cholesky factor of M in work.M and E in work.E. False when M is not positive definite
-    (numbers left the finite range).
+    Leaves the Cholesky factor of M in work.M, E, ``torque_matrix`` in work.B and ``net_torques`` in work.net. False
+    when M is not positive definite (numbers left the finite range).
     """
     assemble(arm, payload, q, qd, work.M, work.E, work)
+    if arm.floating:
+        eliminate_translation(work.M, work.E, work)
     elastic(arm, q, work)
     if not factor(work.M):
         return False
+    torque_matrix(arm, q, work.B)
+    net_torques(work.B, arm, qd, effort, work.net)
     for r in range(q.size):
-        qdd[r] = (arm.torque[r, 0] * effort[0] + arm.torque[r, 1] * effort[1]
-                  - work.E[r] - work.elastic[r] - arm.damping[r] * qd[r])
-    if arm.shortening:
-        steepen(arm.root_slope, arm.tip_slope, arm.torque, q, effort, qdd)
+        qdd[r] = -work.E[r] - work.elastic[r] - arm.damping[r] * qd[r]
+        for i in range(arm.length.size):
+            qdd[r] += work.B[r, i] * work.net[0, i]
     solve(work.M, qdd)
     return True

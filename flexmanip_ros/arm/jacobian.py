@@ -1,7 +1,8 @@
-"""Compiled derivatives of the equations of motion, analytic, no allocation.
+"""Derivatives of the equations of motion by q, q' and the payload's inertial parameters (see ``equations_of_motion``).
 
-With f = M(q) qdd + E(q, qd) (inverse dynamics at fixed qdd), implicit differentiation gives
-dqdd/dq = -M^-1 (df/dq + K), dqdd/dqd = -M^-1 (df/dqd + D), dqdd/dp = -M^-1 df/dp.
+The forces of inertia are the sum of m J' A over all points, A = J q'' + a(q, q'). Their derivative at fixed q'' is
+the sum of m (dJ' A + J' dA), gathered link by link from the tip to the base: a link passes on the force F on its root
+with the derivatives Fq, Fv, which acts on the tip of the link before.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexmanip_ros.arm.equations_of_motion import acceleration, assemble
-from flexmanip_ros.arm.link_jacobian import link_jacobian, point_jacobian
 from flexmanip_ros.numerics.compiled import inlined, kernel
 
 if TYPE_CHECKING:
@@ -20,165 +20,289 @@ if TYPE_CHECKING:
 
 
 @inlined
-def force_jacobian(
-    arm: Manipulator, payload: Array, q: Array, qd: Array, qdd: Array,
-    left: Array, right: Array, dp: Array, work: Workspace,
-) -> None:
-    """Fill df/dq and df/dqd (n, n) and df/dp (n, 4), p = [payload mass, inertia, EI1, EI2].
-
-    Needs work as ``kernels.assemble`` left it for the same q, qd and payload.
-    """
+def move_station(arm: Manipulator, i: int, q: Array, qd: Array, qdd: Array, work: Workspace) -> None:
+    """Set acceleration A of the tip of link i and its derivatives Aq, Av, from those of its root."""
     k = arm.kappa
-    n = 2 + 2 * k
-    for r in range(n):
-        for c in range(n):
-            left[r, c] = 0.0
-            right[r, c] = 0.0
-        for c in range(4):
-            dp[r, c] = 0.0
-    columns = work.columns
-    for r in range(6):
-        for j in range(k):
-            columns[r, j] = 0.0
-    c = np.cos(q[1] - q[0])
-    s = np.sin(q[1] - q[0])
-    w1, w2 = qd[0], qd[1]
-    length = arm.length[0]
-    rate = 0.0
-    second = 0.0
+    o = arm.length.size + i * k
+    c, s, w, wd = np.cos(q[i]), np.sin(q[i]), qd[i], qdd[i]
+    A, Aq, Av = work.A[i + 1], work.Aq[i + 1], work.Av[i + 1]
+    for side in range(2):
+        for r in range(q.size):
+            Aq[side, r] = work.Aq[i, side, r]
+            Av[side, r] = work.Av[i, side, r]
+    x, xd, xdd = arm.length[i], 0.0, 0.0
     for j in range(k):
-        stretch = arm.tip_stretch[0, j]
-        length -= 0.5 * stretch * q[2 + j] * q[2 + j]
-        rate -= stretch * q[2 + j] * qd[2 + j]
-        second -= stretch * (qd[2 + j] * qd[2 + j] + q[2 + j] * qdd[2 + j])
-    pe = second - length * w1 * w1
-    pn = length * qdd[0] + 2.0 * rate * w1
-    base_e = c * pe + s * pn
-    base_n = c * pn - s * pe
-
-    mass = arm.tip_mass + payload[0]
-    for i in range(2):  # with a constant in place of i, numba compiles a version for each
-        e = base_e if i == 1 else 0.0
-        f = base_n if i == 1 else 0.0
-        link_jacobian(arm, i, e, f, q, qd, qdd, left, right, work)
-    at_tip = payload[2] == 0.0 and payload[3] == 0.0
-    for i in range(2):
-        e = base_e if i == 1 else 0.0
-        f = base_n if i == 1 else 0.0
-        lumped = mass if at_tip else arm.tip_mass
-        if i == 0:
-            lumped = mass + arm.joint_mass + 2.0 * arm.half_mass[1]
-        point_jacobian(lumped, 0.0, 0.0, arm, i, e, f, q, qd, qdd, left, right, work)
-        if i == 1 and not at_tip:
-            point_jacobian(payload[0], payload[2], payload[3], arm, i, e, f, q, qd, qdd, left, right, work)
-
-    # Coupling: rows of link 1 see P_q . F'', rows of link 2 see F_q . P''.
-    moments = work.moments
-    A, Ad, Add = moments[0, 0], moments[0, 1], moments[0, 2]
-    B, Bd, Bdd = moments[1, 0], moments[1, 1], moments[1, 2]
-    for j in range(k):
-        Add += moments[0, 3 + j] * qdd[2 + k + j]
-        Bdd += moments[1, 3 + j] * qdd[2 + k + j]
-    fe = Add - 2.0 * Bd * w2 - B * qdd[1] - A * w2 * w2
-    fn = Bdd + 2.0 * Ad * w2 + A * qdd[1] - B * w2 * w2
-    reach_e = s * fe + c * fn  # n1 . F''
-    reach_n = c * fe - s * fn  # e1 . F'' = d(n1 . F'')/d(theta2 - theta1)
-    spin_e = -2.0 * Bd - 2.0 * A * w2
-    spin_n = 2.0 * Ad - 2.0 * B * w2
-
-    turn = length * reach_n
-    left[0, 0] -= turn
-    left[0, 1] += turn
-    turn = -A * base_e - B * base_n
-    left[1, 0] -= turn
-    left[1, 1] += turn
-    right[0, 1] += length * (s * spin_e + c * spin_n)
-    dpe, dpn = -2.0 * length * w1, 2.0 * rate
-    de, dn = c * dpe + s * dpn, c * dpn - s * dpe
-    right[1, 0] += A * dn - B * de
-    for j in range(k):
-        r1 = 2 + j
-        r2 = 2 + k + j
-        v = arm.tip_stretch[0, j] * q[r1]
-        aj, bj = moments[0, 3 + j], moments[1, 3 + j]
-        left[r1, 0] -= v * reach_e
-        left[r1, 1] += v * reach_e
-        turn = aj * base_n - bj * base_e
-        left[r2, 0] -= turn
-        left[r2, 1] += turn
-        right[r1, 1] -= v * (c * spin_e - s * spin_n)
-        right[r2, 0] += aj * de + bj * dn
-        left[0, r1] -= v * reach_e
-        left[r1, r1] -= arm.tip_stretch[0, j] * reach_n
-        # by eta2_j and its rate: F'' changes
-        ge = columns[0, j] - 2.0 * columns[3, j] * w2 - bj * qdd[1] - aj * w2 * w2
-        gn = columns[1, j] + 2.0 * columns[2, j] * w2 + aj * qdd[1] - bj * w2 * w2
-        he = columns[4, j] - 2.0 * bj * w2
-        hn = columns[5, j] + 2.0 * aj * w2
-        left[0, r2] += length * (s * ge + c * gn)
-        right[0, r2] += length * (s * he + c * hn)
+        g, h, gdd = 0.0, 0.0, 0.0
         for t in range(k):
-            vl = arm.tip_stretch[0, t] * q[2 + t]
-            left[2 + t, r2] -= vl * (c * ge - s * gn)
-            right[2 + t, r2] -= vl * (c * he - s * hn)
-        # by eta1_j and its rate: P'' changes
-        stretch = arm.tip_stretch[0, j]
-        if stretch != 0.0:
-            dpe = -stretch * qdd[r1] + v * w1 * w1
-            dpn = -v * qdd[0] - 2.0 * stretch * qd[r1] * w1
-            ge, gn = c * dpe + s * dpn, c * dpn - s * dpe
-            dpe = -2.0 * stretch * qd[r1]
-            dpn = -2.0 * v * w1
-            he, hn = c * dpe + s * dpn, c * dpn - s * dpe
-            left[1, r1] += A * gn - B * ge
-            right[1, r1] += A * hn - B * he
-            for t in range(k):
-                al, bl = moments[0, 3 + t], moments[1, 3 + t]
-                left[2 + k + t, r1] += al * ge + bl * gn
-                right[2 + k + t, r1] += al * he + bl * hn
-    _parameter_columns(arm, payload, q, qd, qdd, base_e, base_n, c, s, length, dp)
+            g += arm.tip_shortening[i, j, t] * q[o + t]
+            h += arm.tip_shortening[i, j, t] * qd[o + t]
+            gdd += arm.tip_shortening[i, j, t] * qdd[o + t]
+        x -= 0.5 * g * q[o + j]
+        xd -= g * qd[o + j]
+        xdd -= h * qd[o + j] + g * qdd[o + j]
+        e, f = -gdd + g * w * w, -2.0 * h * w - g * wd
+        Aq[0, o + j] += c * e - s * f
+        Aq[1, o + j] += s * e + c * f
+        e, f = -2.0 * h, -2.0 * g * w
+        Av[0, o + j] += c * e - s * f
+        Av[1, o + j] += s * e + c * f
+    e, f = xdd - x * w * w, 2.0 * xd * w + x * wd
+    A[0] = work.A[i, 0] + c * e - s * f
+    A[1] = work.A[i, 1] + s * e + c * f
+    Aq[0, i] += -s * e - c * f
+    Aq[1, i] += c * e - s * f
+    e, f = -2.0 * x * w, 2.0 * xd
+    Av[0, i] += c * e - s * f
+    Av[1, i] += s * e + c * f
 
 
 @inlined
-def _parameter_columns(
-    arm: Manipulator, payload: Array, q: Array, qd: Array, qdd: Array,
-    base_e: float, base_n: float, c: float, s: float, length: float, dp: Array,
+def payload_jacobian(
+    arm: Manipulator, payload: Array, q: Array, qd: Array, qdd: Array, left: Array, right: Array, dp: Array,
+    work: Workspace,
 ) -> None:
+    """Add the payload to left and right, set F, Fq, Fv to its force at the tip, and dp (n, 4) by its parameters."""
     k = arm.kappa
-    w2 = qd[1]
-    a = arm.length[1]
-    alpha, alpha_d, alpha_dd = 0.0, 0.0, 0.0
+    links = arm.length.size
+    n = q.size
+    last = links - 1
+    o = links + last * k
+    m, hx, hy = payload[0], payload[1], payload[2]
+    turn, spin, accelerated = q[last], qd[last], qdd[last]
+    g = work.frame[0]
+    for r in range(n):
+        g[r] = 0.0
+    g[last] = 1.0
     for j in range(k):
-        r2 = 2 + k + j
-        a -= 0.5 * arm.tip_stretch[1, j] * q[r2] * q[r2]
-        alpha += arm.tip_slope[1, j] * q[r2]
-        alpha_d += arm.tip_slope[1, j] * qd[r2]
-        alpha_dd += arm.tip_slope[1, j] * qdd[r2]
-    px = payload[2] * np.cos(alpha) - payload[3] * np.sin(alpha)
-    py = payload[2] * np.sin(alpha) + payload[3] * np.cos(alpha)
-    a += px
-    ad, bd = -py * alpha_d, px * alpha_d
-    add = -px * alpha_d * alpha_d - py * alpha_dd
-    bdd = -py * alpha_d * alpha_d + px * alpha_dd
+        g[o + j] = arm.tip_slope[last, j]
+        turn += g[o + j] * q[o + j]
+        spin += g[o + j] * qd[o + j]
+        accelerated += g[o + j] * qdd[o + j]
+    tx, ty = np.cos(turn), np.sin(turn)
+    J, A, Aq, Av = work.J[links], work.A[links], work.Aq[links], work.Av[links]
+    # force by m c_x and m c_y: n psi'' - t psi'^2 and -(t psi'' + n psi'^2), n = (-ty, tx)
+    xx, xy = -ty * accelerated - tx * spin * spin, tx * accelerated - ty * spin * spin
+    yx, yy = -tx * accelerated + ty * spin * spin, -ty * accelerated - tx * spin * spin
+    along, across = tx * A[0] + ty * A[1], tx * A[1] - ty * A[0]
+    for r in range(n):
+        dp[r, 0] = J[0, r] * A[0] + J[1, r] * A[1]
+        dp[r, 1] = J[0, r] * xx + J[1, r] * xy + g[r] * across
+        dp[r, 2] = J[0, r] * yx + J[1, r] * yy - g[r] * along
+        dp[r, 3] = g[r] * accelerated
+    if arm.floating:
+        mass = work.F[2]
+        for r in range(n):
+            x, y = work.P[0, r] / mass, work.P[1, r] / mass
+            dp[r, 0] -= x * A[0] + y * A[1]
+            dp[r, 1] -= x * xx + y * xy
+            dp[r, 2] -= x * yx + y * yy
+    F = work.F
+    F[0] = m * A[0] + hx * xx + hy * yx
+    F[1] = m * A[1] + hx * xy + hy * yy
+    dx, dy = -hx * ty - hy * tx, hx * tx - hy * ty
+    # by psi: d turns to -(hx t + hy n); by psi': -2 psi' (hx t + hy n)
+    qx, qy = hx * -xy + hy * -yy, hx * xx + hy * yx
+    vx, vy = -2.0 * spin * dy, 2.0 * spin * dx
+    moment = -(hx * along + hy * across)
+    for r in range(n):
+        work.Fq[0, r] = m * Aq[0, r] + qx * g[r]
+        work.Fq[1, r] = m * Aq[1, r] + qy * g[r]
+        work.Fv[0, r] = m * Av[0, r] + vx * g[r]
+        work.Fv[1, r] = m * Av[1, r] + vy * g[r]
+    for t in range(n):
+        by_q = dx * Aq[0, t] + dy * Aq[1, t] + moment * g[t]
+        by_v = dx * Av[0, t] + dy * Av[1, t]
+        for r in range(n):
+            if g[r] != 0.0:
+                left[r, t] += g[r] * by_q
+                right[r, t] += g[r] * by_v
+
+
+@inlined
+def tip_load_jacobian(arm: Manipulator, i: int, q: Array, left: Array, right: Array, work: Workspace) -> None:
+    """Add the force work.F at the tip of link i, with its derivatives Fq and Fv, to the link's own rows."""
+    k = arm.kappa
+    o = arm.length.size + i * k
+    c, s = np.cos(q[i]), np.sin(q[i])
+    Fe, Fn = c * work.F[0] + s * work.F[1], c * work.F[1] - s * work.F[0]
+    x = arm.length[i]
+    G = work.own[0]
     for j in range(k):
-        r2 = 2 + k + j
-        stretch = arm.tip_stretch[1, j]
-        ad -= stretch * q[r2] * qd[r2]
-        add -= stretch * (qd[r2] * qd[r2] + q[r2] * qdd[r2])
-    X = add - 2.0 * bd * w2 - py * qdd[1] - a * w2 * w2 + base_e
-    Y = bdd + 2.0 * ad * w2 + a * qdd[1] - py * w2 * w2 + base_n
-    turn = qdd[1] + alpha_dd
-    dp[0, 0] = length * (s * X + c * Y)
-    dp[1, 0] = a * Y - py * X
-    dp[1, 1] = turn
-    for j in range(k):
-        r1, r2 = 2 + j, 2 + k + j
-        dp[r1, 0] = -arm.tip_stretch[0, j] * q[r1] * (c * X - s * Y)
-        slope = arm.tip_slope[1, j]
-        dp[r2, 0] = (-arm.tip_stretch[1, j] * q[r2] - py * slope) * X + px * slope * Y
-        dp[r2, 1] = slope * turn
-        dp[r1, 2] = arm.unit_stiffness[r1] * q[r1]
-        dp[r2, 3] = arm.unit_stiffness[r2] * q[r2]
+        g = 0.0
+        for t in range(k):
+            g += arm.tip_shortening[i, j, t] * q[o + t]
+        x -= 0.5 * g * q[o + j]
+        G[j] = g
+    for r in range(q.size):
+        e = c * work.Fq[0, r] + s * work.Fq[1, r]
+        f = c * work.Fq[1, r] - s * work.Fq[0, r]
+        if r == i:
+            e += Fn
+            f -= Fe
+        left[i, r] += x * f
+        for j in range(k):
+            left[o + j, r] -= G[j] * e
+        e = c * work.Fv[0, r] + s * work.Fv[1, r]
+        f = c * work.Fv[1, r] - s * work.Fv[0, r]
+        right[i, r] += x * f
+        for j in range(k):
+            right[o + j, r] -= G[j] * e
+    for t in range(k):
+        left[i, o + t] -= G[t] * Fn
+        for j in range(k):
+            left[o + j, o + t] -= arm.tip_shortening[i, j, t] * Fe
+
+
+@inlined
+def link_jacobian(
+    arm: Manipulator, i: int, q: Array, qd: Array, qdd: Array, left: Array, right: Array, work: Workspace,
+) -> None:
+    """Add the points of link i to left and right, and their force to work.F, Fq and Fv."""
+    k = arm.kappa
+    n = q.size
+    o = arm.length.size + i * k
+    c, s, w, wd = np.cos(q[i]), np.sin(q[i]), qd[i], qdd[i]
+    A, Aq, Av = work.A[i], work.Aq[i], work.Av[i]
+    re, rn = c * A[0] + s * A[1], c * A[1] - s * A[0]
+    g, Se, Sn = work.own[0], work.own[2], work.own[3]
+    eq, nq, ev, nv = work.own[4], work.own[5], work.own[6], work.own[7]
+    feq, fnq, fev, fnv = work.own[8], work.own[9], work.own[10], work.own[11]
+    for r in range(k + 1):
+        Se[r], Sn[r] = 0.0, 0.0
+        feq[r], fnq[r], fev[r], fnv[r] = 0.0, 0.0, 0.0, 0.0
+    total, fe, fn = 0.0, 0.0, 0.0
+    for p in range(arm.mass.shape[1]):
+        m = arm.mass[i, p]
+        x, y, xd, yd, xdd, ydd = arm.place[i, p], 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(k):
+            G, h, gdd = 0.0, 0.0, 0.0
+            for t in range(k):
+                G += arm.G[i, p, j, t] * q[o + t]
+                h += arm.G[i, p, j, t] * qd[o + t]
+                gdd += arm.G[i, p, j, t] * qdd[o + t]
+            shape = arm.phi[i, p, j]
+            x -= 0.5 * G * q[o + j]
+            xd -= G * qd[o + j]
+            xdd -= h * qd[o + j] + G * qdd[o + j]
+            y += shape * q[o + j]
+            yd += shape * qd[o + j]
+            ydd += shape * qdd[o + j]
+            g[1 + j] = G
+            eq[1 + j] = m * (-gdd - shape * wd + G * w * w)
+            nq[1 + j] = m * (-2.0 * h * w - G * wd - shape * w * w)
+            ev[1 + j] = m * (-2.0 * h - 2.0 * shape * w)
+            nv[1 + j] = m * (-2.0 * G * w)
+        ev[0] = m * (-2.0 * yd - 2.0 * x * w)
+        nv[0] = m * (2.0 * xd - 2.0 * y * w)
+        Ae = m * (xdd - 2.0 * yd * w - y * wd - x * w * w)
+        An = m * (ydd + 2.0 * xd * w + x * wd - y * w * w)
+        total += m
+        fe += Ae
+        fn += An
+        Ae += m * re
+        An += m * rn
+        Se[0] -= m * y
+        Sn[0] += m * x
+        for t in range(k):
+            Se[1 + t] -= m * g[1 + t]
+            Sn[1 + t] += m * arm.phi[i, p, t]
+        right[i, i] += x * nv[0] - y * ev[0]
+        fev[0] += ev[0]
+        fnv[0] += nv[0]
+        for t in range(1, k + 1):
+            feq[t] += eq[t]
+            fnq[t] += nq[t]
+            fev[t] += ev[t]
+            fnv[t] += nv[t]
+            left[i, o + t - 1] += x * nq[t] - y * eq[t] - arm.phi[i, p, t - 1] * Ae - g[t] * An
+            right[i, o + t - 1] += x * nv[t] - y * ev[t]
+            right[o + t - 1, i] += arm.phi[i, p, t - 1] * nv[0] - g[t] * ev[0]
+        for j in range(k):
+            shape, G = arm.phi[i, p, j], g[1 + j]
+            for t in range(k):
+                left[o + j, o + t] += shape * nq[1 + t] - G * eq[1 + t] - arm.G[i, p, j, t] * Ae
+                right[o + j, o + t] += shape * nv[1 + t] - G * ev[1 + t]
+    # the root's acceleration, in the frame, moves all points alike
+    for r in range(n):
+        e = c * Aq[0, r] + s * Aq[1, r]
+        f = c * Aq[1, r] - s * Aq[0, r]
+        if r == i:
+            e += rn
+            f -= re
+        left[i, r] += Se[0] * e + Sn[0] * f
+        for j in range(k):
+            left[o + j, r] += Se[1 + j] * e + Sn[1 + j] * f
+        e = c * Av[0, r] + s * Av[1, r]
+        f = c * Av[1, r] - s * Av[0, r]
+        right[i, r] += Se[0] * e + Sn[0] * f
+        for j in range(k):
+            right[o + j, r] += Se[1 + j] * e + Sn[1 + j] * f
+        for side in range(2):
+            work.Fq[side, r] += total * Aq[side, r]
+            work.Fv[side, r] += total * Av[side, r]
+    feq[0], fnq[0] = -fn, fe  # the frame turns
+    for r in range(k + 1):
+        row = i if r == 0 else o + r - 1
+        work.Fq[0, row] += c * feq[r] - s * fnq[r]
+        work.Fq[1, row] += s * feq[r] + c * fnq[r]
+        work.Fv[0, row] += c * fev[r] - s * fnv[r]
+        work.Fv[1, row] += s * fev[r] + c * fnv[r]
+    fe += total * re
+    fn += total * rn
+    work.F[0] += c * fe - s * fn
+    work.F[1] += s * fe + c * fn
+
+
+@kernel
+def force_jacobian(
+    arm: Manipulator, payload: Array, q: Array, qd: Array, qdd: Array, left: Array, right: Array, dp: Array,
+    work: Workspace,
+) -> None:
+    """Fill left = d(M qdd + E)/dq, right = dE/dqd (n, n) and dp (n, 4) by the payload's inertial parameters, qdd fixed.
+
+    Right after ``assemble``, whose work.J, work.P and work.F it reads.
+    """
+    n = q.size
+    links = arm.length.size
+    total = work.F[2]
+    for r in range(n):
+        for t in range(n):
+            left[r, t] = 0.0
+            right[r, t] = 0.0
+        for side in range(2):
+            work.Aq[0, side, r] = 0.0
+            work.Av[0, side, r] = 0.0
+    work.A[0, 0], work.A[0, 1] = work.a[0, 0], work.a[0, 1]
+    x, y, along, across = 0.0, 0.0, 0.0, 0.0
+    if arm.floating:
+        x, y = work.J[0, 1, n - 1], -work.J[0, 0, n - 1]
+        spin, turn = qd[n - 1], qdd[n - 1]
+        along, across = -y * turn - x * spin * spin, x * turn - y * spin * spin
+        work.Aq[0, 0, n - 1], work.Aq[0, 1, n - 1] = -across, along
+        work.Av[0, 0, n - 1], work.Av[0, 1, n - 1] = -2.0 * x * spin, -2.0 * y * spin
+        # the translation that keeps the momentum
+        tx, ty = -work.F[0] / total, -work.F[1] / total
+        for r in range(n):
+            tx -= work.P[0, r] * qdd[r] / total
+            ty -= work.P[1, r] * qdd[r] / total
+        work.A[0, 0], work.A[0, 1] = along + tx, across + ty
+    for i in range(links):
+        move_station(arm, i, q, qd, qdd, work)
+    payload_jacobian(arm, payload, q, qd, qdd, left, right, dp, work)
+    for back in range(links):
+        i = links - 1 - back
+        tip_load_jacobian(arm, i, q, left, right, work)
+        link_jacobian(arm, i, q, qd, qdd, left, right, work)
+    if arm.floating:
+        left[n - 1, n - 1] -= x * work.F[0] + y * work.F[1]
+        for r in range(n):
+            left[n - 1, r] += x * work.Fq[1, r] - y * work.Fq[0, r]
+            right[n - 1, r] += x * work.Fv[1, r] - y * work.Fv[0, r]
+        for r in range(n):
+            a, b = work.P[0, r] / total, work.P[1, r] / total
+            for t in range(n):
+                left[r, t] -= a * work.Fq[0, t] + b * work.Fq[1, t]
+                right[r, t] -= a * work.Fv[0, t] + b * work.Fv[1, t]
 
 
 @kernel
@@ -193,7 +317,7 @@ def bias_jacobian(
 
 @inlined
 def solve_columns(L: Array, X: Array) -> None:
-    """Overwrite X (n, m) with -M^-1 X, L from ``acceleration_kernel.factor``."""
+    """Overwrite X (n, m) with -M^-1 X, L from ``equations_of_motion.factor``."""
     n, m = X.shape
     for r in range(n):
         for p in range(r):
@@ -217,24 +341,60 @@ def solve_columns(L: Array, X: Array) -> None:
 
 
 @inlined
-def steep_jacobian(
-    root_slope: Array, tip_slope: Array, torque: Array, q: Array, effort: Array, dq: Array,
-) -> None:
-    """Subtract the derivative of ``acceleration_kernel.steepen`` by q from dq (n, n)."""
-    k = root_slope.shape[1]
-    root1, tip1, root2 = 0.0, 0.0, 0.0
-    for j in range(k):
-        root1 += root_slope[0, j] * q[2 + j]
-        tip1 += tip_slope[0, j] * q[2 + j]
-        root2 += root_slope[1, j] * q[2 + k + j]
-    for j in range(k):
-        r1, r2 = 2 + j, 2 + k + j
-        first = torque[r1, 0] * root1 * effort[0]
-        second = torque[r1, 1] * tip1 * effort[1]
-        third = torque[r2, 1] * root2 * effort[1]
-        for m in range(k):
-            dq[r1, 2 + m] -= first * root_slope[0, m] + second * tip_slope[0, m]
-            dq[r2, 2 + k + m] -= third * root_slope[1, m]
+def torque_jacobian(arm: Manipulator, q: Array, qd: Array, work: Workspace, dq: Array) -> None:
+    """Subtract the derivative of B(q) tau by q from dq (n, n), tau the torques less friction."""
+    k = arm.kappa
+    links = arm.length.size
+    if arm.along[0, 0] == 0.0:
+        return
+    net = work.net
+    for i in range(links):
+        o = links + i * k
+        for end in range(2):
+            joint = i + end
+            if joint == links:
+                continue
+            slopes = arm.root_slope[i] if end == 0 else arm.tip_slope[i]
+            slope, rate = 0.0, 0.0
+            for j in range(k):
+                slope += slopes[j] * q[o + j]
+                rate += arm.torque[o + j, joint] * qd[o + j]
+            for t in range(k):
+                # the slope turns the torque into force, and the rates of the shapes into a rate of the joint
+                turned = slope * slopes[t]
+                for j in range(k):
+                    dq[o + j, o + t] -= arm.torque[o + j, joint] * turned * net[0, joint]
+                for r in range(q.size):
+                    dq[r, o + t] += work.B[r, joint] * net[2, joint] * turned * rate
+
+
+@inlined
+def elastic_jacobian(arm: Manipulator, q: Array, dq: Array, work: Workspace) -> None:
+    """Add the derivative of ``equations_of_motion.elastic`` by q to dq (n, n)."""
+    k = arm.kappa
+    links = arm.length.size
+    for r in range(q.size):
+        dq[r, r] += arm.stiffness[r]
+    if arm.along[0, 0] != 0.0:
+        for i in range(links):
+            o = links + i * k
+            for j in range(k):
+                for t in range(k):
+                    dq[o + j, o + t] += work.tangent[i, j, t]
+
+
+@inlined
+def damping_jacobian(arm: Manipulator, work: Workspace, dqd: Array) -> None:
+    """Add damping and the derivative of the friction to dqd (n, n); right after ``acceleration``."""
+    for r in range(dqd.shape[0]):
+        dqd[r, r] += arm.damping[r]
+    for i in range(arm.length.size):
+        if work.net[2, i] != 0.0:
+            for r in range(dqd.shape[0]):
+                force = work.net[2, i] * work.B[r, i]
+                if force != 0.0:
+                    for t in range(dqd.shape[0]):
+                        dqd[r, t] += force * work.B[t, i]
 
 
 @inlined
@@ -242,28 +402,17 @@ def acceleration_jacobian(
     arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array,
     qdd: Array, dq: Array, dqd: Array, dp: Array, work: Workspace,
 ) -> bool:
-    """Fill qdd (n,) and dqdd/dq, dqdd/dqd (n, n), dqdd/dp (n, 4), p = [mass, inertia, EI1, EI2].
+    """Fill qdd (n,), dqdd/dq, dqdd/dqd (n, n), and dp (n, 4): derivative of M qdd + E by the inertial parameters.
 
-    The damping counts as independent of EI. False when M is not positive definite. M's Cholesky
-    factor stays in work.M, so dqdd/dtau is its solution for the columns of ``manipulator.torque_at(arm, q)``.
+    False when M is not positive definite. M's Cholesky factor stays in work.M: for any parameter on which the forces f
+    (n,) of the equations depend, dqdd = M^-1 df.
     """
     if not acceleration(arm, payload, q, qd, effort, qdd, work):
         return False
     force_jacobian(arm, payload, q, qd, qdd, dq, dqd, dp, work)
-    for r in range(q.size):
-        dq[r, r] += arm.stiffness[r]
-        dqd[r, r] += arm.damping[r]
-    if arm.shortening:
-        k = arm.kappa
-        for i in range(2):
-            o = 2 + i * k
-            for j in range(k):
-                r = o + j
-                dp[r, 2 + i] = work.elastic[r] * arm.unit_stiffness[r] / arm.stiffness[r]
-                for m in range(k):
-                    dq[r, o + m] += work.tangent[r, m]
-        steep_jacobian(arm.root_slope, arm.tip_slope, arm.torque, q, effort, dq)
+    elastic_jacobian(arm, q, dq, work)
+    torque_jacobian(arm, q, qd, work, dq)
+    damping_jacobian(arm, work, dqd)
     solve_columns(work.M, dq)
     solve_columns(work.M, dqd)
-    solve_columns(work.M, dp)
     return True

@@ -1,64 +1,61 @@
-"""Constants of the nonlinear two-link flexible arm M(q) q'' + E(q, q') + D q' + K q = B tau (paper eq. 7).
+"""Constants of the nonlinear flexible arm M(q) q'' + E(q, q') + D q' + dV/dq = B tau (paper eq. 7).
 
-q = [theta1, theta2, eta_11.., eta_21..], n = 2 + 2 kappa; theta are the chords' absolute angles.
-Payload arrays are (4,): mass [kg], inertia about its centre of mass [kg m^2], centre of mass x, y [m]
-in the tip tangent frame (x along the tangent).
+q = [theta_1.., eta_11.., eta_21.., phi], n = L (1 + kappa), and one more where the base floats. theta: absolute angles
+of the chords, eta: modal coordinates [m], phi: angle of the base. A payload is a rigid body held at the tip, given by
+its inertial parameters (4,): mass m [kg], first moments m c_x, m c_y [kg m] and inertia about the tip [kg m^2], in the
+frame of the tip's cross-section (x along the tangent). The mass matrix is linear in them.
 
 The compiled functions of ``equations_of_motion`` and ``jacobian`` take a ``Manipulator`` (constants) and a
 ``Workspace`` (scratch for one thread), and allocate nothing. ``dynamics`` evaluates the same functions from Python.
-Outputs are linear: positions = ``arm.output @ q``, rates = ``arm.output @ qd``, (4,) joint1, joint2, link1_bend,
-link2_bend.
+Outputs are linear: positions = ``arm.output @ q``, rates = ``arm.output @ qd``, (2 L,) joint angles, then bends.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.arm.shape_functions import link_tables, output_matrix, quartic, rotary
+from flexmanip_ros.arm.shape_functions import ShapeFunctions, count, quadrature, shape_functions, slope_products
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
+POINTS = 5
+"""Points of a link, beside two for each sine: frequencies are then right to 1e-9, accelerations to 1e-5."""
+
 
 class Manipulator(NamedTuple):
-    """Constants of the arm for the compiled functions; link index first, SI units."""
+    """Constants of the arm for the compiled functions; link index first, P points on a link, SI units."""
 
     kappa: int
-    shortening: bool
-    joint_mass: float
-    tip_mass: float
+    floating: bool
+    """The base floats: phi is the last coordinate, and the translation is eliminated (momentum is constant)."""
     length: Array
-    """(2,) L."""
-    half_mass: Array
-    """(2,) rho L / 2."""
-    inertia: Array
-    """(2,) int rho x^2."""
-    moment: Array
-    """(2,) int rho x."""
-    mean_shape: Array
-    """(2, k) int rho phi."""
-    rigid_shape: Array
-    """(2, k) int rho x phi."""
-    tip_stretch: Array
-    """(2, k) diagonal of S(L); zero without shortening."""
+    """(L,)."""
+    mass: Array
+    """(L, P) masses: the link's own by Gauss-Legendre quadrature, and last what is mounted at its end."""
+    place: Array
+    """(L, P) x of each."""
+    phi: Array
+    """(L, P, k) shapes there."""
+    G: Array
+    """(L, P, k, k) integral of phi' phi'^T from 0 to x; zero without shortening."""
+    slope: Array
+    """(L, P, k) phi'."""
+    curvature: Array
+    """(L, P, k) phi''."""
+    along: Array
+    """(L, P) weights of the quadrature [m]; 0 at the end, everywhere without shortening."""
+    tip_shortening: Array
+    """(L, k, k) G(L)."""
     root_slope: Array
-    """(2, k) phi'(0)."""
+    """(L, k) phi'(0)."""
     tip_slope: Array
-    """(2, k) phi'(L)."""
-    C2: Array
-    """(2, k, k) int rho (phi phi' - x S)."""
-    S1: Array
-    """(2, k, k) int rho S."""
-    W: Array
-    """(2, k, k, k) int rho phi_j S_mp."""
-    Q: Array
-    """(2, k, k, k, k) int rho S_jl S_mp."""
-    quartic: Array
-    """(2, k, k, k, k) totally symmetric: fourth-order elastic energy EI quartic eta^4 / 4."""
+    """(L, k) phi'(L)."""
     rotary: Array
-    """(n, n) hubs and bodies that turn with a slope."""
+    """(n, n) hubs, rotors and bodies that turn with a slope, and the base."""
     stiffness: Array
     """(n,) diagonal of K."""
     damping: Array
@@ -66,128 +63,205 @@ class Manipulator(NamedTuple):
     unit_stiffness: Array
     """(n,) derivative of the stiffness by its link's EI."""
     torque: Array
-    """(n, 2) B."""
+    """(n, L) B."""
+    joint: Array
+    """(L, n) joint angles between link and link (or base), through the slopes: rotors turn with them."""
     output: Array
-    """(4, n) joint angles and bends from q."""
+    """(2 L, n) joint angles and bends from q."""
+    viscous: Array
+    """(L,) viscous friction of the joints [N m s/rad]."""
+    coulomb: Array
+    """(L,) Coulomb friction of the joints [N m]."""
+    base: Array
+    """(3,) mass of a floating base [kg], place of joint 1 from its centre of mass, x and y [m]."""
+    gravity: Array
+    """(2,) [m/s^2]."""
 
 
 class Workspace(NamedTuple):
-    """Scratch memory of the compiled functions, for one thread."""
+    """Scratch memory of the compiled functions, for one thread; stations are joint 1 and the tip of each link."""
 
     M: Array
     E: Array
+    J: Array
+    """(L + 1, 2, n) Jacobians of the stations."""
+    a: Array
+    """(L + 1, 2) their accelerations at qdd = 0."""
+    P: Array
+    """(2, n) linear momentum of all that moves with the base, by the rates."""
+    F: Array
+    """(3,) force on it at qdd = 0, and its mass."""
+    first: Array
+    """(L, 2, n) first moments of a link times the rates of its own coordinates, inertial."""
+    own: Array
+    """(12, k + 1) scratch of one link."""
+    block: Array
+    """(k + 1, k + 1) scratch of one link."""
     elastic: Array
     tangent: Array
-    moments: Array
-    stretch: Array
-    Y: Array
-    Z: Array
-    pairs: Array
-    columns: Array
+    """(L, k, k) derivative of the elastic forces of fourth order."""
+    A: Array
+    """(L + 1, 2) accelerations of the stations."""
+    Aq: Array
+    """(L + 1, 2, n) their derivatives by q."""
+    Av: Array
+    """(L + 1, 2, n) and by q'."""
+    Fq: Array
+    """(2, n) derivative by q of the force that a link passes on to the one before."""
+    Fv: Array
+    frame: Array
+    """(4, n) scratch: derivatives in the frame of a link."""
+    B: Array
+    """(n, L) torque matrix."""
+    net: Array
+    """(3, L) torques less friction, rates of the joints, and derivative of the friction by them."""
+    held: Array
+    """(2, n) scratch of the constraints."""
+    parameters: Array
+    """(n, 4) derivative of the forces by the payload's inertial parameters."""
     left: Array
     right: Array
-    parameters: Array
-    held: Array
 
 
-def workspace(kappa: int) -> Workspace:
-    """Allocate scratch for arms of kappa modes a link."""
-    n = 2 + 2 * kappa
+def workspace(arm: Manipulator) -> Workspace:
+    """Allocate scratch for an arm."""
+    n, k, links = arm.stiffness.size, arm.kappa, arm.length.size
     return Workspace(
-        M=np.zeros((n, n)), E=np.zeros(n), elastic=np.zeros(n), tangent=np.zeros((n, kappa)),
-        moments=np.zeros((2, 3 + kappa)), stretch=np.zeros((2, kappa)),
-        Y=np.zeros((2, kappa, kappa)), Z=np.zeros((2, kappa, kappa, kappa)),
-        pairs=np.zeros((2, kappa, kappa)), columns=np.zeros((6, kappa)),
-        left=np.zeros((n, n)), right=np.zeros((n, n)), parameters=np.zeros((n, 4)), held=np.zeros((2, n)))
+        M=np.zeros((n, n)), E=np.zeros(n), J=np.zeros((links + 1, 2, n)), a=np.zeros((links + 1, 2)),
+        P=np.zeros((2, n)), F=np.zeros(3), first=np.zeros((links, 2, n)), own=np.zeros((12, k + 1)),
+        block=np.zeros((k + 1, k + 1)), elastic=np.zeros(n), tangent=np.zeros((links, k, k)),
+        A=np.zeros((links + 1, 2)), Aq=np.zeros((links + 1, 2, n)), Av=np.zeros((links + 1, 2, n)),
+        Fq=np.zeros((2, n)), Fv=np.zeros((2, n)), frame=np.zeros((4, n)), B=np.zeros((n, links)),
+        net=np.zeros((3, links)),
+        held=np.zeros((2, n)), parameters=np.zeros((n, 4)), left=np.zeros((n, n)), right=np.zeros((n, n)))
 
 
-def payload_array(
-    mass: float = 0.0, inertia: float = 0.0, com: tuple[float, float] = (0.0, 0.0),
-) -> Array:
-    """Pack a payload; raises ModelError when it is not a physical body."""
-    packed = np.array([mass, inertia, com[0], com[1]], dtype=np.float64)
-    if not np.all(np.isfinite(packed)) or mass < 0 or inertia < 0:
+def payload_array(mass: float = 0.0, inertia: float = 0.0, com: tuple[float, float] = (0.0, 0.0)) -> Array:
+    """Inertial parameters (4,) of a body: mass [kg], inertia about its centre of mass [kg m^2], its place [m].
+
+    Raises ModelError when it is not a physical body.
+    """
+    given = np.array([mass, inertia, com[0], com[1]], dtype=np.float64)
+    if not np.all(np.isfinite(given)) or mass < 0 or inertia < 0:
         raise ModelError(
             f'the payload is mass {mass}, inertia {inertia}, com {com}',
             'give finite values, mass and inertia of zero or more')
-    return packed
+    return np.array([mass, mass * com[0], mass * com[1], inertia + mass * (com[0] ** 2 + com[1] ** 2)])
 
 
-def manipulator(arm: ArmParameters, kappa: int | None = None) -> Manipulator:
-    """Precompute the constants of an arm with kappa modes a link (default arm.modes)."""
-    k = arm.modes if kappa is None else kappa
-    if k < 1:
-        raise ModelError(f'kappa is {k}', 'use at least one mode a link')
-    length = np.asarray(arm.link_length)
-    density = np.asarray(arm.linear_density)
-    root, tip = root_slopes(arm, k), tip_slopes(arm, k)
-    tables = [link_tables(L, rho, k, arm.shortening) for L, rho in zip(length, density, strict=True)]
-    j = np.pi * np.arange(1, k + 1)
-    diagonal = np.concatenate([np.zeros(2), stiffness(arm, k)])
-    per_stiffness = np.concatenate([np.zeros(2), *(j**4 / (2 * L**3) for L in length)])
-    stretch = j**2 / (2 * length[:, None]) if arm.shortening else np.zeros((2, k))
-    return Manipulator(
-        kappa=k, shortening=arm.shortening, joint_mass=arm.joint_mass, tip_mass=arm.tip_mass,
-        length=length.copy(), half_mass=density * length / 2, inertia=density * length**3 / 3,
-        moment=density * length**2 / 2,
-        mean_shape=np.stack([t[0] for t in tables]), rigid_shape=np.stack([t[1] for t in tables]),
-        tip_stretch=stretch, root_slope=root, tip_slope=tip,
-        C2=np.stack([t[2] for t in tables]), S1=np.stack([t[3] for t in tables]),
-        W=np.stack([t[4] for t in tables]), Q=np.stack([t[5] for t in tables]),
-        quartic=np.stack([quartic(L, k, arm.shortening) for L in length]),
-        rotary=rotary(arm, root, tip), stiffness=diagonal,
-        damping=np.concatenate([np.zeros(2), damping(arm, k)]),
-        unit_stiffness=per_stiffness, torque=torque_matrix(arm, k),
-        output=output_matrix(arm, root, tip))
+@lru_cache(maxsize=64)
+def manipulator(arm: ArmParameters, kappa: int | None = None, points: int | None = None) -> Manipulator:
+    """Return the constants of an arm with its own shape functions, or with kappa sines a link. Do not write to them.
 
-
-def root_slopes(arm: ArmParameters, kappa: int) -> Array:
-    """Slopes phi'(0) of each link's sine shapes, (2, kappa) [1/m]."""
-    j = np.arange(1, kappa + 1)
-    slopes: Array = np.pi * j / np.asarray(arm.link_length)[:, None]
-    return slopes
-
-
-def tip_slopes(arm: ArmParameters, kappa: int) -> Array:
-    """Slopes phi'(L) of each link's sine shapes, (2, kappa) [1/m]."""
-    j = np.arange(1, kappa + 1)
-    return root_slopes(arm, kappa) * np.where(j % 2, -1.0, 1.0)
-
-
-def stiffness(arm: ArmParameters, kappa: int) -> Array:
-    """Diagonal of Kc, (2 kappa,) [N/m]."""
-    j = np.pi * np.arange(1, kappa + 1)
-    return np.concatenate([
-        EI * j**4 / (2 * L**3) for EI, L in zip(arm.bending_stiffness, arm.link_length, strict=True)])
-
-
-def damping(arm: ArmParameters, kappa: int) -> Array:
-    """Diagonal of the modal damping matrix Dc, (2 kappa,) [N s/m].
-
-    ``stiffness``: Dc = (2 zeta / omega_i1) Kc; ``modal``: 2 zeta omega_ij Mc, with the pinned link's
-    omega_ij = (j pi / L_i)^2 sqrt(EI_i / rho_i).
+    points: of the quadrature over a link, by default ``POINTS`` and two for each sine.
+    Raises ModelError for kappa below 1.
     """
-    j = np.arange(1, kappa + 1)
-    growth = j**4 if arm.damping_model == 'stiffness' else j**2
-    rows = []
-    for L, rho, EI in zip(arm.link_length, arm.linear_density, arm.bending_stiffness, strict=True):
-        first = (np.pi / L) ** 2 * np.sqrt(EI / rho)
-        rows.append(2 * arm.damping_ratio * first * (rho * L / 2) * growth)
-    return np.concatenate(rows)
+    if kappa is not None and kappa < 1:
+        raise ModelError(f'kappa is {kappa}', 'use at least one mode a link')
+    static = kappa is None and arm.shape_functions == 'component'
+    shapes = shape_functions(arm.modes if kappa is None else kappa, static)
+    k = count(arm) if kappa is None else kappa
+    length, density = np.asarray(arm.link_length), np.asarray(arm.linear_density)
+    links = length.size
+    n = links * (1 + k) + bool(arm.base_mass)
+    x, weight = quadrature(points or POINTS + 2 * shapes.sines)
+    x, weight = np.append(x, 1.0), np.append(weight, 0.0)
+    phi, slope, curvature = (np.broadcast_to(values.T, (links, x.size, k)) for values in shapes.at(x))
+    G = slope_products(shapes, x) * arm.shortening
+    root, tip = (shapes.at(np.array([end]))[1].T / length[:, None] for end in (0.0, 1.0))
+    ends = np.array([*[arm.joint_mass] * (links - 1), arm.tip_mass])
+    mass = density[:, None] * length[:, None] * weight
+    mass[:, -1] = ends
+    unit = np.zeros(n)
+    unit[links:links * (1 + k)] = (shapes.stiffness / length[:, None] ** 3).ravel()
+    stiffness = unit.copy()
+    stiffness[links:links * (1 + k)] *= np.repeat(arm.bending_stiffness, k)
+    joint = joint_rows(arm, root, tip, n)
+    scale = length[:, None, None]
+    made = Manipulator(
+        kappa=k, floating=bool(arm.base_mass), length=length.copy(), mass=mass, place=x * length[:, None],
+        phi=phi, G=G / scale[..., None], slope=slope / scale,
+        curvature=curvature / scale ** 2, along=weight * length[:, None] * arm.shortening,
+        tip_shortening=G[-1] / scale, root_slope=root, tip_slope=tip,
+        rotary=_rotary(arm, root, tip, joint), stiffness=stiffness, damping=_damping(arm, stiffness, k),
+        unit_stiffness=unit, torque=_torque_matrix(arm, joint), joint=joint,
+        output=_output_matrix(arm, shapes, joint),
+        viscous=np.array(arm.joint_viscous_friction), coulomb=np.array(arm.joint_coulomb_friction),
+        base=np.array([arm.base_mass, *arm.base_joint_offset]), gravity=np.array(arm.gravity))
+    # kernels are compiled for one memory layout, which a checkpoint keeps
+    contiguous: dict[str, Any] = {
+        name: np.ascontiguousarray(part) for name, part in made._asdict().items() if isinstance(part, np.ndarray)}
+    return made._replace(**contiguous)
 
 
-def torque_matrix(arm: ArmParameters, kappa: int) -> Array:
-    """Generalized force of the two joint torques, (2 + 2 kappa, 2): rows theta, eta_1, eta_2.
+def modal(arm: ArmParameters, kappa: int, link: int) -> slice:
+    """Return where the modal coordinates of a link stand in q."""
+    links = len(arm.link_length)
+    return slice(links + link * kappa, links + (link + 1) * kappa)
 
-    ``paper``: torque 2 acts on link 2's chord alone. ``joint``: it reacts on link 1's tip, and both
-    torques do work through the slopes of the shapes.
+
+def joint_rows(arm: ArmParameters, root: Array, tip: Array, n: int) -> Array:
+    """Angle of each joint through the slopes of the shapes, (L, n): what an encoder reads and a motor turns."""
+    links, k = root.shape
+    rows = np.zeros((links, n))
+    for i in range(links):
+        rows[i, i] = 1.0
+        rows[i, modal(arm, k, i)] = root[i]
+        if i:
+            rows[i, i - 1] = -1.0
+            rows[i, modal(arm, k, i - 1)] = -tip[i - 1]
+    if arm.base_mass:
+        rows[0, -1] = -1.0
+    return rows
+
+
+def _rotary(arm: ArmParameters, root: Array, tip: Array, joint: Array) -> Array:
+    """Constant mass of the bodies whose angle is a chord plus a slope, of the rotors and of the base."""
+    links, k = root.shape
+    R = np.zeros((joint.shape[1], joint.shape[1]))
+    for i in range(links):
+        end = arm.tip_inertia if i == links - 1 else arm.joint_inertia
+        for J, slopes in ((arm.hub_inertia[i], root), (end, tip)):
+            row = np.zeros(len(R))
+            row[i], row[modal(arm, k, i)] = 1.0, slopes[i]
+            R += J * np.outer(row, row)
+        R += arm.rotor_inertia[i] * np.outer(joint[i], joint[i])
+    if arm.base_mass:
+        R[-1, -1] += arm.base_inertia
+    return R
+
+
+def _damping(arm: ArmParameters, stiffness: Array, k: int) -> Array:
+    """Diagonal of the modal damping matrix, (n,) [N s/m].
+
+    ``stiffness``: D = (2 zeta / omega_i1) K; ``modal``: 2 zeta omega_ij M, omega_ij of the pinned link.
     """
-    B = np.zeros((2 + 2 * kappa, 2))
-    B[:2] = np.eye(2)
+    D = np.zeros(stiffness.size)
+    for i, (L, rho) in enumerate(zip(arm.link_length, arm.linear_density, strict=True)):
+        K = stiffness[modal(arm, k, i)]
+        omega = np.sqrt(K / (rho * L / 2))
+        D[modal(arm, k, i)] = 2 * arm.damping_ratio * (
+            K / omega[0] if arm.damping_model == 'stiffness' else rho * L / 2 * omega)
+    return D
+
+
+def _torque_matrix(arm: ArmParameters, joint: Array) -> Array:
+    """Generalized force of the joint torques, (n, L).
+
+    ``paper``: each torque acts on its link's chord alone. ``joint``: it reacts on the end of the link before (or on
+    the base) and does work through the slopes of the shapes.
+    """
     if arm.torque_convention == 'joint':
-        root, tip = root_slopes(arm, kappa), tip_slopes(arm, kappa)
-        B[0, 1] = -1.0
-        B[2:2 + kappa, 0] = root[0]
-        B[2:2 + kappa, 1] = -tip[0]
-        B[2 + kappa:, 1] = root[1]
-    return B
+        return joint.T.copy()
+    return np.eye(joint.shape[1], len(joint))
+
+
+def _output_matrix(arm: ArmParameters, shapes: ShapeFunctions, joint: Array) -> Array:
+    """Joint angles (by the arm's convention) and sensor deflections from q, (2 L, n)."""
+    links, n = joint.shape
+    k = len(shapes.combination)
+    C = np.zeros((2 * links, n))
+    C[:links] = joint if arm.angle_convention == 'encoder' else np.eye(links, n)
+    for i in range(links):
+        C[links + i, modal(arm, k, i)] = shapes.at(np.array([arm.sensor_position[i]]))[0][:, 0]
+    return C

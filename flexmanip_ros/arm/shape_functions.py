@@ -1,85 +1,76 @@
-"""Shape functions of a link (sines): their integrals, rotary inertia and what the sensors see of them."""
+"""Shape functions of a link: sines of the pinned link, with or without the two static shapes of end moments.
+
+``sines``: phi_j = sin(j pi x / L). ``component``: beside them the two shapes that moments at the ends bend (component
+modes of Craig and Bampton): the sines have no curvature at the ends, where the torques act. The shapes are combined to
+the modes of the pinned link, so that mass and stiffness matrix of a link alone stay diagonal; a sine stays what it is.
+"""
 
 from __future__ import annotations
 
-from itertools import permutations
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import eigh
 
 from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
-
-def link_tables(L: float, rho: float, k: int, shortening: bool) -> tuple[Array, ...]:
-    """Integrals over one link by Gauss-Legendre quadrature fine enough to be exact to rounding."""
-    nodes, weights = np.polynomial.legendre.leggauss(40 + 8 * k)
-    x, weights = L * (nodes + 1) / 2, rho * L * weights / 2
-    j = np.arange(1, k + 1)
-    sign = np.where(j % 2, -1.0, 1.0)
-    phi = np.sin(np.pi * j[:, None] * x / L)
-    mean = rho * L * (1 - sign) / (j * np.pi)
-    rigid = -rho * L**2 * sign / (j * np.pi)
-    S = _slope_products(L, k, x) if shortening else np.zeros((k, k, x.size))
-    C2 = rho * L / 2 * np.eye(k) - np.einsum('jmx,x->jm', S, weights * x)
-    S1 = np.einsum('jmx,x->jm', S, weights)
-    W = np.einsum('jx,mpx,x->jmp', phi, S, weights)
-    Q = np.einsum('jlx,mpx,x->jlmp', S, S, weights)
-    return mean, rigid, C2, S1, W, Q
+STATIC = 2
+"""Static shapes of a link: a moment at its root and one at its tip."""
 
 
-def _slope_products(L: float, k: int, x: Array) -> Array:
-    """S_jm(x) = int_0^x phi_j' phi_m' over the arc, (k, k, x) [1/m]."""
-    a = np.pi / L * np.arange(1, k + 1)
-    S = np.empty((k, k, x.size))
-    for j in range(k):
-        for m in range(k):
-            plus = np.sin((a[j] + a[m]) * x) / (a[j] + a[m])
-            minus = x if j == m else np.sin((a[j] - a[m]) * x) / (a[j] - a[m])
-            S[j, m] = a[j] * a[m] * (plus + minus) / 2
-    return S
+class ShapeFunctions(NamedTuple):
+    """Shapes of a pinned link of length 1, k of them: phi(0) = phi(1) = 0 and the mean of phi^2 is 1/2."""
+
+    sines: int
+    """Number of sines."""
+    combination: Array
+    """(k, k) shapes out of the sines and, in the last two columns, x (1 - x) and x (1 - x) (1 - 2 x)."""
+    stiffness: Array
+    """(k,) integral of phi''^2: times EI / L^3 the stiffness of the mode [N/m]."""
+
+    def at(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return phi, phi' and phi'' at x (N,) of a link of length 1, (k, N) each."""
+        turn = np.pi * np.arange(1, self.sines + 1)[:, None]
+        raw = [np.sin(turn * x), turn * np.cos(turn * x), -turn ** 2 * np.sin(turn * x)]
+        if len(self.combination) > self.sines:
+            raw[0] = np.vstack([raw[0], x - x ** 2, x - 3.0 * x ** 2 + 2.0 * x ** 3])
+            raw[1] = np.vstack([raw[1], 1.0 - 2.0 * x, 1.0 - 6.0 * x + 6.0 * x ** 2])
+            raw[2] = np.vstack([raw[2], np.full_like(x, -2.0), -6.0 + 12.0 * x])
+        phi, slope, curvature = (self.combination @ values for values in raw)
+        return phi, slope, curvature
 
 
-def quartic(L: float, k: int, shortening: bool) -> Array:
-    """Curvature of an inextensible beam to third order, w'' (1 + w'^2 / 2): V4 = EI / 2 int w''^2 w'^2."""
-    if not shortening:
-        return np.zeros((k, k, k, k))
-    nodes, weights = np.polynomial.legendre.leggauss(40 + 8 * k)
-    x, weights = L * (nodes + 1) / 2, L * weights / 2
-    a = np.pi / L * np.arange(1, k + 1)[:, None]
-    slope, curvature = a * np.cos(a * x), -(a**2) * np.sin(a * x)
-    P = np.einsum('jx,kx,lx,mx,x->jklm', curvature, curvature, slope, slope, weights, optimize=True)
-    total = np.zeros_like(P)
-    for order in permutations(range(4)):
-        total += np.transpose(P, order)
-    symmetric: Array = total / 12
-    return symmetric
+def count(arm: ArmParameters) -> int:
+    """Return the number kappa of modal coordinates of each link."""
+    return arm.modes + (STATIC if arm.shape_functions == 'component' else 0)
 
 
-def rotary(arm: ArmParameters, root: Array, tip: Array) -> Array:
-    """Constant mass of the bodies whose angle is a chord plus a slope."""
-    k = root.shape[1]
-    R = np.zeros((2 + 2 * k, 2 + 2 * k))
-    bodies = ((arm.hub_inertia[0], 0, root), (arm.hub_inertia[1], 1, root),
-              (arm.joint_inertia, 0, tip), (arm.tip_inertia, 1, tip))
-    for J, link, slopes in bodies:
-        row = np.zeros(2 + 2 * k)
-        row[link] = 1.0
-        row[2 + link * k:2 + (link + 1) * k] = slopes[link]
-        R += J * np.outer(row, row)
-    return R
+@lru_cache(maxsize=64)
+def shape_functions(sines: int, static: bool) -> ShapeFunctions:
+    """Return the shapes of a pinned link, in the order of their frequencies."""
+    turn: Array = np.pi * np.arange(1, sines + 1, dtype=np.float64)
+    if not static:
+        return ShapeFunctions(sines, np.eye(sines), np.asarray(turn ** 4 / 2.0, dtype=np.float64))
+    raw = ShapeFunctions(sines, np.eye(sines + STATIC), np.zeros(0))
+    x, weight = quadrature(20 + 4 * sines)
+    phi, _, curvature = raw.at(x)
+    square, V = eigh((curvature * weight) @ curvature.T, (phi * weight) @ phi.T)
+    V *= np.sqrt(0.5) * np.sign(raw.at(np.zeros(1))[1].T @ V)
+    return ShapeFunctions(sines, V.T.copy(), square / 2.0)
 
 
-def output_matrix(arm: ArmParameters, root: Array, tip: Array) -> Array:
-    """Joint angles (by the arm's convention) and sensor deflections from q, (4, n)."""
-    k = root.shape[1]
-    C = np.zeros((4, 2 + 2 * k))
-    C[0, 0] = C[1, 1] = 1.0
-    if arm.angle_convention == 'encoder':
-        C[1, 0] = -1.0
-        C[0, 2:2 + k] = root[0]
-        C[1, 2:2 + k] = -tip[0]
-        C[1, 2 + k:] = root[1]
-    j = np.pi * np.arange(1, k + 1)
-    for i in range(2):
-        C[2 + i, 2 + i * k:2 + (i + 1) * k] = np.sin(j * arm.sensor_position[i])
-    return C
+def quadrature(points: int) -> tuple[Array, Array]:
+    """Return nodes and weights (points,) of Gauss and Legendre on [0, 1]."""
+    nodes, weights = np.polynomial.legendre.leggauss(points)
+    return (nodes + 1.0) / 2.0, weights / 2.0
+
+
+def slope_products(shapes: ShapeFunctions, x: Array) -> Array:
+    """G(x) (N, k, k), the integral of phi' phi'^T from 0 to x (N,): the link shortens by eta' G(x) eta / 2."""
+    nodes, weights = quadrature(20 + 4 * shapes.sines)
+    inner = x[:, None] * nodes
+    slope = shapes.at(inner.ravel())[1].reshape(-1, *inner.shape)
+    products: Array = np.einsum('jxs,kxs,xs->xjk', slope, slope, x[:, None] * weights, optimize=True)
+    return products

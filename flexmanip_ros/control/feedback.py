@@ -1,19 +1,20 @@
 """State from measurements, and the linear quadratic regulator at a configuration with a payload.
 
 x = [theta, eta, theta', eta'] (2n,), n = 2 + 2 kappa: chord angles theta [rad] and modal coordinates eta [m]
-of ``arm.modes`` modes a link (with one mode alone the second and third of a real link are driven unstable).
+of the arm's shape functions (with one mode alone the second and third of a real link are driven unstable).
 A link at rest under no torque is straight, so the regulator needs no integrator: the plane has no gravity.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve, solve_discrete_are
 
 from flexmanip_ros.arm.linearization import blocks, discretize
-from flexmanip_ros.arm.manipulator import damping, root_slopes, tip_slopes
+from flexmanip_ros.arm.manipulator import manipulator
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ControllerParameters
 from flexmanip_ros.types import Array
@@ -27,18 +28,7 @@ FLOOR = 1e-6
 def observation(config: ControllerParameters) -> Array:
     """Return T (4, n): [encoder angles, bends] = T [theta, eta], and the same for their rates."""
     arm = config.arm
-    k = arm.modes
-    T = np.zeros((4, 2 + 2 * k))
-    T[:2, :2] = np.eye(2)
-    if arm.angle_convention == 'encoder':
-        root, tip = root_slopes(arm, k), tip_slopes(arm, k)
-        T[0, 2:2 + k] = root[0]
-        T[1, 0] = -1.0
-        T[1, 2:2 + k], T[1, 2 + k:] = -tip[0], root[1]
-    j = np.pi * np.arange(1, k + 1)
-    T[2, 2:2 + k] = np.sin(j * arm.sensor_position[0])
-    T[3, 2 + k:] = np.sin(j * arm.sensor_position[1])
-    return T
+    return manipulator(replace(arm, base_mass=0.0) if arm.base_mass else arm).output
 
 
 def reference(config: ControllerParameters, angles: Array) -> Array:
@@ -49,13 +39,14 @@ def reference(config: ControllerParameters, angles: Array) -> Array:
 
 def model(config: ControllerParameters, between: float, payload: float) -> tuple[Array, Array]:
     """Return (A (2n, 2n), B (2n, 2)) of one sample at theta2 - theta1 = ``between`` [rad], payload [kg]."""
-    k = config.arm.modes
-    b = blocks(config.arm, np.array([0.0, between]), payload, k)
-    n = 2 + 2 * k
+    b = blocks(config.arm, np.array([0.0, between]), payload)
+    n = 2 + len(b.Mc)
     M = np.block([[b.Ma, b.Mb], [b.Mb.T, b.Mc]])
-    K, D = np.zeros((n, n)), np.zeros((n, n))
-    K[2:, 2:], D[2:, 2:] = b.Kc, np.diag(damping(config.arm, k))
-    rows = cho_solve(cho_factor(M), np.hstack([-K, -D, np.vstack([b.B_theta, b.B_eta])]))
+    B = np.vstack([b.B_theta, b.B_eta])
+    K, D = np.zeros((n, n)), (B * np.array(config.arm.joint_viscous_friction)) @ B.T
+    K[2:, 2:] = b.Kc
+    D[2:, 2:] += b.Dc
+    rows = cho_solve(cho_factor(M), np.hstack([-K, -D, B]))
     A = np.zeros((2 * n, 2 * n))
     A[:n, n:], A[n:] = np.eye(n), rows[:, :2 * n]
     B = np.vstack([np.zeros((n, 2)), rows[:, 2 * n:]])
@@ -67,7 +58,7 @@ def feedforward(config: ControllerParameters, between: float, payload: float) ->
 
     The quasi-static solution of M q'' + K q = B u with eta'' = 0.
     """
-    b = blocks(config.arm, np.array([0.0, between]), payload, config.arm.modes)
+    b = blocks(config.arm, np.array([0.0, between]), payload)
     F = solve(b.B_theta, b.Ma)
     E = solve(b.Kc, b.B_eta @ F - b.Mb.T, assume_a='pos')
     return F, E

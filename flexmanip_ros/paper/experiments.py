@@ -16,7 +16,7 @@ from flexmanip_ros.studies.scenario import Scenario
 
 ARM: Mapping[str, Any] = {
     'modes': 1, 'torque_convention': 'paper', 'angle_convention': 'chord', 'shortening': False,
-    'slope_correction': False}
+    'shape_functions': 'sines'}
 WINDOW = (4.0, 6.0)
 """From and to [s] of the mean errors."""
 CAPTURE_TIME = 3.0

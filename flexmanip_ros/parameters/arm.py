@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.field import check_all, parameter
 
 SMALLEST = 1e-9
@@ -33,11 +34,28 @@ class ArmParameters:
     damping_model: str = parameter(
         'stiffness', 'damping ratio of the higher modes: stiffness, grows with the frequency; modal, the same for '
         'every mode', choices=('stiffness', 'modal'))
+    shape_functions: str = parameter(
+        'component', 'shapes of a bent link: component, sines and the two static shapes of end moments, which joint '
+        'torques bend; sines, sines alone (the paper)', choices=('component', 'sines'))
     modes: int = parameter(
-        3, 'number kappa of assumed modes of each link (payload_method block uses order / 4 instead)', low=1, high=12)
+        3, 'number of sines among the shape functions of each link (payload_method block uses order / 4 sines instead)',
+        low=1, high=12)
     shortening: bool = parameter(True, 'model the shortening of a bent link to second order (the paper: false)')
-    slope_correction: bool = parameter(
-        True, 'add the quasi-static response of the modes beyond kappa to the encoder angles (the paper: false)')
+    rotor_inertia: tuple[float, ...] = parameter(
+        (0.0, 0.0), "rotary inertia of each joint's rotor, times the gear ratio squared; it turns with the joint",
+        unit='kg m^2', low=0.0, size=2)
+    joint_viscous_friction: tuple[float, ...] = parameter(
+        (0.0, 0.0), 'viscous friction of each joint', unit='N m s/rad', low=0.0, size=2)
+    joint_coulomb_friction: tuple[float, ...] = parameter(
+        (0.0, 0.0), 'Coulomb friction of each joint', unit='N m', low=0.0, size=2)
+    gravity: tuple[float, ...] = parameter(
+        (0.0, 0.0), 'gravity along x and y; (0, -9.81): the arm moves in a vertical plane', unit='m/s^2', size=2)
+    base_mass: float = parameter(
+        0.0, 'mass of a base that floats freely; 0: the base is fixed', unit='kg', low=0.0)
+    base_inertia: float = parameter(
+        0.0, 'rotary inertia of a floating base about its centre of mass', unit='kg m^2', low=0.0)
+    base_joint_offset: tuple[float, ...] = parameter(
+        (0.0, 0.0), 'place of joint 1 from the centre of mass of a floating base, in its frame', unit='m', size=2)
     sensor_position: tuple[float, ...] = parameter(
         (0.5, 0.5), "position of each bend sensor as a fraction of its link's length (the ends do not bend)",
         low=1e-6, high=0.999999, size=2)
@@ -53,3 +71,9 @@ class ArmParameters:
 
     def __post_init__(self) -> None:
         check_all(self)
+        if self.base_mass and not self.base_inertia:
+            raise ParameterError(f"parameter 'base_mass' is {self.base_mass} kg, but 'base_inertia' is 0",
+                                 'give the inertia of the floating base, or base_mass 0 for a fixed one')
+        if self.base_mass and any(self.gravity):
+            raise ParameterError("parameters 'base_mass' and 'gravity' are both set",
+                                 'a base that floats falls freely: leave gravity out')

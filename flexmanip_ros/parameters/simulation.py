@@ -58,11 +58,8 @@ class PlantParameters:
         REFERENCE_ANGLES, 'chord angles theta at the start', unit='rad', size=2)
     model: str = parameter(
         'nonlinear', 'nonlinear: assumed modes; linear: the same, linearized at the initial angles, without shortening '
-        'and slope correction (the paper); finite_element: Hermite beams at the initial angles',
+        '(the paper); finite_element: Hermite beams at the initial angles',
         choices=('nonlinear', 'linear', 'finite_element'))
-    tail_modes: int = parameter(
-        0, 'number of further modes of each link that vibrate without acting back on the arm (model nonlinear with '
-        'arm.slope_correction); they make encoder angles and rates right at small kappa', low=0, high=20)
     elements: int = parameter(10, 'number of finite elements of each link (model finite_element)', low=2, high=60)
     locked: bool = parameter(False, 'hold both joints at their initial angles (encoder angles, or chords)')
     substeps: int = parameter(

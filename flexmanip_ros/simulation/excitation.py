@@ -139,7 +139,7 @@ def _run(state: simulator.PlantState, x: Array, payload: Array, efforts: Array) 
     """Run the plant from x; return the state at the end and the eight signals (N, 8)."""
     x = x.copy()
     signals = np.empty((len(efforts), 4)), np.empty((len(efforts), 4))
-    good = state.model.advance(x, payload, state.memory.copy(), np.ascontiguousarray(efforts), *signals)
+    good = state.model.advance(x, payload, np.ascontiguousarray(efforts), *signals)
     if good < len(efforts):
         raise ModelError('the arm diverges under this torque', 'lower the amplitude')
     return x, np.hstack(signals)

@@ -122,8 +122,13 @@ def chain(arm: ArmParameters, theta: tuple[float, ...], elements: int) -> Chain:
     for i, (T, link) in enumerate(zip((T1, T2), beams, strict=True)):
         x = arm.sensor_position[i] * link.length
         bends.append(link.at(x) @ T - T[0] - x * chords[i])
+    B = (encoders if arm.torque_convention == 'joint' else chords).T
+    for rotor, viscous, row, torque in zip(
+            arm.rotor_inertia, arm.joint_viscous_friction, encoders, B.T, strict=True):
+        M += rotor * np.outer(row, row)
+        D += viscous * np.outer(torque, torque)
     return Chain(
-        M=M, D=D, K=K, B=(encoders if arm.torque_convention == 'joint' else chords).T,
+        M=M, D=D, K=K, B=B,
         C=np.vstack([encoders if arm.angle_convention == 'encoder' else chords, *bends]),
         tip=np.stack([along, T2[-2], slopes['tip2']]))
 
@@ -139,10 +144,6 @@ def finite_element_model(config: PlantParameters) -> LinearModel:
     e2 = np.array([np.cos(theta[1]), np.sin(theta[1])])
     turn = np.array([e2, [-e2[1], e2[0]]]).T  # e2, n2 as columns
 
-    def tip(com: tuple[float, float]) -> Array:
-        motion = parts.tip[:2] + np.outer([-com[1], com[0]], parts.tip[2])
-        return np.vstack([turn @ motion, parts.tip[2]])
-
     return LinearModel(
-        M0=parts.M, D=parts.D, K=parts.K, B=parts.B, C=parts.C, rest_output=rest,
-        dt=1.0 / config.rate, tip=tip, locked=config.locked)
+        M0=parts.M, D=parts.D, K=parts.K, B=parts.B, C=parts.C, rest_output=rest, dt=1.0 / config.rate,
+        tip=np.vstack([turn @ parts.tip[:2], parts.tip[2]]), turn=theta[1], locked=config.locked)

@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexmanip_ros.arm.equations_of_motion import acceleration, hold
-from flexmanip_ros.arm.outputs import end_loads, measure, shake
 from flexmanip_ros.numerics.compiled import kernel
 
 if TYPE_CHECKING:
     from flexmanip_ros.arm.manipulator import Manipulator, Workspace
-    from flexmanip_ros.arm.outputs import Slopes
     from flexmanip_ros.types import Array
 
 LIMIT = 1e6
@@ -57,31 +55,25 @@ def runge_kutta(
 
 @kernel
 def run_nonlinear(
-    arm: Manipulator, payload: Array, slopes: Slopes, held: Array, x: Array, memory: Array,
-    efforts: Array, dt: float, steps: int, position: Array, velocity: Array, scratch: Array,
-    work: Workspace,
+    arm: Manipulator, payload: Array, held: Array, x: Array, efforts: Array, dt: float, steps: int,
+    position: Array, velocity: Array, scratch: Array, work: Workspace,
 ) -> int:
     """Record each sample, then integrate to the next under its torque; return how many samples are good.
 
-    x (2n,) and memory (7 + 2 T,), see ``output_kernel.measure``, are advanced in place. efforts: (N, 2);
-    position, velocity: (N, 4) filled; scratch: (6, 2n).
+    x (2n,) is advanced in place. efforts: (N, L); position, velocity: (N, 2 L) filled; scratch: (6, 2n).
     """
     n = x.size // 2
     count: int = efforts.shape[0]
-    qdd, before = scratch[0, :n], scratch[5, :7]
     for k in range(count):
-        measure(arm, slopes, x[:n], x[n:], memory, position[k], velocity[k])
-        if slopes.active and slopes.step.shape[0]:
-            if not acceleration(arm, payload, x[:n], x[n:], efforts[k], qdd, work):
-                return k
-            end_loads(arm, payload, slopes, x[:n], qdd, efforts[k], before)
+        for r in range(arm.output.shape[0]):
+            place, rate = 0.0, 0.0
+            for c in range(n):
+                place += arm.output[r, c] * x[c]
+                rate += arm.output[r, c] * x[n + c]
+            position[k, r] = place
+            velocity[k, r] = rate
         if not runge_kutta(arm, payload, held, x, efforts[k], dt / steps, steps, scratch, work):
             return k
-        if slopes.active:
-            if not acceleration(arm, payload, x[:n], x[n:], efforts[k], qdd, work):
-                return k
-            end_loads(arm, payload, slopes, x[:n], qdd, efforts[k], memory)
-            shake(slopes, before, memory)
     return count
 
 
@@ -92,13 +84,13 @@ def run_linear(
 ) -> int:
     """Record and step x = [dq; dq'] by x = A x + B u; outputs rest + C dq and C dq'. See run_nonlinear.
 
-    A: (2n, 2n), B: (2n, 2), C: (4, n), rest: (4,), scratch: (6, 2n).
+    A: (2n, 2n), B: (2n, L), C: (2 L, n), rest: (2 L,), scratch: (6, 2n).
     """
     size = x.size
     n = size // 2
     count: int = efforts.shape[0]
     for k in range(count):
-        for r in range(4):
+        for r in range(C.shape[0]):
             place, rate = rest[r], 0.0
             for c in range(n):
                 place += C[r, c] * x[c]
@@ -106,7 +98,9 @@ def run_linear(
             position[k, r] = place
             velocity[k, r] = rate
         for r in range(size):
-            value = B[r, 0] * efforts[k, 0] + B[r, 1] * efforts[k, 1]
+            value = 0.0
+            for i in range(efforts.shape[1]):
+                value += B[r, i] * efforts[k, i]
             for c in range(size):
                 value += A[r, c] * x[c]
             scratch[0, r] = value
@@ -119,4 +113,4 @@ def run_linear(
 
 def scratch(size: int) -> Array:
     """Scratch rows for a state of the given size 2n."""
-    return np.zeros((6, max(size, 7)))
+    return np.zeros((6, size))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.arm.capture import Body, free_object, joined, rates_after
+from flexmanip_ros.arm.capture import Body, free_object, rates_after
 from flexmanip_ros.errors import ModelError, SignalError
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, SensorParameters
 from flexmanip_ros.simulation import models, sensors, waveforms
@@ -36,8 +36,6 @@ class PlantState:
     """(2n,) coordinates and rates."""
     payload: Array
     """(4,) what the arm holds, see ``manipulator.payload_array``."""
-    memory: Array
-    """What the model's outputs remember beside x."""
     noise_std: Array
     """(8,) of the positions, then the rates."""
     noise_block: Array
@@ -73,7 +71,7 @@ def init(config: PlantParameters, start_ns: int = 0, noise_std: Array | None = N
     """
     model = models.build(config)
     return PlantState(
-        model=model, start_ns=start_ns, index=0, x=model.rest(), payload=np.zeros(4), memory=model.memory(),
+        model=model, start_ns=start_ns, index=0, x=model.rest(), payload=np.zeros(4),
         noise_std=_levels(config) if noise_std is None else np.array(noise_std, dtype=np.float64),
         noise_block=sensors.block(config.seed, 0), noise_number=0, gauges=np.zeros((2, 2)),
         commands=np.zeros((config.actuators.command_delay, 2)),
@@ -187,27 +185,27 @@ def _advance(
     queue = np.concatenate([state.commands, sensors.saturated(config, efforts)])
     applied = np.ascontiguousarray(queue[:count])
     reported = np.concatenate([state.reported, applied])
-    x, memory, gauges = state.x.copy(), state.memory.copy(), state.gauges.copy()
+    x, gauges = state.x.copy(), state.gauges.copy()
     position, velocity = np.empty((count, 4)), np.empty((count, 4))
-    good = state.model.advance(x, state.payload, memory, applied, position, velocity)
+    good = state.model.advance(x, state.payload, applied, position, velocity)
     if good < count:
         raise ModelError(
             f'the simulation diverged {(state.index + good) / config.rate:.3f} s after its start',
             'lower the torque, raise the stiffness or the rate, or reset the plant')
     sensors.gauge(config, position, velocity, gauges)
-    after = replace(state, index=state.index + count, x=x, memory=memory, gauges=gauges,
+    after = replace(state, index=state.index + count, x=x, gauges=gauges,
                     commands=queue[count:], reported=reported[count:])
     return after, position, velocity, reported[:count]
 
 
 def _take(config: PlantParameters, state: PlantState, body: Body) -> PlantState:
-    x, memory = state.x.copy(), state.memory
+    x, model = state.x.copy(), state.model
     n = x.size // 2
     if config.capture_impact == 'momentum' and (body.mass or body.inertia):
-        M = state.model.mass_matrix(x, state.payload)
-        x[n:] = rates_after(M, state.model.body_jacobian(x, body.com), x[n:], body, state.model.held)
-        memory = state.model.struck(x, memory, x[n:] - state.x[n:])
-    return replace(state, x=x, memory=memory, payload=joined(state.payload, body))
+        x[n:] = rates_after(
+            model.mass_matrix(x, state.payload), model.body_jacobian(x, state.payload, body.com), x[n:], body,
+            model.floating_mass(state.payload), model.held)
+    return replace(state, x=x, payload=state.payload + body.payload)
 
 
 def _levels(config: PlantParameters) -> Array:

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexmanip_ros.arm import capture, dynamics
+from flexmanip_ros.arm import dynamics
+from flexmanip_ros.arm.manipulator import payload_array
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import Array
 
-CONFIG = PlantParameters(noise='none', arm=ArmParameters(modes=2))
+CONFIG = PlantParameters(noise='none', arm=ArmParameters(modes=1))
 BODY = replace(CONFIG, payload_inertia=3.0, payload_com=(0.3, -0.2), object_velocity=(0.2, -0.1),
                object_spin=0.3)
 WAVES = excitation.sequence(ExcitationParameters(), 400)
@@ -36,7 +37,7 @@ def test_momentum_is_conserved_at_the_capture(config: PlantParameters, model: st
     config = replace(config, model=model)
     before = moving(config)
     after = simulator.attach(config, before)
-    J = before.model.body_jacobian(before.x, config.payload_com)
+    J = before.model.body_jacobian(before.x, before.payload, config.payload_com)
     own = J.T @ np.array([
         *(config.payload_mass * np.array(config.object_velocity)),
         config.payload_inertia * config.object_spin])
@@ -63,7 +64,8 @@ def position_of(state: simulator.PlantState, com: tuple[float, float]) -> Array:
     arm = state.model.arm
     k = arm.kappa
     q = state.x[:state.x.size // 2]
-    reach = [arm.length[i] - arm.tip_stretch[i] @ q[2 + i * k:2 + (i + 1) * k] ** 2 / 2 for i in range(2)]
+    bends = [q[2 + i * k:2 + (i + 1) * k] for i in range(2)]
+    reach = [arm.length[i] - bends[i] @ arm.tip_shortening[i] @ bends[i] / 2 for i in range(2)]
     heading = q[1] + arm.tip_slope[1] @ q[2 + k:]
     unit = [np.array([np.cos(a), np.sin(a)]) for a in (*q[:2], heading)]
     left = np.array([-unit[2][1], unit[2][0]])
@@ -73,7 +75,7 @@ def position_of(state: simulator.PlantState, com: tuple[float, float]) -> Array:
 def test_the_tip_jacobian_is_the_derivative_of_the_tip() -> None:
     state = moving(CONFIG)
     com = (0.3, -0.2)
-    J = state.model.body_jacobian(state.x, com)
+    J = state.model.body_jacobian(state.x, state.payload, com)
     half = state.x.size // 2
     for c in range(half):
         step = np.zeros(state.x.size)
@@ -90,7 +92,7 @@ def test_energy_is_lost_unless_the_object_moves_with_the_tip() -> None:
     after = simulator.attach(CONFIG, before)
     lost = energy - dynamics.energy(arm, after.payload, after.x[:half], after.x[half:])
     assert lost > 0
-    vx, vy, spin = before.model.body_jacobian(before.x, (0.0, 0.0)) @ before.x[half:]
+    vx, vy, spin = before.model.body_jacobian(before.x, before.payload, (0.0, 0.0)) @ before.x[half:]
     matched = replace(CONFIG, object_velocity=(vx, vy), object_spin=spin)
     gentle = simulator.attach(matched, before)
     assert gentle.x == pytest.approx(before.x, abs=1e-12)
@@ -114,11 +116,11 @@ def test_release_keeps_the_rates_and_empties_the_hand() -> None:
 def test_two_captures_make_one_body() -> None:
     state = simulator.attach(CONFIG, moving(CONFIG))
     state = simulator.attach(replace(CONFIG, payload_mass=10.0, payload_com=(0.3, 0.0)), state)
-    assert state.payload == pytest.approx([30.0, 20.0 * 0.1**2 + 10.0 * 0.2**2, 0.1, 0.0])
+    spread = 20.0 * 0.1**2 + 10.0 * 0.2**2
+    assert state.payload == pytest.approx(payload_array(30.0, spread, (0.1, 0.0)))
     # the same mass matrix as two separate bodies have
-    q = state.x[:state.x.size // 2]
-    J = capture.body_jacobian(state.model.arm, q, (0.3, 0.0))
-    M = state.model.mass_matrix(state.x, np.array([20.0, 0.0, 0.0, 0.0])) + 10.0 * J[:2].T @ J[:2]
+    J = state.model.body_jacobian(state.x, state.payload, (0.3, 0.0))
+    M = state.model.mass_matrix(state.x, payload_array(20.0)) + 10.0 * J[:2].T @ J[:2]
     assert state.model.mass_matrix(state.x, state.payload) == pytest.approx(M, rel=1e-12, abs=1e-10)
 
 
@@ -143,5 +145,51 @@ def test_a_soft_gripper_ends_with_the_whole_object() -> None:
         state, _ = simulator.step(config, state, np.zeros(2))
         masses.append(state.payload[0])
     assert masses[:50] == pytest.approx(np.arange(1, 51) * 0.4)
-    assert state.payload == pytest.approx([20.0, 3.0, 0.3, -0.2])
+    assert state.payload == pytest.approx(payload_array(20.0, 3.0, (0.3, -0.2)))
     assert masses[50:] == pytest.approx([20.0] * 10)
+
+
+def test_a_floating_base_keeps_the_angular_momentum_when_a_spinning_body_is_caught() -> None:
+    """About the centre of mass of base and arm before: J of a rigid turn is the place of the body from there."""
+    arm = ArmParameters(modes=1, base_mass=500.0, base_inertia=150.0, base_joint_offset=(0.4, -0.3))
+    config = replace(BODY, arm=arm)
+    before = moving(config)
+    after = simulator.attach(config, before)
+    turn = np.zeros(before.x.size // 2)
+    turn[[0, 1, -1]] = 1.0
+    J = before.model.body_jacobian(before.x, before.payload, config.payload_com)
+    place = np.array([(J @ turn)[1], -(J @ turn)[0]])
+    m, v = config.payload_mass, np.array(config.object_velocity)
+    own = m * (place[0] * v[1] - place[1] * v[0])
+    together = before.model.floating_mass(before.payload) + m  # whose centre of mass is at m place / together
+    expected = turn @ momentum(before) + own + config.payload_inertia * config.object_spin
+    assert turn @ momentum(after) + m / together * own == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize('arm', [
+    ArmParameters(modes=1, base_mass=500.0, base_inertia=150.0, base_joint_offset=(0.4, -0.3)),
+    ArmParameters(modes=1, rotor_inertia=(0.5, 0.3))], ids=['floating base', 'rotors'])
+def test_energy_stays_with_rotors_and_a_floating_base_and_friction_takes_it(arm: ArmParameters) -> None:
+    def energies(arm: ArmParameters) -> Array:
+        config = replace(CONFIG, arm=arm, substeps=20)
+        state = simulator.attach(config, moving(config))
+        half, found = state.x.size // 2, []
+        for _ in range(300):
+            state, _ = simulator.step(config, state, np.zeros(2))
+            found.append(dynamics.energy(state.model.arm, state.payload, state.x[:half], state.x[half:]))
+        return np.array(found)
+
+    free = energies(arm)
+    assert free == pytest.approx(np.full(300, free[0]), rel=1e-6)
+    rubbed = energies(replace(arm, joint_viscous_friction=(0.5, 0.5), joint_coulomb_friction=(0.2, 0.1)))
+    assert np.all(np.diff(rubbed) < 0.0)
+
+
+def test_a_pendulum_under_gravity_swings_about_the_vertical() -> None:
+    """The arm hangs straight down at rest; turned a little, it falls back."""
+    arm = ArmParameters(modes=1, gravity=(0.0, -9.81))
+    hanging = replace(CONFIG, arm=arm, initial_angles=(-np.pi / 2, -np.pi / 2))
+    still = simulator.simulate(hanging, np.zeros((200, 2)))
+    assert np.abs(still.velocity).max() < 1e-9
+    aside = replace(hanging, initial_angles=(-np.pi / 2 + 0.1, -np.pi / 2 + 0.1))
+    assert simulator.simulate(aside, np.zeros((200, 2))).velocity[-1, 0] < -0.05

@@ -22,7 +22,7 @@ def test_equations_of_motion_follow_from_the_lagrangian(
         link_length=(3.0, 2.0), linear_density=(5.0, 4.0), bending_stiffness=(5000.0, 3000.0),
         hub_inertia=(1.0, 2.0), joint_inertia=0.5, tip_inertia=0.3, shortening=shortening)
     derived = lagrangian.forces(parameters, kappa, body)
-    arm = manipulator.manipulator(parameters, kappa)
+    arm = manipulator.manipulator(parameters, kappa, points=40)
     payload = manipulator.payload_array(body[0], body[1], body[2:])
     rng = np.random.default_rng(kappa)
     for _ in range(3):

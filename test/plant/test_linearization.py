@@ -48,7 +48,8 @@ def test_vibration_model_eliminates_the_chords() -> None:
 @pytest.mark.parametrize('model', ['stiffness', 'modal'])
 def test_damping_ratio_is_that_of_the_first_pinned_mode(model: str) -> None:
     arm = ArmParameters(damping_ratio=0.02, damping_model=model)
-    D, K = manipulator.damping(arm, 3), manipulator.stiffness(arm, 3)
+    constants = manipulator.manipulator(arm, 3)
+    D, K = constants.damping[2:], constants.stiffness[2:]
     mass = np.repeat(np.array(arm.linear_density) * np.array(arm.link_length) / 2, 3)
     ratios = D / (2 * np.sqrt(K * mass))
     growth = np.array([1, 4, 9]) if model == 'stiffness' else np.ones(3)
@@ -78,3 +79,21 @@ def test_bad_input_is_named(theta: tuple[float, ...], payload: float, kappa: int
 def test_a_sample_time_of_zero_is_refused() -> None:
     with pytest.raises(ModelError, match='sample time'):
         linearization.discretize(np.zeros((2, 2)), np.zeros((2, 1)), 0.0)
+
+
+@pytest.mark.parametrize('inertia', [0.0, 2.0])
+def test_the_default_shape_functions_are_converged(inertia: float) -> None:
+    """Torque to encoder at 1, 3 and 10 Hz, and two frequencies, against nine sines and the static shapes a link."""
+    payload = manipulator.payload_array(20.0, inertia)
+    q, found = np.radians([60.0, 45.0]), []
+    for modes in (ArmParameters().modes, 9):
+        arm = manipulator.manipulator(ArmParameters(modes=modes))
+        M = dynamics.mass_matrix(arm, payload, np.append(q, np.zeros(2 * arm.kappa)))
+        K = np.diag(arm.stiffness)
+        response = [arm.output[:2] @ np.linalg.solve(K - (2 * np.pi * f) ** 2 * M, arm.torque)
+                    for f in (1.0, 3.0, 10.0)]
+        squares = np.sort(np.linalg.eigvals(np.linalg.solve(M, K)).real)
+        found.append((np.array(response), np.sqrt(squares[2:4])))
+    (ours, frequencies), (converged, exact) = found
+    assert ours == pytest.approx(converged, rel=3e-3)
+    assert frequencies == pytest.approx(exact, rel=5e-5)

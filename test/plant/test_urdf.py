@@ -14,7 +14,7 @@ from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
-ARM = ArmParameters(modes=1, sensor_position=(0.5, 0.4), shortening=False, slope_correction=False)
+ARM = ArmParameters(shape_functions='sines', modes=1, sensor_position=(0.5, 0.4), shortening=False)
 ROBOT = pytest.importorskip('urdf_parser_py.urdf').URDF.from_xml_string(urdf(ARM).encode())
 JOINTS = {joint.name: joint for joint in ROBOT.joints}
 NAMED = {'joint1', 'joint2', 'link1_bend', 'link2_bend'}

@@ -10,7 +10,7 @@ from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
-PARAMETERS = ArmParameters(modes=2, damping_ratio=0.01, hub_inertia=(0.3, 0.2))
+PARAMETERS = ArmParameters(shape_functions='sines', modes=2, damping_ratio=0.01, hub_inertia=(0.3, 0.2))
 ARM = manipulator.manipulator(PARAMETERS)
 PAYLOAD = manipulator.payload_array(20.0, 0.5, (0.1, 0.2))
 TAU = np.array([30.0, -20.0])
