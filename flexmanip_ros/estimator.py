@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,9 +13,7 @@ from flexmanip_ros.identification.factor import FILLED, REJECTED
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.numerics.background import Background
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload import block_extraction, frequency, model_check, structured
-from flexmanip_ros.payload.block_extraction import NOWHERE
-from flexmanip_ros.payload.model_check import Verdict
+from flexmanip_ros.payload import block_extraction, frequency, structured
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, Payload, Status
 
@@ -28,8 +25,6 @@ class PayloadEstimator(NamedTuple):
 
     structured: structured.StructuredState | None
     """None where the payload is read out of the model, or not at all."""
-    configuration_range: Array = NOWHERE
-    """What the configuration went through since the last event, see ``model_check.extend_range``."""
     since_ns: int = 0
     """Stamp of the last event; 0 before the first."""
 
@@ -41,15 +36,12 @@ class PayloadEstimator(NamedTuple):
         """Take the next rows of the log. One call with N rows gives the bits of N calls with one."""
         if self.structured is None:
             return self
-        held, turned = structured.advance(config, self.structured, rows), self.configuration_range
-        if held.model is not None:
-            turned = model_check.extend_range(turned, rows, config.arm.angle_convention == 'encoder')
-        return PayloadEstimator(held, turned, self.since_ns)
+        return self._replace(structured=structured.advance(config, self.structured, rows))
 
     def event(self, config: IdentifierParameters, event: CaptureEvent, background: Background) -> PayloadEstimator:
         """The arm caught or let go of something before the next row."""
         held = self.structured if self.structured is None else structured.event(config, self.structured, event)
-        return PayloadEstimator(held, NOWHERE, event.stamp_ns)
+        return PayloadEstimator(held, event.stamp_ns)
 
     def restart(self, config: IdentifierParameters, events: Sequence[CaptureEvent]) -> PayloadEstimator:
         """Begin again, after events from before every sample."""
@@ -99,21 +91,14 @@ def init(config: IdentifierParameters) -> tuple[PayloadEstimator, ModelEstimator
     return PayloadEstimator(structured.init(config) if wanted else None), ModelEstimator(rpbsid.init(config))
 
 
-def payload(config: IdentifierParameters, state: PayloadEstimator, verdicts: tuple[Verdict, ...] = ()
-            ) -> Payload | None:
-    """Return the payload where it does not rest on the model; else None. verdicts: of models read before."""
-    if state.structured is None:
-        return None
-    return model_check.apply(state.structured, structured.estimate(config, state.structured), verdicts,
-                             state.since_ns)
+def payload(config: IdentifierParameters, state: PayloadEstimator) -> Payload | None:
+    """Return the payload where it does not rest on the model; else None."""
+    return None if state.structured is None else structured.estimate(config, state.structured)
 
 
 @dataclass(frozen=True, eq=False)
 class ModelRequest:
-    """A model to be read out of the identifier; ``background.Request``.
-
-    compare: see what the model says of a payload that does not rest on it.
-    """
+    """A model to be read out of the identifier; ``background.Request``."""
 
     config: IdentifierParameters
     identifier: ModelEstimator
@@ -121,30 +106,22 @@ class ModelRequest:
     stamp_ns: int
     dt: float
     payload: Payload | None
-    compare: bool
 
-    def solve(self) -> tuple[Estimate, Verdict | None]:
-        """Return the estimate with model and modes, and the verdict on the payload."""
+    def solve(self) -> Estimate:
+        """Return the estimate with model and modes."""
         config, identifier, payload = self.config, self.identifier, self.payload
-        held, since_ns = self.estimator.structured, self.estimator.since_ns
         found, without = _identified(config, identifier.rpbsid, self.dt)
         if config.payload_method == 'block' and found is not None:
             payload = block_extraction.estimate(config, found, identifier.angles, identifier.configuration_range)
         if found is None:
-            return Estimate(self.stamp_ns, without, None, (), payload, model_status=without), None
+            return Estimate(self.stamp_ns, without, None, (), payload, model_status=without)
         oscillations = modes(found)
         if config.payload_method == 'frequency':
             payload = frequency.estimate(config, oscillations, identifier.angles, identifier.configuration_range)
-        verdict = None
-        if self.compare and held is not None:
-            alone = structured.estimate(config, held)
-            verdict = model_check.check(config, held, alone, self.estimator.configuration_range, found,
-                                        oscillations, self.stamp_ns, since_ns)
         return Estimate(
             self.stamp_ns, _overall(config, found.status, payload), found.model, oscillations, payload,
             excitation=found.excitation, condition=found.condition, singular_values=found.singular_values,
-            innovation_power=found.innovation_power, model_status=found.status,
-            modes_deviation=math.nan if verdict is None else verdict.deviation), verdict
+            innovation_power=found.innovation_power, model_status=found.status)
 
 
 def with_model_of(config: IdentifierParameters, stamp_ns: int, last: Estimate, payload: Payload | None

@@ -21,6 +21,7 @@ MODES = 'modes'
 PAYLOAD_MASS = 'payload_mass'
 PAYLOAD_ESTIMATE = 'payload_estimate'
 PAYLOAD = 'payload'
+PAYLOAD_BODY = 'payload_body'
 STATUS = 'status'
 ROWS = re.compile(r'^rows: state=(\d+) output=(\d+) dt=(\S+)$')
 COLUMNS = re.compile(r'^columns: state=(\d+) input=(\d+) innovation=(\d+)$')
@@ -117,6 +118,13 @@ def payload_row(payload: Payload) -> LabelledArray:
     return LabelledArray((Dimension('mass std lower95 upper95 consistency', 5, 5),), values)
 
 
+def payload_body(payload: Payload) -> LabelledArray:
+    """Return (5, 4): mass [kg], centre of mass x, y [m] and inertia about it [kg m^2]; then their covariance."""
+    first = np.array([payload.mass, payload.com[0], payload.com[1], payload.inertia[5]])
+    return _matrix('value covariance_mass covariance_com_x covariance_com_y covariance_izz', 'mass com_x com_y izz',
+                   np.vstack([first, np.array(payload.covariance).reshape(4, 4)]))
+
+
 def inertia(payload: Payload, stamp_ns: int, frame_id: str) -> Inertia:
     """Return the payload as a robot driver takes it."""
     return Inertia(stamp_ns, frame_id, payload.mass, payload.com, payload.inertia)
@@ -174,6 +182,8 @@ def outgoing_payload(payload: Payload | None, stamp_ns: int, frame_id: str) -> I
     if all(map(math.isfinite, (payload.std, *payload.com, *payload.inertia))):
         yield PAYLOAD, inertia(payload, stamp_ns, frame_id)
     yield PAYLOAD_ESTIMATE, payload_row(payload)
+    if payload.covariance and all(map(math.isfinite, (*payload.covariance, *payload.com, *payload.inertia))):
+        yield PAYLOAD_BODY, payload_body(payload)
     if math.isfinite(payload.std):
         yield PAYLOAD_MASS, payload.mass
     yield STATUS, payload_status(payload, stamp_ns, frame_id)

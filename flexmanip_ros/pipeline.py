@@ -20,8 +20,6 @@ from flexmanip_ros.event_replay import EventReplay
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.numerics.background import INLINE, Background
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload import model_check
-from flexmanip_ros.payload.model_check import Verdict
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import SampleLog
 from flexmanip_ros.samples.sampling import Clock, Counters
@@ -77,8 +75,6 @@ class State(NamedTuple):
     """Number of the last instant of ``publish_rate``, counted from the first stamp."""
     pending: PendingModel | None = None
     model: ModelEstimate | None = None
-    verdicts: tuple[Verdict, ...] = ()
-    """What models so far say of the payloads that follow."""
     keep_log: bool = False
     """Keep every row of the log, for reports and scores."""
 
@@ -224,10 +220,9 @@ def current(state: State) -> Estimate | None:
     if payload.cursor == 0:
         return None
     model = identifier.estimator._replace(rpbsid=rpbsid.finish(config, identifier.estimator.rpbsid))
-    request = estimator.ModelRequest(config, model, payload.estimator, payload.last_ns, state.clock.dt, None,
-                                     compare=True)
-    estimate, verdict = request.solve()
-    held = estimator.payload(config, payload.estimator, _remember(state, verdict))
+    request = estimator.ModelRequest(config, model, payload.estimator, payload.last_ns, state.clock.dt, None)
+    estimate = request.solve()
+    held = estimator.payload(config, payload.estimator)
     if estimate.model is None:
         return estimate._replace(payload=held)
     return estimator.with_model_of(config, payload.last_ns, estimate, held)._replace(model_is_new=True)
@@ -333,14 +328,13 @@ def _estimate(state: State, background: Background) -> tuple[State, list[Estimat
     """Return the estimate due at the last row taken, and ask for its model when that is due.
 
     A model is due by ``model_rate``, and with every estimate for as long after an event as another may arrive
-    late: so any order of arrival reads models at the same stamps. Meanwhile it is not compared with the payload,
-    as the result would depend on when the event arrived.
+    late: so any order of arrival reads models at the same stamps.
     """
     config, now, last = state.config, state.payload, state.model
     assert config is not None
     assert now is not None
     stamp_ns, since_ns = now.last_ns, now.estimator.since_ns
-    payload = estimator.payload(config, now.estimator, state.verdicts)
+    payload = estimator.payload(config, now.estimator)
     state = state._replace(published=_instant(state, stamp_ns, config.publish_rate))
     settling_ns = (2.0 * config.rewind_time + 1.0 / config.publish_rate) * 1e9
     young = stamp_ns - max(state.first_ns, since_ns) <= settling_ns
@@ -350,7 +344,7 @@ def _estimate(state: State, background: Background) -> tuple[State, list[Estimat
     state = _advance_identifier(state, now.cursor, background)
     assert state.identifier is not None
     request = estimator.ModelRequest(config, state.identifier.estimator, now.estimator, stamp_ns, state.clock.dt,
-                                     payload, compare=not young)
+                                     payload)
     background.start(request)
     due = now.cursor - 1 + int(np.ceil(RESULT_DELAY_S / max(state.clock.dt, 1e-9)))
     state = state._replace(pending=PendingModel(request, since_ns, instant, due))
@@ -362,16 +356,12 @@ def _estimate(state: State, background: Background) -> tuple[State, list[Estimat
 
 
 def _take_model(state: State, background: Background) -> tuple[State, list[Estimate]]:
-    """Take the model under way, if there is one; what it says of the payload counts from the next estimate on."""
+    """Take the model under way, if there is one."""
     pending = state.pending
     if pending is None:
         return state, []
-    estimate, verdict = background.result(pending.request)
+    estimate = background.result(pending.request)
     model = None if estimate.model is None else ModelEstimate(estimate, pending.since_ns, pending.instant)
-    state = state._replace(pending=None, model=model, verdicts=_remember(state, verdict))
+    state = state._replace(pending=None, model=model)
     return state, [estimate._replace(payload_is_new=pending.request.payload is None)]
 
-
-def _remember(state: State, verdict: Verdict | None) -> tuple[Verdict, ...]:
-    assert state.config is not None
-    return model_check.remember(state.verdicts, verdict, int(2e9 * state.config.rewind_time))

@@ -120,7 +120,8 @@ class Payload(NamedTuple):
 
     mass, std, lower, upper: [kg], the last two a 95 % interval; consistency: normalised residual
     power (1 = noise only); com: (3,) [m] and inertia: (6,) ixx ixy ixz iyy iyz izz [kg m^2] about
-    the centre of mass, in the frame of the tip.
+    the centre of mass, in the frame of the tip; covariance: (16,) row by row of mass, com x, com y and izz, empty where
+    the object is no body.
     """
 
     mass: float
@@ -131,6 +132,7 @@ class Payload(NamedTuple):
     status: Status
     com: tuple[float, float, float] = (0.0, 0.0, 0.0)
     inertia: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    covariance: tuple[float, ...] = ()
 
 
 class Estimate(NamedTuple):
@@ -155,6 +157,3 @@ class Estimate(NamedTuple):
     """Whether model and modes were read at this stamp, or are those of an estimate before."""
     payload_is_new: bool = True
     """Whether the payload has not been in an estimate of this stamp before."""
-    modes_deviation: float = float('nan')
-    """How far the model's modes are from those of the arm with this payload, over what is tolerated: beyond 1
-    they disagree; nan where there was nothing to compare."""

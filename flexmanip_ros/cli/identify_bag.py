@@ -104,9 +104,6 @@ def describe(result: Result) -> list[str]:
     for k, mode in enumerate(result.modes):
         spread = f' +- {1.96 * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else ''
         lines.append(f'mode {k + 1}       {mode.frequency_hz:.4f}{spread} Hz, damping ratio {mode.damping_ratio:.4f}')
-    if summary.modes_deviation > 1.0:
-        lines.append('             these modes are not those of the arm with this payload: they deviate '
-                     f'{summary.modes_deviation:.1f} times as much as is tolerated; check the parameters arm.*')
     if summary.payload_ci95_kg is not None:
         lines.append(f'payload      {summary.payload_text()}')
         if summary.consistency is not None and summary.payload_std_kg is not None:

@@ -12,6 +12,11 @@ FIELDS = ('position', 'velocity', 'effort')
 """Arrays of a JointState that a signal NAME/FIELD may name."""
 
 
+LEARNABLE = ('stiffness', 'damping', 'viscous_friction', 'coulomb_friction', 'rotor_inertia', 'torque_gain',
+             'bend_gain', 'bend_offset', 'mode_stiffness')
+"""What the empty arm can teach."""
+
+
 @dataclass(frozen=True)
 class PayloadParameters:
     """What is known beforehand of the arm and of the object; group ``payload`` of the identifier."""
@@ -33,8 +38,11 @@ class PayloadParameters:
     model_error: float = parameter(
         0.003, "relative error of the arm's inertia that widens the interval where a sensor shows more than its noise; "
         'half of it where the arm shows modes beyond kappa', low=0.0, high=1.0)
-    rotary_inertia: bool = parameter(
-        False, "method structured: estimate the object's rotary inertia too, where the signals determine it")
+    object: str = parameter(
+        'body', 'method structured: point, the object is a mass at the tip; body, it has a centre of mass and an '
+        'inertia, which are estimated too', choices=('point', 'body'))
+    learn: tuple[str, ...] = parameter(
+        LEARNABLE, "method structured: what the empty arm teaches, beside the motion; [''] for nothing")
     gravity: float = parameter(
         0.0, 'gravity along -y, in the algebraic method of the paper alone (there 9.81)', unit='m/s^2', low=0.0)
     memory_time: float = parameter(
@@ -42,6 +50,10 @@ class PayloadParameters:
 
     def __post_init__(self) -> None:
         check_all(self)
+        unknown = [name for name in self.learn if name not in LEARNABLE]
+        if unknown:
+            raise ParameterError(f"parameter 'learn' names {', '.join(map(repr, unknown))}",
+                                 f"choose from {', '.join(LEARNABLE)}")
         if len(self.working_point) not in (0, 2):
             raise ParameterError(f"parameter 'working_point' has {len(self.working_point)} elements",
                                  'give two angles, or [] for the measured ones')

@@ -11,18 +11,66 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexmanip_ros.arm.linearization import Blocks, blocks, vibration_model
+from flexmanip_ros.arm.manipulator import manipulator
+from flexmanip_ros.arm.shape_functions import count
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.factor import POWER_RATE
 from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
-from flexmanip_ros.payload.arm_modes import sensor_matrix, to_modal
-from flexmanip_ros.payload.structured_model import chords
+from flexmanip_ros.payload.structured_model import Quantity, chords, signals
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Array, Payload, Status
 
 STEPS = 3
 """Of the search for the payload that would be read as the one that was."""
+
+
+def sensor_matrix(config: IdentifierParameters, kappa: int | None) -> tuple[Array, tuple[bool, ...]] | None:
+    """Return S (m, 2 k), the modal coordinates each output sees, and which outputs are rates.
+
+    The coordinates are those of the arm's own shape functions, or kappa sines a link. None when an output is no bend of
+    the arm: a joint angle has a rigid part that the blocks leave out.
+    """
+    known = signals(config)
+    if known is None or not known.torques:
+        return None
+    seen = manipulator(config.arm, kappa).output[2:, 2:]
+    rows = []
+    for role in known.outputs:
+        if role.quantity not in (Quantity.BEND, Quantity.BEND_RATE):
+            return None
+        rows.append(seen[role.link, :2 * manipulator(config.arm, kappa).kappa])
+    return np.array(rows).reshape(len(rows), -1), tuple(
+        role.quantity is Quantity.BEND_RATE for role in known.outputs)
+
+
+def to_modal(Ac: Array, Bc: Array, C: Array, S: Array, rates: tuple[bool, ...]) -> tuple[Array, Array]:
+    """Return (Ac, Bc) with the state [eta; eta'] from continuous models in any basis.
+
+    Ac: (..., n, n), Bc: (..., n, r), C: (..., m, n), S: (m, n / 2). A displacement without its rate among the
+    outputs is completed by C Ac, in continuous time, where that is known to read the rates (a discrete
+    C A is not: it depends on the payload). Raises numpy.linalg.LinAlgError when that fixes no basis.
+    """
+    h = S.shape[1]
+    is_rate = np.array(rates, dtype=bool)
+    known = np.zeros((S.shape[0], 2 * h))
+    known[~is_rate, :h] = S[~is_rate]
+    known[is_rate, h:] = S[is_rate]
+    seen = np.broadcast_to(C, (*Ac.shape[:-2], *C.shape[-2:]))
+    alone = [row for row in np.flatnonzero(~is_rate)
+             if not any(np.allclose(S[row], S[other]) for other in np.flatnonzero(is_rate))]
+    if alone:
+        derived = np.zeros((len(alone), 2 * h))
+        derived[:, h:] = S[alone]
+        known = np.vstack([known, derived])
+        seen = np.concatenate([seen, C[..., alone, :] @ Ac], axis=-2)
+    if np.linalg.matrix_rank(known) < 2 * h:
+        raise np.linalg.LinAlgError('the outputs do not see every modal coordinate')
+    # eq. (44): seen = known T, so T = known^+ seen takes the identified state to [eta; eta']
+    T = np.linalg.pinv(known) @ seen
+    Ac_modal = np.swapaxes(np.linalg.solve(np.swapaxes(T, -1, -2), np.swapaxes(T @ Ac, -1, -2)), -1, -2)
+    return Ac_modal, T @ Bc
 
 
 def truncated(config: IdentifierParameters, theta: Array, payload: float, kappa: int
@@ -31,10 +79,10 @@ def truncated(config: IdentifierParameters, theta: Array, payload: float, kappa:
 
     theta: (2,) chord angles; payload [kg]. None where the outputs do not see the modes.
     """
-    few, all_modes = sensor_matrix(config, kappa), sensor_matrix(config, config.arm.modes)
+    few, all_modes = sensor_matrix(config, kappa), sensor_matrix(config, None)
     if few is None or all_modes is None:
         return None
-    Ac, Bc = vibration_model(replace(config.arm, damping_ratio=0.0), theta, payload, config.arm.modes)
+    Ac, Bc = vibration_model(replace(config.arm, damping_ratio=0.0), theta, payload)
     h = Ac.shape[0] // 2
     squares, shapes = np.linalg.eig(-Ac[h:, :h])
     lowest = np.argsort(squares.real)[:2 * kappa]
@@ -238,7 +286,7 @@ def _excess(config: IdentifierParameters, theta: Array, kappa: int, mass_of: Cal
             read: float) -> float:
     """Return how much of the mass that was read is none, by the modes that the model has not [kg]."""
     excess = 0.0
-    if config.arm.modes <= kappa:
+    if count(config.arm) <= kappa:
         return excess
     for _ in range(STEPS):
         payload = max(read - excess, 0.0)

@@ -112,7 +112,7 @@ def _start(config: TriggerParameters, state: DetectionState, row: Rows) -> Detec
         return state
     dt = float(np.median(np.diff(row.since(since).stamp_ns))) * 1e-9
     w = max(kernel.SHORTEST + 2, round(config.detection_window / dt))
-    n2 = 2 * state.filter.model.motion.q.size
+    n2 = 2 * state.filter.model.motion.arm.stiffness.size
     m = len(state.filter.model.roles)
     glr = kernel.GlrState(
         trace=np.zeros((w, m, kernel.CAUSES)), factors=np.zeros((w, kernel.CAUSES, kernel.CAUSES)),

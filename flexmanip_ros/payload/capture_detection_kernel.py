@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexmanip_ros.arm.equations_of_motion import solve
-from flexmanip_ros.numerics.compiled import kernel
+from flexmanip_ros.numerics.compiled import inlined, kernel
 from flexmanip_ros.numerics.square_root import factor_information, forward
-from flexmanip_ros.payload.filter_state import EFFECTIVE
+from flexmanip_ros.payload.filter_state import AGAIN, BEFORE, EFFECTIVE, HORIZON, REJECTED, STORED
 from flexmanip_ros.payload.moving_horizon import take
-from flexmanip_ros.payload.process_model import linearize, set_parameters
+from flexmanip_ros.payload.process_model import SERIES, linearize, set_parameters
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -73,24 +73,25 @@ def traces(
     dt: float,
 ) -> None:
     """Compute the traces of an onset for the present state; prior: (3,) deviations of the causes."""
-    n = motion.q.size
+    n = motion.arm.stiffness.size
     w, sensors_count = glr.trace.shape[0], glr.trace.shape[1]
-    set_parameters(motion, m.x, False)
-    # the arm counts as empty; with a constant for that, numba would compile another version of the equations
-    linearize(motion, m.x[:n], m.x[n:2 * n], effort, motion.k[7], n < 0)
+    set_parameters(motion, m.x)
+    for i in range(motion.effort.size):
+        motion.effort[i] = motion.gain[i] * effort[i]
+    linearize(motion, m.x[:n], m.x[n:2 * n], motion.k[7])
     flow, state = glr.flow, glr.state
     for i in range(2 * n):
         for c in range(2 * n):
             flow[i, c] = 0.0
         for c in range(2):
             state[0, i, c] = 0.0
-    # one sample by Taylor's series of fourth order, column by column in state[1]
+    # one sample by Taylor's series, column by column in state[1]
     for column in range(2 * n):
         for i in range(2 * n):
             state[1, i, 0] = 1.0 if i == column else 0.0
             flow[i, column] = state[1, i, 0]
         weight = 1.0
-        for order in range(1, 5):
+        for order in range(1, SERIES + 1):
             for i in range(n):
                 state[1, i, 1] = state[1, n + i, 0]
                 value = 0.0
@@ -103,10 +104,9 @@ def traces(
                 flow[i, column] += weight * state[1, i, 0]
     for c in range(2):
         for i in range(n):
-            motion.a[i] = 0.0
-        for link in range(2):
-            angle = m.x[link]
-            motion.a[link] = motion.arm.length[link] * (np.cos(angle) if c == 1 else -np.sin(angle))
+            motion.a[i] = motion.work.J[motion.arm.length.size, c, i]
+            if motion.arm.floating:
+                motion.a[i] -= motion.work.P[c, i] / motion.work.F[2]
         solve(motion.work.M, motion.a)
         for i in range(n):
             state[0, n + i, c] = motion.a[i]
@@ -221,6 +221,14 @@ def remember(glr: GlrState, fade: float) -> None:
     glr.level[2] = max(glr.level[2] * fade, old)
 
 
+@inlined
+def settled(m: FilterState) -> bool:
+    """Whether the filter has taken over a moving-horizon estimation that fits most samples since the last event."""
+    rows = m.counts[STORED]
+    return bool(rows >= HORIZON or (m.counts[AGAIN] == 0 and m.counts[REJECTED] == 0
+                                    and 2 * m.counts[BEFORE] > rows))
+
+
 @kernel
 def detect_samples(
     motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr: GlrState, prior: Array, dt: float,
@@ -238,10 +246,11 @@ def detect_samples(
             return -k - 1
         clock = glr.clock
         if clock[SINCE_TRACES] == 0:
-            traces(motion, sensors, m, glr, prior, table[k, 1:3], dt)
+            traces(motion, sensors, m, glr, prior, table[k, 1:1 + motion.effort.size], dt)
         clock[SINCE_TRACES] = (clock[SINCE_TRACES] + 1) % REFRESH
         update_glr(m, glr, scratch)
-        clock[QUIET] += 1
+        # while the moving-horizon estimation is on its way, innovations tell nothing
+        clock[QUIET] = clock[QUIET] + 1 if settled(m) else 0
         if clock[ALARMED] > 0:
             clock[ALARMED] += 1
             if clock[ALARMED] > confirm:

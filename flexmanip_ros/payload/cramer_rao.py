@@ -19,7 +19,8 @@ from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured_model
 from flexmanip_ros.payload.block_extraction import masses
-from flexmanip_ros.payload.process_model import PARAMETERS, predict
+from flexmanip_ros.payload.measurement_update import observe
+from flexmanip_ros.payload.process_model import predict
 from flexmanip_ros.payload.structured_model import build, sensors
 from flexmanip_ros.types import Array
 
@@ -94,30 +95,30 @@ def nonlinear(
     model = build(config)
     if model is None:
         raise ModelError('the configured signals cannot give a payload', 'name both torques and both angles')
-    n = model.motion.q.size
-    m = mem.memory(2 * n + model.motion.G.shape[1], len(model.roles))
+    n = model.motion.arm.stiffness.size
+    m = mem.memory(2 * n + model.motion.kind.size, len(model.roles))
     structured_model.first(config, model, m, np.zeros(len(model.roles)))
     m.x[:2] = theta
     m.x[n:n + 2] = 0.0 if rates is None else rates
-    p = m.x.size - PARAMETERS
-    m.S[2 * n:p] = 0.0  # the structure is known, of every mode
-    m.x[p] = np.log(max(payload, 1e-9) / model.motion.scale)
-    m.S[p, p] = 10.0 * structured_model.PAYLOAD_STD
-    if config.payload.rotary_inertia:
-        m.S[-1, -1] = structured_model.PAYLOAD_STD
+    p = model.payload
+    m.x[p] = payload
+    m.S[p:p + model.body, p:p + model.body] = np.diag(10.0 * structured_model.body_std(config, model)[:model.body])
     structured_model.freeze(config, model, theta)
-    seen = sensors(config, model, dt, np.zeros(m.x.size), theta)
-    information = np.zeros((m.x.size, m.x.size))
+    seen = sensors(config, model, dt, np.zeros(m.x.size))
+    information, f = np.zeros((m.x.size, m.x.size)), np.zeros(m.x.size)
     found = []
+    if len(noise_std) != len(config.outputs) + len(model.extra):
+        raise ModelError(f'there are {len(noise_std)} deviations', 'give one for each output and each further angle')
+    measured = np.asarray(noise_std)[[*model.kept, *range(len(config.outputs), len(noise_std))]]
     for k in range(max(counts)):
-        for i, deviation in enumerate(noise_std):
-            f = seen.H[i] @ m.S[n:2 * n] if seen.rate[i] else seen.H[i] @ m.S[:n]
+        for i, deviation in enumerate(measured):
+            observe(seen, i, n, m.x, m.S, f)
             information += np.outer(f, f) / deviation ** 2
-        if not predict(model.motion, m.x, m.S, efforts[k], dt, True):
+        if not predict(model.motion, m.x, m.S, efforts[k], dt):
             raise ModelError('the arm diverges under these torques', 'use smaller torques')
         if k + 1 in counts:
             spread = np.linalg.solve(np.eye(m.x.size) + information, m.S[p])
-            found.append(payload * float(np.sqrt(m.S[p] @ spread)))
+            found.append(float(np.sqrt(m.S[p] @ spread)))
     return np.array(found)
 
 

@@ -9,17 +9,20 @@ from numpy.typing import NDArray
 
 from flexmanip_ros.types import Array
 
-HORIZON = 512
-"""Samples after an event that the moving-horizon estimation reads again."""
+HORIZON = 1024
+"""Samples after an event that the moving-horizon estimation reads again, at most."""
+ENOUGH = 512
+"""It ends with so many once it has converged."""
 
 # Columns of ``noise``, one row a sensor: variance used by the filter; variance of the innovations; its slow part;
 # sum and sum of squares of the residuals in this block; least variance assumed; variance of the fourth differences
-# (white noise only); information on the payload that came from this sensor.
-EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT = range(8)
+# (white noise only); information on the payload that came from this sensor; sum of squares in this iteration.
+EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT = range(9)
 # Elements of ``counts``.
-HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN = range(11)
+(HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN, BEFORE,
+ REJECTED, AGAIN, LEARNED, REFITS) = range(16)
 # Elements of ``score``.
-MOVE, VARIANCE, DRIFT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, SHOWN, INFORMATION, ODDS = range(9)
+MOVE, VARIANCE, DRIFT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA = range(9)
 
 
 class FilterState(NamedTuple):
@@ -30,25 +33,29 @@ class FilterState(NamedTuple):
     S: Array
     """(nx, nx) square root of the covariance."""
     noise: Array
-    """(m, 8) what is known of each sensor's noise."""
+    """(m, 9) what is known of each sensor's noise."""
     recent: Array
     """(m, 4) its last measurements."""
     counts: NDArray[np.int64]
-    """(11,) counters."""
+    """(16,) counters."""
     score: Array
     """(9,) MOVE: sum of the payload's updates in this batch, VARIANCE: the variance they should have; DRIFT: mean of
     MOVE^2 / VARIANCE; NOW: time since process noise was added [s]; EMPTY_ARM_BIAS: payload of the arm before the event,
-    when it was empty, in standard deviations, EXCESS_BIAS: in those left when the inertia error is allowed for; SHOWN:
-    correlation of the innovations with the output of the residual modes, INFORMATION: its variance; ODDS: logarithm
-    of the prior odds of residual modes."""
+    when it was empty, in standard deviations, EXCESS_BIAS: in those left with the inertia error allowed for; COST: of
+    the samples in this iteration, COST_BEFORE: of the first BEFORE samples in the last one;
+    LAMBDA: damping of Levenberg and Marquardt."""
     x0: Array
     """(nx,) mean just after the last event."""
     S0: Array
     """(nx, nx) its square root."""
     xi: Array
     """(nx,) fitted departure from x0 in units of S0."""
-    corrections: Array
-    """(HORIZON, m) what the residual modes were taken to add to the measurements since the event."""
+    accepted: Array
+    """(nx,) xi of the last iteration that did not raise the cost."""
+    normal: Array
+    """(nx, nx) N gathered there."""
+    gradient: Array
+    """(nx,) gradient there."""
     xr: Array
     """(nx,) reference trajectory of the present Gauss-Newton iteration."""
     Sr: Array
@@ -57,43 +64,32 @@ class FilterState(NamedTuple):
     """(nx, nx) information gathered in the iteration."""
     g: Array
     """(nx,) gradient gathered in the iteration."""
-    residual: Array
-    """(2, a) modes beyond kappa: departure from where the torque holds them, its rate."""
-    torque: Array
-    """(2,) held before the latest sample."""
-    torque0: Array
-    """(2,) held before the last event."""
     innovation: Array
     """(m, 2) the latest, and its variance before the update."""
     power: Array
     """(m,) mean squared normalised innovation of each sensor since the event, slowly forgotten."""
 
 
-def memory(nx: int, m: int, a: int = 0) -> FilterState:
-    """Allocate for nx states, m sensors, a modes beyond kappa."""
+def memory(nx: int, m: int) -> FilterState:
+    """Allocate for nx states and m sensors."""
     return FilterState(
-        x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 8)), recent=np.zeros((m, 4)),
-        counts=np.zeros(11, dtype=np.int64),
-        score=np.zeros(9), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx),
-        corrections=np.zeros((HORIZON, m)), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
-        g=np.zeros(nx), residual=np.zeros((2, a)), torque=np.zeros(2), torque0=np.zeros(2),
-        innovation=np.zeros((m, 2)), power=np.ones(m))
+        x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 9)), recent=np.zeros((m, 4)),
+        counts=np.zeros(16, dtype=np.int64), score=np.zeros(9), x0=np.zeros(nx), S0=np.zeros((nx, nx)),
+        xi=np.zeros(nx), accepted=np.zeros(nx), normal=np.zeros((nx, nx)), gradient=np.zeros(nx),
+        xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
+        g=np.zeros(nx), innovation=np.zeros((m, 2)), power=np.ones(m))
 
 
 def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
     """Return the same values in arrays of their own.
 
-    Once the corrections are complete, nothing writes them any more, and they are shared. horizon False: what belongs to
-    the moving horizon is shared too; then only an event writes it.
+    horizon False: what belongs to a complete moving horizon is shared; then only an event writes it.
     """
-    (x, S, noise, recent, counts, score, x0, S0, xi, corrections, xr, Sr, N, g, residual, torque, torque0,
-     innovation, power) = state
-    complete = counts[STORED] >= HORIZON
-    if not complete:
-        corrections = corrections.copy()
-    if horizon or not complete:
-        x0, S0, xi, xr, Sr = x0.copy(), S0.copy(), xi.copy(), xr.copy(), Sr.copy()
-        N, g, torque0 = N.copy(), g.copy(), torque0.copy()
+    x, S, noise, recent, counts, score, x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g, innovation, power = state
+    if horizon or counts[STORED] < HORIZON:
+        x0, S0, xi = x0.copy(), S0.copy(), xi.copy()
+        accepted, normal, gradient = accepted.copy(), normal.copy(), gradient.copy()
+        xr, Sr, N, g = xr.copy(), Sr.copy(), N.copy(), g.copy()
     return FilterState(
-        x.copy(), S.copy(), noise.copy(), recent.copy(), counts.copy(), score.copy(), x0, S0, xi, corrections, xr, Sr,
-        N, g, residual.copy(), torque.copy(), torque0, innovation.copy(), power.copy())
+        x.copy(), S.copy(), noise.copy(), recent.copy(), counts.copy(), score.copy(), x0, S0, xi, accepted, normal,
+        gradient, xr, Sr, N, g, innovation.copy(), power.copy())

@@ -10,19 +10,16 @@ from numpy.typing import NDArray
 from flexmanip_ros.numerics.compiled import kernel
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
+from flexmanip_ros.payload import structured_model
 from flexmanip_ros.payload.filter_state import BATCHES, BLOCKS, DRIFT, EFFECTIVE, FLOOR, POWER, WEIGHT, WHITE
 from flexmanip_ros.payload.measurement_update import MeasurementModel
-from flexmanip_ros.payload.process_model import PARAMETERS
-from flexmanip_ros.payload.residual_modes import residual_probability
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import Array, Payload, Status
 
 QUANTILE = 1.959963984540054
 """Of the normal distribution, for 95 %."""
-UNKNOWN_STD = 0.5
-"""A payload whose logarithm is less certain than this is not known."""
-VAGUE_STD = 0.2
-"""A rotary inertia whose logarithm is less certain than this is not told."""
+UNKNOWN_STD = 0.3
+"""A payload is not known whose relative standard deviation is larger: it keeps that of its prior."""
 FEW = 50
 """Samples after an event before anything is claimed."""
 POWER_LIMIT = 2.0
@@ -44,17 +41,14 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     if m is None or sensors is None:
         begun = Status.DIVERGED if restarts else Status.WARMING_UP  # it may fall over at every sample
         return Payload(0.0, math.inf, 0.0, math.inf, 1.0, begun)
-    state = m.x.size - PARAMETERS
-    scale = model.motion.scale
+    state = model.payload
     held = bool(m.counts[mem.HELD])
-    deviation, consistency, drift, reckoned = figures(
-        m.S, state, m.noise, sensors.rate, m.score, m.counts)
+    consistency, drift, reckoned = figures(m.noise, sensors.rate, m.score, m.counts)
     if math.isnan(consistency):
         consistency = plain_misfit(sensors, m)
     restless = math.sqrt(drift * max(1.0, consistency / POWER_LIMIT))
     widening, doubt = (restless * max(1.0, abs(float(m.score[bias])) / FREE_BIAS)
                        for bias in (mem.EMPTY_ARM_BIAS, mem.EXCESS_BIAS))
-    std = widening * deviation
     status = Status.TRACKING
     if consistency > POWER_LIMIT or doubt > WIDENING_LIMIT:
         status = Status.INCONSISTENT
@@ -62,34 +56,55 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         status = Status.WARMING_UP
     if restarts and m.counts[mem.SEEN] < SETTLED:
         status = Status.DIVERGED
-    mass = scale * math.exp(min(float(m.x[state]), 12.0)) if held else 0.0
-    error = reckoned * inertia_error(config, model, mass)
+    body = m.x[state:state + model.body].copy()
+    spread = (widening ** 2) * (m.S[state:state + model.body] @ m.S[state:state + model.body].T)
+    spread[0, 0] += (reckoned * inertia_error(config, model, max(float(body[0]), 0.0) if held else 0.0)) ** 2
     if not held:
-        return empty(float(m.x[state]), math.hypot(std, error), consistency, status)
-    std = math.hypot(std, error / mass)
-    if std > UNKNOWN_STD and status is Status.TRACKING:
-        status = Status.POORLY_EXCITED
-    lower = max(0.0, mass * (1.0 - QUANTILE * std))
-    upper = mass * math.exp(min(QUANTILE * std, 20.0))
-    inertia, status = rotary(model, m, widening, status)
-    return Payload(mass, mass * std, lower, upper, consistency, status, inertia=inertia)
+        return empty(float(body[0]), math.sqrt(spread[0, 0]), consistency, status)
+    known_point = model.body > 1 and not spread[1:, 1:].any()
+    if model.body > 1 and not known_point:
+        body, spread = point_or_body(body, spread, structured_model.body_mean(config, model),
+                                     structured_model.body_std(config, model))
+    mass, std = max(float(body[0]), 0.0), math.sqrt(spread[0, 0])
+    if std > UNKNOWN_STD * mass:  # a linearization tells too much of what moves hardly
+        std = max(std, float(structured_model.body_std(config, model)[0]))
+        status = Status.POORLY_EXCITED if status is Status.TRACKING else status
+    found = Payload(mass, std, max(0.0, mass - QUANTILE * std), mass + QUANTILE * std, consistency, status)
+    return found if model.body == 1 or known_point else with_body(found, body, spread)
 
 
-def rotary(
-    model: Model, m: mem.FilterState, widening: float, status: Status,
-) -> tuple[tuple[float, float, float, float, float, float], Status]:
-    """Return the payload's inertia about its centre of mass, refused with a status where it is not known.
+def point_or_body(body: Array, spread: Array, mean: Array, std: Array) -> tuple[Array, Array]:
+    """Return inertial parameters (4,) and covariance (4, 4) of an object that may be a point.
 
-    A planar arm feels the turning about z alone; the rest stays zero.
+    Savage-Dickey density ratio: the Bayes factor of a point (no first moments, no inertia about the tip) is the
+    posterior density of these zeros over their prior density. Both objects are as likely before; the result has mean
+    and covariance of the mixture. mean, std: (4,) of the prior.
     """
-    nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    if model.motion.inertia == 0.0:
-        return nothing, status
-    std = widening * spread(m.S, m.x.size - 1)
-    if std > VAGUE_STD:
-        return nothing, Status.POORLY_EXCITED if status is Status.TRACKING else status
-    about_z = model.motion.inertia * math.exp(min(float(m.x[-1]), 12.0))
-    return (0.0, 0.0, 0.0, 0.0, 0.0, about_z), status
+    rest = slice(1, 4)
+    gain = np.linalg.solve(spread[rest, rest], spread[rest, 0])
+    point = np.array([body[0] - gain @ body[rest], 0.0, 0.0, 0.0])
+    left = max(float(spread[0, 0] - gain @ spread[rest, 0]), 0.0)
+    scale = std[rest]
+    scaled = spread[rest, rest] / np.outer(scale, scale)
+    logarithm = 0.5 * (float((mean[rest] / scale) @ (mean[rest] / scale))
+                       - float(body[rest] @ np.linalg.solve(spread[rest, rest], body[rest]))
+                       - float(np.linalg.slogdet(scaled)[1]))
+    share = 1.0 / (1.0 + math.exp(-min(max(logarithm, -700.0), 700.0)))
+    middle = share * point + (1.0 - share) * body
+    mixed = (1.0 - share) * spread + share * (1.0 - share) * np.outer(point - body, point - body)
+    mixed[0, 0] += share * left
+    return middle, mixed
+
+
+def with_body(found: Payload, body: Array, spread: Array) -> Payload:
+    """Add centre of mass and inertia about it, with the covariance of mass, both coordinates and inertia."""
+    m = max(float(body[0]), 1e-9)
+    x, y = body[1] / m, body[2] / m
+    J = np.array([[1.0, 0.0, 0.0, 0.0], [-x / m, 1.0 / m, 0.0, 0.0], [-y / m, 0.0, 1.0 / m, 0.0],
+                  [x * x + y * y, -2.0 * x, -2.0 * y, 1.0]])
+    inertia = max(float(body[3] - m * (x * x + y * y)), 0.0)
+    return found._replace(com=(float(x), float(y), 0.0), inertia=(0.0, 0.0, 0.0, 0.0, 0.0, inertia),
+                          covariance=tuple((J @ spread @ J.T).ravel().tolist()))
 
 
 def empty(seeming: float, std: float, consistency: float, status: Status) -> Payload:
@@ -107,17 +122,12 @@ def empty(seeming: float, std: float, consistency: float, status: Status) -> Pay
 
 def inexact(config: IdentifierParameters, model: Model, m: mem.FilterState, mass: float) -> float:
     """Deviation [kg] of a payload by the error to reckon with in the arm's inertia; 0 for an exact arm."""
-    return misjudged(m.noise, m.score, m.counts) * inertia_error(config, model, mass)
+    return misjudged(m.noise, m.counts) * inertia_error(config, model, mass)
 
 
 def inertia_error(config: IdentifierParameters, model: Model, mass: float) -> float:
-    """Deviation [kg] of a payload by ``model_error`` of everything at the tip; more below three modes a link.
-
-    What the modes left out give way under a torque falls with the third power of kappa + 1/2. Chains read at
-    kappa 1, 2, 3 and 5 err rather as its root: 0.8, 0.3, 0.1 and 0.1 % of everything at the tip.
-    """
-    coarse: float = max(1.0, (3.5 / (model.motion.arm.kappa + 0.5)) ** 1.5)
-    return config.payload.model_error * coarse * (mass + model.motion.scale)
+    """Deviation [kg] of a payload by ``model_error`` of everything at the tip."""
+    return config.payload.model_error * (mass + model.motion.scale)
 
 
 def plain_misfit(sensors: MeasurementModel, m: mem.FilterState) -> float:
@@ -126,20 +136,8 @@ def plain_misfit(sensors: MeasurementModel, m: mem.FilterState) -> float:
     return float(np.median(ratio[~sensors.rate]))
 
 
-RESIDUAL_SHARE = 0.5
-"""Of the error to reckon with, what is left where nothing misfits but the modes beyond kappa, allowed for."""
-
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
-
-
-@kernel
-def spread(S: Array, row: int) -> float:
-    """Standard deviation of one state, S: (nx, nx) square root of the covariance."""
-    square = 0.0
-    for c in range(S.shape[1]):
-        square += S[row, c] * S[row, c]
-    return math.sqrt(square)
 
 
 @kernel
@@ -167,21 +165,19 @@ def drift(score: Array, counts: Integers) -> float:
 
 
 @kernel
-def misjudged(noise: Array, score: Array, counts: Integers) -> float:
+def misjudged(noise: Array, counts: Integers) -> float:
     """Share of the model-error allowance that the interval carries, 0 to 1.
 
-    1 where the innovations of a sensor exceed its white noise; else ``RESIDUAL_SHARE`` times the probability of
-    residual modes.
+    1 where the innovations of a sensor exceed its white noise, else 0.
     """
     chance = 2.5 * math.sqrt(2.0 / max(counts[BLOCKS], 1))
     for i in range(noise.shape[0]):
         if noise[i, EFFECTIVE] >= (1.0 + chance) * max(noise[i, WHITE], noise[i, FLOOR]):
             return 1.0
-    return RESIDUAL_SHARE * residual_probability(score)
+    return 0.0
 
 
 @kernel
-def figures(S: Array, row: int, noise: Array, rate: Booleans, score: Array, counts: Integers
-            ) -> tuple[float, float, float, float]:
-    """Return deviation of the payload's state, misfit, drift and ``misjudged``, in one call."""
-    return spread(S, row), misfit(noise, rate), drift(score, counts), misjudged(noise, score, counts)
+def figures(noise: Array, rate: Booleans, score: Array, counts: Integers) -> tuple[float, float, float]:
+    """Return misfit, drift and ``misjudged``, in one call."""
+    return misfit(noise, rate), drift(score, counts), misjudged(noise, counts)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexmanip_ros.numerics.compiled import inlined
-from flexmanip_ros.numerics.square_root import absorb_measurement, project
+from flexmanip_ros.numerics.square_root import absorb_measurement, dot, project
 from flexmanip_ros.payload.filter_state import (
     BATCHES,
     BLOCK_POWER,
@@ -17,27 +17,23 @@ from flexmanip_ros.payload.filter_state import (
     DRIFT,
     EFFECTIVE,
     FLOOR,
+    HORIZON,
     IN_BATCH,
     IN_BLOCK,
-    INFORMATION,
     MOVE,
     POWER,
     SEEN,
-    SHOWN,
     SINCE_EVENT,
     SLOW,
+    STORED,
     VARIANCE,
     WEIGHT,
     WHITE,
 )
-from flexmanip_ros.payload.process_model import PARAMETERS
-from flexmanip_ros.payload.residual_modes import residual_amplitude, residual_output
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
     from flexmanip_ros.payload.filter_state import FilterState
-    from flexmanip_ros.payload.process_model import ProcessModel
-    from flexmanip_ros.payload.residual_modes import ResidualModes
 
 OUTLIER = 4.0
 """Innovations beyond this many standard deviations count less (Huber)."""
@@ -54,10 +50,10 @@ class MeasurementModel(NamedTuple):
     """(m, n) of q or qd."""
     rate: NDArray[np.bool_]
     """(m,) whether H reads qd."""
-    feed: Array
-    """(m, 2) direct effect of the torque."""
-    residual: ResidualModes
-    """What rings beyond kappa."""
+    gain: NDArray[np.int64]
+    """(m,) which state is the logarithm of the sensor's gain; -1: none."""
+    offset: NDArray[np.int64]
+    """(m,) which state is its offset; -1: none."""
     block: int
     """Samples in a block: a tenth of the slowest vibration."""
     diffusion: Array
@@ -66,42 +62,50 @@ class MeasurementModel(NamedTuple):
     """(nx,) scratch."""
     f: Array
     """(nx,) scratch."""
+    L: Array
+    """(nx, nx) scratch."""
     W: Array
     """(nx, 2 nx) scratch."""
 
 
 @inlined
-def measure(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, effort: Array, y: Array) -> None:
+def observe(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Array) -> float:
+    """Return what sensor i should read and fill f (nx,) with the spread of that, S' times its derivative."""
+    predicted = project(x, S, sensors.H[i], n if sensors.rate[i] else 0, f)
+    gain, offset = sensors.gain[i], sensors.offset[i]
+    if gain >= 0:
+        factor = np.exp(x[gain])
+        predicted *= factor
+        for c in range(f.size):
+            f[c] = factor * f[c] + predicted * S[gain, c]
+    if offset >= 0:
+        predicted += x[offset]
+        for c in range(f.size):
+            f[c] += S[offset, c]
+    return predicted
+
+
+@inlined
+def measure(sensors: MeasurementModel, m: FilterState, y: Array) -> None:
     """Update the filter with one sample and gather what its innovations say of noise and payload."""
-    payload = m.x.size - PARAMETERS
     x, S, f = m.x, m.S, sensors.f
-    n = motion.q.size
-    share = residual_amplitude(m.score)
+    n = sensors.H.shape[1]
+    payload = 2 * n
     for i in range(y.size):
         r = m.noise[i, EFFECTIVE]
-        predicted = project(x, S, sensors.H[i], n if sensors.rate[i] else 0, f)
-        more = residual_output(sensors.residual, m, i)
-        e = y[i] - predicted - sensors.feed[i, 0] * effort[0] - sensors.feed[i, 1] * effort[1] - share * more
-        spread = 0.0
-        for c in range(f.size):
-            spread += f[c] * f[c]
+        e = y[i] - observe(sensors, i, n, x, S, f)
+        spread = dot(f, f)
         variance = spread + r
         square = e * e / variance
         m.innovation[i, 0], m.innovation[i, 1] = e, variance
         m.power[i] += (min(square, 25.0) - m.power[i]) / min(m.counts[SINCE_EVENT] + 100, 1000)
-        more /= np.sqrt(variance)
-        m.score[SHOWN] += more * min(max(e / np.sqrt(variance) + share * more, -5.0), 5.0)
-        m.score[INFORMATION] += more * more
         residual = min(max(e / np.sqrt(variance), -5.0), 5.0) * np.sqrt(r)
         m.noise[i, BLOCK_SUM] += residual
         m.noise[i, BLOCK_POWER] += residual * residual
         if square > OUTLIER * OUTLIER:
             r += e * e / (OUTLIER * OUTLIER) - variance
             variance = spread + r
-        gain = 0.0
-        for c in range(f.size):
-            gain += S[payload, c] * f[c]
-        gain /= variance
+        gain = dot(S[payload], f) / variance
         m.score[MOVE] += gain * e
         m.score[VARIANCE] += gain * gain * variance
         m.noise[i, WEIGHT] += gain * gain * variance
@@ -127,8 +131,16 @@ def white_noise(m: FilterState, i: int, y: float) -> None:
 
 @inlined
 def learn_noise(sensors: MeasurementModel, m: FilterState) -> None:
-    """At the end of a block: the variance of each sensor, and its slow part when that is not white."""
+    """At the end of a block: the variance of each sensor, and its slow part when that is not white.
+
+    While the horizon is open the moving-horizon estimation tells it: the filter may be on its way.
+    """
     m.counts[IN_BLOCK] += 1
+    if m.counts[STORED] < HORIZON:
+        m.counts[IN_BLOCK] = 0
+        for i in range(m.noise.shape[0]):
+            m.noise[i, BLOCK_SUM] = 0.0
+            m.noise[i, BLOCK_POWER] = 0.0
     if m.counts[IN_BLOCK] < sensors.block:
         return
     m.counts[IN_BLOCK] = 0

@@ -2,9 +2,9 @@
 
 An extended Kalman filter linearizes each sample once. The first samples after an event are linearized at a poor guess
 of the payload, and that error would remain. Moving-horizon estimation mends it: a Gauss-Newton iteration reads the
-samples since the event again (at most ``HORIZON``), three for each new sample. When it has caught up with the filter,
-its minimum replaces the filter's state, and the next iteration is linearized there. The arrival cost is the state at
-the event, with mean x0 and covariance S0 S0'.
+samples since the event again (at most ``HORIZON``), ``ROWS`` for each new sample. When it has caught up with the
+filter, its minimum replaces the filter's state, and the next iteration is linearized there. The arrival cost is the
+state at the event, with mean x0 and covariance S0 S0'.
 """
 
 from __future__ import annotations
@@ -14,30 +14,37 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexmanip_ros.numerics.compiled import inlined, kernel, merged
-from flexmanip_ros.numerics.square_root import absorb_noise, backward, factor_information, forward, project
+from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, factor_information, forward
 from flexmanip_ros.payload.filter_state import (
+    AGAIN,
+    BEFORE,
+    COST,
+    COST_BEFORE,
     EFFECTIVE,
+    ENOUGH,
+    FIT,
+    FLOOR,
     HELD,
     HORIZON,
     IN_BATCH,
     ITERATED,
     ITERATING,
+    LAMBDA,
+    LEARNED,
     MOVE,
     NOW,
+    POWER,
+    REFITS,
+    REJECTED,
     SINCE_EVENT,
     SINCE_NOISE,
+    SLOW,
     STORED,
     VARIANCE,
+    WHITE,
 )
-from flexmanip_ros.payload.measurement_update import OUTLIER, judge_payload, learn_noise, measure
-from flexmanip_ros.payload.process_model import PARAMETERS, predict
-from flexmanip_ros.payload.residual_modes import (
-    excite_residual,
-    propagate_residual,
-    residual_amplitude,
-    residual_output,
-    residual_probability,
-)
+from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, observe
+from flexmanip_ros.payload.process_model import confine, predict
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -51,107 +58,209 @@ FIRST_ITERATION = 8
 """Samples after an event before the first Gauss-Newton iteration: fewer tell less than the prior."""
 
 
+ROWS = 8
+"""Rows that are read again for each new sample."""
+CONVERGED = 0.02
+"""A step that lowers the cost by less, for each sample, has converged: the horizon may grow."""
+FITS = 1.5
+"""Or one whose cost is at most this times what white noise costs."""
+LOST = 1e4
+"""A trajectory that costs more, for each measurement, says nothing of the arm."""
+TRUSTED = 2.0
+"""Standard deviations that the filter is moved by a step of the moving-horizon estimation."""
+UNFIT = 2.0
+"""Times the cost of white noise: more is no fit."""
+MOST_REFITS = 3
+"""How often a fit is begun again after an event: an arm that is another one never fits."""
+STRAY, STRAY_EVERY = 3.0, 500
+"""Power over white noise of every sensor with which the filter is begun again; samples between two looks."""
+SLACK = 1.0
+"""By so much may the cost rise: less than the estimate can tell."""
+LEAST_DAMPING = 1e-3
+"""Damping of Levenberg and Marquardt with which a rejected step is taken again."""
+REJECTIONS = 8
+"""How often a step is shortened that raises the cost."""
+
+
 @merged
 def begin_iteration(m: FilterState) -> None:
     """Start a Gauss-Newton iteration at the event, from the trajectory of the last one."""
     nx = m.x.size
+    m.score[COST] = 0.0
     for i in range(nx):
-        m.xr[i] = m.x0[i]
         m.g[i] = 0.0
+        m.xr[i] = m.x0[i] + dot(m.S0[i], m.xi)
+        m.score[COST] += m.xi[i] * m.xi[i]
         for c in range(nx):
-            m.xr[i] += m.S0[i, c] * m.xi[c]
             m.Sr[i, c] = m.S0[i, c]
             m.N[i, c] = 0.0
+    for i in range(m.noise.shape[0]):
+        m.noise[i, FIT] = 0.0
     m.counts[ITERATED] = 0
     m.counts[ITERATING] = 1
 
 
 @merged
 def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array) -> bool:
-    """Take one sample since the event into the iteration: N += f f' / r, g += f e / r. False when not finite.
+    """Take one sample since the event into the iteration: N += f f' / r, g += f e / r. False: the step was too long.
 
-    table: (N, 3 + m), its first row is the first sample after the event.
+    table: (N, 1 + L + m), its first row is the first sample after the event. The cost is Huber's.
     """
-    passed = m.counts[ITERATED]
-    sample = table[passed]
-    n, nx = motion.q.size, m.x.size
-    effort, f = sample[1:3], sensors.f
-    if not predict(motion, m.xr, m.Sr, effort, sample[0], m.counts[HELD] != 0):
+    sample = table[m.counts[ITERATED]]
+    n, nx = sensors.H.shape[1], m.x.size
+    links, f = motion.effort.size, sensors.f
+    if not predict(motion, m.xr, m.Sr, sample[1:1 + links], sample[0]):
         return False
-    if sample[0] > 0.0:
-        before = m.torque0 if passed == 0 else table[passed - 1, 1:3]
-        excite_residual(motion, sensors.residual, m.xr, before, effort, residual_probability(m.score))
     for i in range(m.noise.shape[0]):
         r = m.noise[i, EFFECTIVE]
-        predicted = project(m.xr, m.Sr, sensors.H[i], n if sensors.rate[i] else 0, f)
-        measured = sample[3 + i] - m.corrections[passed, i]
-        e = measured - predicted - sensors.feed[i, 0] * effort[0] - sensors.feed[i, 1] * effort[1]
+        e = sample[1 + links + i] - observe(sensors, i, n, m.xr, m.Sr, f)
         weight = 1.0 / r
-        if e * e * weight > OUTLIER * OUTLIER:
-            weight = OUTLIER / (abs(e) * np.sqrt(r))
+        m.score[COST] += e * e * weight
+        m.noise[i, FIT] += e * e
         for a in range(nx):
             scaled = weight * f[a]
             m.g[a] += scaled * e
             for b in range(a + 1):
                 m.N[a, b] += scaled * f[b]
     m.counts[ITERATED] += 1
+    if not m.score[COST] < LOST * (nx + m.noise.shape[0] * m.counts[ITERATED]):
+        return False
+    return m.counts[ITERATED] != m.counts[BEFORE] or not m.score[COST] > m.score[COST_BEFORE] + SLACK
+
+
+@merged
+def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
+    """Accept the iteration and step on; hand state and spread to the filter if it has caught up with it."""
+    nx = m.x.size
+    for i in range(nx):
+        m.accepted[i] = m.xi[i]
+        m.gradient[i] = m.g[i] - m.xi[i]
+        for c in range(i + 1):
+            m.normal[i, c] = m.N[i, c]
+    fits = m.score[COST] < FITS * (nx + m.noise.shape[0] * m.counts[ITERATED])
+    m.counts[BEFORE] = m.counts[ITERATED]
+    m.score[COST_BEFORE] = m.score[COST]
+    m.score[LAMBDA] = m.score[LAMBDA] / 8.0 if m.score[LAMBDA] > LEAST_DAMPING and not fits else 0.0
+    m.counts[REJECTED] = 0
+    m.counts[ITERATING] = 0
+    if not damped_step(motion, sensors, m):
+        return False
+    gained = dot(m.g, m.gradient)
+    m.counts[AGAIN] = 0 if fits or gained < CONVERGED * m.counts[ITERATED] else 1
+    if m.counts[ITERATED] == m.counts[STORED]:
+        if not factor_information(m.N):
+            return False
+        for i in range(m.noise.shape[0]):
+            m.noise[i, POWER] = m.noise[i, FIT] / m.counts[ITERATED]
+            m.noise[i, SLOW] = m.noise[i, POWER]
+        if m.counts[ITERATED] >= ENOUGH and gained < 0.5 * nx:
+            m.counts[STORED] = HORIZON
+        # the step was not seen to lower the cost yet: the filter takes no more of it than it can tell
+        part = min(1.0, TRUSTED / np.sqrt(max(gained, 1e-300)))
+        for i in range(nx):
+            m.x[i] = m.xr[i] + part * dot(m.Sr[i], m.g)
+            forward(m.N, m.Sr[i])
+            for c in range(nx):
+                m.S[i, c] = m.Sr[i, c]
     return True
 
 
 @merged
-def finish_iteration(m: FilterState) -> bool:
-    """Step to the minimum, and hand state and spread at the last sample to the filter."""
-    nx = m.x.size
-    payload = nx - PARAMETERS
-    if not factor_information(m.N):
+def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
+    """Set xi to the accepted one and a step of Levenberg and Marquardt, m.g; the payload stays possible."""
+    nx = m.xi.size
+    L, p = sensors.L, motion.p
+    for i in range(nx):
+        m.g[i] = m.gradient[i]
+        for c in range(i + 1):
+            L[i, c] = m.normal[i, c]
+        L[i, i] += m.score[LAMBDA] * (1.0 + L[i, i])
+    if not factor_information(L):
         return False
+    forward(L, m.g)
+    backward(L, m.g)
     for i in range(nx):
-        m.g[i] -= m.xi[i]
-    forward(m.N, m.g)
-    backward(m.N, m.g)
-    move = 0.0
-    for c in range(nx):
-        move += m.S0[payload, c] * m.g[c]
-    # a step in the logarithm of the payload is not trusted beyond the range of its linearisation
-    limit = 1.0 if m.counts[HELD] != 0 else 1e300
-    shorten = min(1.0, limit / max(abs(move), 1e-300))
-    for c in range(nx):
-        m.xi[c] += shorten * m.g[c]
-    for i in range(nx):
-        value = m.xr[i]
-        for c in range(nx):
-            value += m.Sr[i, c] * shorten * m.g[c]
-        m.x[i] = value
-        forward(m.N, m.Sr[i])
-        for c in range(nx):
-            m.S[i, c] = m.Sr[i, c]
-    m.counts[ITERATING] = 0
+        m.xi[i] = m.accepted[i] + m.g[i]
+    first = nx - p.size
+    for c in range(p.size):
+        p[c] = m.x0[first + c] + dot(m.S0[first + c], m.xi)
+    confine(motion, p)
+    for c in range(p.size):
+        i = first + c
+        moved = p[c] - m.x0[i] - dot(m.S0[i], m.xi)
+        if moved != 0.0 and m.S0[i, i] != 0.0:
+            m.xi[i] += moved / m.S0[i, i]
+            m.g[i] += moved / m.S0[i, i]
+    return True
+
+
+@merged
+def reject_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
+    """Take a shorter step from the accepted xi, nearer to the gradient, and begin the iteration again."""
+    m.counts[REJECTED] += 1
+    m.score[LAMBDA] = max(8.0 * m.score[LAMBDA], LEAST_DAMPING)
+    if m.counts[REJECTED] > REJECTIONS:  # a valley that bends: go on from here
+        m.score[COST_BEFORE] = 1e300
+    if not damped_step(motion, sensors, m):
+        return False
+    begin_iteration(m)
     return True
 
 
 @merged
 def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array) -> bool:
-    """Store the correction of the newest sample, and let the Gauss-Newton iteration take up to three samples."""
+    """Let the Gauss-Newton iteration take up to three samples."""
     stored = m.counts[STORED]
     if stored >= HORIZON:
         return True
-    share = residual_amplitude(m.score)
-    for i in range(m.corrections.shape[1]):
-        m.corrections[stored, i] = share * residual_output(sensors.residual, m, i)
     m.counts[STORED] = stored + 1
-    if m.counts[ITERATING] == 0:
-        if stored + 1 < FIRST_ITERATION or 3 * (stored + 1) > 2 * HORIZON:
-            return True
-        begin_iteration(m)
-    for _ in range(3):
-        if m.counts[ITERATED] < m.counts[STORED] and not iterate_sample(motion, sensors, m, table):
-            return False
-    if m.counts[ITERATED] == m.counts[STORED]:
-        m.counts[IN_BATCH] = 0
-        m.score[MOVE] = 0.0
-        m.score[VARIANCE] = 0.0
-        return finish_iteration(m)
+    if stored + 1 < FIRST_ITERATION:
+        return True
+    if stored + 1 == HORIZON:
+        return not fails(m)
+    for _ in range(ROWS):
+        if m.counts[ITERATING] == 0:
+            if m.counts[AGAIN] == 0 and m.counts[BEFORE] == m.counts[STORED]:
+                break
+            begin_iteration(m)
+        until = m.counts[BEFORE]
+        if m.counts[AGAIN] == 0:
+            until = min(m.counts[STORED], until + until // 2 + FIRST_ITERATION)
+        if not iterate_sample(motion, sensors, m, table):
+            if m.counts[BEFORE] == 0 or not reject_step(motion, sensors, m):
+                return False
+        elif m.counts[ITERATED] == until:
+            m.counts[IN_BATCH] = 0
+            m.score[MOVE] = 0.0
+            m.score[VARIANCE] = 0.0
+            if not finish_iteration(motion, sensors, m):
+                return False
     return True
+
+
+@inlined
+def fails(m: FilterState) -> bool:
+    """Whether the moving-horizon estimation ended in a minimum that is none: it fits too badly, or too few samples."""
+    if m.counts[REFITS] >= MOST_REFITS:
+        return False
+    expected = m.xi.size + m.noise.shape[0] * m.counts[BEFORE]
+    failed = bool(m.score[COST_BEFORE] > UNFIT * expected or 2 * m.counts[BEFORE] < m.counts[STORED])
+    m.counts[REFITS] += failed
+    return failed
+
+
+@inlined
+def strays(sensors: MeasurementModel, m: FilterState) -> bool:
+    """Whether the filter left the arm after all: every sensor shows far more than its noise, block after block."""
+    if m.counts[LEARNED] == 0 or m.counts[HELD] == 0 or m.counts[REFITS] >= MOST_REFITS:
+        return False
+    if m.counts[STORED] < HORIZON or m.counts[SINCE_EVENT] % STRAY_EVERY != 0:
+        return False
+    least = STRAY
+    for i in range(m.noise.shape[0]):
+        least = min(least, m.noise[i, POWER] / max(m.noise[i, WHITE], m.noise[i, FLOOR]))
+    m.counts[REFITS] += least >= STRAY
+    return least >= STRAY
 
 
 @inlined
@@ -173,21 +282,21 @@ def diffuse(sensors: MeasurementModel, m: FilterState, duration: float) -> None:
 def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array, k: int) -> bool:
     """Take the sample in row k of the table; False when numbers left the finite range.
 
-    table: (N, 3 + m), see ``advance``.
+    table: (N, 1 + L + m), see ``advance``.
     """
-    duration, effort, y = table[k, 0], table[k, 1:3], table[k, 3:]
-    if not predict(motion, m.x, m.S, effort, duration, m.counts[HELD] != 0):
+    links = motion.effort.size
+    duration, effort, y = table[k, 0], table[k, 1:1 + links], table[k, 1 + links:]
+    if not predict(motion, m.x, m.S, effort, duration):
         return False
-    if duration > 0.0:
-        excite_residual(motion, sensors.residual, m.x, m.torque, effort, residual_probability(m.score))
-        propagate_residual(sensors.residual, m, duration, effort)
-        m.torque[0], m.torque[1] = effort[0], effort[1]
-    measure(motion, sensors, m, effort, y)
-    if not abs(m.x[m.x.size - PARAMETERS]) < 1e9:
+    measure(sensors, m, y)
+    confine(motion, m.x[m.x.size - motion.kind.size:])
+    if not abs(m.x[2 * sensors.H.shape[1]]) < 1e9:
         return False
     m.counts[SINCE_EVENT] += 1
     learn_noise(sensors, m)
     if not iterate(motion, sensors, m, table):
+        return False
+    if strays(sensors, m):
         return False
     judge_payload(sensors, m)
     diffuse(sensors, m, duration)
@@ -198,7 +307,7 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
 def advance(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array, first: int) -> int:
     """Take the samples in the rows of the table from ``first`` on.
 
-    table: (N, 3 + m) duration since the sample before, torques held meanwhile, measurements. While the horizon
+    table: (N, 1 + L + m) duration since the sample before, torques held meanwhile, measurements. While the horizon
     is open (fewer than ``HORIZON`` samples since the event), the table begins with the first sample after it.
     Returns the row after the last one taken; less than N when numbers left the finite range.
     """

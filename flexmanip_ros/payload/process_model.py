@@ -1,199 +1,310 @@
 """Process model of the structured filter: the arm's equations carry the mean, their Jacobian the covariance.
 
-The state is x = [q (n), qd (n), d (n - 4), p (6)]. d: modal stiffness deviation, the logarithm of the stiffness of each
-mode beyond a link's first over what the link's stiffness factor gives, link 1 first. p = [payload, logarithm of the
-stiffness factors of links 1 and 2, damping ratios 1 and 2, logarithm of the rotary inertia]. The covariance is S S'
-with the square root S (nx, nx), which moves as S <- F S, F the Jacobian of the flow.
+The state is x = [q (n), qd (n), p]. p: what is not known of payload and arm, each entry of a ``Kind`` and a link (see
+``ProcessModel.kind``); kinds that are not estimated stay at the value of the parameters. The covariance is S S' with
+the square root S (nx, nx), which moves as S <- F S, F the Jacobian of the flow.
 """
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from flexmanip_ros.arm.equations_of_motion import acceleration, factor, solve
-from flexmanip_ros.arm.jacobian import acceleration_jacobian
+from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, acceleration, factor, net_torques, solve
+from flexmanip_ros.arm.jacobian import acceleration_jacobian, damping_jacobian, solve_columns
 from flexmanip_ros.numerics.compiled import inlined, kernel, merged
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
     from flexmanip_ros.arm.manipulator import Manipulator, Workspace
 
-PARAMETERS = 6
-"""Last states: payload, two stiffness factors (logarithm), two damping ratios, rotary inertia (logarithm)."""
 SERIES = 12
 """Terms of the motion's exponential: 1e-9 of the fastest mode at one radian a step."""
 SPREAD_SERIES = 6
 """Terms of the spread's: it weighs, and need not be exact."""
+STIFF_STEP = 2.0
+"""Longest step over the time constant of the stiffest damper: the series of the exponential converges quickly there."""
+
+
+MOST_STEPS = 2000.0
+"""Steps from a sample to the next: an arm that needs more is none."""
+
+
+class Kind(IntEnum):
+    """What an entry of p is. The body's come first, then those of a link or joint."""
+
+    MASS = 0
+    """Mass of the payload [kg]."""
+    FIRST_X = 1
+    """Its first moment along the tangent of the tip, m c_x [kg m]."""
+    FIRST_Y = 2
+    """And to its left, m c_y [kg m]."""
+    INERTIA = 3
+    """Its inertia about the tip [kg m^2]."""
+    STIFFNESS = 4
+    """Logarithm of EI over its nominal value."""
+    DAMPING = 5
+    """Damping ratio."""
+    VISCOUS = 6
+    """Viscous friction of a joint [N m s/rad]."""
+    COULOMB = 7
+    """Coulomb friction of a joint [N m]."""
+    ROTOR = 8
+    """Rotor inertia of a joint [kg m^2]."""
+    TORQUE_GAIN = 9
+    """Logarithm of torque over reported effort."""
+    BEND_GAIN = 10
+    """Logarithm of measured over true bend."""
+    BEND_OFFSET = 11
+    """Measured bend of a straight link [m]."""
+    MODE = 12
+    """Logarithm of the stiffness of a mode beyond the first over what its link's stiffness gives; number link k + j."""
+
+
+# for the compiled functions, to which an enumeration is no constant
+(MASS, FIRST_X, FIRST_Y, INERTIA, STIFFNESS, DAMPING, VISCOUS, COULOMB, ROTOR, TORQUE_GAIN, BEND_GAIN, BEND_OFFSET,
+ MODE) = (int(kind) for kind in Kind)
 
 
 class ProcessModel(NamedTuple):
-    """The arm as the filter integrates it; stiffness and damping in ``arm`` are set from the state."""
+    """The arm as the filter integrates it; what the state holds is written into ``arm`` before each use."""
 
     arm: Manipulator
     work: Workspace
+    kind: NDArray[np.int64]
+    """(np,) what each entry of p is."""
+    link: NDArray[np.int64]
+    """(np,) of which link or joint."""
     frozen: bool
-    """Hold the mass matrix at the working point (a linear plant) instead of following the configuration."""
+    """Keep the mass matrix of the working point (a linear plant) instead of following the configuration."""
     M0: Array
     """(n, n) mass matrix of the empty arm at the working point, used when frozen."""
     Mp: Array
-    """(n, n) its derivative by the payload."""
-    Mi: Array
-    """(n, n) its derivative by the payload's rotary inertia."""
+    """(4, n, n) its derivatives by the payload's inertial parameters."""
     stiffness: Array
     """(n,) nominal K."""
     damping: Array
     """(n,) D at a damping ratio of one."""
-    inertia: float
-    """Rotary inertia [kg m^2] of state zero; 0: a point mass."""
+    rotary: Array
+    """(n, n) nominal ``Manipulator.rotary``."""
     scale: float
-    """Payload [kg] of state zero when something is held."""
-    least: float
-    """Least payload [kg] of an arm thought empty: keeps the mass matrix positive."""
+    """Mass [kg] that the empty arm has at its tip."""
+    least: Array
+    """(2,) mass m_a [kg] and inertia I_a [kg m^2] below zero: a payload with (m - m_a) (I - I_a) >= |h|^2,
+    m >= m_a / 2, keeps the mass matrix positive; h: its first moments."""
+    least_rotor: Array
+    """(L,) least rotor inertia [kg m^2], for the same reason."""
     substeps: float
     """Longest integration step [s]."""
     payload: Array
+    """(4,) inertial parameters of the payload."""
+    effort: Array
+    """(L,) torques."""
+    gain: Array
+    """(L,) torque over reported effort."""
+    p: Array
+    """(np,) scratch."""
     a: Array
-    q: Array
     k: Array
     dq: Array
     dqd: Array
     dp: Array
     G: Array
+    """(n, np) derivative of the accelerations by p."""
     X: Array
     Y: Array
 
 
-@inlined
-def payload_mass(motion: ProcessModel, state: float, held: bool) -> float:
-    """Payload [kg] from its state: scale exp(state) > 0 when something is held, else the state itself."""
-    if held:
-        return motion.scale * float(np.exp(min(state, 12.0)))
-    return max(state, motion.least)
-
-
 @merged
-def set_parameters(motion: ProcessModel, x: Array, held: bool) -> None:
-    """Write payload, stiffness and damping of the state into the arm."""
-    n = motion.q.size
-    k = (n - 2) // 2
-    p = x.size - PARAMETERS
-    motion.payload[0] = payload_mass(motion, x[p], held)
-    motion.payload[1] = 0.0
-    if held and motion.inertia > 0.0:
-        motion.payload[1] = motion.inertia * np.exp(min(x[p + 5], 12.0))
-    for link in range(2):
-        ratio = x[p + 3 + link]
-        for mode in range(k):
-            j = 2 + link * k + mode
-            factor_EI = x[p + 1 + link]
-            if mode > 0:
-                factor_EI += x[2 * n + link * (k - 1) + mode - 1]
-            motion.arm.stiffness[j] = motion.stiffness[j] * np.exp(factor_EI)
-            motion.arm.damping[j] = motion.damping[j] * ratio
+def set_parameters(motion: ProcessModel, x: Array) -> None:
+    """Write what the state holds of payload and arm into motion."""
+    arm, payload = motion.arm, motion.payload
+    n = arm.stiffness.size
+    k, links = arm.kappa, arm.length.size
+    for c in range(4):
+        payload[c] = 0.0
+    for i in range(links):
+        motion.gain[i] = 1.0
+    first_rotor = True
+    for c in range(motion.kind.size):
+        value, kind, i = x[2 * n + c], motion.kind[c], motion.link[c]
+        o = links + i * k
+        if kind <= INERTIA:
+            payload[kind] = value
+        elif kind == STIFFNESS:
+            factor_EI = np.exp(value)
+            for j in range(k):
+                arm.stiffness[o + j] = motion.stiffness[o + j] * factor_EI
+        elif kind == DAMPING:
+            for j in range(k):
+                arm.damping[o + j] = motion.damping[o + j] * value
+        elif kind == VISCOUS:
+            arm.viscous[i] = value
+        elif kind == COULOMB:
+            arm.coulomb[i] = value
+        elif kind == ROTOR:
+            for r in range(n):
+                for t in range(n):
+                    before = motion.rotary[r, t] if first_rotor else arm.rotary[r, t]
+                    arm.rotary[r, t] = before + value * arm.joint[i, r] * arm.joint[i, t]
+            first_rotor = False
+        elif kind == TORQUE_GAIN:
+            motion.gain[i] = np.exp(value)
+        elif kind == MODE:
+            arm.stiffness[links + i] *= np.exp(value)
 
 
 @inlined
-def accelerate(motion: ProcessModel, q: Array, qd: Array, effort: Array, qdd: Array) -> bool:
-    """Fill qdd (n,); leaves the factor of M in work.M."""
+def confine(motion: ProcessModel, p: Array) -> None:
+    """Move p (np,) to what a payload can be: mass and inertia high enough for a positive mass matrix."""
+    p[MASS] = max(p[MASS], 0.5 * motion.least[0])
+    if p.size > INERTIA and motion.kind[INERTIA] == INERTIA:
+        moment = p[FIRST_X] * p[FIRST_X] + p[FIRST_Y] * p[FIRST_Y]
+        p[INERTIA] = max(p[INERTIA], motion.least[1] + moment / (p[MASS] - motion.least[0]))
+    for c in range(p.size):
+        if motion.kind[c] == ROTOR:
+            p[c] = max(p[c], motion.least_rotor[motion.link[c]])
+
+
+@inlined
+def accelerate(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
+    """Fill qdd (n,) under motion.effort; leaves the factor of M in work.M."""
+    arm, work = motion.arm, motion.work
     if not motion.frozen:
-        return acceleration(motion.arm, motion.payload, q, qd, effort, qdd, motion.work)
-    arm, M = motion.arm, motion.work.M
+        return acceleration(arm, motion.payload, q, qd, motion.effort, qdd, work)
     n = q.size
     for r in range(n):
         for c in range(r + 1):
-            M[r, c] = motion.M0[r, c]
-            M[r, c] += motion.payload[0] * motion.Mp[r, c] + motion.payload[1] * motion.Mi[r, c]
-    if not factor(M):
+            work.M[r, c] = motion.M0[r, c] + arm.rotary[r, c] - motion.rotary[r, c]
+            for p in range(4):
+                work.M[r, c] += motion.payload[p] * motion.Mp[p, r, c]
+    if not factor(work.M):
         return False
     for r in range(n):
-        qdd[r] = (arm.torque[r, 0] * effort[0] + arm.torque[r, 1] * effort[1]
-                  - arm.stiffness[r] * q[r] - arm.damping[r] * qd[r])
-    solve(M, qdd)
+        for i in range(arm.length.size):
+            work.B[r, i] = arm.torque[r, i]
+    net_torques(work.B, arm, qd, motion.effort, work.net)
+    for r in range(n):
+        work.elastic[r] = arm.stiffness[r] * q[r]
+        qdd[r] = -work.elastic[r] - arm.damping[r] * qd[r]
+        for i in range(arm.length.size):
+            qdd[r] += arm.torque[r, i] * work.net[0, i]
+    solve(work.M, qdd)
     return True
 
 
-@kernel
-def linearize(motion: ProcessModel, q: Array, qd: Array, effort: Array, qdd: Array, held: bool) -> bool:
-    """Fill qdd and its derivatives: motion.dq, motion.dqd (n, n), motion.G by d and p."""
+@inlined
+def linearize_frozen(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
+    """The same as ``acceleration_jacobian`` for a mass matrix that stays."""
+    if not accelerate(motion, q, qd, qdd):
+        return False
     n = q.size
-    k = (n - 2) // 2
-    deviations = motion.G.shape[1] - PARAMETERS
-    arm, M, a, G = motion.arm, motion.work.M, motion.a, motion.G
-    if motion.frozen:
-        if not accelerate(motion, q, qd, effort, qdd):
-            return False
-        for c in range(n + 2):
-            for r in range(n):
-                a[r] = 0.0
-            if c >= n:
-                share = motion.Mp if c == n else motion.Mi
-                for r in range(n):
-                    for j in range(n):
-                        a[r] -= share[r, j] * qdd[j]
-            else:
-                a[c] = -arm.stiffness[c]
-            solve(M, a)
-            for r in range(n):
-                if c >= n:
-                    motion.dp[r, c - n] = a[r]
-                else:
-                    motion.dq[r, c] = a[r]
-                    bends = arm.stiffness[c] > 0.0
-                    motion.dqd[r, c] = a[r] * arm.damping[c] / arm.stiffness[c] if bends else 0.0
-    elif not acceleration_jacobian(
-            arm, motion.payload, q, qd, effort, qdd, motion.dq, motion.dqd, motion.dp, motion.work):
-        return False
-    rate = motion.payload[0] if held else 1.0
     for r in range(n):
-        for c in range(1, 5):
-            G[r, deviations + c] = 0.0
-        G[r, deviations] = motion.dp[r, 0] * rate
-        G[r, deviations + 5] = motion.dp[r, 1] * motion.payload[1]
-    for link in range(2):
-        for mode in range(k):
-            j = 2 + link * k + mode
-            for r in range(n):
-                a[r] = 0.0
-            a[j] = 1.0
-            solve(M, a)
-            for r in range(n):
-                by_stiffness = -arm.stiffness[j] * q[j] * a[r]
-                G[r, deviations + 1 + link] += by_stiffness
-                G[r, deviations + 3 + link] -= motion.damping[j] * qd[j] * a[r]
-                if mode > 0:
-                    G[r, link * (k - 1) + mode - 1] = by_stiffness
+        for c in range(n):
+            motion.dq[r, c] = 0.0
+            motion.dqd[r, c] = 0.0
+        motion.dq[r, r] = motion.arm.stiffness[r]
+        for p in range(4):
+            motion.dp[r, p] = 0.0
+            for c in range(n):
+                motion.dp[r, p] += motion.Mp[p, r, c] * qdd[c]
+    damping_jacobian(motion.arm, motion.work, motion.dqd)
+    solve_columns(motion.work.M, motion.dq)
+    solve_columns(motion.work.M, motion.dqd)
     return True
 
 
 @kernel
-def predict(motion: ProcessModel, x: Array, S: Array, effort: Array, duration: float, held: bool) -> bool:
+def linearize(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
+    """Fill qdd under motion.effort and its derivatives: motion.dq, motion.dqd (n, n), motion.G by p."""
+    if motion.frozen:
+        if not linearize_frozen(motion, q, qd, qdd):
+            return False
+    elif not acceleration_jacobian(
+            motion.arm, motion.payload, q, qd, motion.effort, qdd, motion.dq, motion.dqd, motion.dp, motion.work):
+        return False
+    n = q.size
+    arm, G, dp, net = motion.arm, motion.G, motion.dp, motion.work.net
+    k, links = arm.kappa, arm.length.size
+    # G first holds the derivative of M qdd + E + D qd + dV/dq - B tau
+    for c in range(motion.kind.size):
+        kind, i = motion.kind[c], motion.link[c]
+        o = links + i * k
+        for r in range(n):
+            G[r, c] = 0.0
+        if kind <= INERTIA:
+            for r in range(n):
+                G[r, c] = dp[r, kind]
+        elif kind == STIFFNESS:
+            for j in range(k):
+                G[o + j, c] = motion.work.elastic[o + j]
+        elif kind == DAMPING:
+            for j in range(k):
+                G[o + j, c] = motion.damping[o + j] * qd[o + j]
+        elif kind == MODE:
+            G[links + i, c] = arm.stiffness[links + i] * q[links + i]
+        elif kind == ROTOR:
+            turn = 0.0
+            for r in range(n):
+                turn += arm.joint[i, r] * qdd[r]
+            for r in range(n):
+                G[r, c] = arm.joint[i, r] * turn
+        else:
+            force = 0.0
+            if kind == VISCOUS:
+                force = net[1, i]
+            elif kind == COULOMB:
+                force = np.tanh(net[1, i] / STICTION_RATE)
+            elif kind == TORQUE_GAIN:
+                force = -motion.effort[i]
+            if force != 0.0:
+                for r in range(n):
+                    G[r, c] = force * motion.work.B[r, i]
+    solve_columns(motion.work.M, G)
+    return True
+
+
+@kernel
+def predict(motion: ProcessModel, x: Array, S: Array, reported: Array, duration: float) -> bool:
     """Carry x and S over a time [s] with the torque held; False when numbers left the finite range."""
     if duration <= 0.0:
         return True
-    set_parameters(motion, x, held)
-    steps = max(int(np.ceil(duration / motion.substeps)), 1)
-    for _ in range(steps):
-        if not exponential_step(motion, x, effort, duration / steps, held):
+    n = motion.arm.stiffness.size
+    set_parameters(motion, x)
+    for i in range(motion.effort.size):
+        motion.effort[i] = motion.gain[i] * reported[i]
+    left = duration
+    while left > 0.0:
+        if not linearize(motion, x[:n], x[n:2 * n], motion.k[0]):
             return False
-        spread(motion, S, duration / steps)
+        stiff = 0.0
+        for r in range(n):
+            stiff -= motion.dqd[r, r]
+        steps = np.ceil(left / min(motion.substeps, STIFF_STEP / max(stiff, 1e-9)) - 1e-9)
+        if not steps < MOST_STEPS:
+            return False
+        h = left / max(steps, 1.0)
+        if not exponential_step(motion, x, h):
+            return False
+        spread(motion, S, h)
+        left = left - h if steps > 1.0 else 0.0
     return True
 
 
 @merged
-def exponential_step(motion: ProcessModel, x: Array, effort: Array, h: float, held: bool) -> bool:
-    """Advance x by h, exactly where the motion is linear; leaves the linearisation at the start in motion.
+def exponential_step(motion: ProcessModel, x: Array, h: float) -> bool:
+    """Advance x by h, exactly where the motion is linear; right after ``linearize`` at x.
 
     Exponential Rosenbrock method of third order: x1 = x + h phi_1(h F) f(x), then x1 + 2 h phi_3(h F) of what
     f(x1) - f(x) misses of F (x1 - x). The vibration turns too far in one sample for a step of Runge and
     Kutta: their damping of the fastest mode read as 0.3 % of payload.
     """
-    n = motion.q.size
+    n = motion.arm.stiffness.size
     q, qd = x[:n], x[n:2 * n]
     total, term = motion.k[1:3], motion.k[4:6]
-    if not linearize(motion, q, qd, effort, motion.k[0], held):
-        return False
     for i in range(n):
         term[0, i] = qd[i]
         term[1, i] = motion.k[0, i]
@@ -202,7 +313,7 @@ def exponential_step(motion: ProcessModel, x: Array, effort: Array, h: float, he
         x[i] += total[0, i]
         x[n + i] += total[1, i]
     if not motion.frozen:
-        if not accelerate(motion, q, qd, effort, motion.k[3]):
+        if not accelerate(motion, q, qd, motion.k[3]):
             return False
         for i in range(n):
             missed = motion.k[3, i] - motion.k[0, i]
@@ -226,7 +337,7 @@ def series(motion: ProcessModel, h: float, first: int, scale: float) -> None:
 
     v / first! stands in rows 4, 5 of motion.k (positions, rates) and is used up; total: rows 1, 2.
     """
-    n = motion.q.size
+    n = motion.arm.stiffness.size
     total, term, following = motion.k[1:3], motion.k[4:6], motion.k[6:8]
     for part in range(2):
         for i in range(n):
@@ -248,7 +359,7 @@ def series(motion: ProcessModel, h: float, first: int, scale: float) -> None:
 @merged
 def spread(motion: ProcessModel, S: Array, h: float) -> None:
     """S <- F S, F the Taylor series of the linearised flow over h."""
-    n = motion.q.size
+    n = motion.arm.stiffness.size
     nx = S.shape[1]
     X, Y = motion.X, motion.Y
     for i in range(2 * n):
@@ -269,8 +380,9 @@ def spread(motion: ProcessModel, S: Array, h: float) -> None:
             for i in range(n):
                 for p in range(motion.G.shape[1]):
                     g = motion.G[i, p]
-                    for c in range(nx):
-                        Y[n + i, c] += g * S[2 * n + p, c]
+                    if g != 0.0:
+                        for c in range(nx):
+                            Y[n + i, c] += g * S[2 * n + p, c]
         weight *= h / order
         for i in range(2 * n):
             for c in range(nx):

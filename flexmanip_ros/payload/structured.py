@@ -11,17 +11,18 @@ import numpy as np
 
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
-from flexmanip_ros.payload import moving_horizon, residual_modes, structured_model
+from flexmanip_ros.payload import moving_horizon, structured_model
 from flexmanip_ros.payload.interval import inexact, judge
 from flexmanip_ros.payload.measurement_update import MeasurementModel
-from flexmanip_ros.payload.process_model import PARAMETERS, predict
-from flexmanip_ros.payload.residual_modes import excite_residual, propagate_residual, residual_probability
+from flexmanip_ros.payload.process_model import predict
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload
 
 FIRST_LOOK = 24
 """Samples looked at before the filter starts: they tell its noise."""
+UNTAUGHT = 100
+"""An arm that catches something within so many samples was not seen empty: it keeps the parameters that it is given."""
 LONGEST_S = 10.0
 """An event this long after the last sample [s]: the motion is unknown by then, and the next sample starts it again."""
 
@@ -46,6 +47,8 @@ class StructuredState(NamedTuple):
     """(2,) torque held since then."""
     restarts: int = 0
     """How often numbers left the finite range."""
+    refits: int = 0
+    """How often the empty arm's fit was begun again."""
 
 
 class Horizon(NamedTuple):
@@ -102,13 +105,8 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     m = mem.copy(state.memory)
     assert state.effort is not None
     assert state.sensors is not None
-    ahead, held = max(event.stamp_ns - state.last_ns, 0), bool(m.counts[mem.HELD])
-    predict(state.model.motion, m.x, m.S, state.effort, min(ahead * 1e-9, LONGEST_S), held)
-    if ahead > 0:
-        excite_residual(state.model.motion, state.sensors.residual, m.x, m.torque, state.effort,
-                        residual_probability(m.score))
-        propagate_residual(state.sensors.residual, m, ahead * 1e-9, state.effort)
-        m.torque[:] = state.effort
+    ahead = max(event.stamp_ns - state.last_ns, 0)
+    predict(state.model.motion, m.x, m.S, state.effort, min(ahead * 1e-9, LONGEST_S))
     _change(config, state.model, m, event.kind)
     last_ns = state.last_ns + ahead
     return state._replace(memory=m, last_ns=last_ns, horizon=Horizon(state.cursor, last_ns, state.effort))
@@ -121,16 +119,20 @@ def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
 
 def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, kind: EventKind) -> None:
     """Reopen what an event changes: the rates, and what is held."""
-    payload = m.x.size - PARAMETERS
+    payload = model.payload
     held = bool(m.counts[mem.HELD])
-    before = float(model.motion.scale * np.exp(min(m.x[payload], 12.0))) if held else 0.0
+    before = max(float(m.x[payload]), 0.0) if held else 0.0
+    if kind is EventKind.CAPTURE and m.counts[mem.SEEN] < UNTAUGHT:
+        structured_model.take_as_known(model, m)
     columns = structured_model.jump(config, model, m)
-    opened = np.zeros((m.x.size, 2))
+    opened = np.zeros((m.x.size, model.body))
     if kind is EventKind.CAPTURE:
         if not held:
             _forget_payload(config, model, m)  # the arm was empty: its payload was the bias of the model
-        opened[payload, 0] = structured_model.PAYLOAD_STD
-        opened[-1, 1] = structured_model.PAYLOAD_STD if config.payload.rotary_inertia else 0.0
+        opened[payload, 0] = structured_model.body_std(config, model)[0]  # a point first
+        m.x[payload] += structured_model.body_mean(config, model)[0]
+        m.counts[mem.REFITS] = 0
+        m.counts[mem.LEARNED] = m.counts[mem.SEEN] >= UNTAUGHT
         m.counts[mem.HELD] = 1
     else:
         _forget_payload(config, model, m)
@@ -143,33 +145,31 @@ def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, kind
 
 def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterState) -> None:
     """Condition an empty arm on holding exactly nothing; drop what is known of a payload that is let go."""
-    payload = m.x.size - PARAMETERS
+    payload = model.payload
     if not m.counts[mem.HELD]:
         f = m.S[payload].copy()
         square = float(f @ f)
         if square > 0.0:
-            if m.counts[mem.SINCE_EVENT] > mem.HORIZON:
+            if m.counts[mem.SINCE_EVENT] > mem.ENOUGH:
                 m.score[mem.EMPTY_ARM_BIAS] = m.x[payload] / np.sqrt(square)
                 m.score[mem.EXCESS_BIAS] = m.x[payload] / np.hypot(np.sqrt(square), inexact(config, model, m, 0.0))
             gain = m.S @ f / square
             m.x[:] -= gain * m.x[payload]
             m.S[:] -= np.outer(gain, f)
-    for gone in (payload, m.x.size - 1):
-        m.x[gone] = 0.0
-        m.S[gone] = 0.0
+    m.x[payload:payload + model.body] = 0.0
+    m.S[payload:payload + model.body] = 0.0
 
 
 def _set_arrival_cost(m: mem.FilterState) -> None:
     """Begin a new moving horizon here: the present state is its arrival cost."""
     m.x0[:], m.S0[:] = m.x, m.S
     m.xi[:] = 0.0
-    m.torque0[:] = m.torque
     for counter in (mem.STORED, mem.ITERATED, mem.ITERATING, mem.SINCE_EVENT, mem.SINCE_NOISE, mem.IN_BATCH,
-                    mem.BATCHES):
+                    mem.BATCHES, mem.BEFORE, mem.REJECTED, mem.AGAIN):
         m.counts[counter] = 0
     m.counts[mem.BLOCKS] = min(m.counts[mem.BLOCKS], 40)
     m.score[:mem.EMPTY_ARM_BIAS] = 0.0
-    m.score[mem.DRIFT] = 1.0
+    m.score[mem.DRIFT], m.score[mem.LAMBDA] = 1.0, 0.0
     m.noise[:, mem.WEIGHT] = 0.0
     m.power[:] = 1.0
 
@@ -180,15 +180,15 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     assert model is not None
     Y = measurements(model, rows)
     dt = float(np.median(np.diff(rows.stamp_ns) * 1e-9))
-    size = 2 * model.motion.q.size + model.motion.G.shape[1]
-    m = mem.memory(size, len(model.roles), 2 * residual_modes.MODES)
+    m = mem.memory(2 * model.motion.arm.stiffness.size + model.motion.kind.size, len(model.roles))
     m.noise[:] = structured_model.noise(model, Y)
     structured_model.first(config, model, m, Y[0])
     structured_model.freeze(config, model, np.mean(rows.angles, axis=0))
-    m.torque[:] = rows.u[0]
+    if not state.refits:  # the simplest arm first; all that may be learned where that does not fit
+        structured_model.take_as_known(model, m)
     _set_arrival_cost(m)
-    seen = sensors(config, model, dt, structured_model.diffusion(config, model, m), m.x[:2])
-    m.score[mem.ODDS] = 0.0 if seen.residual.push.any() else residual_modes.UNBENT_ODDS
+    m.counts[mem.REFITS] = state.refits
+    seen = sensors(config, model, dt, structured_model.diffusion(config, model, m))
     events = state.early
     first_ns, effort = int(rows.stamp_ns[0]), rows.u[0].copy()
     state = state._replace(
@@ -210,7 +210,6 @@ def _resume(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
     fresh = reopen(config, state, measurements(state.model, rows.between(rows.first, rows.first + 1))[0])
     assert fresh.memory is not None
     last_ns, effort = int(rows.stamp_ns[0]), rows.u[0].copy()
-    fresh.memory.torque[:] = fresh.memory.torque0[:] = effort
     return fresh._replace(last_ns=last_ns, effort=effort, horizon=Horizon(rows.first, last_ns, effort))
 
 
@@ -221,10 +220,9 @@ def reopen(
     assert state.model is not None
     assert state.memory is not None
     m = mem.copy(state.memory)
-    n = state.model.motion.q.size
+    n = state.model.motion.arm.stiffness.size
     parameters, spread = m.x[2 * n:].copy(), m.S[2 * n:].copy()
     structured_model.first(config, state.model, m, m.recent[:, 0] if y is None else y)
-    m.residual[:] = 0.0
     m.x[2 * n:] = parameters
     m.S[2 * n:] = 0.0
     m.S[2 * n:, 2 * n:] = np.linalg.qr(spread.T)[1].T
@@ -242,12 +240,12 @@ def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> St
     table, first = input_table(state, rows)
     taken = moving_horizon.advance(state.model.motion, state.sensors, m, table, first)
     if taken < len(table):
-        return _restart(config, state, rows.since(rows.first + taken - first))
+        return _restart(config, state, m, rows.since(rows.first + taken - first))
     return state._replace(memory=m, cursor=rows.until, last_ns=int(rows.stamp_ns[-1]), effort=rows.u[-1].copy())
 
 
 def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
-    """Return what the kernel reads, (N, 3 + m), and the row of it that belongs to the first of ``rows``.
+    """Return what the kernel reads, (N, 1 + L + m), and the row of it that belongs to the first of ``rows``.
 
     Columns: duration since the sample before [s], torques held meanwhile [N m], measurements. While the
     horizon is open the table reaches back to its first row.
@@ -261,25 +259,54 @@ def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
     reach = rows.since(begin)
     assert effort is not None
     stamps, y = reach.stamp_ns, measurements(state.model, reach)
-    table = np.empty((len(y), 3 + y.shape[1]))
-    table[0, 0], table[0, 1:3] = stamps[0] - before_ns, effort
-    table[1:, 0], table[1:, 1:3] = stamps[1:] - stamps[:-1], reach.u[:-1]
+    links = effort.size
+    table = np.empty((len(y), 1 + links + y.shape[1]))
+    table[0, 0], table[0, 1:1 + links] = stamps[0] - before_ns, effort
+    table[1:, 0], table[1:, 1:1 + links] = stamps[1:] - stamps[:-1], reach.u[:-1]
     np.maximum(table[:, 0], 0.0, out=table[:, 0])
     table[:, 0] *= 1e-9
-    table[:, 3:] = y
+    table[:, 1 + links:] = y
     return table, rows.first - begin
 
 
-def _restart(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
-    """Numbers left the finite range: begin again after the first of the rows, knowing whether the arm holds."""
+def _restart(config: IdentifierParameters, state: StructuredState, m: mem.FilterState, rows: Rows) -> StructuredState:
+    """Begin again after the first of the rows: numbers left the finite range, or a fit failed.
+
+    The first fit is that of the simplest arm and of a point; the next ones learn all that they may, and a body. What is
+    held begins with its prior, and the arm with what was learned before the event.
+    """
+    assert state.model is not None
     assert state.memory is not None
-    fresh = init(config)._replace(restarts=state.restarts + 1, cursor=rows.first + 1)
-    if state.memory.counts[mem.HELD]:
+    model = state.model
+    refits = int(m.counts[mem.REFITS])
+    unfit = refits > state.memory.counts[mem.REFITS]
+    following = rows.since(rows.first + 1)
+    if m.counts[mem.HELD] and m.counts[mem.LEARNED] and np.isfinite(m.S0).all():
+        m = mem.copy(m)
+        m.x[:], m.S[:] = m.x0, m.S0
+        n, payload = model.motion.arm.stiffness.size, model.payload
+        parameters, spread = m.x[payload:].copy(), m.S[payload:].copy()
+        first = rows.between(rows.first, rows.first + 1)
+        structured_model.first(config, model, m, measurements(model, first)[0])
+        m.x[payload:], m.S[2 * n:] = parameters, 0.0
+        m.S[2 * n:, 2 * n:] = np.linalg.qr(spread.T)[1].T
+        body = slice(payload, payload + model.body)
+        m.x[body] = structured_model.body_mean(config, model)[:model.body]
+        m.S[body], m.S[:, body] = 0.0, 0.0
+        m.S[body, body] = np.diag(structured_model.body_std(config, model)[:model.body])
+        m.counts[mem.REFITS] = refits
+        _set_arrival_cost(m)
+        last_ns, effort = int(first.stamp_ns[0]), first.u[0].copy()
+        fresh = state._replace(memory=m, cursor=rows.first + 1, last_ns=last_ns, effort=effort,
+                               horizon=Horizon(rows.first + 1, last_ns, effort))
+        return advance(config, fresh, following)
+    fresh = init(config)._replace(restarts=state.restarts + (not unfit), cursor=rows.first + 1, refits=refits)
+    if m.counts[mem.HELD]:
         grasped = CaptureEvent(int(rows.stamp_ns[0]), EventKind.CAPTURE)
         fresh = fresh._replace(early=((rows.first + 1, grasped),))
-    return advance(config, fresh, rows.since(rows.first + 1))
+    return advance(config, fresh, following)
 
 
 def measurements(model: Model, rows: Rows) -> Array:
-    """Return outputs and the angles that are not among them, (N, m)."""
-    return np.hstack([rows.y, rows.angles[:, list(model.extra)]]) if model.extra else rows.y
+    """Return the outputs that are measurements and the angles that are not among them, (N, m)."""
+    return np.hstack([rows.y[:, list(model.kept)], rows.angles[:, list(model.extra)]])

@@ -9,14 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.arm.capture import body_jacobian
+from flexmanip_ros.arm.capture import tip_jacobian
 from flexmanip_ros.arm.dynamics import mass_matrix
-from flexmanip_ros.arm.manipulator import manipulator, workspace
+from flexmanip_ros.arm.manipulator import Manipulator, manipulator, modal, workspace
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.measurement_update import MeasurementModel
-from flexmanip_ros.payload.process_model import PARAMETERS, ProcessModel, set_parameters
-from flexmanip_ros.payload.residual_modes import residual_modes, residual_probability
+from flexmanip_ros.payload.process_model import Kind, ProcessModel, set_parameters
 from flexmanip_ros.types import Array
 
 
@@ -107,11 +106,27 @@ class Model(NamedTuple):
 
     motion: ProcessModel
     roles: tuple[Role, ...]
-    """Of every measurement: the outputs, then the angles that are not among them."""
+    """Of every measurement: of the outputs, then the angles that are not among them."""
+    kept: tuple[int, ...]
+    """Which outputs are measurements: the rate of what is measured itself is none."""
     extra: tuple[int, ...]
-    """Which of the two angles are appended to the outputs."""
+    """Which of the angles are appended to the outputs."""
     slowest: float
     """Lowest pinned frequency of a link [Hz]."""
+    prior: Array
+    """(np,) prior standard deviation of each entry of p."""
+    given: Array
+    """(np,) its prior mean."""
+
+    @property
+    def payload(self) -> int:
+        """Which state is the payload; the rest of the body follows it."""
+        return 2 * self.motion.arm.stiffness.size
+
+    @property
+    def body(self) -> int:
+        """How many states describe the payload: 1 a point, 4 a body."""
+        return int(np.sum(self.motion.kind <= Kind.INERTIA))
 
 
 def build(config: IdentifierParameters) -> Model | None:
@@ -119,10 +134,16 @@ def build(config: IdentifierParameters) -> Model | None:
     known = signals(config)
     if known is None or not known.torques or not known.angles:
         return None
-    extra = tuple(i for i in range(2) if Role(Quantity.ANGLE, i) not in known.outputs)
-    roles = known.outputs + tuple(Role(Quantity.ANGLE, i) for i in extra)
-    slowest = min(pinned_frequencies(config.arm))
-    return Model(motion(config), roles, extra, slowest)
+    extra = tuple(i for i in range(len(config.arm.link_length)) if Role(Quantity.ANGLE, i) not in known.outputs)
+    # a torque step sends waves through the links, which rates show and few shape functions do not have
+    measured = {role.link + 2 * (role.quantity // 2) for role in known.outputs
+                if role.quantity in (Quantity.ANGLE, Quantity.BEND)} | set(extra)
+    kept = tuple(i for i, role in enumerate(known.outputs) if role.quantity in (Quantity.ANGLE, Quantity.BEND)
+                 or role.link + 2 * (role.quantity // 2) not in measured)
+    roles = tuple(known.outputs[i] for i in kept) + tuple(Role(Quantity.ANGLE, i) for i in extra)
+    model = motion(config)
+    return Model(model, roles, kept, extra, min(pinned_frequencies(config.arm)), priors(config, model),
+                 _given(config.arm, model))
 
 
 def pinned_frequencies(arm: ArmParameters) -> tuple[float, ...]:
@@ -132,101 +153,177 @@ def pinned_frequencies(arm: ArmParameters) -> tuple[float, ...]:
         for L, EI, rho in zip(arm.link_length, arm.bending_stiffness, arm.linear_density, strict=True))
 
 
+LEARNED = {
+    'stiffness': Kind.STIFFNESS, 'damping': Kind.DAMPING, 'viscous_friction': Kind.VISCOUS,
+    'coulomb_friction': Kind.COULOMB, 'rotor_inertia': Kind.ROTOR, 'torque_gain': Kind.TORQUE_GAIN,
+    'bend_gain': Kind.BEND_GAIN, 'bend_offset': Kind.BEND_OFFSET, 'mode_stiffness': Kind.MODE}
+"""What ``payload.learn`` may name."""
+
+
+def learned(config: IdentifierParameters) -> tuple[tuple[Kind, int], ...]:
+    """Return what each entry of p is, and of which link: the body, then what the arm teaches."""
+    body = (Kind.MASS,) if config.payload.object == 'point' else (Kind.MASS, Kind.FIRST_X, Kind.FIRST_Y, Kind.INERTIA)
+    known = signals(config)
+    bends = {role.link for role in known.outputs if role.quantity in (Quantity.BEND, Quantity.BEND_RATE)} \
+        if known else set()
+    entries = [(kind, 0) for kind in body]
+    for name in config.payload.learn:
+        kind = LEARNED[name]
+        if kind is Kind.MODE:  # static shapes are no modes
+            k = config.arm.modes if config.arm.shape_functions == 'sines' else 0
+            entries += [(kind, i * k + j) for i in range(len(config.arm.link_length)) for j in range(1, k)]
+            continue
+        for i in range(len(config.arm.link_length)):
+            if kind not in (Kind.BEND_GAIN, Kind.BEND_OFFSET) or i in bends:
+                entries.append((kind, i))
+    return tuple(entries)
+
+
 def motion(config: IdentifierParameters) -> ProcessModel:
     """Allocate the arm for the compiled functions; its mass matrices are set at the working point later."""
     nominal = manipulator(config.arm)
-    n = 2 + 2 * nominal.kappa
-    constants = n - 4 + PARAMETERS
-    nx = 2 * n + constants
+    n, links = nominal.torque.shape
+    kinds = learned(config)
+    size = len(kinds)
+    nx = 2 * n + size
     unit = manipulator(replace(config.arm, damping_ratio=0.5)).damping / 0.5
-    arm = nominal._replace(stiffness=nominal.stiffness.copy(), damping=nominal.damping.copy())
-    lightest = config.arm.tip_mass + config.arm.linear_density[1] * config.arm.link_length[1] / 3
-    rotary = lightest if config.payload.rotary_inertia else 0.0
-    fastest = max(pinned_frequencies(config.arm)) * 2 * np.pi * (nominal.kappa + 0.25) ** 2
+    arm = nominal._replace(**{name: getattr(nominal, name).copy() for name in (
+        'stiffness', 'damping', 'viscous', 'coulomb', 'rotary')})
+    lightest = config.arm.tip_mass + config.arm.linear_density[-1] * config.arm.link_length[-1] / 3
+    fastest = max(np.sqrt(nominal.stiffness[modal(config.arm, nominal.kappa, i)] * 2 / (rho * L)).max()
+                  for i, (rho, L) in enumerate(zip(config.arm.linear_density, config.arm.link_length, strict=True)))
     return ProcessModel(
-        arm=arm, work=workspace(nominal.kappa), frozen=config.payload.dynamics == 'linear',
-        M0=np.zeros((n, n)), Mp=np.zeros((n, n)), Mi=np.zeros((n, n)), stiffness=nominal.stiffness,
-        damping=unit,
-        inertia=rotary * (0.1 * config.arm.link_length[1]) ** 2,
-        scale=lightest, least=-0.5 * lightest, substeps=STEP_ANGLE / fastest, payload=np.zeros(4),
-        a=np.zeros(n), q=np.zeros(n), k=np.zeros((8, n)), dq=np.zeros((n, n)), dqd=np.zeros((n, n)),
-        dp=np.zeros((n, 4)),
-        G=np.zeros((n, constants)), X=np.zeros((2 * n, nx)), Y=np.zeros((2 * n, nx)))
+        arm=arm, work=workspace(nominal), kind=np.array([kind for kind, _ in kinds], dtype=np.int64),
+        link=np.array([link for _, link in kinds], dtype=np.int64), frozen=config.payload.dynamics == 'linear',
+        M0=np.zeros((n, n)), Mp=np.zeros((4, n, n)), stiffness=nominal.stiffness, damping=unit, rotary=nominal.rotary,
+        scale=lightest, least=_least(nominal, lightest),
+        least_rotor=_least_rotor(nominal), substeps=STEP_ANGLE / fastest, payload=np.zeros(4),
+        effort=np.zeros(links), gain=np.ones(links), p=np.zeros(size), a=np.zeros(n), k=np.zeros((8, n)),
+        dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)), G=np.zeros((n, size)), X=np.zeros((2 * n, nx)),
+        Y=np.zeros((2 * n, nx)))
 
 
-def sensors(
-    config: IdentifierParameters, model: Model, dt: float, diffusion: Array, theta: Array,
-) -> MeasurementModel:
-    """Return how each measurement follows from the state; dt: sample time [s], theta: first chords (2,)."""
+def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Array) -> MeasurementModel:
+    """Return how each measurement follows from the state; dt: sample time [s]."""
     output = model.motion.arm.output
-    direct = truncated_feedthrough(config.arm, model.motion.arm.kappa)
-    H = np.empty((len(model.roles), output.shape[1]))
-    rows = np.zeros(len(model.roles), dtype=np.int64)
-    rate = np.zeros(len(model.roles), dtype=np.bool_)
-    feed = np.zeros((len(model.roles), 2))
+    links, count = len(config.arm.link_length), len(model.roles)
+    H = np.empty((count, output.shape[1]))
+    rate = np.zeros(count, dtype=np.bool_)
+    gain, offset = np.full(count, -1), np.full(count, -1)
     for i, role in enumerate(model.roles):
-        row = rows[i] = role.link + (2 if role.quantity in (Quantity.BEND, Quantity.BEND_RATE) else 0)
-        H[i] = output[row]
+        bends = role.quantity in (Quantity.BEND, Quantity.BEND_RATE)
+        H[i] = output[role.link + links * bends]
         rate[i] = role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE)
-        if not rate[i]:
-            feed[i] = direct[row]
+        if bends:
+            gain[i] = _state(model.motion, Kind.BEND_GAIN, role.link)
+            offset[i] = -1 if rate[i] else _state(model.motion, Kind.BEND_OFFSET, role.link)
     nx = diffusion.size
     block = max(2, round(0.1 / (model.slowest * dt)))
-    more = residual_modes(config.arm, theta, model.motion.arm.kappa, rows, rate)
-    return MeasurementModel(H=H, rate=rate, feed=feed, residual=more, block=block, diffusion=diffusion,
-                            deviation=np.zeros(nx), f=np.zeros(nx), W=np.zeros((nx, 2 * nx)))
+    return MeasurementModel(H=H, rate=rate, gain=gain, offset=offset, block=block, diffusion=diffusion,
+                            deviation=np.zeros(nx), f=np.zeros(nx), L=np.zeros((nx, nx)), W=np.zeros((nx, 2 * nx)))
 
 
-def truncated_feedthrough(arm: ArmParameters, kappa: int) -> Array:
-    """What the modes beyond kappa add to angles and bends under a held torque, (4, 2) per N m.
-
-    A pinned beam under end moments has exact slopes and deflections; their sine series up to kappa is what
-    the model has already. Zero for the paper's torques, which do not bend, and for chord angles.
-    """
-    through = np.zeros((4, 2))
-    if arm.torque_convention != 'joint' or not arm.slope_correction:
-        return through
-    j = np.pi * np.arange(1, kappa + 1)
-    sign = np.cos(j)
-    near, far, bend_near, bend_far = [], [], [], []
-    for L, EI, s in zip(arm.link_length, arm.bending_stiffness, arm.sensor_position, strict=True):
-        near.append(L / (3 * EI) - np.sum(2 * L / (EI * j ** 2)))
-        far.append(-L / (6 * EI) - np.sum(2 * L * sign / (EI * j ** 2)))
-        shape = 2 * L ** 2 / (EI * j ** 3) * np.sin(j * s)
-        bend_near.append(L ** 2 / (6 * EI) * s * (1 - s) * (2 - s) - np.sum(shape))
-        bend_far.append(-L ** 2 / (6 * EI) * s * (1 - s ** 2) - np.sum(sign * shape))
-    # link 1 carries torque 1 at its root and minus torque 2 at its tip, link 2 carries torque 2 at its root
-    if arm.angle_convention == 'encoder':
-        through[0] = near[0], -far[0]
-        through[1] = -far[0], near[0] + near[1]
-    through[2] = bend_near[0], -bend_far[0]
-    through[3, 1] = bend_near[1]
-    return through
+def _state(motion: ProcessModel, kind: Kind, link: int) -> int:
+    """Return which state that is; -1: none."""
+    found = np.flatnonzero((motion.kind == kind) & (motion.link == link))
+    return 2 * motion.arm.stiffness.size + int(found[0]) if found.size else -1
 
 
+def inertias(arm: Manipulator) -> Array:
+    """Inertia (L,) of the straight empty arm beyond each joint, about it [kg m^2]."""
+    links = arm.length.size
+    M = mass_matrix(arm, np.zeros(4), np.zeros(arm.stiffness.size))
+    return np.array([M[i:links, i:links].sum() for i in range(links)])
+
+
+DRIFT_SHARE = 3e-3
+"""Part of its prior deviation by which a parameter of the arm may drift in the square root of a second, over T."""
 CERTAIN = 1e-9
 """Standard deviation of what is taken as known."""
 EMPTY_STD = 0.05
 """Standard deviation of what an empty arm seems to hold, over its lightest tip mass."""
-PAYLOAD_STD = 2.0
-"""Standard deviation of the logarithm of an unknown payload."""
+PAYLOAD_STD = 3.0
+"""Standard deviation of an unknown payload, over the same mass; it is thought to weigh as much as that."""
+COM_STD = 0.1
+"""Of its centre of mass and its radius of gyration, over the length of the last link."""
+ROTOR_STD = 0.003
+"""Of a rotor inertia, over the inertia of the straight empty arm beyond its joint."""
+VISCOUS_STD = 0.02
+"""Of a viscous friction: the rate [1/s] at which it alone would slow down that inertia."""
+COULOMB_STD = 0.005
+"""Of a Coulomb friction: the deceleration [rad/s^2] that it alone would give that inertia."""
+GAIN_STD = 0.03
+"""Of the logarithm of the gains of torques and bends: calibrated to a few percent."""
+OFFSET_STD = 1e-3
+"""Of the offset of a bend, over the length of its link."""
+BASE_RATE_STD = 0.05
+"""Of the rate of a floating base before the first sample [rad/s]: it rests nearly."""
+SPIN = 0.3
+"""Expected spin of the object relative to the tip at a capture [rad/s]."""
 ANGLE_STD, RATE_STD = 0.03, 1.0
 """Chords [rad] and their rates [rad/s] before the first sample."""
 BEND_STD = 0.01
 """Bending over the length of the link before the first sample."""
-OTHER_JUMP = 0.3
-"""Part of the rate jump at a capture that the rigid impulse at the tip does not explain."""
+OTHER_JUMP = 0.01
+"""Part of the rate jump at a capture that an impulse at the tip does not explain: the shape functions are few."""
 RATE_NOISE = 10.0
 """Variance of rates over their white noise before they are known: rates show what the modes left out do."""
 FLOORS = {Quantity.ANGLE: 1e-6, Quantity.ANGLE_RATE: 1e-5, Quantity.BEND: 1e-7, Quantity.BEND_RATE: 1e-6}
 """Least standard deviations of a sensor [rad, rad/s, m, m/s]: no signal is exact."""
 
 
+def priors(config: IdentifierParameters, motion: ProcessModel) -> Array:
+    """Return the prior standard deviation (np,) of each entry of p; of the body, as an empty arm has it."""
+    J, L = inertias(motion.arm), np.array(config.arm.link_length)
+    alike = {Kind.MASS: EMPTY_STD * motion.scale, Kind.STIFFNESS: config.payload.stiffness_std,
+             Kind.DAMPING: config.payload.damping_std, Kind.TORQUE_GAIN: GAIN_STD, Kind.BEND_GAIN: GAIN_STD}
+    by_joint = {Kind.VISCOUS: VISCOUS_STD * J, Kind.COULOMB: COULOMB_STD * J, Kind.ROTOR: ROTOR_STD * J,
+                Kind.BEND_OFFSET: OFFSET_STD * L}
+    # shear, rotary inertia and coarse elements all move a mode the farther the higher it is, as j^2 or faster
+    modes = config.payload.model_error * (np.arange(1, motion.arm.kappa + 1) ** 2 - 1) / 3
+    by_joint[Kind.MODE] = np.tile(modes, len(L))
+    return np.array([by_joint[kind][link] if kind in by_joint else alike.get(kind, 0.0)
+                     for kind, link in zip(map(Kind, motion.kind), motion.link, strict=True)])
+
+
+def _given(arm: ArmParameters, motion: ProcessModel) -> Array:
+    """Return the prior mean (np,) of each entry of p, the value of its parameter."""
+    values = {Kind.DAMPING: (arm.damping_ratio,) * len(arm.link_length), Kind.VISCOUS: arm.joint_viscous_friction,
+              Kind.COULOMB: arm.joint_coulomb_friction}
+    return np.array([values[kind][link] if kind in values else 0.0
+                     for kind, link in zip(map(Kind, motion.kind), motion.link, strict=True)])
+
+
+def body_std(config: IdentifierParameters, model: Model) -> Array:
+    """Return the prior deviations (4,) of a captured body's mass, first moments and inertia."""
+    mass, reach = PAYLOAD_STD * model.motion.scale, COM_STD * config.arm.link_length[-1]
+    return np.array([mass, mass * reach, mass * reach, mass * reach ** 2])
+
+
+def body_mean(config: IdentifierParameters, model: Model) -> Array:
+    """Return the prior mean (4,) of a captured body: a point is at the edge of what is possible, so not there."""
+    mass, _, _, inertia = body_std(config, model) / PAYLOAD_STD
+    return np.array([mass, 0.0, 0.0, inertia])
+
+
+def _least(arm: Manipulator, mass: float) -> Array:
+    """Return the least mass and inertia of a payload with which the mass matrix stays positive: half the arm's own."""
+    J = tip_jacobian(arm, np.zeros(4), np.zeros(arm.stiffness.size))[2]
+    turning = 1.0 / float(J @ np.linalg.solve(mass_matrix(arm, np.zeros(4), np.zeros(arm.stiffness.size)), J))
+    return np.array([-0.5 * mass, -0.5 * turning])
+
+
+def _least_rotor(arm: Manipulator) -> Array:
+    """Return the least rotor inertias (L,) [kg m^2] with which the mass matrix stays positive."""
+    M = mass_matrix(arm, np.zeros(4), np.zeros(arm.stiffness.size))
+    return np.array([-0.25 / float(row @ np.linalg.solve(M, row)) for row in arm.joint])
+
+
 def noise(model: Model, Y: Array) -> Array:
     """First guess of every sensor's noise from its first samples Y (N, m), as ``FilterState.noise``."""
     differences = np.diff(Y, n=4, axis=0)
     white = (1.4826 * np.median(np.abs(differences), axis=0)) ** 2 / 70
-    rows = np.zeros((len(model.roles), 8))
+    rows = np.zeros((len(model.roles), 9))
     for i, role in enumerate(model.roles):
         rate = role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE)
         rows[i, mem.FLOOR] = FLOORS[role.quantity] ** 2
@@ -238,45 +335,49 @@ def noise(model: Model, Y: Array) -> Array:
 
 def first(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Array) -> None:
     """Fill x and S from the first measurement; the arm is empty and may move."""
-    n = model.motion.q.size
-    k = (n - 2) // 2
+    arm = model.motion.arm
+    n, k, links = arm.stiffness.size, arm.kappa, arm.length.size
     m.x[:] = 0.0
-    angles = np.zeros(2)
+    angles = np.zeros(links)
     for i, role in enumerate(model.roles):
         if role.quantity is Quantity.ANGLE:
             angles[role.link] = y[i]
         elif role.quantity is Quantity.BEND:
-            shape = model.motion.arm.output[2 + role.link, 2 + role.link * k]
-            m.x[2 + role.link * k] = y[i] * shape / (shape ** 2 + 0.1)
-    m.x[:2] = chords(config.arm, angles)
-    p = m.x.size - PARAMETERS
-    m.x[p + 3:p + 5] = config.arm.damping_ratio
+            shape = arm.output[links + role.link, links + role.link * k]
+            m.x[links + role.link * k] = y[i] * shape / (shape ** 2 + 0.1)
+    m.x[:links] = chords(config.arm, angles)
+    m.x[2 * n:] = model.given
     std = np.zeros(m.x.size)
-    std[:2], std[n:n + 2] = ANGLE_STD, RATE_STD
+    std[:links], std[n:n + links] = ANGLE_STD, RATE_STD
+    if arm.floating:  # only angles relative to the base are seen
+        std[n - 1], std[2 * n - 1] = CERTAIN, BASE_RATE_STD
     for link, (L, EI, rho) in enumerate(zip(config.arm.link_length, config.arm.bending_stiffness,
                                             config.arm.linear_density, strict=True)):
-        part = slice(2 + link * k, 2 + (link + 1) * k)
-        j = np.arange(1, k + 1)
-        std[part] = BEND_STD * L / j ** 2
+        part = modal(config.arm, k, link)
+        std[part] = BEND_STD * L / np.arange(1, k + 1) ** 2
         # a mode's rate is its bending times its frequency, which grows as j^2
         std[n + part.start:n + part.stop] = BEND_STD * L * (np.pi / L) ** 2 * np.sqrt(EI / rho)
-    std[p] = EMPTY_STD * model.motion.scale
-    # shear, rotary inertia and coarse elements all move a mode the farther the higher it is, as j^2 or faster
-    deviations = config.payload.model_error * (np.arange(2, k + 1) ** 2 - 1) / 3
-    std[2 * n:p] = np.maximum(np.tile(deviations, 2), CERTAIN)
-    std[p + 1:p + 3] = max(config.payload.stiffness_std, CERTAIN)
-    std[p + 3:p + 5] = max(config.payload.damping_std, CERTAIN)
+    std[2 * n:] = model.prior
     m.S[:] = np.diag(std)
 
 
+def take_as_known(model: Model, m: mem.FilterState) -> None:
+    """Take friction, rotors, gains and offsets as given: an unknown object hides them."""
+    n = model.motion.arm.stiffness.size
+    for c, kind in enumerate(model.motion.kind):
+        if kind > Kind.DAMPING:
+            m.x[2 * n + c] = model.given[c]
+            m.S[2 * n + c] = 0.0
+
+
 def freeze(config: IdentifierParameters, model: Model, angles: Array) -> None:
-    """Set the mass matrices of a linear plant at its working point, given or as measured (2,), unbent."""
-    rest = np.zeros(model.motion.q.size)
-    rest[:2] = config.payload.working_point or chords(config.arm, angles)
-    nominal = model.motion.arm
+    """Set the mass matrices of a linear plant at its working point, given or as measured (L,), unbent."""
+    nominal = manipulator(config.arm)
+    rest = np.zeros(nominal.stiffness.size)
+    rest[:len(angles)] = config.payload.working_point or chords(config.arm, angles)
     model.motion.M0[:] = mass_matrix(nominal, np.zeros(4), rest)
-    model.motion.Mp[:] = mass_matrix(nominal, np.array([1.0, 0.0, 0.0, 0.0]), rest) - model.motion.M0
-    model.motion.Mi[:] = mass_matrix(nominal, np.array([0.0, 1.0, 0.0, 0.0]), rest) - model.motion.M0
+    for p, unit in enumerate(np.eye(4)):
+        model.motion.Mp[p] = mass_matrix(nominal, unit, rest) - model.motion.M0
 
 
 def widen(S: Array, columns: Array) -> Array:
@@ -286,23 +387,27 @@ def widen(S: Array, columns: Array) -> Array:
 
 
 def jump(config: IdentifierParameters, model: Model, m: mem.FilterState) -> Array:
-    """Columns (nx, c) of the rate jump at an event: an impulse at the tip, and what it leaves open."""
-    n = model.motion.q.size
-    held = bool(m.counts[mem.HELD])
-    set_parameters(model.motion, m.x, held)
+    """Columns (nx, c) of the rate jump at an event: an impulse at the tip, force and moment, and what it leaves open.
+
+    Whatever a body of unknown mass does to the rates, it does through such an impulse p on the arm as it was: q'
+    jumps by M^-1 J' p, p the expected mass times the expected speed, and a moment likewise.
+    """
+    motion = model.motion
+    n, links = motion.arm.stiffness.size, motion.arm.length.size
+    set_parameters(motion, m.x)
     q = m.x[:n]
-    if model.motion.frozen:
-        M = (model.motion.M0 + model.motion.payload[0] * model.motion.Mp
-             + model.motion.payload[1] * model.motion.Mi)
-        q = np.concatenate([q[:2], np.zeros(n - 2)])
+    if motion.frozen:
+        M = motion.M0 + np.tensordot(motion.payload, motion.Mp, 1)
+        q = np.concatenate([q[:links], np.zeros(n - links)])
     else:
-        M = mass_matrix(model.motion.arm, model.motion.payload, q)
-    J = body_jacobian(model.motion.arm, q, (0.0, 0.0))[:2]
-    impulse = np.linalg.solve(M, J.T)
-    mobility, axes = np.linalg.eigh(J @ impulse)
-    reach = mobility > 1e-3 * mobility[-1]  # a straight arm gives no way along its links
-    speed = np.hypot(config.payload.capture_speed, np.linalg.norm(J @ m.x[n:2 * n]))
-    rates = impulse @ axes[:, reach] / np.sqrt(mobility[reach]) * speed
+        M = mass_matrix(motion.arm, motion.payload, q)
+    J = tip_jacobian(motion.arm, motion.payload, q)
+    if model.body == 1:
+        J = J[:2]
+    speed = np.hypot(config.payload.capture_speed, np.linalg.norm(J[:2] @ m.x[n:2 * n]))
+    mass, _, moment, inertia = body_std(config, model) / PAYLOAD_STD
+    impulse = np.array([mass * speed, mass * speed, moment * speed + inertia * SPIN])[:len(J)]
+    rates = np.linalg.solve(M, J.T) * impulse
     other = OTHER_JUMP * np.sqrt((rates ** 2).sum(axis=1))
     columns = np.zeros((m.x.size, rates.shape[1] + n))
     columns[n:2 * n] = np.hstack([rates, np.diag(other)])
@@ -310,24 +415,22 @@ def jump(config: IdentifierParameters, model: Model, m: mem.FilterState) -> Arra
 
 
 def shake(model: Model, m: mem.FilterState) -> None:
-    """An event rings modes beyond kappa, and rates show it; by how much nobody knows, unlike at a torque."""
+    """An event rings vibrations that no few shape functions have, and rates show them."""
     for i, role in enumerate(model.roles):
         if role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE):
-            shaken = m.noise[i, mem.WHITE] * (1.0 + (RATE_NOISE - 1.0) * min(1.0, 2.0 * residual_probability(m.score)))
-            m.noise[i, mem.EFFECTIVE] = max(m.noise[i, mem.EFFECTIVE], shaken)
+            m.noise[i, mem.EFFECTIVE] = max(m.noise[i, mem.EFFECTIVE], RATE_NOISE * m.noise[i, mem.WHITE])
 
 
 def diffusion(config: IdentifierParameters, model: Model, m: mem.FilterState) -> Array:
     """Standard deviation (nx,) each state gains in the square root of a second, so that memory is finite."""
-    n = model.motion.q.size
+    arm = model.motion.arm
+    n, links = arm.stiffness.size, arm.length.size
     T = config.payload.memory_time
     gained = np.zeros(m.x.size)
     # a rate is then forgotten over T: what it gains in T equals what T seconds of samples tell of it
-    gained[n:n + 2] = 1e-4 / T
-    gained[n + 2:2 * n] = 1e-5 / T * np.array(config.arm.link_length).max()
-    p = m.x.size - PARAMETERS
-    gained[2 * n:p] = 1e-4 / T
-    gained[p] = (1e-4 if m.counts[mem.HELD] else 1e-3) / T
-    gained[p + 1:p + 5] = 1e-4 / T
-    gained[p + 5] = 1e-3 / T if config.payload.rotary_inertia else 0.0
+    gained[n:n + links] = 1e-4 / T
+    gained[n + links:2 * n] = 1e-5 / T * np.array(config.arm.link_length).max()
+    gained[2 * n:] = DRIFT_SHARE / T * model.prior
+    body = body_std(config, model)[:model.body] / PAYLOAD_STD
+    gained[model.payload:model.payload + model.body] = (1e-4 if m.counts[mem.HELD] else 1e-3) / T * body
     return gained

@@ -209,7 +209,7 @@ def report_estimate(report: Report, estimate: Estimate | None, order: int) -> No
         return
     report.values.update(
         excitation=estimate.excitation, condition=estimate.condition,
-        innovation_power=estimate.innovation_power, modes_deviation=estimate.modes_deviation)
+        innovation_power=estimate.innovation_power)
     if estimate.singular_values is not None:
         report.values['order'] = order
         report.values['suggested_order'] = suggested_order(estimate.singular_values)

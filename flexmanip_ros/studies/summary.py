@@ -7,8 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
+import numpy as np
+
 from flexmanip_ros import pipeline
-from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, Status
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, Payload, Status
 
 ADVICE: Mapping[Status, str] = {
     Status.WARMING_UP: 'record for longer, while the arm moves',
@@ -40,18 +42,19 @@ class Summary:
     consistency: float | None
     capture_time_s: float | None
     release_time_s: float | None
+    payload_com_m: tuple[float, ...] | None = None
+    payload_com_std_m: tuple[float, ...] | None = None
+    payload_inertia_kgm2: float | None = None
+    payload_inertia_std_kgm2: float | None = None
     vaf_simulation_percent: tuple[float | None, ...] | None = None
     vaf_prediction_percent: tuple[float | None, ...] | None = None
     model_status: str = 'TRACKING'
     """Status of the model, where ``status`` is that of the payload. It is not in the JSON."""
-    modes_deviation: float = math.nan
-    """Deviation of the model's modes from those of the arm with this payload, over what is tolerated: above 1
-    they disagree. It is not in the JSON."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the values as JSON has them: no NaN, no infinity, lists instead of tuples."""
         return {item.name: _json(getattr(self, item.name)) for item in fields(self)
-                if item.name not in ('model_status', 'modes_deviation')}
+                if item.name != 'model_status'}
 
     def payload_text(self) -> str:
         """Return payload and interval in words; where they are not reliable, the reason and what to do next."""
@@ -78,16 +81,25 @@ def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -
         wall_s=wall_s,
         status='WARMING_UP' if estimate is None else estimate.status.name,
         model_status='WARMING_UP' if estimate is None else estimate.model_status.name,
-        modes_deviation=math.nan if estimate is None else estimate.modes_deviation,
         frequencies_hz=tuple(mode.frequency_hz for mode in modes),
         damping_ratios=tuple(mode.damping_ratio for mode in modes),
         payload_mass_kg=None if payload is None else _known(payload.mass),
         payload_std_kg=None if payload is None else _known(payload.std),
         payload_ci95_kg=None if payload is None else (_known(payload.lower), _known(payload.upper)),
         consistency=None if payload is None else _known(payload.consistency),
+        **_body(payload),
         capture_time_s=event_time(state, EventKind.CAPTURE),
         release_time_s=event_time(state, EventKind.RELEASE),
     )
+
+
+def _body(payload: Payload | None) -> dict[str, Any]:
+    """Return centre of mass and inertia with their deviations; nothing where the object is a point."""
+    if payload is None or not payload.covariance:
+        return {}
+    std = np.sqrt(np.maximum(np.array(payload.covariance)[::5], 0.0)).tolist()
+    return {'payload_com_m': payload.com[:2], 'payload_com_std_m': tuple(std[1:3]),
+            'payload_inertia_kgm2': payload.inertia[5], 'payload_inertia_std_kgm2': std[3]}
 
 
 def event_time(state: pipeline.State, kind: EventKind) -> float | None:

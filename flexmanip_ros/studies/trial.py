@@ -85,6 +85,8 @@ def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_k
     low, high = interval
     for name in ('vaf_simulation_percent', 'vaf_prediction_percent', 'wall_s'):
         row.pop(name)
+    for kind in ('payload_com_m', 'payload_com_std_m'):
+        row[f'{kind}_x'], row[f'{kind}_y'] = row.pop(kind) or (None, None)
     for kind in ('frequencies_hz', 'damping_ratios'):
         for k, value in enumerate(row.pop(kind)):
             row[f'{kind.split("_")[0]}_{k + 1}'] = value

@@ -21,7 +21,8 @@ from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, Status
 START = 1_700_000_000_000_000_000
 KEYS = ['samples', 'gaps', 'sample_time_s', 'wall_s', 'status', 'frequencies_hz', 'damping_ratios',
         'payload_mass_kg', 'payload_std_kg', 'payload_ci95_kg', 'consistency', 'capture_time_s',
-        'release_time_s', 'vaf_simulation_percent', 'vaf_prediction_percent']
+        'release_time_s', 'payload_com_m', 'payload_com_std_m', 'payload_inertia_kgm2', 'payload_inertia_std_kgm2',
+        'vaf_simulation_percent', 'vaf_prediction_percent']
 OTHER = {'payload_method': 'none', 'inputs': ['motor/effort'], 'outputs': ['arm/position', 'arm/velocity'],
          'angles': [], 'order': 2, 'past_window': 6, 'future_window': 4}
 SETTINGS = [f'--set={name}={json.dumps(value)}' for name, value in OTHER.items()]

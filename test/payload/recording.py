@@ -16,7 +16,7 @@ from flexmanip_ros.types import CaptureEvent, EventKind
 
 BENDS = ('link1_bend/position', 'link2_bend/position')
 RATES = ('link1_bend/velocity', 'link2_bend/velocity')
-ARM = ArmParameters(damping_ratio=0.003, modes=2, slope_correction=False)
+ARM = ArmParameters(shape_functions='sines', damping_ratio=0.003, modes=2)
 
 
 def config(

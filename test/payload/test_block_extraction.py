@@ -16,8 +16,7 @@ from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
 from flexmanip_ros.payload import block_extraction
-from flexmanip_ros.payload.arm_modes import to_modal
-from flexmanip_ros.payload.block_extraction import estimate, extend_range, extract
+from flexmanip_ros.payload.block_extraction import estimate, extend_range, extract, to_modal
 from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.types import StateSpace, Status
 
@@ -78,7 +77,7 @@ def test_a_model_without_stiffness_is_refused():
 @pytest.mark.parametrize(('tip_mass', 'noise'), [(5.0, 1e-7), (5.0, 1e-5), (9.9, 1e-5)])
 def test_a_mass_below_zero_is_never_a_narrow_interval_at_zero(tip_mass, noise):
     config = configure(IdentifierParameters, {
-        'payload_method': 'block', 'arm.angle_convention': 'chord', 'arm.modes': 1})
+        'payload_method': 'block', 'arm.angle_convention': 'chord', 'arm.shape_functions': 'sines', 'arm.modes': 1})
     theta, dt = np.radians([60.0, 45.0]), 1e-3
     lighter = replace(config.arm, tip_mass=tip_mass)
     A, B = discretize(*vibration_model(lighter, theta, 0.0, 1), dt)
@@ -107,7 +106,7 @@ def _sharp(model, order=4):
 
 def _config(**changes):
     return configure(IdentifierParameters, {
-        'payload_method': 'block', 'arm.angle_convention': 'chord', 'arm.modes': 1,
+        'payload_method': 'block', 'arm.angle_convention': 'chord', 'arm.shape_functions': 'sines', 'arm.modes': 1,
         **{name.replace('__', '.'): value for name, value in changes.items()}})
 
 

@@ -59,7 +59,7 @@ def test_a_capture_at_rest_is_told_when_the_torque_resumes():
     samples = rows_of(trajectory.effort[:, :2], Y, trajectory.position[:, :2], trajectory.stamp_ns)
     ((found, told),) = detect(settings(), samples)
     assert found.kind is EventKind.CAPTURE
-    assert 2.0e9 < told <= 2.1e9
+    assert 2.0e9 < told <= 2.15e9  # an arm that rested has taught nothing of its friction and gains
 
 
 def test_single_samples_give_the_events_of_a_block():

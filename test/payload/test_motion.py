@@ -7,6 +7,7 @@ import pytest
 
 from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.payload import process_model
+from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.payload.structured_model import motion
 
 SHORT = {
@@ -17,17 +18,23 @@ TORQUE = np.array([2.0, -0.8])
 
 @pytest.fixture
 def arm():
-    return motion(configure(IdentifierParameters, SHORT))
+    found = motion(configure(IdentifierParameters, SHORT))
+    found.effort[:] = TORQUE
+    return found
 
 
 def bent(arm, n: int) -> np.ndarray:
-    """A bent arm in motion, holding something."""
+    """A bent arm in motion, holding a body, with friction, rotors and sensors of their own."""
     rng = np.random.default_rng(0)
-    x = np.zeros(2 * n + arm.G.shape[1])
+    x = np.zeros(2 * n + arm.kind.size)
     x[:2], x[n:n + 2] = (1.0, 0.6), (0.3, -0.4)
-    x[2:n] = rng.normal(size=n - 2) * np.tile([5e-3, 5e-4, 1e-4], 2)
-    x[n + 2:2 * n] = rng.normal(size=n - 2) * np.tile([0.5, 0.2, 0.1], 2)
-    process_model.set_parameters(arm, x, True)
+    size = np.tile([1.0, 0.1, 0.02, 0.01, 0.01], 2)
+    x[2:n] = rng.normal(size=n - 2) * 5e-3 * size
+    x[n + 2:2 * n] = rng.normal(size=n - 2) * 0.5 * size
+    values = {Kind.MASS: 0.7, Kind.FIRST_X: 0.05, Kind.FIRST_Y: 0.02, Kind.INERTIA: 0.02, Kind.STIFFNESS: 0.02,
+              Kind.DAMPING: 0.01, Kind.VISCOUS: 0.05, Kind.COULOMB: 0.02, Kind.ROTOR: 0.01, Kind.TORQUE_GAIN: 0.03}
+    x[2 * n:] = [values.get(Kind(kind), 0.0) for kind in arm.kind]
+    process_model.set_parameters(arm, x)
     return x
 
 
@@ -35,7 +42,7 @@ def fine(arm, x: np.ndarray, n: int, duration: float, steps: int) -> np.ndarray:
     """Runge and Kutta with steps so small that they count as exact."""
     def slope(state):
         qdd = np.zeros(n)
-        assert process_model.accelerate(arm, state[:n].copy(), state[n:].copy(), TORQUE, qdd)
+        assert process_model.accelerate(arm, state[:n].copy(), state[n:].copy(), qdd)
         return np.concatenate([state[n:], qdd])
 
     state, h = x[:2 * n].copy(), duration / steps
@@ -50,46 +57,50 @@ def fine(arm, x: np.ndarray, n: int, duration: float, steps: int) -> np.ndarray:
 def error(arm, x: np.ndarray, exact: np.ndarray, n: int, duration: float, h: float) -> float:
     state = x.copy()
     for _ in range(round(duration / h)):
-        assert process_model.exponential_step(arm, state, TORQUE, h, True)
+        assert process_model.linearize(arm, state[:n], state[n:2 * n], arm.k[0])
+        assert process_model.exponential_step(arm, state, h)
     return float(np.abs(state[:n] - exact[:n]).max())
 
 
 def test_a_step_of_one_sample_is_exact_to_a_hundredth_of_the_sensors_and_of_third_order(arm):
-    n = arm.q.size
+    n = arm.arm.stiffness.size
     x = bent(arm, n)
-    exact = fine(arm, x, n, 0.02, 1000)
-    coarse, halved = (error(arm, x, exact, n, 0.02, h) for h in (1e-3, 5e-4))
+    x[2 * n:][arm.kind == Kind.COULOMB] = 0.0  # it has no third derivative to speak of
+    process_model.set_parameters(arm, x)
+    exact = fine(arm, x, n, 0.02, 4000)
+    coarse, halved = (error(arm, x, exact, n, 0.02, h) for h in (1e-4, 5e-5))
     assert coarse < 1e-7  # of bends of 5e-3 m
     assert halved < coarse / 6
 
 
 def test_the_linearisation_is_the_derivative_of_the_motion(arm):
-    n = arm.q.size
+    n = arm.arm.stiffness.size
     x = bent(arm, n)
     qdd, low, high = np.zeros(n), np.zeros(n), np.zeros(n)
-    assert process_model.linearize(arm, x[:n].copy(), x[n:2 * n].copy(), TORQUE, qdd, True)
+    assert process_model.linearize(arm, x[:n].copy(), x[n:2 * n].copy(), qdd)
     dq, dqd = arm.dq.copy(), arm.dqd.copy()
     for i in range(2 * n):
         up, down = x[:2 * n].copy(), x[:2 * n].copy()
         up[i] += 1e-6
         down[i] -= 1e-6
-        process_model.accelerate(arm, up[:n].copy(), up[n:].copy(), TORQUE, high)
-        process_model.accelerate(arm, down[:n].copy(), down[n:].copy(), TORQUE, low)
+        process_model.accelerate(arm, up[:n].copy(), up[n:].copy(), high)
+        process_model.accelerate(arm, down[:n].copy(), down[n:].copy(), low)
         given = dq[:, i] if i < n else dqd[:, i - n]
-        np.testing.assert_allclose((high - low) / 2e-6, given, rtol=1e-5, atol=1e-6 * np.abs(given).max())
+        np.testing.assert_allclose((high - low) / 2e-6, given, rtol=1e-4, atol=1e-6 * np.abs(given).max())
 
 
-def test_the_derivatives_by_stiffness_and_unevenness_are_those_of_the_motion(arm):
-    n = arm.q.size
+def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(arm):
+    n = arm.arm.stiffness.size
     x = bent(arm, n)
     qdd, low, high = np.zeros(n), np.zeros(n), np.zeros(n)
-    assert process_model.linearize(arm, x[:n].copy(), x[n:2 * n].copy(), TORQUE, qdd, True)
+    assert process_model.linearize(arm, x[:n].copy(), x[n:2 * n].copy(), qdd)
     G = arm.G.copy()
     for c in range(G.shape[1]):
         up, down = x.copy(), x.copy()
         up[2 * n + c] += 1e-5
         down[2 * n + c] -= 1e-5
         for state, acceleration in ((up, high), (down, low)):
-            process_model.set_parameters(arm, state, True)
-            process_model.accelerate(arm, x[:n].copy(), x[n:2 * n].copy(), TORQUE, acceleration)
-        np.testing.assert_allclose((high - low) / 2e-5, G[:, c], rtol=1e-4, atol=1e-6 * np.abs(G).max())
+            process_model.set_parameters(arm, state)
+            arm.effort[:] = arm.gain * TORQUE / np.exp(0.03)
+            process_model.accelerate(arm, x[:n].copy(), x[n:2 * n].copy(), acceleration)
+        np.testing.assert_allclose((high - low) / 2e-5, G[:, c], rtol=1e-4, atol=1e-5 * np.abs(G[:, c]).max() + 1e-9)

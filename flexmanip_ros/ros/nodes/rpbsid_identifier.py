@@ -7,6 +7,7 @@ publishes   ~/model           std_msgs/Float64MultiArray  [[A, B, K], [C, D, I]]
             ~/modes           std_msgs/Float64MultiArray  damped frequency [Hz], damping ratio
             ~/payload_mass    std_msgs/Float64            kg; nothing while nothing is known
             ~/payload_estimate std_msgs/Float64MultiArray mass, std, 95 % interval, consistency; latched
+            ~/payload_body     std_msgs/Float64MultiArray mass, centre of mass, inertia, and their covariance; latched
             ~/payload         geometry_msgs/InertiaStamped at the stamp of the sample that gave it; latched
             ~/status          diagnostic_msgs/DiagnosticArray stamp, status and numbers of payload or model; latched
             /diagnostics      diagnostic_msgs/DiagnosticArray  1 Hz
@@ -50,7 +51,8 @@ NAME = 'rpbsid_identifier'
 TOPICS = {
     messages.MODEL: (Float64MultiArray, qos.latched), messages.MODES: (Float64MultiArray, qos.output),
     messages.PAYLOAD_MASS: (Float64, qos.output), messages.PAYLOAD_ESTIMATE: (Float64MultiArray, qos.latched),
-    messages.PAYLOAD: (InertiaStamped, qos.latched), messages.STATUS: (DiagnosticArray, qos.latched),
+    messages.PAYLOAD: (InertiaStamped, qos.latched), messages.PAYLOAD_BODY: (Float64MultiArray, qos.latched),
+    messages.STATUS: (DiagnosticArray, qos.latched),
 }
 """Type and quality of service of each output."""
 

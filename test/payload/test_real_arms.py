@@ -1,0 +1,57 @@
+"""Arms and objects as they are, simulated independently of this package: the estimator is told the ideal arm.
+
+The recordings stand outside of the repository; without them these tests are skipped.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flexmanip_ros import pipeline
+from flexmanip_ros.io import bag
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
+from flexmanip_ros.types import Payload, Status
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def last_payload(name: str) -> tuple[Payload, dict[str, Any]]:
+    """What is known of the payload at the end of a recording, and the truth."""
+    folder = Path(os.environ.get('FLEXMANIP_DATA', ROOT.parent / 'shared' / 'data'))
+    if not (folder / name).exists():
+        pytest.skip(f'{name} is not at {folder}; set FLEXMANIP_DATA')
+    truth = json.loads((folder / f'{name}.truth.json').read_text(encoding='utf-8'))
+    arm = ArmParameters(damping_ratio=0.003)
+    if 'base' in truth:
+        arm = replace(arm, base_mass=truth['base']['mass'], base_inertia=truth['base']['inertia'])
+    config = IdentifierParameters(arm=arm, model_rate=0.1)
+    payload = None
+    for estimate in pipeline.run(config, bag.read(folder / name)):
+        payload = estimate.payload
+    assert payload is not None
+    return payload, truth
+
+
+@pytest.mark.parametrize('name', ['arm_friction_rotor', 'arm_gains', 'arm_body', 'arm_orbit'])
+def test_the_mass_is_within_seven_tenths_of_a_percent_inside_its_interval_and_trusted(name: str) -> None:
+    found, truth = last_payload(name)
+    assert found.status is Status.TRACKING
+    assert found.mass == pytest.approx(truth['payload'], rel=0.007)
+    assert found.lower < truth['payload'] < found.upper
+
+
+@pytest.mark.parametrize('name', ['arm_body', 'arm_orbit'])
+def test_centre_and_inertia_of_a_body_are_known(name: str) -> None:
+    found, truth = last_payload(name)
+    assert found.com[:2] == pytest.approx(truth['com'], abs=0.006)
+    assert found.inertia[5] == pytest.approx(truth['inertia'], rel=0.05)
+    deviations = np.sqrt(np.diag(np.array(found.covariance).reshape(4, 4)))[1:]
+    errors = np.array([*found.com[:2], found.inertia[5]]) - [*truth['com'], truth['inertia']]
+    assert np.all(np.abs(errors) < 3.5 * deviations)
