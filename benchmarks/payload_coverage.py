@@ -17,7 +17,7 @@ from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantP
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
-ARM = ArmParameters(damping_ratio=0.003, modes=2, slope_correction=False)
+ARM = ArmParameters(shape_functions='sines', damping_ratio=0.003, modes=2)
 MARKS = (100, 250, 500, 1000, 2000)
 
 

@@ -19,7 +19,7 @@ from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, Status
 
 PAPER = {'torque_convention': 'paper', 'angle_convention': 'chord', 'shortening': False,
-         'slope_correction': False}
+         'shape_functions': 'sines'}
 MARKS = (100, 250, 1000, 2990)
 
 

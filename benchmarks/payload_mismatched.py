@@ -31,7 +31,7 @@ SHORT = ArmParameters(
     tip_mass=3.0, damping_ratio=0.01)
 PAPER = ArmParameters(
     damping_ratio=0.0, torque_convention='paper', angle_convention='chord', shortening=False,
-    slope_correction=False)
+    shape_functions='sines')
 MARKS = (1000, 2990)
 DATA = Path(os.environ.get('FLEXMANIP_DATA', Path(__file__).resolve().parents[2] / 'shared' / 'data'))
 

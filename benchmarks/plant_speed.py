@@ -44,7 +44,7 @@ def best(action: Callable[[], object], repeats: int = 7) -> float:
 def with_scipy(config: PlantParameters, efforts: np.ndarray) -> np.ndarray:
     """Coordinates and rates (N, 2 n) at the samples."""
     arm = manipulator.manipulator(config.arm)
-    work, n = manipulator.workspace(arm.kappa), 2 + 2 * arm.kappa
+    work, n = manipulator.workspace(arm), 2 + 2 * arm.kappa
     x, payload, qdd = simulator.init(config).x, np.zeros(4), np.empty(n)
     rows, first = [], 0
     changes = np.flatnonzero(np.any(np.diff(efforts, axis=0) != 0, axis=1)) + 1
@@ -81,7 +81,7 @@ def main() -> int:
                         'times_faster_than_scipy': faster, **more})
 
     for kappa in (1, 3, 5):
-        config = PlantParameters(noise='none', arm=ArmParameters(modes=kappa))
+        config = PlantParameters(noise='none', arm=ArmParameters(shape_functions='sines', modes=kappa))
         run = simulator.simulate(config, efforts, EVENT)
         ours = best(lambda config=config: simulator.simulate(config, efforts, EVENT))
         theirs = best(lambda config=config: with_scipy(config, efforts), repeats=2)
@@ -92,8 +92,8 @@ def main() -> int:
                largest_bend_difference_from_scipy=float(gap))
         report(f'scipy, kappa {kappa}', theirs)
     for name, config in (
-        ('nonlinear, kappa 3, tail 6', PlantParameters(noise='none', tail_modes=6)),
-        ('linear, kappa 3', PlantParameters(noise='none', model='linear')),
+        ('component modes, three sines', PlantParameters(noise='none')),
+        ('linear, the same', PlantParameters(noise='none', model='linear')),
         ('finite elements, 10 a link', PlantParameters(noise='none', model='finite_element')),
     ):
         report(name, best(lambda config=config: simulator.simulate(config, efforts, EVENT), repeats=3))
