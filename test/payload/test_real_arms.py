@@ -16,8 +16,16 @@ import pytest
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.io import bag
-from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
-from flexmanip_ros.types import Payload, Status
+from flexmanip_ros.io.parameter_file import read
+from flexmanip_ros.parameters import (
+    ArmParameters,
+    ExcitationParameters,
+    IdentifierParameters,
+    PlantParameters,
+    configure,
+)
+from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.types import CaptureEvent, EventKind, Payload, Status
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -55,3 +63,32 @@ def test_centre_and_inertia_of_a_body_are_known(name: str) -> None:
     deviations = np.sqrt(np.diag(np.array(found.covariance).reshape(4, 4)))[1:]
     errors = np.array([*found.com[:2], found.inertia[5]]) - [*truth['com'], truth['inertia']]
     assert np.all(np.abs(errors) < 3.5 * deviations)
+
+
+def simulated(arm: ArmParameters, mass: float, peaks: tuple[float, float]) -> Payload:
+    """What is known of a point mass 3 s after the capture, on a simulation of the very same arm."""
+    plant = PlantParameters(arm=arm, payload_mass=mass, seed=3)
+    caught = (CaptureEvent(3_000_000_000, EventKind.CAPTURE),)
+    run = simulator.simulate(plant, excitation.sequence(ExcitationParameters(amplitude=peaks), 6000), caught)
+    payload = None
+    for estimate in pipeline.run(IdentifierParameters(arm=arm, model_rate=0.1), simulator.records(run, caught)):
+        payload = estimate.payload
+    assert payload is not None
+    return payload
+
+
+@pytest.mark.parametrize(('preset', 'mass', 'peaks'), [
+    ('quanser', 0.05, (0.05, 0.02)), ('de_luca_siciliano', 0.1, (0.135, 0.045)), ('reference', 20.0, (10.0, 5.0))])
+def test_every_arm_that_is_shipped_knows_its_payload(preset: str, mass: float, peaks: tuple[float, float]) -> None:
+    path = ROOT / 'config' / 'arms' / f'{preset}.yaml'
+    given = {name: value for name, value in read(path, 'rpbsid_identifier').items() if name.startswith('arm.')}
+    found = simulated(configure(IdentifierParameters, given).arm, mass, peaks)
+    assert found.status is Status.TRACKING
+    assert found.mass == pytest.approx(mass, rel=0.01)
+    assert abs(found.mass - mass) < 3.5 * found.std
+
+
+def test_hubs_do_not_bias_a_light_payload() -> None:
+    found = simulated(ArmParameters(hub_inertia=(0.5, 0.3)), 1.5, (10.0, 5.0))
+    assert found.status is Status.TRACKING
+    assert abs(found.mass - 1.5) < 3.5 * found.std
