@@ -276,7 +276,7 @@ def plant_segment_chain(rows: list[dict[str, Any]]) -> Claims:
     further out.
     """
     for row in rows:
-        if row['shape_functions'] == 'component':
+        if row['shape_functions'] == 'component_modes':
             yield Claim(f'{row["case"]}: worst difference of four signals', max(row['relative_rms_percent'].values()),
                         high=2.0, unit='%')
 

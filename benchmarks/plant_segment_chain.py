@@ -118,7 +118,7 @@ def main() -> int:
         theta = tuple(np.radians(degrees))
         efforts = scale * excitation.sequence(ExcitationParameters(), round(1000 * options.time))
         truth = simulate_chain(ARM, theta, efforts, 1e-3)
-        for shapes, second in (('sines', False), ('sines', True), ('component', True)):
+        for shapes, second in (('sines', False), ('sines', True), ('component_modes', True)):
             arm = replace(ARM, shape_functions=shapes, shortening=second)
             config = PlantParameters(arm=arm, noise='none', initial_angles=theta)
             run = simulator.simulate(config, efforts)

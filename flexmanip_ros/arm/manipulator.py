@@ -158,7 +158,7 @@ def manipulator(arm: ArmParameters, kappa: int | None = None, points: int | None
     """
     if kappa is not None and kappa < 1:
         raise ModelError(f'kappa is {kappa}', 'use at least one mode a link')
-    static = kappa is None and arm.shape_functions == 'component'
+    static = kappa is None and arm.shape_functions == 'component_modes'
     shapes = shape_functions(arm.modes if kappa is None else kappa, static)
     k = count(arm) if kappa is None else kappa
     length, density = np.asarray(arm.link_length), np.asarray(arm.linear_density)

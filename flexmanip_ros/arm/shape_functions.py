@@ -1,8 +1,8 @@
 """Shape functions of a link: sines of the pinned link, with or without the two static shapes of end moments.
 
-``sines``: phi_j = sin(j pi x / L). ``component``: beside them the two shapes that moments at the ends bend (component
-modes of Craig and Bampton): the sines have no curvature at the ends, where the torques act. The shapes are combined to
-the modes of the pinned link, so that mass and stiffness matrix of a link alone stay diagonal; a sine stays what it is.
+``sines``: phi_j = sin(j pi x / L). ``component_modes`` (Craig and Bampton): beside them the two shapes that moments at
+the ends bend, since sines have no curvature at the ends, where the torques act. The shapes are combined to the modes of
+the pinned link, so that mass and stiffness matrix of a link alone stay diagonal; a sine stays what it is.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class ShapeFunctions(NamedTuple):
 
 def count(arm: ArmParameters) -> int:
     """Return the number kappa of modal coordinates of each link."""
-    return arm.modes + (STATIC if arm.shape_functions == 'component' else 0)
+    return arm.modes + (STATIC if arm.shape_functions == 'component_modes' else 0)
 
 
 @lru_cache(maxsize=64)

@@ -10,7 +10,7 @@ from flexmanip_ros.types import Array
 
 @inlined
 def project(x: Array, S: Array, H: Array, offset: int, f: Array) -> float:
-    """Return H x[offset:] and fill f (nx,) = S' H', the spread of that measurement."""
+    """Return H x[offset:] and fill f = S' H', the spread of that measurement, for the first f.size columns of S."""
     value = 0.0
     for c in range(f.size):
         f[c] = 0.0
@@ -39,50 +39,52 @@ def dot(a: Array, b: Array) -> float:
 
 @inlined
 def absorb_measurement(x: Array, S: Array, f: Array, e: float, r: float, variance: float) -> None:
-    """Potter's update: innovation e of variance = f'f + r, r the noise variance, f = S' H'."""
-    nx = x.size
+    """Potter's update: innovation e of variance = f'f + r, r the noise variance, f = S' H' where that is not zero."""
     gamma = 1.0 / (1.0 + np.sqrt(r / variance))
-    for i in range(nx):
-        gain = dot(S[i], f) / variance
+    for i in range(x.size):
+        gain = dot(f, S[i]) / variance
         x[i] += gain * e
         gain *= gamma
-        for c in range(nx):
+        for c in range(f.size):
             S[i, c] -= gain * f[c]
 
 
 @kernel
 def absorb_noise(S: Array, deviation: Array, W: Array) -> None:
-    """S <- lower triangular L, L L' = S S' + diag(deviation^2), by Householder; W: (nx, 2 nx) scratch."""
+    """S <- lower triangular L, L L' = S S' + diag(deviation^2), by Householder; W: (nx, 2 nx) scratch.
+
+    A row of zeros takes no column: the columns behind the last one needed are zero.
+    """
     nx = S.shape[0]
     for i in range(nx):
         for c in range(nx):
             W[i, c] = S[i, c]
             W[i, nx + c] = 0.0
         W[i, nx + i] = deviation[i]
-    width = 2 * nx
+    width, own = 2 * nx, 0
     for i in range(nx):
         norm = 0.0
-        for c in range(i, width):
+        for c in range(own, width):
             norm += W[i, c] * W[i, c]
         norm = np.sqrt(norm)
         if norm > 0.0:
-            if W[i, i] > 0.0:
+            if W[i, own] > 0.0:
                 norm = -norm
-            head = W[i, i] - norm
+            head = W[i, own] - norm
             square = -norm * head  # half the squared length of the reflection vector
             if square > 0.0:
-                W[i, i] = head
+                W[i, own] = head
                 for r in range(i + 1, nx):
                     dot = 0.0
-                    for c in range(i, width):
+                    for c in range(own, width):
                         dot += W[i, c] * W[r, c]
                     dot /= square
-                    for c in range(i, width):
+                    for c in range(own, width):
                         W[r, c] -= dot * W[i, c]
-            W[i, i] = norm
-    for i in range(nx):
+            W[i, own] = norm
+            own += 1
         for c in range(nx):
-            S[i, c] = W[i, c] if c <= i else 0.0
+            S[i, c] = W[i, c] if c < own else 0.0
 
 
 @kernel

@@ -35,8 +35,8 @@ class ArmParameters:
         'stiffness', 'damping ratio of the higher modes: stiffness, grows with the frequency; modal, the same for '
         'every mode', choices=('stiffness', 'modal'))
     shape_functions: str = parameter(
-        'component', 'shapes of a bent link: component, sines and the two static shapes of end moments, which joint '
-        'torques bend; sines, sines alone (the paper)', choices=('component', 'sines'))
+        'component_modes', 'shapes of a bent link: component_modes, sines and the two static shapes of end moments, '
+        'which joint torques bend; sines, sines alone (the paper)', choices=('component_modes', 'sines'))
     modes: int = parameter(
         3, 'number of sines among the shape functions of each link (payload_method block uses order / 4 sines instead)',
         low=1, high=12)

@@ -26,6 +26,7 @@ from flexmanip_ros.payload.filter_state import (
     SINCE_EVENT,
     SLOW,
     STORED,
+    USED,
     VARIANCE,
     WEIGHT,
     WHITE,
@@ -88,7 +89,7 @@ def observe(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Ar
 @inlined
 def measure(sensors: MeasurementModel, m: FilterState, y: Array) -> None:
     """Update the filter with one sample and gather what its innovations say of noise and payload."""
-    x, S, f = m.x, m.S, sensors.f
+    x, S, f = m.x, m.S, sensors.f[:m.counts[USED]]
     n = sensors.H.shape[1]
     payload = 2 * n
     for i in range(y.size):
@@ -105,7 +106,7 @@ def measure(sensors: MeasurementModel, m: FilterState, y: Array) -> None:
         if square > OUTLIER * OUTLIER:
             r += e * e / (OUTLIER * OUTLIER) - variance
             variance = spread + r
-        gain = dot(S[payload], f) / variance
+        gain = dot(f, S[payload]) / variance
         m.score[MOVE] += gain * e
         m.score[VARIANCE] += gain * gain * variance
         m.noise[i, WEIGHT] += gain * gain * variance

@@ -40,6 +40,7 @@ from flexmanip_ros.payload.filter_state import (
     SINCE_NOISE,
     SLOW,
     STORED,
+    USED,
     VARIANCE,
     WHITE,
 )
@@ -107,9 +108,9 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
     table: (N, 1 + L + m), its first row is the first sample after the event. The cost is Huber's.
     """
     sample = table[m.counts[ITERATED]]
-    n, nx = sensors.H.shape[1], m.x.size
-    links, f = motion.effort.size, sensors.f
-    if not predict(motion, m.xr, m.Sr, sample[1:1 + links], sample[0]):
+    n, nx, used = sensors.H.shape[1], m.x.size, m.counts[USED]
+    links, f = motion.effort.size, sensors.f[:used]
+    if not predict(motion, m.xr, m.Sr, used, sample[1:1 + links], sample[0]):
         return False
     for i in range(m.noise.shape[0]):
         r = m.noise[i, EFFECTIVE]
@@ -117,7 +118,7 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
         weight = 1.0 / r
         m.score[COST] += e * e * weight
         m.noise[i, FIT] += e * e
-        for a in range(nx):
+        for a in range(used):
             scaled = weight * f[a]
             m.g[a] += scaled * e
             for b in range(a + 1):
@@ -188,9 +189,12 @@ def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
     for c in range(p.size):
         i = first + c
         moved = p[c] - m.x0[i] - dot(m.S0[i], m.xi)
-        if moved != 0.0 and m.S0[i, i] != 0.0:
-            m.xi[i] += moved / m.S0[i, i]
-            m.g[i] += moved / m.S0[i, i]
+        own = m.counts[USED] - 1  # the column of this state alone is the last in its row
+        while own >= 0 and m.S0[i, own] == 0.0:
+            own -= 1
+        if moved != 0.0 and own >= 0:
+            m.xi[own] += moved / m.S0[i, own]
+            m.g[own] += moved / m.S0[i, own]
     return True
 
 
@@ -272,7 +276,10 @@ def diffuse(sensors: MeasurementModel, m: FilterState, duration: float) -> None:
         return
     root = np.sqrt(m.score[NOW])
     for i in range(m.x.size):
-        sensors.deviation[i] = sensors.diffusion[i] * root
+        known = True
+        for c in range(m.counts[USED]):
+            known &= m.S[i, c] == 0.0
+        sensors.deviation[i] = 0.0 if known else sensors.diffusion[i] * root
     absorb_noise(m.S, sensors.deviation, sensors.W)
     m.counts[SINCE_NOISE] = 0
     m.score[NOW] = 0.0
@@ -286,7 +293,7 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     """
     links = motion.effort.size
     duration, effort, y = table[k, 0], table[k, 1:1 + links], table[k, 1 + links:]
-    if not predict(motion, m.x, m.S, effort, duration):
+    if not predict(motion, m.x, m.S, m.counts[USED], effort, duration):
         return False
     measure(sensors, m, y)
     confine(motion, m.x[m.x.size - motion.kind.size:])

@@ -22,9 +22,15 @@ if TYPE_CHECKING:
     from flexmanip_ros.arm.manipulator import Manipulator, Workspace
 
 SERIES = 12
-"""Terms of the motion's exponential: 1e-9 of the fastest mode at one radian a step."""
-SPREAD_SERIES = 6
-"""Terms of the spread's: it weighs, and need not be exact."""
+"""Terms of an exponential whose error does not matter: 1e-9 of what turns by one radian."""
+STEP_ANGLE = 2.0
+"""Largest angle [rad] the fastest mode may turn in an integration step."""
+MOTION_ERROR = 1e-8
+"""Share of the fastest mode that the motion's exponential leaves out in a step."""
+SPREAD_ERROR = 1e-4
+"""Of the spread's: it weighs, and need not be exact."""
+MOST_TERMS = 30
+"""Terms of an exponential at most: more than ``STEP_ANGLE`` needs."""
 STIFF_STEP = 2.0
 """Longest step over the time constant of the stiffest damper: the series of the exponential converges quickly there."""
 
@@ -267,9 +273,36 @@ def linearize(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
     return True
 
 
+@inlined
+def slower(motion: ProcessModel, duration: float) -> float:
+    """Return 1, or 0.5 where Coulomb friction may change its sign within a time [s]: it bends the motion."""
+    arm, qdd = motion.arm, motion.k[0]
+    for i in range(arm.length.size):
+        if arm.coulomb[i] != 0.0:
+            change = 0.0
+            for r in range(qdd.size):
+                change += arm.joint[i, r] * qdd[r]
+            if abs(motion.work.net[1, i]) < 3.0 * STICTION_RATE + duration * abs(change):
+                return 0.5
+    return 1.0
+
+
+@inlined
+def terms(angle: float, error: float) -> int:
+    """Return how many terms of an exponential leave out less than an error: angle^k / k! < error."""
+    k, left = 1, angle
+    while left > error and k < MOST_TERMS:
+        k += 1
+        left *= angle / k
+    return k
+
+
 @kernel
-def predict(motion: ProcessModel, x: Array, S: Array, reported: Array, duration: float) -> bool:
-    """Carry x and S over a time [s] with the torque held; False when numbers left the finite range."""
+def predict(motion: ProcessModel, x: Array, S: Array, used: int, reported: Array, duration: float) -> bool:
+    """Carry x and S over a time [s] with the torque held; False when numbers left the finite range.
+
+    used: number of columns of S, the first ones, that are not zero.
+    """
     if duration <= 0.0:
         return True
     n = motion.arm.stiffness.size
@@ -283,20 +316,22 @@ def predict(motion: ProcessModel, x: Array, S: Array, reported: Array, duration:
         stiff = 0.0
         for r in range(n):
             stiff -= motion.dqd[r, r]
-        steps = np.ceil(left / min(motion.substeps, STIFF_STEP / max(stiff, 1e-9)) - 1e-9)
+        longest = min(motion.substeps * slower(motion, left), STIFF_STEP / max(stiff, 1e-9))
+        steps = np.ceil(left / longest - 1e-9)
         if not steps < MOST_STEPS:
             return False
         h = left / max(steps, 1.0)
-        if not exponential_step(motion, x, h):
+        angle = max(STEP_ANGLE * h / motion.substeps, stiff * h)
+        if not exponential_step(motion, x, h, terms(angle, MOTION_ERROR)):
             return False
-        spread(motion, S, h)
+        spread(motion, S, used, h, terms(angle, SPREAD_ERROR))
         left = left - h if steps > 1.0 else 0.0
     return True
 
 
 @merged
-def exponential_step(motion: ProcessModel, x: Array, h: float) -> bool:
-    """Advance x by h, exactly where the motion is linear; right after ``linearize`` at x.
+def exponential_step(motion: ProcessModel, x: Array, h: float, count: int) -> bool:
+    """Advance x by h, exactly where the motion is linear; right after ``linearize`` at x. count: terms of the series.
 
     Exponential Rosenbrock method of third order: x1 = x + h phi_1(h F) f(x), then x1 + 2 h phi_3(h F) of what
     f(x1) - f(x) misses of F (x1 - x). The vibration turns too far in one sample for a step of Runge and
@@ -308,7 +343,7 @@ def exponential_step(motion: ProcessModel, x: Array, h: float) -> bool:
     for i in range(n):
         term[0, i] = qd[i]
         term[1, i] = motion.k[0, i]
-    series(motion, h, 1, h)
+    series(motion, h, 1, h, count)
     for i in range(n):
         x[i] += total[0, i]
         x[n + i] += total[1, i]
@@ -321,7 +356,7 @@ def exponential_step(motion: ProcessModel, x: Array, h: float) -> bool:
                 missed -= motion.dq[i, j] * total[0, j] + motion.dqd[i, j] * total[1, j]
             term[0, i] = 0.0
             term[1, i] = missed / 6.0
-        series(motion, h, 3, 2.0 * h)
+        series(motion, h, 3, 2.0 * h, max(count - 2, 1))
         for i in range(n):
             x[i] += total[0, i]
             x[n + i] += total[1, i]
@@ -332,7 +367,7 @@ def exponential_step(motion: ProcessModel, x: Array, h: float) -> bool:
 
 
 @merged
-def series(motion: ProcessModel, h: float, first: int, scale: float) -> None:
+def series(motion: ProcessModel, h: float, first: int, scale: float, count: int) -> None:
     """Fill total with scale x phi_first(h F) v, F the linearisation, phi_l(z) = sum of z^j / (j + l)!.
 
     v / first! stands in rows 4, 5 of motion.k (positions, rates) and is used up; total: rows 1, 2.
@@ -342,7 +377,7 @@ def series(motion: ProcessModel, h: float, first: int, scale: float) -> None:
     for part in range(2):
         for i in range(n):
             total[part, i] = scale * term[part, i]
-    for order in range(first + 1, first + SERIES):
+    for order in range(first + 1, first + count):
         weight = h / order
         for i in range(n):
             value = 0.0
@@ -357,34 +392,33 @@ def series(motion: ProcessModel, h: float, first: int, scale: float) -> None:
 
 
 @merged
-def spread(motion: ProcessModel, S: Array, h: float) -> None:
-    """S <- F S, F the Taylor series of the linearised flow over h."""
+def spread(motion: ProcessModel, S: Array, used: int, h: float, count: int) -> None:
+    """S <- F S, F the Taylor series of the linearised flow over h, in the first ``used`` columns."""
     n = motion.arm.stiffness.size
-    nx = S.shape[1]
     X, Y = motion.X, motion.Y
     for i in range(2 * n):
-        for c in range(nx):
+        for c in range(used):
             X[i, c] = S[i, c]
     weight = 1.0
-    for order in range(1, SPREAD_SERIES + 1):
+    for order in range(1, count + 1):
         for i in range(n):
-            for c in range(nx):
+            for c in range(used):
                 Y[i, c] = X[n + i, c]
                 Y[n + i, c] = 0.0
             for j in range(n):
                 a = motion.dq[i, j]
                 b = motion.dqd[i, j]
-                for c in range(nx):
+                for c in range(used):
                     Y[n + i, c] += a * X[j, c] + b * X[n + j, c]
         if order == 1:
             for i in range(n):
                 for p in range(motion.G.shape[1]):
                     g = motion.G[i, p]
                     if g != 0.0:
-                        for c in range(nx):
+                        for c in range(used):
                             Y[n + i, c] += g * S[2 * n + p, c]
         weight *= h / order
         for i in range(2 * n):
-            for c in range(nx):
+            for c in range(used):
                 S[i, c] += weight * Y[i, c]
                 X[i, c] = Y[i, c]

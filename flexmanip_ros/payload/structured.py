@@ -106,7 +106,7 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     assert state.effort is not None
     assert state.sensors is not None
     ahead = max(event.stamp_ns - state.last_ns, 0)
-    predict(state.model.motion, m.x, m.S, state.effort, min(ahead * 1e-9, LONGEST_S))
+    predict(state.model.motion, m.x, m.S, m.x.size, state.effort, min(ahead * 1e-9, LONGEST_S))
     _change(config, state.model, m, event.kind)
     last_ns = state.last_ns + ahead
     return state._replace(memory=m, last_ns=last_ns, horizon=Horizon(state.cursor, last_ns, state.effort))
@@ -163,6 +163,7 @@ def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterSta
 def _set_arrival_cost(m: mem.FilterState) -> None:
     """Begin a new moving horizon here: the present state is its arrival cost."""
     m.x0[:], m.S0[:] = m.x, m.S
+    m.counts[mem.USED] = int(m.S.any(axis=1).sum())
     m.xi[:] = 0.0
     for counter in (mem.STORED, mem.ITERATED, mem.ITERATING, mem.SINCE_EVENT, mem.SINCE_NOISE, mem.IN_BATCH,
                     mem.BATCHES, mem.BEFORE, mem.REJECTED, mem.AGAIN):
@@ -186,6 +187,7 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     structured_model.freeze(config, model, np.mean(rows.angles, axis=0))
     if not state.refits:  # the simplest arm first; all that may be learned where that does not fit
         structured_model.take_as_known(model, m)
+    m.S[:] = structured_model.triangular(m.S)
     _set_arrival_cost(m)
     m.counts[mem.REFITS] = state.refits
     seen = sensors(config, model, dt, structured_model.diffusion(config, model, m))
@@ -225,7 +227,7 @@ def reopen(
     structured_model.first(config, state.model, m, m.recent[:, 0] if y is None else y)
     m.x[2 * n:] = parameters
     m.S[2 * n:] = 0.0
-    m.S[2 * n:, 2 * n:] = np.linalg.qr(spread.T)[1].T
+    m.S[:] = structured_model.widen(m.S, np.vstack([np.zeros((2 * n, spread.shape[1])), spread]))
     _set_arrival_cost(m)
     assert state.effort is not None
     return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.effort))
@@ -284,16 +286,18 @@ def _restart(config: IdentifierParameters, state: StructuredState, m: mem.Filter
     if m.counts[mem.HELD] and m.counts[mem.LEARNED] and np.isfinite(m.S0).all():
         m = mem.copy(m)
         m.x[:], m.S[:] = m.x0, m.S0
-        n, payload = model.motion.arm.stiffness.size, model.payload
+        payload = model.payload
         parameters, spread = m.x[payload:].copy(), m.S[payload:].copy()
         first = rows.between(rows.first, rows.first + 1)
         structured_model.first(config, model, m, measurements(model, first)[0])
-        m.x[payload:], m.S[2 * n:] = parameters, 0.0
-        m.S[2 * n:, 2 * n:] = np.linalg.qr(spread.T)[1].T
         body = slice(payload, payload + model.body)
+        spread[:model.body] = 0.0
+        m.x[payload:], m.S[payload:] = parameters, 0.0
         m.x[body] = structured_model.body_mean(config, model)[:model.body]
-        m.S[body], m.S[:, body] = 0.0, 0.0
-        m.S[body, body] = np.diag(structured_model.body_std(config, model)[:model.body])
+        opened = np.zeros((m.x.size, model.body))
+        opened[body] = np.diag(structured_model.body_std(config, model)[:model.body])
+        m.S[:] = structured_model.widen(m.S, np.hstack([np.vstack([np.zeros((payload, spread.shape[1])), spread]),
+                                                        opened]))
         m.counts[mem.REFITS] = refits
         _set_arrival_cost(m)
         last_ns, effort = int(first.stamp_ns[0]), first.u[0].copy()

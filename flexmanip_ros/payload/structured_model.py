@@ -15,7 +15,7 @@ from flexmanip_ros.arm.manipulator import Manipulator, manipulator, modal, works
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.measurement_update import MeasurementModel
-from flexmanip_ros.payload.process_model import Kind, ProcessModel, set_parameters
+from flexmanip_ros.payload.process_model import STEP_ANGLE, Kind, ProcessModel, set_parameters
 from flexmanip_ros.types import Array
 
 
@@ -96,9 +96,6 @@ def _in_order_of_links(names: tuple[str, ...]) -> tuple[str, ...] | None:
         return {1: names, 2: ('', *names)}.get(links[0])
     return names if not names else None
 
-
-STEP_ANGLE = 1.0
-"""Largest angle [rad] the fastest mode may turn in an integration step."""
 
 
 class Model(NamedTuple):
@@ -382,7 +379,18 @@ def freeze(config: IdentifierParameters, model: Model, angles: Array) -> None:
 
 def widen(S: Array, columns: Array) -> Array:
     """Return a square root of S S' + columns columns'."""
-    root: Array = np.linalg.qr(np.hstack([S, columns]).T)[1].T
+    return triangular(np.hstack([S, columns]))
+
+
+def triangular(S: Array) -> Array:
+    """Return the square root of S S' (nx, nx) whose columns are zero from the rank on, each row's last one its own.
+
+    A state that is taken as known is a row of zeros, and has no column.
+    """
+    unknown = S.any(axis=1)
+    rank = int(unknown.sum())
+    root = np.zeros((len(S), len(S)))
+    root[unknown, :rank] = np.linalg.qr(S[unknown].T)[1].T
     return root
 
 

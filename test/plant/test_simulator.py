@@ -72,7 +72,7 @@ def test_steps_do_not_change_the_state_they_start_from() -> None:
 
 
 @pytest.mark.parametrize('shortening', [False, True])
-@pytest.mark.parametrize(('shapes', 'substeps'), [('sines', 0), ('component', 20)])
+@pytest.mark.parametrize(('shapes', 'substeps'), [('sines', 0), ('component_modes', 20)])
 def test_energy_is_conserved_without_torque(shapes: str, substeps: int, shortening: bool) -> None:
     """Shapes of end moments ring faster, and Runge and Kutta damp what turns far in a step."""
     config = replace(CLEAN, substeps=substeps, arm=ArmParameters(
