@@ -67,7 +67,7 @@ def draw(rows: list[dict]) -> None:
         points = [(row['kappa'], row['frequency'][mode]) for row in rows if len(row['frequency']) > mode]
         left.semilogy(*zip(*points, strict=True), 'o-', label=f'mode {mode + 1}')
     left.set_title('natural frequencies')
-    for column, name in enumerate(simulator.JOINT_NAMES):
+    for column, name in enumerate(simulator.joint_names(2)):
         style = 's--' if column < 2 else 'o-'
         right.semilogy(KAPPAS, [row['response'][column] for row in rows], style, label=name.replace('_', ' '))
     right.set_title('response to square waves')

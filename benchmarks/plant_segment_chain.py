@@ -112,7 +112,7 @@ def main() -> int:
     parser.add_argument('--time', type=float, default=3.0, help='seconds simulated a case')
     options = parser.parse_args()
     results = []
-    names = ' '.join(f'{name:>10}' for name in simulator.JOINT_NAMES)
+    names = ' '.join(f'{name:>10}' for name in simulator.joint_names(2))
     print(f'{"case":18} {"model":40} {"peak bend":>10} {names}  [%]')
     for name, (degrees, scale) in CASES.items():
         theta = tuple(np.radians(degrees))
@@ -128,7 +128,7 @@ def main() -> int:
             print(f'{name:18} {model:40} {peak:7.1f} mm ' + ' '.join(f'{value:10.3f}' for value in row))
             results.append({'case': name, 'shape_functions': shapes, 'second_order': second,
                             'peak_bend_mm': peak,
-                            'relative_rms_percent': dict(zip(simulator.JOINT_NAMES, row, strict=True))})
+                            'relative_rms_percent': dict(zip(simulator.joint_names(2), row, strict=True))})
     target = Path(__file__).parent / 'results' / 'plant_segment_chain.json'
     target.parent.mkdir(exist_ok=True)
     target.write_text(json.dumps(results, indent=1) + '\n', encoding='utf-8')

@@ -34,18 +34,18 @@ class Linearization(NamedTuple):
     acceleration: Array
 
     def state_space(self) -> tuple[Array, Array]:
-        """Continuous (A (2n, 2n), B (2n, 2)) of x = [dq; dq']."""
+        """Continuous (A (2n, 2n), B (2n, L)) of x = [dq; dq']."""
         n = len(self.M)
         rows = cho_solve(cho_factor(self.M), np.hstack([
             -(self.K + self.K_M + self.K_E), -(self.C_E + self.D), self.B]))
         A = np.block([[np.zeros((n, n)), np.eye(n)], [rows[:, :2 * n]]])
-        return A, np.vstack([np.zeros((n, 2)), rows[:, 2 * n:]])
+        return A, np.vstack([np.zeros_like(self.B), rows[:, 2 * n:]])
 
 
 def linearize(
     arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array, simplified: bool = False,
 ) -> Linearization:
-    """Linearize at coordinates q (n,), rates qd (n,) and joint torques effort (2,) [N m].
+    """Linearize at coordinates q (n,), rates qd (n,) and joint torques effort (L,) [N m].
 
     simplified: as in the paper, bending in M and all of C_E, K_M and K_E are dropped.
     Raises ModelError when a number is not finite or a size is wrong.

@@ -28,9 +28,9 @@ def urdf(arm: ArmParameters, segments: int = 12, name: str = 'flexible_arm') -> 
     robot = ET.Element('robot', name=name)
     _link(robot, 'base_link')
     parent, offset = 'base_link', 0.0
-    for link in range(2):
+    for link in range(len(arm.link_length)):
         parent, offset = _flexible_link(robot, arm, link, segments, parent, offset)
-    _body(robot, 'link2_tip', parent, offset, arm.tip_mass, arm.tip_inertia, '0.3 0.3 0.3 1', arm)
+    _body(robot, f'link{len(arm.link_length)}_tip', parent, offset, arm.tip_mass, arm.tip_inertia, '0.3 0.3 0.3 1', arm)
     ET.indent(robot)
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding='unicode') + '\n'
 
@@ -74,7 +74,7 @@ def _flexible_link(
         _joint(robot, f'{child}_turn', 'continuous', parent, child, offset, mimic=(bend, turns[index]))
         parent, offset = child, h
     end = f'link{number}_end'
-    mass, inertia = (arm.joint_mass, arm.joint_inertia) if link == 0 else (0.0, 0.0)
+    mass, inertia = (arm.joint_mass, arm.joint_inertia) if link < len(arm.link_length) - 1 else (0.0, 0.0)
     _body(robot, end, parent, offset, mass, inertia, COLOURS[link], arm, mimic=(bend, turns[-1]))
     return end, 0.0
 

@@ -19,7 +19,7 @@ from flexmanip_ros.types import Array
 
 
 class Measured(NamedTuple):
-    """Encoder angles and bends (4,) [rad, m], their rates (4,), and torques (2,) to add [N m]."""
+    """Encoder angles and bends (2 L,) [rad, m], their rates (2 L,), and torques (L,) to add [N m]."""
 
     position: Array
     velocity: Array
@@ -75,7 +75,7 @@ def init(config: ControllerParameters) -> ControllerState:
 
 
 def goto(state: ControllerState, angles: Array) -> ControllerState:
-    """Move to other encoder angles (2,) [rad], as fast as rate, torque and bend may be."""
+    """Move to other encoder angles (L,) [rad], as fast as rate, torque and bend may be."""
     if state.setpoint is not None and np.array_equal(state.setpoint, angles):
         return state
     return state._replace(setpoint=np.asarray(angles, dtype=np.float64))
@@ -91,10 +91,11 @@ def estimate(config: ControllerParameters, state: ControllerState, found: Payloa
 
 def step(config: ControllerParameters, state: ControllerState, measured: Measured
          ) -> tuple[ControllerState, Array]:
-    """Return the torques (2,) [N m] for a sample, within the limits."""
+    """Return the torques (L,) [N m] for a sample, within the limits."""
     x = _filtered(config, state, measured)
-    state = _scheduled(config, state, float(x[1] - x[0]))
-    way = _onward(config, state, measured.position[:2])
+    links = len(config.arm.link_length)
+    state = _scheduled(config, state, float(x[links - 1] - x[0]))
+    way = _onward(config, state, measured.position[:links])
     state = state._replace(way=way, goal=state.setpoint)
     wanted, acceleration = _wanted(config, state, way)
     feedforward = state.between(state.old.F, state.now.F) @ acceleration
@@ -107,7 +108,8 @@ def _filtered(config: ControllerParameters, state: ControllerState, measured: Me
     """Correct the prediction by the sample; at the first one the arm is taken for straight and at rest."""
     if state.x is None:
         first = np.zeros(len(state.now.A))
-        first[:2] = reference(config, measured.position[:2])
+        links = len(measured.position) // 2
+        first[:links] = reference(config, measured.position[:links])
         return first
     innovation = np.concatenate([measured.position, measured.velocity]) - state.C @ state.x
     x: Array = state.x + state.now.L @ innovation
@@ -121,8 +123,9 @@ def _onward(config: ControllerParameters, state: ControllerState, present: Array
         return way
     position, rate, *_ = way.now()
     design = state.now
-    bends = state.C[2:4, 2:len(design.A) // 2] @ design.E
-    limits = np.concatenate([config.move_effort * np.asarray(config.effort_limit), [config.move_bend] * 2])
+    links = len(position)
+    bends = state.C[links:2 * links, links:len(design.A) // 2] @ design.E
+    limits = np.concatenate([config.move_effort * np.asarray(config.effort_limit), [config.move_bend] * links])
     seconds = path.duration(
         reference(config, state.setpoint - position), reference(config, rate), config.setpoint_rate,
         np.vstack([design.F, bends]), limits)
@@ -130,12 +133,13 @@ def _onward(config: ControllerParameters, state: ControllerState, present: Array
 
 
 def _wanted(config: ControllerParameters, state: ControllerState, way: Path) -> tuple[Array, Array]:
-    """Return the state (2n,) that belongs to the way, bends included, and the chords' acceleration (2,)."""
+    """Return the state (2n,) that belongs to the way, bends included, and the chords' acceleration (L,)."""
     n = len(state.now.A) // 2
     if way.ended:
         wanted = np.zeros(2 * n)
-        wanted[:2] = reference(config, way.goal)
-        return wanted, np.zeros(2)
+        goal = reference(config, way.goal)
+        wanted[:len(goal)] = goal
+        return wanted, np.zeros(len(goal))
     position, rate, acceleration, jerk = (reference(config, row) for row in way.now())
     bends = state.between(state.old.E, state.now.E)
     return np.concatenate([position, bends @ acceleration, rate, bends @ jerk]), acceleration

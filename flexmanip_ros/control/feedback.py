@@ -1,6 +1,6 @@
 """State from measurements, and the linear quadratic regulator at a configuration with a payload.
 
-x = [theta, eta, theta', eta'] (2n,), n = 2 + 2 kappa: chord angles theta [rad] and modal coordinates eta [m]
+x = [theta, eta, theta', eta'] (2n,), n = L (1 + kappa): chord angles theta [rad] and modal coordinates eta [m]
 of the arm's shape functions (with one mode alone the second and third of a real link are driven unstable).
 A link at rest under no torque is straight, so the regulator needs no integrator: the plane has no gravity.
 """
@@ -26,39 +26,44 @@ FLOOR = 1e-6
 
 
 def observation(config: ControllerParameters) -> Array:
-    """Return T (4, n): [encoder angles, bends] = T [theta, eta], and the same for their rates."""
+    """Return T (2 L, n): [encoder angles, bends] = T [theta, eta], and the same for their rates."""
     arm = config.arm
     return manipulator(replace(arm, base_mass=0.0) if arm.base_mass else arm).output
 
 
 def reference(config: ControllerParameters, angles: Array) -> Array:
-    """Return the chord angles (2,) of a straight arm whose encoders read ``angles`` (2,)."""
-    relative = config.arm.angle_convention == 'encoder'
-    return np.array([angles[0], angles[1] + angles[0] * relative])
+    """Return the chord angles (L,) of a straight arm whose encoders read ``angles`` (L,)."""
+    return np.cumsum(angles) if config.arm.angle_convention == 'encoder' else np.array(angles, dtype=np.float64)
 
 
 def model(config: ControllerParameters, between: float, payload: float) -> tuple[Array, Array]:
-    """Return (A (2n, 2n), B (2n, 2)) of one sample at theta2 - theta1 = ``between`` [rad], payload [kg]."""
-    b = blocks(config.arm, np.array([0.0, between]), payload)
-    n = 2 + len(b.Mc)
+    """Return (A (2n, 2n), B (2n, L)) of one sample at theta2 - theta1 = ``between`` [rad], payload [kg]."""
+    b = blocks(config.arm, turned(config, between), payload)
+    links = len(b.Ma)
+    n = links + len(b.Mc)
     M = np.block([[b.Ma, b.Mb], [b.Mb.T, b.Mc]])
     B = np.vstack([b.B_theta, b.B_eta])
     K, D = np.zeros((n, n)), (B * np.array(config.arm.joint_viscous_friction)) @ B.T
-    K[2:, 2:] = b.Kc
-    D[2:, 2:] += b.Dc
+    K[links:, links:] = b.Kc
+    D[links:, links:] += b.Dc
     rows = cho_solve(cho_factor(M), np.hstack([-K, -D, B]))
     A = np.zeros((2 * n, 2 * n))
     A[:n, n:], A[n:] = np.eye(n), rows[:, :2 * n]
-    B = np.vstack([np.zeros((n, 2)), rows[:, 2 * n:]])
+    B = np.vstack([np.zeros_like(B), rows[:, 2 * n:]])
     return discretize(A, B, 1.0 / config.rate)
 
 
+def turned(config: ControllerParameters, between: float) -> Array:
+    """Return chord angles (L,) [rad] with that angle between the links: the blocks depend on it alone."""
+    return np.array([0.0, between])[:len(config.arm.link_length)]
+
+
 def feedforward(config: ControllerParameters, between: float, payload: float) -> tuple[Array, Array]:
-    """Return (F (2, 2), E (2 kappa, 2)): torques and modal coordinates per acceleration of the chords.
+    """Return (F (L, L), E (L kappa, L)): torques and modal coordinates per acceleration of the chords.
 
     The quasi-static solution of M q'' + K q = B u with eta'' = 0.
     """
-    b = blocks(config.arm, np.array([0.0, between]), payload)
+    b = blocks(config.arm, turned(config, between), payload)
     F = solve(b.B_theta, b.Ma)
     E = solve(b.Kc, b.B_eta @ F - b.Mb.T, assume_a='pos')
     return F, E
@@ -67,9 +72,9 @@ def feedforward(config: ControllerParameters, between: float, payload: float) ->
 class Design(NamedTuple):
     """Everything made for one configuration and payload.
 
-    A (2n, 2n), B (2n, 2): one sample; G (2, 2n): torque = -G (x - x_ref); L (2n, 8): weight of the innovation
-    of [positions, rates]; the stationary linear quadratic regulator and Kalman filter. F (2, 2): torque that
-    accelerates the chords (2,) without vibration, E (2 kappa, 2): modal coordinates that go with it.
+    A (2n, 2n), B (2n, L): one sample; G (L, 2n): torque = -G (x - x_ref); L (2n, 4 L): weight of the innovation
+    of [positions, rates]; the stationary linear quadratic regulator and Kalman filter. F (L, L): torque that
+    accelerates the chords (L,) without vibration, E (L kappa, L): modal coordinates that go with it.
     """
 
     A: Array
@@ -85,7 +90,8 @@ def design(config: ControllerParameters, between: float, payload: float) -> Desi
     A, B = model(config, between, payload)
     T = observation(config)
     C = np.kron(np.eye(2), T)
-    scale = np.array([config.angle_scale] * 2 + [config.bend_scale] * (T.shape[1] - 2))
+    links = len(T) // 2
+    scale = np.array([config.angle_scale] * links + [config.bend_scale] * (T.shape[1] - links))
     Q = np.diag(np.concatenate([1.0 / scale, 1.0 / (RATE_SCALE * scale)]) ** 2)
     R = np.diag(1.0 / np.asarray(config.effort_scale) ** 2)
     W = B @ np.diag(np.asarray(config.disturbance_std) ** 2) @ B.T

@@ -22,7 +22,7 @@ SHORTEST = 1e-3
 
 
 class Path(NamedTuple):
-    """Coefficients (6, 2) of the time since the start over the duration [s], and how old it is [s]."""
+    """Coefficients (6, L) of the time since the start over the duration [s], and how old it is [s]."""
 
     coefficients: Array
     duration: float
@@ -30,7 +30,7 @@ class Path(NamedTuple):
 
     @property
     def goal(self) -> Array:
-        """Where it ends, (2,)."""
+        """Where it ends, (L,)."""
         end: Array = self.coefficients.sum(axis=0)
         return end
 
@@ -44,10 +44,10 @@ class Path(NamedTuple):
         return self.age >= self.duration
 
     def now(self) -> Array:
-        """Return position, rate, acceleration and jerk (4, 2) now."""
+        """Return position, rate, acceleration and jerk (4, L) now."""
         s = self.age / self.duration
         powers = np.array([s**k for k in range(6)])
-        rows, c, scale = np.zeros((4, 2)), self.coefficients, 1.0
+        rows, c, scale = np.zeros((4, self.coefficients.shape[1])), self.coefficients, 1.0
         for row in range(4):
             rows[row] = (powers[:len(c)] @ c) * scale
             c = c[1:] * np.arange(1, len(c))[:, None]
@@ -59,13 +59,13 @@ class Path(NamedTuple):
 
 def rest(position: Array) -> Path:
     """Stay."""
-    coefficients = np.zeros((6, 2))
+    coefficients = np.zeros((6, len(position)))
     coefficients[0] = position
     return Path(coefficients, SHORTEST, SHORTEST)
 
 
 def plan(before: Path, goal: Array, duration: float) -> Path:
-    """Leave a path where it is now, with the rate and acceleration it has, to be at rest at the goal (2,)."""
+    """Leave a path where it is now, with the rate and acceleration it has, to be at rest at the goal (L,)."""
     position, rate, acceleration, _ = before.now()
     a0, a1, a2 = position, rate * duration, acceleration * duration**2 / 2.0
     d = np.asarray(goal) - a0 - a1 - a2
@@ -75,9 +75,9 @@ def plan(before: Path, goal: Array, duration: float) -> Path:
 
 
 def duration(distance: Array, rate: Array, fastest: float, loads: Array, limits: Array) -> float:
-    """Return the duration [s] of a move by ``distance`` (2,) that begins with ``rate`` (2,).
+    """Return the duration [s] of a move by ``distance`` (L,) that begins with ``rate`` (L,).
 
-    fastest: the largest rate; loads (r, 2): what each acceleration costs (torques, bends); limits (r,): what
+    fastest: the largest rate; loads (r, L): what each acceleration costs (torques, bends); limits (r,): what
     they may. From rest it is the shortest that keeps to all of them.
     """
     by_rate = PEAK_RATE * float(np.abs(distance).max()) / fastest

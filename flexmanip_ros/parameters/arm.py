@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.parameters.field import check_all, parameter
+from flexmanip_ros.parameters.field import check_all, fit_links, parameter
 
 SMALLEST = 1e-9
 """Lower bound of quantities that must be positive."""
@@ -13,23 +13,24 @@ SMALLEST = 1e-9
 
 @dataclass(frozen=True)
 class ArmParameters:
-    """Two flexible links, two joints, a mass at the tip; symbols as in docs/notation.md."""
+    """One or two flexible links, a joint before each, a mass at the tip; symbols as in docs/notation.md."""
 
-    link_length: tuple[float, ...] = parameter((3.0, 3.0), 'length of each link', unit='m', low=SMALLEST, size=2)
+    link_length: tuple[float, ...] = parameter(
+        (3.0, 3.0), 'length of each link; one value: an arm of one link', unit='m', low=SMALLEST, size=2, per_link=True)
     linear_density: tuple[float, ...] = parameter(
-        (5.0, 5.0), 'mass per length of each link', unit='kg/m', low=SMALLEST, size=2)
+        (5.0, 5.0), 'mass per length of each link', unit='kg/m', low=SMALLEST, size=2, per_link=True)
     bending_stiffness: tuple[float, ...] = parameter(
         (5000.0, 5000.0), "Young's modulus times second moment of area of each link", unit='N m^2',
-        low=SMALLEST, size=2)
-    joint_mass: float = parameter(10.0, 'mass at the end of link 1', unit='kg', low=SMALLEST)
-    tip_mass: float = parameter(10.0, 'mass at the end of link 2 before a capture', unit='kg', low=SMALLEST)
+        low=SMALLEST, size=2, per_link=True)
+    joint_mass: float = parameter(10.0, 'mass at the end of link 1, where joint 2 is', unit='kg', low=SMALLEST)
+    tip_mass: float = parameter(10.0, 'mass at the end of the last link before a capture', unit='kg', low=SMALLEST)
     hub_inertia: tuple[float, ...] = parameter(
         (0.0, 0.0), "rotary inertia of each joint's hub, which turns with the root of its link", unit='kg m^2',
-        low=0.0, size=2)
+        low=0.0, size=2, per_link=True)
     joint_inertia: float = parameter(
         0.0, 'rotary inertia of the mass at the end of link 1, which turns with that end', unit='kg m^2', low=0.0)
     tip_inertia: float = parameter(
-        0.0, 'rotary inertia of the tip mass, which turns with the end of link 2', unit='kg m^2', low=0.0)
+        0.0, 'rotary inertia of the tip mass, which turns with the end of the last link', unit='kg m^2', low=0.0)
     damping_ratio: float = parameter(0.0, "damping ratio of each link's first pinned mode", low=0.0, high=0.99)
     damping_model: str = parameter(
         'stiffness', 'damping ratio of the higher modes: stiffness, grows with the frequency; modal, the same for '
@@ -43,11 +44,11 @@ class ArmParameters:
     shortening: bool = parameter(True, 'model the shortening of a bent link to second order (the paper: false)')
     rotor_inertia: tuple[float, ...] = parameter(
         (0.0, 0.0), "rotary inertia of each joint's rotor, times the gear ratio squared; it turns with the joint",
-        unit='kg m^2', low=0.0, size=2)
+        unit='kg m^2', low=0.0, size=2, per_link=True)
     joint_viscous_friction: tuple[float, ...] = parameter(
-        (0.0, 0.0), 'viscous friction of each joint', unit='N m s/rad', low=0.0, size=2)
+        (0.0, 0.0), 'viscous friction of each joint', unit='N m s/rad', low=0.0, size=2, per_link=True)
     joint_coulomb_friction: tuple[float, ...] = parameter(
-        (0.0, 0.0), 'Coulomb friction of each joint', unit='N m', low=0.0, size=2)
+        (0.0, 0.0), 'Coulomb friction of each joint', unit='N m', low=0.0, size=2, per_link=True)
     gravity: tuple[float, ...] = parameter(
         (0.0, 0.0), 'gravity along x and y; (0, -9.81): the arm moves in a vertical plane', unit='m/s^2', size=2)
     base_mass: float = parameter(
@@ -58,7 +59,7 @@ class ArmParameters:
         (0.0, 0.0), 'place of joint 1 from the centre of mass of a floating base, in its frame', unit='m', size=2)
     sensor_position: tuple[float, ...] = parameter(
         (0.5, 0.5), "position of each bend sensor as a fraction of its link's length (the ends do not bend)",
-        low=1e-6, high=0.999999, size=2)
+        low=1e-6, high=0.999999, size=2, per_link=True)
     effort_delay: int = parameter(
         0, 'number of samples by which effort lags; 1: a message reports the torque of the interval before it',
         unit='samples', low=0, high=10)
@@ -71,6 +72,7 @@ class ArmParameters:
 
     def __post_init__(self) -> None:
         check_all(self)
+        fit_links(self, len(self.link_length))
         if self.base_mass and not self.base_inertia:
             raise ParameterError(f"parameter 'base_mass' is {self.base_mass} kg, but 'base_inertia' is 0",
                                  'give the inertia of the floating base, or base_mass 0 for a fixed one')

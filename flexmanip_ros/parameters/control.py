@@ -6,20 +6,21 @@ from dataclasses import dataclass, field
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.arm import ArmParameters
-from flexmanip_ros.parameters.field import check_all, parameter
+from flexmanip_ros.parameters.field import check_all, fit_links, parameter
 
 
 @dataclass(frozen=True)
 class ControllerParameters:
     """Joint hold and vibration damping, scheduled on payload and configuration (node ``payload_controller``)."""
 
-    joints: tuple[str, ...] = parameter(('joint1', 'joint2'), 'names of the two joints', size=2)
+    joints: tuple[str, ...] = parameter(('joint1', 'joint2'), 'names of the joints', size=2, per_link=True)
     bends: tuple[str, ...] = parameter(
-        ('link1_bend', 'link2_bend'), 'names of the two bend sensors (deflection and rate)', size=2)
+        ('link1_bend', 'link2_bend'), 'names of the bend sensors (deflection and rate)', size=2, per_link=True)
     hold_present: bool = parameter(
         True, 'true: hold the angles of the first sample after activation; false: move to setpoint')
     setpoint: tuple[float, ...] = parameter(
-        (0.0, 0.0), 'encoder angles to hold; setting them ends hold_present', unit='rad', size=2, live=True)
+        (0.0, 0.0), 'encoder angles to hold; setting them ends hold_present', unit='rad', size=2, per_link=True,
+        live=True)
     setpoint_rate: float = parameter(
         0.2, 'largest rate of the held angles while they move to a new setpoint', unit='rad/s', low=1e-3, high=100.0,
         live=True)
@@ -34,16 +35,17 @@ class ControllerParameters:
         0.02, 'bend that costs as much as a torque of effort_scale (larger: less damping of vibration)', unit='m',
         low=1e-7)
     effort_scale: tuple[float, ...] = parameter(
-        (100.0, 50.0), 'torque that costs one unit in the regulator', unit='N m', low=1e-6, size=2)
+        (100.0, 50.0), 'torque that costs one unit in the regulator', unit='N m', low=1e-6, size=2, per_link=True)
     effort_limit: tuple[float, ...] = parameter(
         (300.0, 150.0), 'largest torque of each joint; a larger command is cut to it', unit='N m', low=0.0, size=2,
-        live=True)
+        per_link=True, live=True)
     noise_std: tuple[float, ...] = parameter(
         (3e-3, 3e-3, 3e-4, 3e-4, 0.2, 0.2, 0.02, 0.02),
         'measurement noise that the filter assumes for the angles, the bends, then their rates (larger: slower filter, '
-        'less disturbed by modes beyond kappa)', unit='rad, m, rad/s, m/s', low=1e-12, size=8)
+        'less disturbed by modes beyond kappa)', unit='rad, m, rad/s, m/s', low=1e-12, size=8, per_link=True)
     disturbance_std: tuple[float, ...] = parameter(
-        (1.0, 1.0), 'white torque disturbance that the filter assumes beside the command', unit='N m', low=1e-9, size=2)
+        (1.0, 1.0), 'white torque disturbance that the filter assumes beside the command', unit='N m', low=1e-9, size=2,
+        per_link=True)
     rate: float = parameter(1000.0, 'joint states a second', unit='Hz', low=10.0, high=100000.0)
     use_estimate: bool = parameter(True, 'schedule the gains on the estimated payload', live=True)
     initial_payload: float = parameter(0.0, 'payload before the first trusted estimate', unit='kg', low=0.0)
@@ -69,7 +71,8 @@ class ControllerParameters:
 
     def __post_init__(self) -> None:
         check_all(self)
-        if len({*self.joints, *self.bends}) != 4:
+        fit_links(self, len(self.arm.link_length))
+        if len({*self.joints, *self.bends}) != 2 * len(self.joints):
             raise ParameterError("parameters 'joints' and 'bends' name a signal twice", 'name each once')
         for fraction in self.arm.sensor_position:
             if not 0.05 <= fraction <= 0.95:

@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from flexmanip_ros.parameters.control import AdapterParameters, ControllerParameters
-from flexmanip_ros.parameters.field import Leaf, leaves
+from flexmanip_ros.parameters.field import LINKS, Leaf, leaves
 from flexmanip_ros.parameters.identifier import IdentifierParameters
 from flexmanip_ros.parameters.simulation import ExcitationParameters, PlantParameters
 from flexmanip_ros.parameters.trigger import TriggerParameters
@@ -71,6 +71,8 @@ def kind(leaf: Leaf) -> str:
     name = {bool: 'bool', int: 'integer', float: 'double', str: 'string'}[leaf.kind]
     if not leaf.is_array:
         return name
+    if leaf.per_link and leaf.size is not None:
+        return f'{name}[{leaf.size // LINKS} a link]'
     return f'{name}[{leaf.size}]' if leaf.size is not None else f'{name}[]'
 
 

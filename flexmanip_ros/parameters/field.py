@@ -13,6 +13,8 @@ from flexmanip_ros.errors import ParameterError
 
 Config = TypeVar('Config')
 
+LINKS = 2
+"""Most links of an arm."""
 WANTED = {
     bool: ('true or false', 'true/false values'), int: ('a whole number', 'whole numbers'),
     float: ('a number', 'numbers'), str: ('a text', 'texts'),
@@ -35,6 +37,8 @@ class Leaf:
     choices: tuple[str, ...]
     size: int | None
     live: bool
+    per_link: bool = False
+    """Whether it holds as many values for each link or joint; ``size`` is that of two links."""
 
     @property
     def range_words(self) -> str:
@@ -45,14 +49,16 @@ class Leaf:
 
 
 def parameter(default: Any, words: str, *, unit: str = '', low: float | None = None, high: float | None = None,
-              choices: tuple[str, ...] = (), size: int | None = None, live: bool = False) -> Any:
+              choices: tuple[str, ...] = (), size: int | None = None, live: bool = False,
+              per_link: bool = False) -> Any:
     """Declare a parameter on a frozen dataclass.
 
     low, high: inclusive bounds (of every element of an array); size: fixed length of an array;
-    live: may be changed while the node runs.
+    live: may be changed while the node runs; per_link: values for each link or joint, see ``fit_links``.
     """
     return field(default=default, metadata={
-        'words': words, 'unit': unit, 'low': low, 'high': high, 'choices': choices, 'size': size, 'live': live})
+        'words': words, 'unit': unit, 'low': low, 'high': high, 'choices': choices, 'size': size, 'live': live,
+        'per_link': per_link})
 
 
 def leaves(cls: type, prefix: str = '') -> tuple[Leaf, ...]:
@@ -117,6 +123,30 @@ def check_all(config: Any) -> None:
             object.__setattr__(config, leaf.name, check(leaf, getattr(config, leaf.name)))
 
 
+def fit_links(config: Any, links: int) -> None:
+    """Give each parameter that is declared per link as many values as links; for use in ``__post_init__``.
+
+    A default of two links loses the values of the second one where there is no second link. Raises ParameterError where
+    a list that was given has another size.
+    """
+    for leaf in leaves(type(config)):
+        if not leaf.per_link or '.' in leaf.name:
+            continue
+        value = getattr(config, leaf.name)
+        wanted = len(leaf.default) // LINKS * links
+        if value == leaf.default:
+            value = of_links(value, links)
+        if len(value) != wanted:
+            raise ParameterError(f"parameter '{leaf.name}' has {len(value)} elements, but the arm has {links} links",
+                                 f'give {wanted} {WANTED[leaf.kind][1]}')
+        object.__setattr__(config, leaf.name, value)
+
+
+def of_links(values: tuple[Any, ...], links: int) -> tuple[Any, ...]:
+    """Return those values of the first links; values: of two links, alternating."""
+    return tuple(value for k, value in enumerate(values) if k % LINKS < links)
+
+
 def check(leaf: Leaf, value: Any) -> Any:
     """Return the value in the declared type. Raises ParameterError naming the parameter."""
     if not leaf.is_array:
@@ -127,7 +157,8 @@ def check(leaf: Leaf, value: Any) -> Any:
     items = tuple(_check_one(leaf, item) for item in value)
     if leaf.kind is str and items == ('',):
         items = ()  # ROS cannot write an empty list of a known type; [''] stands for it
-    if leaf.size is not None and len(items) != leaf.size:
+    if leaf.size is not None and len(items) != leaf.size and not (
+            leaf.per_link and len(items) * LINKS == leaf.size):
         raise ParameterError(f"parameter '{leaf.name}' has {len(items)} elements", f'give {leaf.size} {wanted}')
     return items
 

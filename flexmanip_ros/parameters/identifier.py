@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.arm import ArmParameters
-from flexmanip_ros.parameters.field import check_all, parameter
+from flexmanip_ros.parameters.field import check_all, of_links, parameter
 
 FIELDS = ('position', 'velocity', 'effort')
 """Arrays of a JointState that a signal NAME/FIELD may name."""
@@ -54,9 +55,6 @@ class PayloadParameters:
         if unknown:
             raise ParameterError(f"parameter 'learn' names {', '.join(map(repr, unknown))}",
                                  f"choose from {', '.join(LEARNABLE)}")
-        if len(self.working_point) not in (0, 2):
-            raise ParameterError(f"parameter 'working_point' has {len(self.working_point)} elements",
-                                 'give two angles, or [] for the measured ones')
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,7 @@ class IdentifierParameters:
         ('link1_bend/position', 'link2_bend/position', 'link1_bend/velocity', 'link2_bend/velocity'),
         'output signals, each NAME/FIELD of JointState')
     angles: tuple[str, ...] = parameter(
-        ('joint1/position', 'joint2/position'), "the two signals of the arm's configuration; ['']: none")
+        ('joint1/position', 'joint2/position'), "the signals of the arm's configuration, one a joint; ['']: none")
     order: int = parameter(4, 'order n of the model', low=1, high=60)
     past_window: int = parameter(10, 'past window p', unit='samples', low=1, high=200)
     future_window: int = parameter(5, 'future window f', unit='samples', low=1, high=200)
@@ -139,13 +137,19 @@ class IdentifierParameters:
 
     def __post_init__(self) -> None:
         check_all(self)
+        links = len(self.arm.link_length)
+        fit_signals(self, links)
+        if len(self.payload.working_point) not in (0, links):
+            raise ParameterError(f"parameter 'payload.working_point' has {len(self.payload.working_point)} elements",
+                                 f'give {links}, or [] for the measured ones')
         for group in ('inputs', 'outputs', 'angles'):
             _check_signals(group, getattr(self, group))
         for group in ('inputs', 'outputs'):
             if not getattr(self, group):
                 raise ParameterError(f"parameter '{group}' is empty", 'name at least one NAME/FIELD')
-        if self.angles and len(self.angles) != 2:
-            raise ParameterError(f"parameter 'angles' names {len(self.angles)} signals", "name two, or [''] for none")
+        if self.angles and len(self.angles) != links:
+            raise ParameterError(f"parameter 'angles' names {len(self.angles)} signals",
+                                 f"name one for each joint ({links}), or [''] for none")
         if self.state_basis == 'tracked' and self.estimator != 'paper':
             raise ParameterError("parameter 'state_basis' is 'tracked'",
                                  "set estimator to 'paper', or choose singular or fixed")
@@ -156,6 +160,14 @@ class IdentifierParameters:
             raise ParameterError(
                 f"parameter 'order' is {self.order}",
                 f'it cannot exceed future_window x outputs ({self.future_window * len(self.outputs)})')
+
+
+def fit_signals(config: Any, links: int) -> None:
+    """Leave the signals of the second link out of the default inputs, outputs and angles of an arm of one link."""
+    for item in fields(config):
+        value = getattr(config, item.name)
+        if item.name in ('inputs', 'outputs', 'angles') and value == item.default:
+            object.__setattr__(config, item.name, of_links(value, links))
 
 
 def _check_signals(group: str, names: tuple[str, ...]) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.arm import ArmParameters
-from flexmanip_ros.parameters.field import check_all, parameter
+from flexmanip_ros.parameters.field import check_all, fit_links, parameter
 
 REFERENCE_ANGLES = (math.pi / 3, math.pi / 4)
 """Chord angles of the paper's reference configuration [rad]: 60 and 45 degrees."""
@@ -23,7 +23,8 @@ class SensorParameters:
     bend_resolution: float = parameter(
         0.0, 'deflections are rounded to multiples of this; 0: no rounding', unit='m', low=0.0, high=1.0)
     bias: tuple[float, ...] = parameter(
-        (0.0,) * 8, 'constant error of the four positions, then of the four rates', unit='rad, m, rad/s, m/s', size=8)
+        (0.0,) * 8, 'constant error of the angles, then bends, then of their rates', unit='rad, m, rad/s, m/s', size=8,
+        per_link=True)
     strain_cutoff: float = parameter(
         0.0, "corner frequency of the strain gauges' first-order low-pass, on deflections and their rates; 0: none",
         unit='Hz', low=0.0, high=1e6)
@@ -41,7 +42,7 @@ class ActuatorParameters:
     """Limits of the drives; all are off by default."""
 
     torque_limit: tuple[float, ...] = parameter(
-        (0.0, 0.0), 'largest torque of each joint; 0: no limit', unit='N m', low=0.0, size=2)
+        (0.0, 0.0), 'largest torque of each joint; 0: no limit', unit='N m', low=0.0, size=2, per_link=True)
     command_delay: int = parameter(
         0, 'number of samples between a command and its torque', unit='samples', low=0, high=100)
 
@@ -55,7 +56,7 @@ class PlantParameters:
 
     rate: float = parameter(1000.0, 'samples a second', unit='Hz', low=1.0, high=100000.0)
     initial_angles: tuple[float, ...] = parameter(
-        REFERENCE_ANGLES, 'chord angles theta at the start', unit='rad', size=2)
+        REFERENCE_ANGLES, 'chord angles theta at the start', unit='rad', size=2, per_link=True)
     model: str = parameter(
         'nonlinear', 'nonlinear: assumed modes; linear: the same, linearized at the initial angles, without shortening '
         '(the paper); finite_element: Hermite beams at the initial angles',
@@ -84,11 +85,11 @@ class PlantParameters:
     snr_db: float = parameter(40.0, 'signal-to-noise ratio of every output', unit='dB', low=-20.0, high=200.0)
     rehearsal_torque: tuple[float, ...] = parameter(
         (10.0, 5.0), "peak torque of the paper's square waves, simulated before a live run to learn the signal levels "
-        'that snr_db refers to (noise snr)', unit='N m', low=0.0, size=2)
+        'that snr_db refers to (noise snr)', unit='N m', low=0.0, size=2, per_link=True)
     noise_std: tuple[float, ...] = parameter(
         (1e-5, 1e-5, 1e-5, 1e-5, 1e-3, 1e-3, 1e-3, 1e-3),
-        'standard deviation of the four positions, then of the four rates (noise std)', unit='rad, m, rad/s, m/s',
-        low=0.0, size=8)
+        'standard deviation of the angles, then bends, then of their rates (noise std)', unit='rad, m, rad/s, m/s',
+        low=0.0, size=8, per_link=True)
     seed: int = parameter(1, 'seed of the noise', low=0)
     sensors: SensorParameters = field(default_factory=SensorParameters)
     actuators: ActuatorParameters = field(default_factory=ActuatorParameters)
@@ -96,6 +97,8 @@ class PlantParameters:
 
     def __post_init__(self) -> None:
         check_all(self)
+        for group in (self, self.sensors, self.actuators):
+            fit_links(group, len(self.arm.link_length))
         if self.sensors.stamp_jitter * self.rate > 0.15:  # three deviations stay below half an interval
             raise ParameterError(
                 f"parameter 'sensors.stamp_jitter' is {self.sensors.stamp_jitter} s, so that stamps change places",
@@ -114,10 +117,11 @@ class ExcitationParameters:
     shape: str = parameter(
         'square', 'form of the torque over time', choices=('square', 'multisine', 'prbs', 'chirp', 'zero'))
     amplitude: tuple[float, ...] = parameter(
-        (10.0, 5.0), 'peak torque of each joint', unit='N m', low=0.0, size=2, live=True)
+        (10.0, 5.0), 'peak torque of each joint', unit='N m', low=0.0, size=2, per_link=True, live=True)
     offset: tuple[float, ...] = parameter(
-        (0.0, 0.0), 'constant torque added to each joint', unit='N m', size=2, live=True)
-    period: tuple[float, ...] = parameter((1.0, 0.5), 'period of each square wave', unit='s', low=1e-3, size=2)
+        (0.0, 0.0), 'constant torque added to each joint', unit='N m', size=2, per_link=True, live=True)
+    period: tuple[float, ...] = parameter(
+        (1.0, 0.5), 'period of each square wave', unit='s', low=1e-3, size=2, per_link=True)
     band: tuple[float, ...] = parameter(
         (0.5, 15.0), 'lowest and highest frequency of multisine and chirp', unit='Hz', low=1e-3, size=2)
     repeat_time: float = parameter(
@@ -131,7 +135,7 @@ class ExcitationParameters:
         6.0, 'length of the run for which allowed_angle and the expected payload accuracy hold', unit='s',
         low=0.1, high=60.0)
     initial_angles: tuple[float, ...] = parameter(
-        REFERENCE_ANGLES, 'chord angles at which the torque is designed', unit='rad', size=2)
+        REFERENCE_ANGLES, 'chord angles at which the torque is designed', unit='rad', size=2, per_link=True)
     payload_mass: float = parameter(20.0, 'payload for which the expected accuracy is computed', unit='kg', low=0.0)
     snr_db: float = parameter(
         40.0, 'signal-to-noise ratio for which the expected accuracy is computed', unit='dB', low=-20.0, high=200.0)
@@ -139,6 +143,7 @@ class ExcitationParameters:
 
     def __post_init__(self) -> None:
         check_all(self)
+        fit_links(self, len(self.arm.link_length))
         low, high = self.band
         if not low < high:
             raise ParameterError(f"parameter 'band' is {low} to {high} Hz", 'give the lower frequency first')

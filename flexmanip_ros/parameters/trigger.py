@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from flexmanip_ros.parameters.arm import ArmParameters
 from flexmanip_ros.parameters.field import check_all, parameter
-from flexmanip_ros.parameters.identifier import PayloadParameters
+from flexmanip_ros.parameters.identifier import PayloadParameters, fit_signals
 
 
 @dataclass(frozen=True)
@@ -45,3 +45,4 @@ class TriggerParameters:
 
     def __post_init__(self) -> None:
         check_all(self)
+        fit_signals(self, len(self.arm.link_length))

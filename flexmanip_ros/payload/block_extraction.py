@@ -35,12 +35,13 @@ def sensor_matrix(config: IdentifierParameters, kappa: int | None) -> tuple[Arra
     known = signals(config)
     if known is None or not known.torques:
         return None
-    seen = manipulator(config.arm, kappa).output[2:, 2:]
+    links = len(config.arm.link_length)
+    seen = manipulator(config.arm, kappa).output[links:, links:]
     rows = []
     for role in known.outputs:
         if role.quantity not in (Quantity.BEND, Quantity.BEND_RATE):
             return None
-        rows.append(seen[role.link, :2 * manipulator(config.arm, kappa).kappa])
+        rows.append(seen[role.link, :links * manipulator(config.arm, kappa).kappa])
     return np.array(rows).reshape(len(rows), -1), tuple(
         role.quantity is Quantity.BEND_RATE for role in known.outputs)
 
@@ -75,9 +76,9 @@ def to_modal(Ac: Array, Bc: Array, C: Array, S: Array, rates: tuple[bool, ...]) 
 
 def truncated(config: IdentifierParameters, theta: Array, payload: float, kappa: int
               ) -> tuple[Array, Array] | None:
-    """Return (Ac, Bc) of the lowest 2 kappa vibrations of the undamped arm, as if it had kappa modes.
+    """Return (Ac, Bc) of the lowest L kappa vibrations of the undamped arm, as if it had kappa modes.
 
-    theta: (2,) chord angles; payload [kg]. None where the outputs do not see the modes.
+    theta: (L,) chord angles; payload [kg]. None where the outputs do not see the modes.
     """
     few, all_modes = sensor_matrix(config, kappa), sensor_matrix(config, None)
     if few is None or all_modes is None:
@@ -85,12 +86,12 @@ def truncated(config: IdentifierParameters, theta: Array, payload: float, kappa:
     Ac, Bc = vibration_model(replace(config.arm, damping_ratio=0.0), theta, payload)
     h = Ac.shape[0] // 2
     squares, shapes = np.linalg.eig(-Ac[h:, :h])
-    lowest = np.argsort(squares.real)[:2 * kappa]
+    lowest = np.argsort(squares.real)[:len(config.arm.link_length) * kappa]
     shapes = shapes.real
     pushed = np.linalg.solve(shapes, Bc[h:])[lowest]
     # the same displacements at the sensors, in the coordinates of kappa modes
     P = np.linalg.lstsq(few[0], all_modes[0] @ shapes[:, lowest], rcond=None)[0]
-    n = 2 * kappa
+    n = len(config.arm.link_length) * kappa
     A, B = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, Bc.shape[1]))
     A[:n, n:] = np.eye(n)
     A[n:, :n] = -np.linalg.solve(P.T, (P * squares.real[lowest]).T).T
@@ -213,14 +214,15 @@ def extract(
 ) -> float:
     """Return the payload [kg] of a continuous model with the state [eta; eta'].
 
-    Ac: (4 kappa, 4 kappa), Bc: (4 kappa, 2), theta: (2,) chord angles [rad]; known_mb: take M_b from the
+    Ac: (2 L kappa, 2 L kappa), Bc: (2 L kappa, L), theta: (L,) chord angles [rad]; known_mb: take M_b from the
     arm instead of from the model. Raises ModelError on other shapes or a singular model.
     """
-    order = 4 * kappa
-    if Ac.shape != (order, order) or Bc.shape != (order, 2):
+    links = len(arm.link_length)
+    order = 2 * links * kappa
+    if Ac.shape != (order, order) or Bc.shape != (order, links):
         raise ModelError(
             f'block extraction got A {Ac.shape} and B {Bc.shape} for kappa = {kappa}',
-            f'give A ({order}, {order}) and B ({order}, 2): the order must be 4 kappa')
+            f'give A ({order}, {order}) and B ({order}, {links}): the order must be 2 L kappa')
     try:
         mass = float(masses(arm, blocks(arm, theta, kappa=kappa), Ac, Bc, known_mb))
     except np.linalg.LinAlgError as err:
@@ -240,14 +242,15 @@ def estimate(config: IdentifierParameters, identified: Identified, angles: Array
              ) -> Payload:
     """Return the payload of an identified model with its 95 % interval; never a NaN.
 
-    angles: (2,) measured, by the arm's convention; configuration_range: from ``extend_range``. The interval is that
+    angles: (L,) measured, by the arm's convention; configuration_range: from ``extend_range``. The interval is that
     of models
     drawn from the covariance of the identified one (``block_interval``), and reaches over what a model of
     kappa modes at one configuration cannot know: further modes, and with a known M_b how the arm moved.
     """
-    kappa = identified.model.order // 4
-    seen = sensor_matrix(config, kappa) if identified.model.order == 4 * kappa else None
-    if seen is None or angles.shape != (2,) or np.linalg.matrix_rank(seen[0]) < 2 * kappa:
+    links = len(config.arm.link_length)
+    kappa = identified.model.order // (2 * links)
+    seen = sensor_matrix(config, kappa) if kappa and identified.model.order == 2 * links * kappa else None
+    if seen is None or angles.shape != (links,) or np.linalg.matrix_rank(seen[0]) < links * kappa:
         return unknown(Status.UNOBSERVABLE)
     theta = working_point(config, angles)
     known = config.payload.known_coupling
@@ -298,15 +301,15 @@ def _excess(config: IdentifierParameters, theta: Array, kappa: int, mass_of: Cal
 
 
 def working_point(config: IdentifierParameters, angles: Array) -> Array:
-    """Return the chord angles (2,) that a model belongs to: measured ones, or where a linear plant stays."""
+    """Return the chord angles (L,) that a model belongs to: measured ones, or where a linear plant stays."""
     given = config.payload.working_point
-    if config.payload.dynamics == 'linear' and len(given) == 2:
+    if config.payload.dynamics == 'linear' and given:
         return np.array(given, dtype=np.float64)
     return chords(config.arm, angles)
 
 
 def masses(arm: ArmParameters, empty: Blocks, Ac: Array, Bc: Array, known_mb: bool) -> Array:
-    """Return the payload [kg] of each model of a stack, Ac: (..., 4 kappa, 4 kappa), Bc: (..., 4 kappa, 2).
+    """Return the payload [kg] of each model of a stack, Ac: (..., 2 L kappa, 2 L kappa), Bc: (..., 2 L kappa, L).
 
     empty: the blocks of the arm without payload. Raises numpy.linalg.LinAlgError when one is singular.
     """
@@ -323,8 +326,7 @@ def masses(arm: ArmParameters, empty: Blocks, Ac: Array, Bc: Array, known_mb: bo
         M_b = np.asarray(np.linalg.solve(X_t @ X, X_t @ (empty.Mc - M_t)))  # eq. (50), least squares
     M_a = np.linalg.solve(X_t @ X, X_t @ _transpose(M_b))  # eq. (51), least squares
     trace = np.trace(M_a - empty.Ma, axis1=-2, axis2=-1)
-    L1, L2 = arm.link_length
-    return np.asarray(trace / (L1 ** 2 + L2 ** 2))  # eq. (52)
+    return np.asarray(trace / sum(L ** 2 for L in arm.link_length))  # eq. (52)
 
 
 def _transpose(stack: NDArray[Any]) -> Array:

@@ -171,7 +171,10 @@ def information(m: FilterState, glr: GlrState) -> None:
             for b in range(a + 1):
                 glr.factors[lag, a, b] += glr.factors[lag - 1, a, b]
     for lag in range(glr.trace.shape[0]):
-        factor_information(glr.factors[lag])
+        if not factor_information(glr.factors[lag]):  # an arm that is none: nothing can be told of an onset
+            for a in range(CAUSES):
+                for b in range(a + 1):
+                    glr.factors[lag, a, b] = 1e150 if a == b else 0.0
 
 
 @kernel

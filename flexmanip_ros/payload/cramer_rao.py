@@ -34,7 +34,7 @@ def structure_known(
     theta: (2,) chords; states: (N, 4 kappa) true [eta; eta'], efforts: (N, 2), noise_std: (4 kappa,).
     """
     kappa = _kappa(states, efforts, noise_std, counts)
-    step = 1e-4 * (payload + arm.tip_mass + arm.linear_density[1] * arm.link_length[1] / 3)
+    step = 1e-4 * (payload + arm.tip_mass + arm.linear_density[-1] * arm.link_length[-1] / 3)
     (A_up, B_up), (A, _), (A_down, B_down) = (
         discretize(*vibration_model(arm, theta, payload + change, kappa), dt)
         for change in (step, 0.0, max(-step, -payload)))
@@ -98,8 +98,9 @@ def nonlinear(
     n = model.motion.arm.stiffness.size
     m = mem.memory(2 * n + model.motion.kind.size, len(model.roles))
     structured_model.first(config, model, m, np.zeros(len(model.roles)))
-    m.x[:2] = theta
-    m.x[n:n + 2] = 0.0 if rates is None else rates
+    links = len(config.arm.link_length)
+    m.x[:links] = theta
+    m.x[n:n + links] = 0.0 if rates is None else rates
     p = model.payload
     m.x[p] = payload
     m.S[p:p + model.body, p:p + model.body] = np.diag(10.0 * structured_model.body_std(config, model)[:model.body])

@@ -28,7 +28,7 @@ MISFIT = 10.8
 
 
 def frequencies(arm: ArmParameters, theta: Array, payloads: Array, count: int) -> Array:
-    """Return the lowest undamped frequencies [Hz], (payloads, count), at chords theta (2,)."""
+    """Return the lowest undamped frequencies [Hz], (payloads, count), at chords theta (L,)."""
     empty, one = blocks(arm, theta), blocks(arm, theta, 1.0)
     Ma = empty.Ma + payloads[:, None, None] * (one.Ma - empty.Ma)
     coupling = np.broadcast_to(empty.Mb, (payloads.size, *empty.Mb.shape))
@@ -43,11 +43,11 @@ def estimate(config: IdentifierParameters, modes: Sequence[Mode], angles: Array,
              ) -> Payload:
     """Return the payload that fits the lowest two identified modes; never a NaN.
 
-    angles: (2,) as measured [rad]; configuration_range: (2,) or (0,) smallest and largest cosine between the links
+    angles: (L,) as measured [rad]; configuration_range: (2,) or (0,) smallest and largest cosine between the links
     since the last event. The modes are means over that range, so the interval covers what they mean at either end of
     it. Modes without a standard deviation give no interval, hence no estimate.
     """
-    if angles.shape != (2,):
+    if angles.shape != (len(config.arm.link_length),):
         return unknown(Status.UNOBSERVABLE)
     usable = sorted(mode for mode in modes if mode.frequency_hz > 0.0 and math.isfinite(mode.frequency_std_hz)
                     and mode.frequency_std_hz > 0.0 and abs(mode.damping_ratio) < 1.0)[:2]
@@ -61,8 +61,8 @@ def estimate(config: IdentifierParameters, modes: Sequence[Mode], angles: Array,
 
 
 def _at(arm: ArmParameters, theta: Array, usable: Sequence[Mode]) -> Payload:
-    """Return the payload that modes mean at chords theta (2,) [rad]."""
-    lightest = arm.tip_mass + arm.linear_density[1] * arm.link_length[1] / 3
+    """Return the payload that modes mean at chords theta (L,) [rad]."""
+    lightest = arm.tip_mass + arm.linear_density[-1] * arm.link_length[-1] / 3
     payloads = lightest * LARGEST * np.linspace(0.0, 1.0, GRID) ** 3
     natural = np.array([mode.frequency_hz / math.sqrt(1.0 - mode.damping_ratio ** 2) for mode in usable])
     std = np.array([mode.frequency_std_hz for mode in usable])

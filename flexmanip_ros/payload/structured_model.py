@@ -20,14 +20,14 @@ from flexmanip_ros.types import Array
 
 
 def chords(arm: ArmParameters, angles: Array) -> Array:
-    """Return absolute chord angles (2,) [rad] of measured ones (2,).
+    """Return absolute chord angles (L,) [rad] of measured ones (L,).
 
     An encoder reads root slopes on top: some milliradians that swing about zero with the vibration, so
     they are left out at a working point (give averaged angles where that matters). ``structured`` keeps them.
     """
     if arm.angle_convention == 'chord':
         return np.asarray(angles, dtype=np.float64)
-    return np.array([angles[0], angles[0] + angles[1]])
+    return np.cumsum(angles, dtype=np.float64)
 
 
 class Quantity(IntEnum):
@@ -55,14 +55,14 @@ class Signals(NamedTuple):
 
 
 def signals(config: IdentifierParameters) -> Signals | None:
-    """Return what the configured names mean, or None where they describe no two-link arm.
+    """Return what the configured names mean, or None where they do not describe the arm.
 
     A name used in ``angles`` or ``inputs`` is a joint, in that order; any other is a bend sensor: of the link
     its digits say when one ends in 1 and the other in 2, else in the order of appearance.
     """
-    joints = _names(config.angles) or _names(config.inputs)
+    joints, links = _names(config.angles) or _names(config.inputs), len(config.arm.link_length)
     bends = _in_order_of_links(_names(tuple(name for name in config.outputs
-                                            if name.rpartition('/')[0] not in joints)))
+                                            if name.rpartition('/')[0] not in joints)), links)
     if bends is None:
         return None
     roles: list[Role] = []
@@ -75,9 +75,9 @@ def signals(config: IdentifierParameters) -> Signals | None:
             roles.append(Role(Quantity.ANGLE_RATE if is_rate else Quantity.ANGLE, joints.index(name)))
         else:
             roles.append(Role(Quantity.BEND_RATE if is_rate else Quantity.BEND, bends.index(name)))
-    torques = (len(config.inputs) == 2 and _names(config.inputs) == joints
+    torques = (len(config.inputs) == links and _names(config.inputs) == joints
                and all(name.endswith('/effort') for name in config.inputs))
-    angles = len(config.angles) == 2 and all(name.endswith('/position') for name in config.angles)
+    angles = len(config.angles) == links and all(name.endswith('/position') for name in config.angles)
     return Signals(tuple(roles), angles, torques)
 
 
@@ -86,14 +86,16 @@ def _names(of: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name.rpartition('/')[0] for name in of))
 
 
-def _in_order_of_links(names: tuple[str, ...]) -> tuple[str, ...] | None:
-    """Return the bend sensors of link 1 and link 2; None when more than two or one of no known link."""
+def _in_order_of_links(names: tuple[str, ...], links: int) -> tuple[str, ...] | None:
+    """Return the bend sensors of link 1 and link 2; None when more than there are links or one of no known link."""
+    if links == 1:
+        return names if len(names) <= 1 else None
     numbers = [re.findall(r'\d+', name) for name in names]
-    links = [int(found[0]) if found and found[0] in ('1', '2') else 0 for found in numbers]
+    of = [int(found[0]) if found and found[0] in ('1', '2') else 0 for found in numbers]
     if len(names) == 2:
-        return names[::-1] if links == [2, 1] else names
+        return names[::-1] if of == [2, 1] else names
     if len(names) == 1:
-        return {1: names, 2: ('', *names)}.get(links[0])
+        return {1: names, 2: ('', *names)}.get(of[0])
     return names if not names else None
 
 

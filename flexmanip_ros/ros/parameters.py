@@ -16,6 +16,7 @@ from rclpy.parameter import Parameter
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import Leaf, check, configure, flatten, leaves
 from flexmanip_ros.parameters.document import NODES, limits
+from flexmanip_ros.parameters.field import LINKS
 from flexmanip_ros.ros.rclpy_workarounds import declare, parameter_overrides
 
 Config = TypeVar('Config')
@@ -81,7 +82,7 @@ def descriptor(leaf: Leaf) -> ParameterDescriptor:
         name=leaf.name, type=_type(leaf).value, description=leaf.words + unit, read_only=not leaf.live)
     notes = [limits(leaf)] if limits(leaf) else []
     if leaf.size is not None:
-        notes.append(f'{leaf.size} values')
+        notes.append(f'{leaf.size // LINKS} values a link' if leaf.per_link else f'{leaf.size} values')
     if not leaf.is_array and (leaf.low is not None or leaf.high is not None):
         if leaf.kind is float:
             described.floating_point_range = [FloatingPointRange(
@@ -164,6 +165,8 @@ def arm_line(node: Any) -> str:
     def both(values: Iterable[float]) -> str:
         return ' and '.join(f'{value:g}' for value in values)
 
-    return (f'arm: links of {both(arm.link_length)} m, {both(arm.linear_density)} kg/m, '
-            f'{both(arm.bending_stiffness)} N m^2, masses {arm.joint_mass:g} kg at joint 2 and {arm.tip_mass:g} kg at '
-            f'the tip; {origin}')
+    links, masses = 'link', f'mass {arm.tip_mass:g} kg at the tip'
+    if len(arm.link_length) > 1:
+        links, masses = 'links', f'masses {arm.joint_mass:g} kg at joint 2 and {arm.tip_mass:g} kg at the tip'
+    return (f'arm: {links} of {both(arm.link_length)} m, {both(arm.linear_density)} kg/m, '
+            f'{both(arm.bending_stiffness)} N m^2, {masses}; {origin}')

@@ -26,18 +26,18 @@ BEYOND = 10.0
 
 
 def torque(config: ExcitationParameters, k: int) -> Array:
-    """Torque (2,) [N m] held from sample k on."""
-    peak, tables = amplitude(config), [waveforms.unit(config, i) for i in range(2)]
-    return np.array([config.offset[i] + peak[i] * tables[i][k % tables[i].size] for i in range(2)])
+    """Torque (L,) [N m] held from sample k on."""
+    peak, tables = amplitude(config), [waveforms.unit(config, i) for i in range(len(config.amplitude))]
+    return np.array([config.offset[i] + peak[i] * tables[i][k % tables[i].size] for i in range(len(peak))])
 
 
 def sequence(config: ExcitationParameters, n: int) -> Array:
-    """Torques (n, 2) [N m] of samples 0 .. n - 1: the same numbers as ``torque``."""
+    """Torques (n, L) [N m] of samples 0 .. n - 1: the same numbers as ``torque``."""
     return waveforms.scaled(config, amplitude(config), n)
 
 
 def amplitude(config: ExcitationParameters) -> tuple[float, ...]:
-    """Peak torques (2,) [N m]: as given, or scaled to the allowed angle."""
+    """Peak torques (L,) [N m]: as given, or scaled to the allowed angle."""
     if not config.allowed_angle:
         return config.amplitude
     return fitted_amplitude(config)
@@ -85,8 +85,7 @@ def fitted_amplitude(config: ExcitationParameters) -> tuple[float, ...]:
 
 
 def _scaled(config: ExcitationParameters, scale: float) -> ExcitationParameters:
-    first, second = config.amplitude
-    return replace(config, amplitude=(first * scale, second * scale))
+    return replace(config, amplitude=tuple(peak * scale for peak in config.amplitude))
 
 
 def motion(config: ExcitationParameters, plant: PlantParameters) -> float:
@@ -95,7 +94,8 @@ def motion(config: ExcitationParameters, plant: PlantParameters) -> float:
         run = simulator.simulate(plant, sequence(config, round(config.design_time * config.rate)))
     except ModelError:
         return float('inf')
-    return float(np.max(np.abs(run.position[:, :2] - run.position[0, :2])))
+    links = len(config.amplitude)
+    return float(np.max(np.abs(run.position[:, :links] - run.position[0, :links])))
 
 
 @lru_cache(maxsize=16)
@@ -103,7 +103,7 @@ def expected_std(config: ExcitationParameters) -> dict[float, float]:
     """Smallest standard deviation [kg] of an unbiased payload estimate, by seconds after the capture.
 
     Cramer-Rao bound with the payload and the whole state after the capture unknown and the arm known; all
-    eight signals measured with white noise at snr_db; capture half way through design_time.
+    signals measured with white noise at snr_db; capture half way through design_time.
     """
     plant = replace(plant_of(config), arm=config.arm)
     efforts = sequence(config, round(config.design_time * config.rate))
@@ -117,7 +117,8 @@ def expected_std(config: ExcitationParameters) -> dict[float, float]:
     payload[0] = max(payload[0], step)
     after = _run(state, state.x, payload, later)[1]
     signal = np.vstack([before, after])
-    std = sensors.std_for_snr(signal[:, :4], signal[:, 4:], config.snr_db)
+    half = signal.shape[1] // 2
+    std = sensors.std_for_snr(signal[:, :half], signal[:, half:], config.snr_db)
     if not np.all(std > 0):
         return dict.fromkeys(_times(config), float('inf'))
     size = state.x.size
@@ -136,9 +137,9 @@ def _times(config: ExcitationParameters) -> tuple[float, ...]:
 
 
 def _run(state: simulator.PlantState, x: Array, payload: Array, efforts: Array) -> tuple[Array, Array]:
-    """Run the plant from x; return the state at the end and the eight signals (N, 8)."""
+    """Run the plant from x; return the state at the end and the signals (N, 4 L)."""
     x = x.copy()
-    signals = np.empty((len(efforts), 4)), np.empty((len(efforts), 4))
+    signals = [np.empty((len(efforts), 2 * efforts.shape[1])) for _ in range(2)]
     good = state.model.advance(x, payload, np.ascontiguousarray(efforts), *signals)
     if good < len(efforts):
         raise ModelError('the arm diverges under this torque', 'lower the amplitude')
@@ -146,7 +147,7 @@ def _run(state: simulator.PlantState, x: Array, payload: Array, efforts: Array) 
 
 
 def _bound(sensitivity: Array) -> float:
-    """Cramer-Rao bound of the first parameter from whitened sensitivities (N, 8, parameters)."""
+    """Cramer-Rao bound of the first parameter from whitened sensitivities (N, 4 L, parameters)."""
     rows = sensitivity.reshape(-1, sensitivity.shape[2])
     scale = np.linalg.norm(rows, axis=0)
     if not np.all(scale > 0):
@@ -163,6 +164,6 @@ def describe(config: ExcitationParameters) -> str:
     turn = np.degrees(motion(replace(config, allowed_angle=0.0, amplitude=peak), plant_of(config)))
     accuracy = ', '.join(
         f'{std:.2g} kg in {time:g} s' for time, std in expected_std(config).items()) or 'too short a run'
-    return (f'{config.shape}: peaks {peak[0]:.3g} and {peak[1]:.3g} N m turn the empty arm by up to '
+    return (f'{config.shape}: peaks {" and ".join(f"{value:.3g}" for value in peak)} N m turn the empty arm by up to '
             f'{turn:.2g} deg in {config.design_time:g} s; best standard deviation of a '
             f'{config.payload_mass:g} kg payload at {config.snr_db:g} dB: {accuracy}')

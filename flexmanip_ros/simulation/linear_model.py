@@ -27,7 +27,7 @@ class LinearModel:
     ) -> None:
         self.held = np.zeros((0, M0.shape[0]))
         if locked:  # coordinates that leave both joint angles alone
-            T = null_space(C[:2])
+            T = null_space(C[:len(C) // 2])
             M0, D, K, B, C = T.T @ M0 @ T, T.T @ D @ T, T.T @ K @ T, T.T @ B, C @ T
             tip = tip @ T
         self.M0, self.D, self.K, self.B, self.C = M0, D, K, B, C
@@ -47,7 +47,7 @@ class LinearModel:
         return run_linear(A, B, self.C, self.rest_output, x, efforts, position, velocity, self._scratch)
 
     def step_matrices(self, payload: Array) -> tuple[Array, Array]:
-        """Discrete (A (2n, 2n), B (2n, 2)) with a payload, kept for the last few payloads."""
+        """Discrete (A (2n, 2n), B (2n, L)) with a payload, kept for the last few payloads."""
         key = payload.tobytes()
         if key not in self._steps:
             if len(self._steps) > 8:
@@ -56,12 +56,12 @@ class LinearModel:
         return self._steps[key]
 
     def continuous(self, payload: Array) -> tuple[Array, Array]:
-        """Continuous (Ac (2n, 2n), Bc (2n, 2)) of x = [dq; dq']."""
+        """Continuous (Ac (2n, 2n), Bc (2n, L)) of x = [dq; dq']."""
         n = self.M0.shape[0]
         rows = cho_solve(cho_factor(self.mass_matrix(self.rest(), payload)),
                          np.hstack([-self.K, -self.D, self.B]))
         Ac = np.block([[np.zeros((n, n)), np.eye(n)], [rows[:, :2 * n]]])
-        return Ac, np.vstack([np.zeros((n, 2)), rows[:, 2 * n:]])
+        return Ac, np.vstack([np.zeros_like(self.B), rows[:, 2 * n:]])
 
     def mass_matrix(self, x: Array, payload: Array) -> Array:
         """See Model; constant."""

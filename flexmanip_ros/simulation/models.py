@@ -97,6 +97,9 @@ def build(config: PlantParameters) -> Model:
     if config.model == 'nonlinear':
         return NonlinearModel(config)
     arm = config.arm
+    if config.model == 'finite_element' and len(arm.link_length) == 1:
+        raise ParameterError("parameter 'model' is 'finite_element', but the arm has one link",
+                             "choose 'model' nonlinear or linear")
     for name, value in (('gravity', any(arm.gravity)), ('base_mass', arm.base_mass),
                         ('joint_coulomb_friction', any(arm.joint_coulomb_friction))):
         if value:

@@ -31,10 +31,10 @@ def normal(seed: int, first: int, count: int) -> Array:
 
 
 def std_for_snr(position: Array, velocity: Array, snr_db: float) -> Array:
-    """Standard deviations (8,) for a signal-to-noise ratio [dB] of every output.
+    """Standard deviations (4 L,) for a signal-to-noise ratio [dB] of every output.
 
     The signal is the deviation from its mean over the run: for a joint angle the motion counts, not the
-    posture. position, velocity: (N, 4) noise-free.
+    posture. position, velocity: (N, 2 L) noise-free.
     """
     signal = np.concatenate([position.std(axis=0), velocity.std(axis=0)])
     level: Array = signal * 10.0 ** (-snr_db / 20.0)
@@ -43,31 +43,33 @@ def std_for_snr(position: Array, velocity: Array, snr_db: float) -> Array:
 
 @kernel
 def low_pass(values: Array, state: Array, share: float) -> None:
-    """Filter values (N, 2) in place by a first-order lag: state (2,) moves by share of the difference."""
+    """Filter values (N, L) in place by a first-order lag: state (L,) moves by share of the difference."""
     for k in range(values.shape[0]):
-        for c in range(2):
+        for c in range(values.shape[1]):
             state[c] += share * (values[k, c] - state[c])
             values[k, c] = state[c]
 
 
 def gauge(config: PlantParameters, position: Array, velocity: Array, state: Array) -> None:
-    """Let strain gauges smooth the deflections, in place; state (2, 2) carries on between calls."""
+    """Let strain gauges smooth the deflections, in place; state (2, L) carries on between calls."""
     cutoff = config.sensors.strain_cutoff
     if cutoff:
         share = 1.0 - np.exp(-2.0 * np.pi * cutoff / config.rate)
         for row, values in enumerate((position, velocity)):
-            bends = np.ascontiguousarray(values[:, 2:])
+            links = values.shape[1] // 2
+            bends = np.ascontiguousarray(values[:, links:])
             low_pass(bends, state[row], share)
-            values[:, 2:] = bends
+            values[:, links:] = bends
 
 
 def read(config: PlantParameters, position: Array, velocity: Array, std: Array, drawn: Array) -> None:
-    """Add bias and noise, then round, in place; std (8,), drawn (N, 10) standard normal numbers."""
+    """Add bias and noise, then round, in place; std (4 L,), drawn (N, 10) standard normal numbers."""
     bias = np.array(config.sensors.bias)
-    position += bias[:4] + std[:4] * drawn[:, :4]
-    velocity += bias[4:] + std[4:] * drawn[:, 4:8]
-    for columns, step in ((slice(0, 2), config.sensors.encoder_resolution),
-                          (slice(2, 4), config.sensors.bend_resolution)):
+    m = position.shape[1]
+    position += bias[:m] + std[:m] * drawn[:, :m]
+    velocity += bias[m:] + std[m:] * drawn[:, 4:4 + m]
+    for columns, step in ((slice(0, m // 2), config.sensors.encoder_resolution),
+                          (slice(m // 2, m), config.sensors.bend_resolution)):
         if step:
             position[:, columns] = step * np.round(position[:, columns] / step)
 
@@ -85,7 +87,7 @@ def arrives(config: PlantParameters, drawn: Array) -> np.ndarray[tuple[int], np.
 
 
 def saturated(config: PlantParameters, efforts: Array) -> Array:
-    """Efforts (N, 2) [N m] within the torque limits."""
+    """Efforts (N, L) [N m] within the torque limits."""
     limits = np.array(config.actuators.torque_limit)
     limits[limits == 0.0] = np.inf
     return np.asarray(np.minimum(np.maximum(efforts, -limits), limits))

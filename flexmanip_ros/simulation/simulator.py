@@ -19,7 +19,12 @@ from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, Sens
 from flexmanip_ros.simulation import models, sensors, waveforms
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointRecord
 
-JOINT_NAMES = ('joint1', 'joint2', 'link1_bend', 'link2_bend')
+
+def joint_names(links: int) -> tuple[str, ...]:
+    """Return the names in a message: joints, then bends."""
+    return (*(f'joint{i + 1}' for i in range(links)), *(f'link{i + 1}_bend' for i in range(links)))
+
+
 REHEARSAL_TIME = 6.0
 """Seconds of the rehearsal that finds the signal levels, with the capture half way (the paper's run)."""
 
@@ -37,45 +42,46 @@ class PlantState:
     payload: Array
     """(4,) what the arm holds, see ``manipulator.payload_array``."""
     noise_std: Array
-    """(8,) of the positions, then the rates."""
+    """(4 L,) of the positions, then the rates."""
     noise_block: Array
     """(BLOCK, 10) standard normal numbers around the next sample."""
     noise_number: int
     """Which block that is."""
     gauges: Array
-    """(2, 2) low-pass state of the deflections and of their rates."""
+    """(2, L) low-pass state of the deflections and of their rates."""
     commands: Array
-    """(command_delay, 2) torques on their way to the drives."""
+    """(command_delay, L) torques on their way to the drives."""
     reported: Array
-    """(effort_delay, 2) torques that are still to be reported."""
+    """(effort_delay, L) torques that are still to be reported."""
     taking: Body | None = None
     """Part of an object that a soft gripper takes at each of the next samples."""
     taking_left: int = 0
 
 
 class Trajectory(NamedTuple):
-    """A simulated run as its messages tell it, columns in the order of JOINT_NAMES (effort: the joints)."""
+    """A simulated run as its messages tell it, columns in the order of its names (effort: the joints)."""
 
     stamp_ns: np.ndarray[tuple[int], np.dtype[np.int64]]
     position: Array
     velocity: Array
     effort: Array
-    names: tuple[str, ...] = JOINT_NAMES
+    names: tuple[str, ...]
 
 
 def init(config: PlantParameters, start_ns: int = 0, noise_std: Array | None = None) -> PlantState:
     """Put the arm at rest at its initial angles, empty; sample 0 is stamped start_ns.
 
-    noise_std: (8,) overrides the parameters'. With ``noise: snr`` and none given, the levels come from a
+    noise_std: (4 L,) overrides the parameters'. With ``noise: snr`` and none given, the levels come from a
     noise-free rehearsal of the paper's excitation.
     """
     model = models.build(config)
+    links = len(config.arm.link_length)
     return PlantState(
         model=model, start_ns=start_ns, index=0, x=model.rest(), payload=np.zeros(4),
         noise_std=_levels(config) if noise_std is None else np.array(noise_std, dtype=np.float64),
-        noise_block=sensors.block(config.seed, 0), noise_number=0, gauges=np.zeros((2, 2)),
-        commands=np.zeros((config.actuators.command_delay, 2)),
-        reported=np.zeros((config.arm.effort_delay, 2)))
+        noise_block=sensors.block(config.seed, 0), noise_number=0, gauges=np.zeros((2, links)),
+        commands=np.zeros((config.actuators.command_delay, links)),
+        reported=np.zeros((config.arm.effort_delay, links)))
 
 
 def stamp(config: PlantParameters, state: PlantState) -> int:
@@ -86,12 +92,12 @@ def stamp(config: PlantParameters, state: PlantState) -> int:
 def step(
     config: PlantParameters, state: PlantState, efforts: Array,
 ) -> tuple[PlantState, JointRecord | None]:
-    """Record the present sample and integrate one period under efforts (2,) [N m].
+    """Record the present sample and integrate one period under efforts (L,) [N m].
 
     The record is None when the sample is lost on its way (``sensors.drop_probability``).
-    Raises SignalError when efforts are not two finite numbers, ModelError when the simulation diverges.
+    Raises SignalError when efforts are not as many finite numbers as joints, ModelError when the simulation diverges.
     """
-    efforts = _checked(np.asarray(efforts, dtype=np.float64).reshape(1, -1))
+    efforts = _checked(config, np.asarray(efforts, dtype=np.float64).reshape(1, -1))
     now = stamp(config, state)
     number = state.index // sensors.BLOCK
     if number != state.noise_number:
@@ -102,8 +108,8 @@ def step(
         return state, None
     sensors.read(config, position, velocity, state.noise_std, drawn)
     record = JointRecord(
-        now + int(sensors.jitter_ns(config, drawn)[0]), JOINT_NAMES, position[0], velocity[0],
-        np.array([*effort[0], 0.0, 0.0]))
+        now + int(sensors.jitter_ns(config, drawn)[0]), joint_names(len(effort[0])), position[0], velocity[0],
+        np.concatenate([effort[0], np.zeros_like(effort[0])]))
     return state, record
 
 
@@ -130,17 +136,18 @@ def simulate(
     config: PlantParameters, efforts: Array, events: Sequence[CaptureEvent] = (), start_ns: int = 0,
     noise_std: Array | None = None,
 ) -> Trajectory:
-    """Run efforts.shape[0] samples under efforts (N, 2) [N m], events applied at their stamps.
+    """Run efforts.shape[0] samples under efforts (N, L) [N m], events applied at their stamps.
 
     The same numbers as N steps. With ``noise: snr`` and no noise_std given, the levels are those of this
     very trajectory (a live plant cannot know them and rehearses).
     """
-    efforts = _checked(np.asarray(efforts, dtype=np.float64))
+    efforts = _checked(config, np.asarray(efforts, dtype=np.float64))
     count = efforts.shape[0]
     own_levels = config.noise == 'snr' and noise_std is None
-    state = init(config, start_ns, np.zeros(8) if own_levels else noise_std)
+    state = init(config, start_ns, np.zeros(4 * efforts.shape[1]) if own_levels else noise_std)
     stamps = start_ns + np.round(np.arange(count) * 1e9 / config.rate).astype(np.int64)
-    rows = np.empty((count, 10))
+    m = 2 * efforts.shape[1]
+    rows = np.empty((count, 2 * m + m // 2))
     ordered = sorted(events, key=lambda event: event.stamp_ns)
     places = [int(np.searchsorted(stamps, event.stamp_ns)) for event in ordered]
     for first, last, event in zip([0, *places], [*places, count], [None, *ordered], strict=True):
@@ -151,13 +158,13 @@ def simulate(
             state, *parts = _advance(config, state, efforts[first:end])
             rows[first:end] = np.hstack(parts)
             first = end
-    position, velocity, effort = rows[:, :4].copy(), rows[:, 4:8].copy(), rows[:, 8:].copy()
+    position, velocity, effort = rows[:, :m].copy(), rows[:, m:2 * m].copy(), rows[:, 2 * m:].copy()
     levels = sensors.std_for_snr(position, velocity, config.snr_db) if own_levels else state.noise_std
     drawn = sensors.normal(config.seed, 0, count)
     sensors.read(config, position, velocity, levels, drawn)
     kept = sensors.arrives(config, drawn)
     stamps = stamps + sensors.jitter_ns(config, drawn)
-    return Trajectory(stamps[kept], position[kept], velocity[kept], effort[kept])
+    return Trajectory(stamps[kept], position[kept], velocity[kept], effort[kept], joint_names(efforts.shape[1]))
 
 
 def records(
@@ -170,13 +177,13 @@ def records(
             yield waiting.pop()
         yield JointRecord(
             now, trajectory.names, trajectory.position[k], trajectory.velocity[k],
-            np.array([*trajectory.effort[k], 0.0, 0.0]))
+            np.concatenate([trajectory.effort[k], np.zeros_like(trajectory.effort[k])]))
 
 
 def _advance(
     config: PlantParameters, state: PlantState, efforts: Array,
 ) -> tuple[PlantState, Array, Array, Array]:
-    """Run commands (N, 2); return the state after them, positions, rates (N, 4) and reported torques."""
+    """Run commands (N, L); return the state after them, positions, rates (N, 2 L) and reported torques."""
     if state.taking is not None:
         state = _take(config, state, state.taking)
         left = state.taking_left - 1
@@ -186,7 +193,7 @@ def _advance(
     applied = np.ascontiguousarray(queue[:count])
     reported = np.concatenate([state.reported, applied])
     x, gauges = state.x.copy(), state.gauges.copy()
-    position, velocity = np.empty((count, 4)), np.empty((count, 4))
+    position, velocity = (np.empty((count, 2 * efforts.shape[1])) for _ in range(2))
     good = state.model.advance(x, state.payload, applied, position, velocity)
     if good < count:
         raise ModelError(
@@ -210,21 +217,22 @@ def _take(config: PlantParameters, state: PlantState, body: Body) -> PlantState:
 
 def _levels(config: PlantParameters) -> Array:
     if config.noise == 'none':
-        return np.zeros(8)
+        return np.zeros(4 * len(config.arm.link_length))
     if config.noise == 'std':
         return np.array(config.noise_std)
     gauges_only = SensorParameters(strain_cutoff=config.sensors.strain_cutoff)
     quiet = replace(config, noise='none', sensors=gauges_only)
-    waves = ExcitationParameters(rate=config.rate, amplitude=config.rehearsal_torque)
+    waves = ExcitationParameters(rate=config.rate, amplitude=config.rehearsal_torque, arm=config.arm)
     efforts = waveforms.scaled(waves, waves.amplitude, round(REHEARSAL_TIME * config.rate))
     half = round(round(len(efforts) / 2) * 1e9 / config.rate)
     run = simulate(quiet, efforts, (CaptureEvent(half, EventKind.CAPTURE),))
     return sensors.std_for_snr(run.position, run.velocity, config.snr_db)
 
 
-def _checked(efforts: Array) -> Array:
-    if efforts.ndim != 2 or efforts.shape[1] != 2:
-        raise SignalError(f'the efforts have shape {efforts.shape}', 'give one torque for each of 2 joints')
+def _checked(config: PlantParameters, efforts: Array) -> Array:
+    links = len(config.arm.link_length)
+    if efforts.ndim != 2 or efforts.shape[1] != links:
+        raise SignalError(f'the efforts have shape {efforts.shape}', f'give one torque for each of {links} joints')
     if not np.all(np.isfinite(efforts)):
         raise SignalError('an effort is not finite', 'look at the controller that sent it')
     return efforts

@@ -14,9 +14,9 @@ CREST_PASSES = 200
 
 
 def scaled(config: ExcitationParameters, peak: tuple[float, ...], n: int) -> Array:
-    """Torques (n, 2) [N m] of samples 0 .. n - 1 with peak torques (2,) [N m] about the offset."""
+    """Torques (n, L) [N m] of samples 0 .. n - 1 with peak torques (L,) [N m] about the offset."""
     columns = []
-    for i in range(2):
+    for i in range(len(peak)):
         table = unit(config, i)
         columns.append(config.offset[i] + peak[i] * table[np.arange(n) % table.size])
     return np.stack(columns, axis=1)

@@ -116,7 +116,7 @@ def payload_bound(config: IdentifierParameters, signals: Signals, capture_time: 
     damping from the empty arm can be a little better. mass: the payload, or its estimate [kg]; the noise is measured
     on the signals. None where there is no bound: no angles, no sample after the capture, or no noise.
     """
-    if signals.angles.shape[1] != 2 or not mass > 0.0 or dt <= 0.0:
+    if signals.angles.shape[1] != len(config.arm.link_length) or not mass > 0.0 or dt <= 0.0:
         return None
     first = int(np.searchsorted(signals.time, capture_time - 0.5 * dt))
     count = min(signals.stamp_ns.size - first, LONGEST)

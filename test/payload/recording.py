@@ -41,7 +41,7 @@ def record(
     trajectory = simulator.simulate(parameters, efforts, events)
     columns = {'position': trajectory.position, 'velocity': trajectory.velocity}
     parts = [name.split('/') for name in outputs]
-    Y = np.column_stack([columns[field][:, simulator.JOINT_NAMES.index(joint)] for joint, field in parts])
+    Y = np.column_stack([columns[field][:, trajectory.names.index(joint)] for joint, field in parts])
     return rows_of(trajectory.effort[:, :2], Y, trajectory.position[:, :2], trajectory.stamp_ns)
 
 

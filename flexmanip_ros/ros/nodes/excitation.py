@@ -59,8 +59,8 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
     def summary(self) -> str:
         """Say which torque it is."""
         config = self.config
-        return (f'{config.shape} of {config.amplitude[0]:g} and {config.amplitude[1]:g} N m at {config.rate:g} Hz, '
-                f'clock {config.clock}')
+        peaks = ' and '.join(f'{peak:g}' for peak in config.amplitude)
+        return f'{config.shape} of {peaks} N m at {config.rate:g} Hz, clock {config.clock}'
 
     def activated(self) -> None:
         """Sample 0 is now."""
@@ -74,7 +74,7 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
         if self._timer is not None:
             self._timer.cancel()
         self._grid.stop()
-        self._send(np.zeros(2))
+        self._send(np.zeros(len(self.config.amplitude)))
 
     def _tick(self) -> None:
         if not self.active or not (self._grid.begun or self._grid.begin()):

@@ -50,7 +50,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._estimate: PayloadEstimate | None = None
         self.dropped = 0
         self.sent = 0
-        self._added, self._added_at = np.zeros(2), -np.inf
+        self._added, self._added_at = np.zeros(len(self.config.joints)), -np.inf
         self._last_ns: int | None = None
         self._arrived = np.inf
         self._meter = Meter()
@@ -86,7 +86,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
 
     def deactivated(self) -> None:
         """Leave the arm without torque."""
-        self._send(np.zeros(2))
+        self._send(np.zeros(len(self.config.joints)))
 
     def configuration_changed(self, config: ControllerParameters) -> None:
         """Go to a new setpoint."""
@@ -146,7 +146,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         if not max(np.abs(position).max(), np.abs(velocity).max()) < LARGEST:  # false for NaN too
             return None
         fresh = time.monotonic() - self._added_at <= self.config.stale_after
-        return controller.Measured(position, velocity, self._added if fresh else np.zeros(2))
+        return controller.Measured(position, velocity, self._added if fresh else np.zeros(len(self.config.joints)))
 
     def _on_estimate(self, message: Float64MultiArray) -> None:
         if len(message.data) != 5:
@@ -164,7 +164,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
             self.get_logger().info(f'payload {estimate.mass:.2f} kg: {self.state.verdict.value}')
 
     def _on_added(self, message: Float64MultiArray) -> None:
-        if len(message.data) != 2 or not np.isfinite(message.data).all():
+        if len(message.data) != len(self.config.joints) or not np.isfinite(message.data).all():
             self._drop('added_efforts', 'an added effort is not two finite torques; it was dropped')
             return
         self._added, self._added_at = np.array(message.data), time.monotonic()
@@ -176,7 +176,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._arrived = np.inf
         if self.state is not None:
             self.state = self.state._replace(x=None)
-        self._send(np.zeros(2))
+        self._send(np.zeros(len(self.config.joints)))
         self.log_throttled('silence', f'no joint_states for {self.config.stale_after:g} s: zero torque')
 
     def _send(self, torque: Array) -> None:

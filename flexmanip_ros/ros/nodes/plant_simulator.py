@@ -44,7 +44,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
     def __init__(self, **options: Any) -> None:
         super().__init__(NAME, PlantParameters, **options)
         self.state: simulator.PlantState | None = None
-        self.efforts = np.zeros(2)
+        self.efforts = np.zeros(len(self.config.arm.link_length))
         self.dropped_commands = 0
         self.lost_commands = LossCounter()
         self.late_events = 0
@@ -73,7 +73,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         state = simulator.init(self.config)
         self._noise_std = state.noise_std
         state = simulator.attach(self.config, state)
-        state, _ = simulator.step(self.config, state, np.zeros(2))
+        state, _ = simulator.step(self.config, state, np.zeros(len(self.config.arm.link_length)))
         simulator.release(self.config, state)
 
     def summary(self) -> str:
@@ -102,7 +102,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         """Put the arm at its start from the next stamp on: stamps never go back."""
         self._restarted_ns = self._stamp(self.samples)
         self.state = simulator.init(self.config, self._restarted_ns, self._noise_std)
-        self._pending, self._fault, self.efforts = (), '', np.zeros(2)
+        self._pending, self._fault, self.efforts = (), '', np.zeros(len(self.config.arm.link_length))
 
     def _stamp(self, index: int) -> int:
         return self._grid.start_ns + round(index * 1e9 / self.config.rate)
@@ -145,8 +145,9 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
     def _on_command(self, message: Float64MultiArray, info: object) -> None:
         self.lost_commands.note(sequence_number(info))
         efforts = np.array(message.data)
-        if efforts.size != 2:
-            self._drop(f'a command has {efforts.size} values; send one torque for each of the 2 joints')
+        links = len(self.config.arm.link_length)
+        if efforts.size != links:
+            self._drop(f'a command has {efforts.size} values; send one torque for each of the {links} joints')
         elif not all(map(math.isfinite, efforts.tolist())):
             self._drop('a command has a value that is not finite; look at the controller')
         else:
