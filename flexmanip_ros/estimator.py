@@ -14,8 +14,9 @@ from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.numerics.background import Background
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, frequency, structured
+from flexmanip_ros.payload.arm_parameters import taught
 from flexmanip_ros.samples.sample_log import Rows
-from flexmanip_ros.types import Array, CaptureEvent, Estimate, Payload, Status
+from flexmanip_ros.types import ArmParameter, Array, CaptureEvent, Estimate, Payload, Status
 
 NO_ANGLES: Array = np.empty(0)
 
@@ -94,6 +95,11 @@ def init(config: IdentifierParameters) -> tuple[PayloadEstimator, ModelEstimator
 def payload(config: IdentifierParameters, state: PayloadEstimator) -> Payload | None:
     """Return the payload where it does not rest on the model; else None."""
     return None if state.structured is None else structured.estimate(config, state.structured)
+
+
+def arm_parameters(config: IdentifierParameters, state: PayloadEstimator) -> tuple[ArmParameter, ...]:
+    """Return what the arm taught; empty where the payload rests on the model."""
+    return taught(config, state.structured)
 
 
 @dataclass(frozen=True, eq=False)

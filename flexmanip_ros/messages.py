@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.types import Array, Estimate, Mode, Payload, StateSpace, Status
+from flexmanip_ros.types import ArmParameter, Array, Estimate, Mode, Payload, StateSpace, Status
 
 MODEL = 'model'
 MODES = 'modes'
@@ -22,6 +22,7 @@ PAYLOAD_MASS = 'payload_mass'
 PAYLOAD_ESTIMATE = 'payload_estimate'
 PAYLOAD = 'payload'
 PAYLOAD_BODY = 'payload_body'
+ARM_PARAMETERS = 'arm_parameters'
 STATUS = 'status'
 ROWS = re.compile(r'^rows: state=(\d+) output=(\d+) dt=(\S+)$')
 COLUMNS = re.compile(r'^columns: state=(\d+) input=(\d+) innovation=(\d+)$')
@@ -125,6 +126,12 @@ def payload_body(payload: Payload) -> LabelledArray:
                    np.vstack([first, np.array(payload.covariance).reshape(4, 4)]))
 
 
+def arm_parameters(found: Sequence[ArmParameter]) -> LabelledArray:
+    """Return one parameter a row, value and standard deviation; the label of the rows names them, in this order."""
+    return _matrix(','.join(one.name for one in found), 'value std',
+                   np.array([(one.value, one.std) for one in found]).reshape(len(found), 2))
+
+
 def inertia(payload: Payload, stamp_ns: int, frame_id: str) -> Inertia:
     """Return the payload as a robot driver takes it."""
     return Inertia(stamp_ns, frame_id, payload.mass, payload.com, payload.inertia)
@@ -165,6 +172,7 @@ Value = LabelledArray | Inertia | Diagnostics | float
 def outgoing(estimate: Estimate, frame_id: str) -> Iterator[tuple[str, Value]]:
     """Yield (topic below the node's name, value) of everything an estimate publishes."""
     yield from outgoing_payload(estimate.payload, estimate.stamp_ns, frame_id)
+    yield from outgoing_arm(estimate)
     yield from outgoing_model(estimate)
 
 
@@ -187,6 +195,13 @@ def outgoing_payload(payload: Payload | None, stamp_ns: int, frame_id: str) -> I
     if math.isfinite(payload.std):
         yield PAYLOAD_MASS, payload.mass
     yield STATUS, payload_status(payload, stamp_ns, frame_id)
+
+
+def outgoing_arm(estimate: Estimate) -> Iterator[tuple[str, Value]]:
+    """Yield what the arm taught, if it is told with this estimate."""
+    found = estimate.arm_parameters
+    if found and all(math.isfinite(one.value) and math.isfinite(one.std) for one in found):
+        yield ARM_PARAMETERS, arm_parameters(found)
 
 
 def outgoing_model(estimate: Estimate) -> Iterator[tuple[str, Value]]:

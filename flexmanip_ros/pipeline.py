@@ -30,6 +30,8 @@ GROUP = 16
 0.4 ms, which delays a sample less than the 3 ms that an estimate may take."""
 RESULT_DELAY_S = 0.005
 """Time from the row that a model is asked for at to the row at which it is taken [s]. Reading it takes 1 to 3 ms."""
+ARM_RATE = 1.0
+"""How often an estimate carries what the arm taught [Hz]: it changes slowly."""
 HOPELESS = 2000
 """Messages without a single usable one after which a replay gives up."""
 ROUNDING = 1e-6
@@ -73,6 +75,8 @@ class State(NamedTuple):
     first_ns: int = 0
     published: int = -1
     """Number of the last instant of ``publish_rate``, counted from the first stamp."""
+    told: int = -1
+    """Number of the last second from the first stamp on in which an estimate carried the arm's parameters."""
     pending: PendingModel | None = None
     model: ModelEstimate | None = None
     keep_log: bool = False
@@ -175,9 +179,12 @@ def one_a_stamp(estimates: Iterable[Estimate]) -> Iterator[Estimate]:
 def _one_a_stamp(estimates: Iterable[tuple[State, Estimate]]) -> Iterator[tuple[State, Estimate]]:
     waiting: tuple[State, Estimate] | None = None
     for state, estimate in estimates:
+        arm = estimate.arm_parameters
         if waiting is not None and waiting[1].stamp_ns != estimate.stamp_ns:
             yield waiting
-        waiting = state, estimate._replace(payload_is_new=True)
+        elif waiting is not None:
+            arm = arm or waiting[1].arm_parameters
+        waiting = state, estimate._replace(payload_is_new=True, arm_parameters=arm)
     if waiting is not None:
         yield waiting
 
@@ -335,12 +342,15 @@ def _estimate(state: State, background: Background) -> tuple[State, list[Estimat
     assert now is not None
     stamp_ns, since_ns = now.last_ns, now.estimator.since_ns
     payload = estimator.payload(config, now.estimator)
-    state = state._replace(published=_instant(state, stamp_ns, config.publish_rate))
+    second = _instant(state, stamp_ns, ARM_RATE)
+    arm = estimator.arm_parameters(config, now.estimator) if second > state.told else ()
+    state = state._replace(published=_instant(state, stamp_ns, config.publish_rate),
+                           told=second if arm else state.told)
     settling_ns = (2.0 * config.rewind_time + 1.0 / config.publish_rate) * 1e9
     young = stamp_ns - max(state.first_ns, since_ns) <= settling_ns
     instant = _instant(state, stamp_ns, config.model_rate)
     if last is not None and last.since_ns == since_ns and not young and instant <= last.instant:
-        return state, [estimator.with_model_of(config, stamp_ns, last.estimate, payload)]
+        return state, [estimator.with_model_of(config, stamp_ns, last.estimate, payload)._replace(arm_parameters=arm)]
     state = _advance_identifier(state, now.cursor, background)
     assert state.identifier is not None
     request = estimator.ModelRequest(config, state.identifier.estimator, now.estimator, stamp_ns, state.clock.dt,
@@ -351,8 +361,8 @@ def _estimate(state: State, background: Background) -> tuple[State, list[Estimat
     if payload is None:  # it rests on the model
         return state, []
     if last is None:
-        return state, [estimator.without_model(config, stamp_ns, payload)]
-    return state, [estimator.with_model_of(config, stamp_ns, last.estimate, payload)]
+        return state, [estimator.without_model(config, stamp_ns, payload)._replace(arm_parameters=arm)]
+    return state, [estimator.with_model_of(config, stamp_ns, last.estimate, payload)._replace(arm_parameters=arm)]
 
 
 def _take_model(state: State, background: Background) -> tuple[State, list[Estimate]]:

@@ -135,6 +135,14 @@ class Payload(NamedTuple):
     covariance: tuple[float, ...] = ()
 
 
+class ArmParameter(NamedTuple):
+    """A parameter of the arm as it was found, with its standard deviation, in SI units."""
+
+    name: str
+    value: float
+    std: float
+
+
 class Estimate(NamedTuple):
     """Everything published at one stamp. ``model`` and ``payload`` are None until there is one."""
 
@@ -157,3 +165,5 @@ class Estimate(NamedTuple):
     """Whether model and modes were read at this stamp, or are those of an estimate before."""
     payload_is_new: bool = True
     """Whether the payload has not been in an estimate of this stamp before."""
+    arm_parameters: tuple[ArmParameter, ...] = ()
+    """What the arm taught, with the first estimate of each second."""

@@ -45,6 +45,8 @@ def _parser() -> console.Parser:
     add('--output', metavar='OUT',
         help='write the estimates: a table where the name ends in .csv or .npz, else a rosbag2 recording')
     add('--report', metavar='REPORT.html', help='write a report: one HTML page with figures and tables')
+    add('--save-arm', metavar='FILE.yaml',
+        help='write what the arm taught (stiffness, damping, friction, rotors, gains, offsets) as a parameter file')
     add('--json', action='store_true', help='print the result as JSON in the last line of stdout')
     add('--joint-states', metavar='TOPIC', default='joint_states',
         help='topic of the joint states; default: joint_states, in any namespace')
@@ -73,7 +75,7 @@ def _main(given: argparse.Namespace) -> int:
         events_required=given.capture_event is not None,
         capture_time=given.capture_time, release_time=given.release_time, detect=given.detect,
         validate_from=given.validate_from,
-        output=given.output, report=given.report)
+        output=given.output, report=given.report, save_arm=given.save_arm)
     with console.progress('identifying', 'messages') as progress:
         result = identify(request, progress)
     if not given.json:

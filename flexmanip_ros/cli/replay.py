@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from flexmanip_ros import pipeline
+from flexmanip_ros import estimator, pipeline
 from flexmanip_ros.cli.console import require_matplotlib
-from flexmanip_ros.errors import BagError, FlexmanipError, ParameterError
+from flexmanip_ros.errors import BagError, FlexmanipError, ParameterError, SignalError
 from flexmanip_ros.io import bag
-from flexmanip_ros.io.outputs import TableOutput, check_place, open_output
+from flexmanip_ros.io.outputs import TableOutput, check_place, open_output, write_text
 from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.parameters.document import yaml_text
+from flexmanip_ros.payload.arm_parameters import as_parameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies import holdout
@@ -44,6 +46,8 @@ class Request:
     validate_from: float | None = None
     output: str | None = None
     report: str | None = None
+    save_arm: str | None = None
+    """Parameter file for what the arm taught."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +75,8 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
         require_matplotlib()
         if request.output is not None and Path(request.output).resolve() == Path(request.report).resolve():
             raise ParameterError(f"--output and --report are both '{request.report}'", 'give two names')
+    if request.save_arm is not None:
+        check_place(request.save_arm)
     messages = _Messages(request, progress)
     kept: list[Estimate] = []
     state, interrupted = pipeline.init(), False
@@ -100,11 +106,13 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
         summary = replace(summary, vaf_simulation_percent=tuple(scores.simulation.tolist()),
                           vaf_prediction_percent=tuple(scores.prediction.tolist()))
     fault = messages.fault or _dropped(state)
+    if request.save_arm is not None:
+        _save_arm(request, state, last)
     if request.report is not None and signals is not None:
         _report(request, summary, messages, kept, signals, last, scores, state, fault)
     return Result(
         summary, () if last is None else last.modes, state.clock.outputs or request.config.outputs,
-        tuple(str(place) for place in (request.output, request.report) if place is not None), fault,
+        tuple(str(place) for place in (request.output, request.report, request.save_arm) if place is not None), fault,
         interrupted, _remark(state, messages.foreign))
 
 
@@ -178,6 +186,21 @@ class _Messages:
         if limit is None or self.first_ns is None:
             return NEVER
         return self.first_ns + round(limit * 1e9)
+
+
+def _save_arm(request: Request, state: pipeline.State, last: Estimate | None) -> None:
+    """Write what the arm taught as parameters for every node. Raises SignalError where it taught nothing."""
+    config = state.config or request.config
+    found = () if state.payload is None else estimator.arm_parameters(config, state.payload.estimator)
+    if not found:
+        raise SignalError('the recording taught nothing of the arm, so --save-arm has nothing to write',
+                          'it needs payload_method structured, torques, angles and some 0.1 s of samples')
+    status = 'unknown' if last is None else last.status.name
+    deviations = ', '.join(f'{one.name} {one.value:.6g} +- {one.std:.2g}' for one in found)
+    heading = (f"What the arm taught in the recording '{Path(request.bag).name}', status {status}. "
+               f'Values and standard deviations: {deviations}.')
+    assert request.save_arm is not None
+    write_text(request.save_arm, yaml_text('rpbsid_identifier', as_parameters(config, found), heading))
 
 
 def _dropped(state: pipeline.State) -> FlexmanipError | None:

@@ -111,7 +111,9 @@ def _filtered(config: ControllerParameters, state: ControllerState, measured: Me
         links = len(measured.position) // 2
         first[:links] = reference(config, measured.position[:links])
         return first
-    innovation = np.concatenate([measured.position, measured.velocity]) - state.C @ state.x
+    offset = np.zeros(len(state.C))
+    offset[len(config.joints):len(measured.position)] = config.arm.bend_offset
+    innovation = np.concatenate([measured.position, measured.velocity]) - offset - state.C @ state.x
     x: Array = state.x + state.now.L @ innovation
     return x
 

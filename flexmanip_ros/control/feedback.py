@@ -28,7 +28,8 @@ FLOOR = 1e-6
 def observation(config: ControllerParameters) -> Array:
     """Return T (2 L, n): [encoder angles, bends] = T [theta, eta], and the same for their rates."""
     arm = config.arm
-    return manipulator(replace(arm, base_mass=0.0) if arm.base_mass else arm).output
+    output = manipulator(replace(arm, base_mass=0.0) if arm.base_mass else arm).output
+    return np.asarray(np.append(np.ones(len(arm.bend_gain)), arm.bend_gain)[:, None] * output)
 
 
 def reference(config: ControllerParameters, angles: Array) -> Array:
@@ -46,7 +47,7 @@ def model(config: ControllerParameters, between: float, payload: float) -> tuple
     K, D = np.zeros((n, n)), (B * np.array(config.arm.joint_viscous_friction)) @ B.T
     K[links:, links:] = b.Kc
     D[links:, links:] += b.Dc
-    rows = cho_solve(cho_factor(M), np.hstack([-K, -D, B]))
+    rows = cho_solve(cho_factor(M), np.hstack([-K, -D, B * np.array(config.arm.torque_gain)]))
     A = np.zeros((2 * n, 2 * n))
     A[:n, n:], A[n:] = np.eye(n), rows[:, :2 * n]
     B = np.vstack([np.zeros_like(B), rows[:, 2 * n:]])
@@ -66,7 +67,7 @@ def feedforward(config: ControllerParameters, between: float, payload: float) ->
     b = blocks(config.arm, turned(config, between), payload)
     F = solve(b.B_theta, b.Ma)
     E = solve(b.Kc, b.B_eta @ F - b.Mb.T, assume_a='pos')
-    return F, E
+    return F / np.array(config.arm.torque_gain)[:, None], E
 
 
 class Design(NamedTuple):

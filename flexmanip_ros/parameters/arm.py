@@ -49,6 +49,12 @@ class ArmParameters:
         (0.0, 0.0), 'viscous friction of each joint', unit='N m s/rad', low=0.0, size=2, per_link=True)
     joint_coulomb_friction: tuple[float, ...] = parameter(
         (0.0, 0.0), 'Coulomb friction of each joint', unit='N m', low=0.0, size=2, per_link=True)
+    torque_gain: tuple[float, ...] = parameter(
+        (1.0, 1.0), 'torque of each joint over the effort that is reported', low=0.1, high=10.0, size=2, per_link=True)
+    bend_gain: tuple[float, ...] = parameter(
+        (1.0, 1.0), 'measured over true bend of each link', low=0.1, high=10.0, size=2, per_link=True)
+    bend_offset: tuple[float, ...] = parameter(
+        (0.0, 0.0), 'measured bend of each link when it is straight', unit='m', size=2, per_link=True)
     gravity: tuple[float, ...] = parameter(
         (0.0, 0.0), 'gravity along x and y; (0, -9.81): the arm moves in a vertical plane', unit='m/s^2', size=2)
     base_mass: float = parameter(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -166,7 +166,9 @@ def learned(config: IdentifierParameters) -> tuple[tuple[Kind, int], ...]:
     bends = {role.link for role in known.outputs if role.quantity in (Quantity.BEND, Quantity.BEND_RATE)} \
         if known else set()
     entries = [(kind, 0) for kind in body]
-    for name in config.payload.learn:
+    given = {name for name, neutral in (('torque_gain', 1.0), ('bend_gain', 1.0), ('bend_offset', 0.0))
+             if any(value != neutral for value in getattr(config.arm, name))}
+    for name in (*config.payload.learn, *sorted(given.difference(config.payload.learn))):
         kind = LEARNED[name]
         if kind is Kind.MODE:  # static shapes are no modes
             k = config.arm.modes if config.arm.shape_functions == 'sines' else 0
@@ -281,14 +283,17 @@ def priors(config: IdentifierParameters, motion: ProcessModel) -> Array:
     # shear, rotary inertia and coarse elements all move a mode the farther the higher it is, as j^2 or faster
     modes = config.payload.model_error * (np.arange(1, motion.arm.kappa + 1) ** 2 - 1) / 3
     by_joint[Kind.MODE] = np.tile(modes, len(L))
-    return np.array([by_joint[kind][link] if kind in by_joint else alike.get(kind, 0.0)
+    fixed = {kind for name, kind in LEARNED.items() if name not in config.payload.learn}
+    return np.array([0.0 if kind in fixed else by_joint[kind][link] if kind in by_joint else alike.get(kind, 0.0)
                      for kind, link in zip(map(Kind, motion.kind), motion.link, strict=True)])
 
 
 def _given(arm: ArmParameters, motion: ProcessModel) -> Array:
     """Return the prior mean (np,) of each entry of p, the value of its parameter."""
-    values = {Kind.DAMPING: (arm.damping_ratio,) * len(arm.link_length), Kind.VISCOUS: arm.joint_viscous_friction,
-              Kind.COULOMB: arm.joint_coulomb_friction}
+    values: dict[Kind, Any] = {
+        Kind.DAMPING: (arm.damping_ratio,) * len(arm.link_length), Kind.VISCOUS: arm.joint_viscous_friction,
+        Kind.COULOMB: arm.joint_coulomb_friction, Kind.TORQUE_GAIN: np.log(arm.torque_gain),
+        Kind.BEND_GAIN: np.log(arm.bend_gain), Kind.BEND_OFFSET: arm.bend_offset}
     return np.array([values[kind][link] if kind in values else 0.0
                      for kind, link in zip(map(Kind, motion.kind), motion.link, strict=True)])
 

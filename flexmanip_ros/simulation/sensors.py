@@ -62,6 +62,14 @@ def gauge(config: PlantParameters, position: Array, velocity: Array, state: Arra
             values[:, links:] = bends
 
 
+def misread(config: PlantParameters, position: Array, velocity: Array) -> None:
+    """Let the bend sensors read with their gain and offset, in place."""
+    links = position.shape[1] // 2
+    gain = np.array(config.arm.bend_gain)
+    position[:, links:] = gain * position[:, links:] + np.array(config.arm.bend_offset)
+    velocity[:, links:] *= gain
+
+
 def read(config: PlantParameters, position: Array, velocity: Array, std: Array, drawn: Array) -> None:
     """Add bias and noise, then round, in place; std (4 L,), drawn (N, 10) standard normal numbers."""
     bias = np.array(config.sensors.bias)

@@ -194,12 +194,13 @@ def _advance(
     reported = np.concatenate([state.reported, applied])
     x, gauges = state.x.copy(), state.gauges.copy()
     position, velocity = (np.empty((count, 2 * efforts.shape[1])) for _ in range(2))
-    good = state.model.advance(x, state.payload, applied, position, velocity)
+    good = state.model.advance(x, state.payload, applied * np.array(config.arm.torque_gain), position, velocity)
     if good < count:
         raise ModelError(
             f'the simulation diverged {(state.index + good) / config.rate:.3f} s after its start',
             'lower the torque, raise the stiffness or the rate, or reset the plant')
     sensors.gauge(config, position, velocity, gauges)
+    sensors.misread(config, position, velocity)
     after = replace(state, index=state.index + count, x=x, gauges=gauges,
                     commands=queue[count:], reported=reported[count:])
     return after, position, velocity, reported[:count]

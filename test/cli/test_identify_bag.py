@@ -13,8 +13,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.cli.identify_bag import main
+from flexmanip_ros.cli.simulate_bag import main as simulate
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.bag_writer import BagWriter
+from flexmanip_ros.io.parameter_file import read
 from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, Status
 
@@ -169,6 +171,32 @@ def test_an_event_in_the_recording_is_found(capsys, tmp_path):
     path = _bag(tmp_path / 'bag', _oscillator(600), 3.0)
     _, out, _ = _run(capsys, path, *SETTINGS, '--json')
     assert json.loads(out)['capture_time_s'] == 3.0
+
+
+def test_what_the_arm_taught_is_saved_and_given_back_as_parameters(capsys, tmp_path):
+    place, saved = tmp_path / 'faulty', tmp_path / 'arm.yaml'
+    faults = {'torque_gain': (1.04, 0.97), 'bend_gain': (0.98, 1.02), 'bend_offset': (5e-4, -3e-4),
+              'joint_viscous_friction': (0.8, 0.4)}
+    given = [part for name, value in faults.items() for part in ('--set', f'arm.{name}={list(value)}')]
+    assert simulate([str(place), '--duration', '4', '--capture-time', '3', '--payload', '20', *given]) == 0
+    code, *_ = _run(capsys, place, '--save-arm', saved, '--json', '--output', tmp_path / 'estimates')
+    assert code == 0
+    written = read(saved, 'rpbsid_identifier')
+    for name, value in faults.items():
+        assert written[f'arm.{name}'] == pytest.approx(value, rel=0.05, abs=2e-5), name
+    code, out, _ = _run(capsys, place, '--params', saved, '--json')
+    result = json.loads(out.splitlines()[-1])
+    assert result['status'] == 'TRACKING'
+    assert result['payload_ci95_kg'][0] < 20.0 < result['payload_ci95_kg'][1]
+    with Reader(tmp_path / 'estimates') as reader:
+        store = get_typestore(Stores.ROS2_JAZZY)
+        found = [store.deserialize_cdr(raw, one.msgtype) for one, _, raw in reader.messages()
+                 if one.topic == '/rpbsid_identifier/arm_parameters']
+    assert len(found) == 4  # one a second
+    names = found[-1].layout.dim[0].label.split(',')
+    values = found[-1].data.reshape(len(names), 2)
+    assert values[names.index('joint1_torque_gain'), 0] == pytest.approx(1.04, rel=0.01)
+    assert (values[:, 1] > 0.0).all()
 
 
 def test_what_comes_before_a_fault_is_used_and_written(recording, capsys, tmp_path):

@@ -51,7 +51,7 @@ def test_flat_names_and_values_rebuild_the_same_configuration(cls: type) -> None
     ({'order': 0}, 'order'),
     ({'order': 4.5}, 'whole number'),
     ({'order': True}, 'whole number'),
-    ({'arm.link_length': [3.0]}, 'arm.link_length'),
+    ({'arm.link_length': [3.0, 3.0, 3.0]}, 'arm.link_length'),
     ({'arm.link_length': [3.0, -1.0]}, 'arm.link_length'),
     ({'arm.link_length': [3.0, math.nan]}, 'arm.link_length'),
     ({'arm.link_length': 3.0}, 'list of numbers'),

@@ -8,6 +8,7 @@ publishes   ~/model           std_msgs/Float64MultiArray  [[A, B, K], [C, D, I]]
             ~/payload_mass    std_msgs/Float64            kg; nothing while nothing is known
             ~/payload_estimate std_msgs/Float64MultiArray mass, std, 95 % interval, consistency; latched
             ~/payload_body     std_msgs/Float64MultiArray mass, centre of mass, inertia, and their covariance; latched
+            ~/arm_parameters   std_msgs/Float64MultiArray what the empty arm taught: values, deviations; 1 Hz, latched
             ~/payload         geometry_msgs/InertiaStamped at the stamp of the sample that gave it; latched
             ~/status          diagnostic_msgs/DiagnosticArray stamp, status and numbers of payload or model; latched
             /diagnostics      diagnostic_msgs/DiagnosticArray  1 Hz
@@ -52,7 +53,7 @@ TOPICS = {
     messages.MODEL: (Float64MultiArray, qos.latched), messages.MODES: (Float64MultiArray, qos.output),
     messages.PAYLOAD_MASS: (Float64, qos.output), messages.PAYLOAD_ESTIMATE: (Float64MultiArray, qos.latched),
     messages.PAYLOAD: (InertiaStamped, qos.latched), messages.PAYLOAD_BODY: (Float64MultiArray, qos.latched),
-    messages.STATUS: (DiagnosticArray, qos.latched),
+    messages.STATUS: (DiagnosticArray, qos.latched), messages.ARM_PARAMETERS: (Float64MultiArray, qos.latched),
 }
 """Type and quality of service of each output."""
 
@@ -178,7 +179,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             if not self.context.ok():  # a context that has ended publishes nothing
                 return
             values = messages.outgoing_payload(estimate.payload, estimate.stamp_ns, self.config.payload_frame)
-            for name, value in (*(values if estimate.payload_is_new else ()), *messages.outgoing_model(estimate)):
+            new = (*values, *messages.outgoing_arm(estimate)) if estimate.payload_is_new else ()
+            for name, value in (*new, *messages.outgoing_model(estimate)):
                 self.outputs[name].publish(to_message(value))
                 self.published += 1
             self.estimate = estimate
