@@ -48,8 +48,8 @@ def ours(u: np.ndarray, y: np.ndarray, half: int, values: dict[str, object]) -> 
     found = rpbsid.identified(config, rpbsid.finish(config, state), DT)
     assert found is not None
     stamps = (np.arange(len(u)) * round(DT * 1e9)).astype(np.int64)
-    signals = Signals(stamps, u, y, np.empty((len(u), 0)), np.zeros(len(u), dtype=bool), config.inputs,
-                      config.outputs)
+    signals = Signals(stamps, u, y, np.empty((len(u), 0)), np.zeros(len(u), dtype=bool), np.zeros(len(u), dtype=int),
+                      config.inputs, config.outputs)
     scores = holdout.score(found.model, signals, half * DT)
     return {'simulation': scores.simulation.tolist(), 'prediction': scores.prediction.tolist()}
 

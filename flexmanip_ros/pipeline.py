@@ -321,14 +321,16 @@ def _due_rows(state: State, payload: EventReplay[PayloadEstimator]) -> list[int]
     """Return the rows not taken yet that are the first at or after an instant of ``publish_rate``."""
     assert state.config is not None
     cursor = payload.cursor
-    stamps = state.log.rows(cursor, state.log.end).stamp_ns
+    rows = state.log.rows(cursor, state.log.end)
+    measured = np.flatnonzero(rows.missing == 0)
+    stamps = rows.stamp_ns[measured]
     instants = ((stamps - state.first_ns) * state.config.publish_rate * 1e-9 + ROUNDING).astype(np.int64)
     if not len(instants) or instants[-1] <= state.published:
         return []
     new = np.empty(len(instants), dtype=np.bool_)
     new[0] = instants[0] > state.published
     new[1:] = instants[1:] > instants[:-1]
-    return [int(row) for row in np.flatnonzero(new) + cursor]
+    return [int(row) for row in measured[new] + cursor]
 
 
 def _estimate(state: State, background: Background) -> tuple[State, list[Estimate]]:

@@ -20,6 +20,7 @@ from flexmanip_ros.identification.prediction_error import (
     descend,
     directions,
     forgets,
+    measured,
 )
 from flexmanip_ros.identification.realization import lightly_damped
 from flexmanip_ros.types import Array, StateSpace
@@ -87,9 +88,9 @@ def fit_stretch(
     ``any`` frees it where that is the better model. None where nothing simulates the stretch.
     """
     m = starts[0].C.shape[0] if starts else 0
-    if starts and not np.all(np.ptp(samples[:, -m:], axis=0) > 0.0):
+    if starts and not np.all(np.nanmax(samples[:, -m:], axis=0) > np.nanmin(samples[:, -m:], axis=0)):
         return None  # a silent output tells nothing
-    power = np.sum((samples[:, -m:] * scale[-m:]) ** 2, axis=0)
+    power = np.nansum((samples[:, -m:] * scale[-m:]) ** 2, axis=0)
     floor, found = -np.inf, []
     for realized in starts:
         moments = realized.residual.T @ realized.residual
@@ -103,7 +104,9 @@ def fit_stretch(
         light = lightly_damped(begin.A, LIGHT)
         if light is not begin.A:
             found.append(_attempt(samples, begin._replace(A=light), structure, scale, noise, floor))
-    slow = averaged(*_signals(samples, scale, starts[0].B.shape[1]), starts[0].A.shape[0]) if starts else None
+    slow = None
+    if starts:
+        slow = averaged(*_signals(interpolated(samples), scale, starts[0].B.shape[1]), starts[0].A.shape[0])
     if slow is not None:
         found.append(_attempt(samples, *candidate(slow, feedthrough), scale, noise, floor))
     for k, old in enumerate(fits):
@@ -125,9 +128,21 @@ def fit_stretch(
         condition=float(np.linalg.cond(starts[0].state / np.where(length > 0.0, length, 1.0))))
 
 
+def interpolated(samples: Array) -> Array:
+    """Return samples (N, c) with interpolated values in the place of those that were not measured (NaN)."""
+    absent = np.isnan(samples[:, -1])
+    if not absent.any():
+        return samples
+    filled, rows = samples.copy(), np.arange(len(samples))
+    for column in filled.T:
+        gone = np.isnan(column)
+        column[gone] = np.interp(rows[gone], rows[~gone], column[~gone])
+    return filled
+
+
 def unexplained(covariance: Array, Y: Array) -> float:
     """Share of power of Y (N, m) in residuals of a covariance (m, m), the mean over the outputs."""
-    power = np.mean(Y ** 2, axis=0)
+    power = np.nanmean(Y ** 2, axis=0)
     return float(np.mean(np.diag(covariance) / np.where(power > 0.0, power, np.inf)))
 
 
@@ -207,7 +222,7 @@ def _recursion(samples: Array, attempt: Attempt) -> Recursion:
     return Recursion(
         theta=fit.theta._replace(x=fit.end), structure=structure, scale=attempt.scale, P=fit.directions,
         root=root,
-        covariance=fit.covariance + CLEAN * np.diag(np.mean(Y ** 2, axis=0)), weight=float(len(U)),
+        covariance=fit.covariance + CLEAN * np.diag(np.nanmean(Y ** 2, axis=0)), weight=float(measured(Y)),
         widening=widening, strikes=0, gain=fit.theta.K if gain is None else gain,
         singular_values=np.zeros(0), condition=float('nan'), trend=trend, trend_share=trend_share)
 

@@ -222,11 +222,12 @@ def state_prior(
 def advance_factor(
     U: Array, Y: Array, R: Array, z: Array, row: Array, scratch: Array, peaks: Array, prior: Array,
     scale: Array, mean: Array, variance: Array, scalars: Array, counts: Array,
-    p: int, feedthrough: int, alpha: float, beta: float, mode: int, outcome: Outcomes,
+    p: int, feedthrough: int, alpha: float, beta: float, mode: int, missing: NDArray[np.int64], outcome: Outcomes,
 ) -> None:
     """Run N samples. U: (N, r), Y: (N, m) in outside units; every other array is state, overwritten.
 
-    outcome: (N,) is written: LEARNT_ROW, REJECTED_ROW or QUIET_ROW.
+    missing: (N,) not 0: the sample never came, and no window holds it. outcome: (N,) is written: LEARNT_ROW,
+    REJECTED_ROW or QUIET_ROW.
     """
     r = U.shape[1]
     m = Y.shape[1]
@@ -237,6 +238,9 @@ def advance_factor(
     new = np.empty(width)
     for k in range(U.shape[0]):
         outcome[k] = LEARNT_ROW
+        if missing[k] > 0:
+            counts[FILLED] = 0
+            continue
         if not accept(U[k], Y[k], new, scale, mean, counts):
             outcome[k] = REJECTED_ROW
             continue

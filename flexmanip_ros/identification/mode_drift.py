@@ -109,6 +109,8 @@ def drifting(U: Array, Y: Array, fit: Fit, structure: Structure, widening: float
     end, X = theta.x.copy(), np.zeros((len(moving), n))
     E, S = np.empty(Y.shape), np.empty((len(moving), *Y.shape))
     sway(U, Y, *theta[:4], moving, end, X, E, S)
+    absent = np.isnan(Y[:, 0])
+    E[absent], S[:, absent] = 0.0, 0.0
     lower = np.linalg.cholesky(fit.covariance)
     e, *s = (solve_triangular(lower, part.T, lower=True, check_finite=False).ravel() for part in (E, *S))
     own = np.array(s)

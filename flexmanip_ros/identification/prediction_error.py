@@ -52,6 +52,8 @@ def linearize(
 ) -> None:
     """Run the predictor x+ = A x + B u + K e, e = y - C x - D u over (L, r), (L, m), and its derivatives.
 
+    A row of Y that is NaN was not measured: e = 0, and it counts for nothing.
+
     Parameters in order: A, B row-major if free_system, K if free_gain, C if free_output, D if free_direct,
     then x at the start. whiten: (m, m), whiten' whiten = inverse innovation covariance. On return x is the
     state after the last sample, N (d, d) += J' J and g (d,) += J' e with J the derivatives of the whitened
@@ -69,8 +71,13 @@ def linearize(
     e, after, moved = np.empty(m), np.empty(n), np.empty((n, d))
     filled = 0
     for k in range(U.shape[0]):
-        innovation(U[k], Y[k], C, D, x, e)
-        for o in range(m):
+        absent = Y[k, 0] != Y[k, 0]
+        if absent:  # the prediction goes on without it
+            for o in range(m):
+                e[o] = 0.0
+        else:
+            innovation(U[k], Y[k], C, D, x, e)
+        for o in range(0 if absent else m):
             row = J[filled + o]
             for j in range(d):
                 row[j] = 0.0
@@ -88,8 +95,8 @@ def linearize(
                 if free_direct:
                     for i in range(r):
                         row[at_d + q * r + i] += w * U[k, i]
-        filled += m
-        if filled == GATHERED * m or k == U.shape[0] - 1:
+        filled += 0 if absent else m
+        if filled == GATHERED * m or (filled and k == U.shape[0] - 1):
             part = J[:filled]
             N += np.dot(part.T, part)
             g += np.dot(part.T, residuals[:filled])
@@ -98,8 +105,9 @@ def linearize(
             for j in range(d):
                 moved[i, j] = 0.0
             for q in range(n):
+                a = A[i, q] if absent else closed[i, q]
                 for j in range(d):
-                    moved[i, j] += closed[i, q] * X[q, j]
+                    moved[i, j] += a * X[q, j]
             if free_system:
                 for j in range(n):
                     moved[i, i * n + j] += x[j]
@@ -108,7 +116,7 @@ def linearize(
             if free_gain:
                 for j in range(m):
                     moved[i, at_k + i * m + j] += e[j]
-            for o in range(m):
+            for o in range(0 if absent else m):
                 if free_output:
                     for j in range(n):
                         moved[i, at_c + o * n + j] -= K[i, o] * x[j]
@@ -131,7 +139,11 @@ def residual_moments(
     e = np.empty(m)
     after = np.empty(n)
     for k in range(U.shape[0]):
-        innovation(U[k], Y[k], C, D, x, e)
+        if Y[k, 0] != Y[k, 0]:
+            for o in range(m):
+                e[o] = 0.0
+        else:
+            innovation(U[k], Y[k], C, D, x, e)
         following(U[k], A, B, K, x, e, after)
         for i in range(n):
             x[i] = after[i]
@@ -274,10 +286,15 @@ def run(U: Array, Y: Array, theta: Theta) -> tuple[Array, Array]:
     m = Y.shape[1]
     moments, end = np.zeros((m, m)), theta.x.copy()
     residual_moments(U, Y, *theta.matrices(), end, moments)
-    covariance = moments / len(U)
+    covariance = moments / measured(Y)
     if not np.all(np.isfinite(covariance)):
         return covariance, end
     return covariance + 1e-14 * max(np.trace(covariance), 1e-300) * np.eye(m), end
+
+
+def measured(Y: Array) -> int:
+    """Return the number of rows of Y (N, m) that were measured, at least 1."""
+    return max(len(Y) - int(np.isnan(Y[:, 0]).sum()), 1)
 
 
 def score(U: Array, Y: Array, theta: Theta) -> tuple[float, Array]:
@@ -352,7 +369,8 @@ def descend(U: Array, Y: Array, theta: Theta, structure: Structure, iterations: 
         if len(U) * gain < 0.01:
             break
     P = directions(theta, structure)
-    free = covariance * len(U) / max(len(U) - P.shape[1] / Y.shape[1], 0.2 * len(U))
+    count = measured(Y)
+    free = covariance * count / max(count - P.shape[1] / Y.shape[1], 0.2 * count)
     information, _, _, arrival, end = derivatives(U, Y, theta, structure, free, P)
     if not np.all(np.isfinite(information)):
         return None

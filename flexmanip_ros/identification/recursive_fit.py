@@ -13,7 +13,7 @@ from flexmanip_ros.identification import model_output
 from flexmanip_ros.identification.batch_fit import BLOCK, UNEXPLAINED, Recursion, arrive, fit_stretch, unexplained
 from flexmanip_ros.identification.factor import Outcomes
 from flexmanip_ros.identification.moments import triangle
-from flexmanip_ros.identification.prediction_error import condition, derivatives, moved, run
+from flexmanip_ros.identification.prediction_error import condition, derivatives, measured, moved, run
 from flexmanip_ros.numerics.background import Background
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Rows
@@ -234,10 +234,20 @@ def solve(request: FitRequest) -> FitResult:
     try:
         if request.R is None or request.scale is None:
             assert request.old is not None
-            return FitResult(_block(request.old, request.rows.u_y))
+            return FitResult(_block(request.old, samples_of(request.rows)))
         return FitResult(_stretch(request, request.R, request.scale))
     except np.linalg.LinAlgError:
         return FitResult(None, failed=True)
+
+
+def samples_of(rows: Rows) -> Array:
+    """Return inputs and outputs (N, r + m); outputs that were not measured are NaN, and no fit counts them."""
+    samples = rows.u_y
+    absent = rows.missing > 0
+    if absent.any():
+        samples = samples.copy()
+        samples[absent, rows.log.width.inputs:] = np.nan
+    return samples
 
 
 def _stretch(request: FitRequest, R: Array, scale: Array) -> Recursion | None:
@@ -248,7 +258,7 @@ def _stretch(request: FitRequest, R: Array, scale: Array) -> Recursion | None:
         longer = replace(config, future_window=config.past_window)
         starts.append(model_output.from_factor(longer, R, scale))
     found = fit_stretch(
-        request.rows.u_y, [realized for realized, _, _ in starts if realized is not None],
+        samples_of(request.rows), [realized for realized, _, _ in starts if realized is not None],
         [fit for fit in (request.old, request.older) if fit is not None],
         starts[0][2], config.direct_feedthrough, 'sensor' if config.refinement == 'output_error' else 'any')
     if found is None or found.trend_share == 0.0:
@@ -261,7 +271,7 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
     r = old.theta.B.shape[1]
     U = np.ascontiguousarray(samples[:, :r] * old.scale[:r])
     Y = np.ascontiguousarray(samples[:, r:] * old.scale[r:])
-    k = old.root.shape[0]
+    k, count = old.root.shape[0], measured(Y)
     kept = old.root * np.sqrt(1.0 + len(U) / MEMORY) * np.exp(0.5 * old.drift)
     if old.trend_share > 0.0:
         kept = triangle(np.hstack([kept, old.trend_share * old.trend[:, None]]).T).T
@@ -272,7 +282,7 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
             return None
         power = float(np.trace(np.linalg.solve(noise, before))) / Y.shape[1]
         known = min(old.weight, 2.0 * NOISE_BLOCKS * len(U))
-        noise = noise * max(1.0, power - CHANCE * np.sqrt(2.0 / Y.shape[1] * (1.0 / len(U) + 1.0 / known)))
+        noise = noise * max(1.0, power - CHANCE * np.sqrt(2.0 / Y.shape[1] * (1.0 / count + 1.0 / known)))
     zeta, theta, further = np.zeros(k), old.theta, 0.0
     arrival, root = np.zeros((0, k)), kept
     for _ in range(2 if old.lost else 1):  # a state that was lost makes the first derivatives poor
@@ -297,7 +307,7 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
     strikes = old.strikes + 1 if not left < UNEXPLAINED else 0
     if strikes >= 2 or not np.isfinite(left):
         return None
-    share = max(len(U) / (old.weight + len(U)), 1.0 / NOISE_BLOCKS)
+    share = max(count / (old.weight + count), count / len(U) / NOISE_BLOCKS)
     step = kept @ zeta
     step[k - len(end):] = 0.0  # the state moves anyway
     moving = old.drift + further if further > 0.0 else 0.0
@@ -307,7 +317,7 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
         theta=theta._replace(x=end), root=arrive(root, arrival), strikes=strikes,
         gain=theta.K if old.structure.free_gain else old.gain, lost=False,
         covariance=(1.0 - share) * old.covariance + share * covariance,
-        weight=min(old.weight + len(U), MEMORY),
+        weight=min(old.weight + count, MEMORY),
         drift=old.drift + (moving - old.drift) / DRIFT_BLOCKS,
         trend=trend, trend_share=lasting, trend_lag=lag)
 

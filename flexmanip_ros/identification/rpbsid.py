@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.identification import decimation, factor, model_output, paper_recursion, recursive_fit
@@ -144,7 +145,8 @@ def _advance(config: IdentifierParameters, state: RpbsidState, rows: Rows, backg
         if new.refined is not None:
             until = min(until, done + recursive_fit.until_chunk(new.refined))
         some = rows.between(done, until)
-        outcome = _run(config, new, np.ascontiguousarray(some.u), np.ascontiguousarray(some.y))
+        outcome = _run(config, new, np.ascontiguousarray(some.u), np.ascontiguousarray(some.y),
+                       np.ascontiguousarray(some.missing))
         if new.refined is not None:
             new = new._replace(refined=recursive_fit.refine(
                 config, new.refined, some, outcome, new.memory[0], new.scale, background))
@@ -160,12 +162,13 @@ def _decimate(config: IdentifierParameters, state: RpbsidState, decimator: decim
     first = log.end
     if state.refined is not None:
         log = log.from_row(recursive_fit.first_needed(state.refined))
+    absent = rows.missing[at]
     log = log.append(rows.stamp_ns[at], kept[:, :r], kept[:, r:], np.zeros((len(at), 0)),
-                     np.zeros(len(at), dtype=np.bool_))
+                     np.zeros(len(at), dtype=np.bool_), missing=np.where(absent > config.decimation // 2, absent, 0))
     return state._replace(decimator=decimator, decimated=log), log.rows(first, log.end)
 
 
-def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array) -> Outcomes:
+def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array, missing: NDArray[np.int64]) -> Outcomes:
     """Run the compiled kernel, overwriting the arrays of the state; return what became of each sample."""
     recursive = config.estimator == 'paper'  # stale states: it must forget
     mode = MODES['excitation' if recursive and config.forgetting == 'innovation' else config.forgetting]
@@ -178,13 +181,15 @@ def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array) -
             int(config.weighted_observability), int(config.state_basis == 'tracked'),
             np.array(config.regularization), np.array(config.forgetting_factor), mode)
         memory: tuple[Any, ...] = state.memory
+        Y = Y.copy()
+        Y[missing > 0] = np.nan  # rejected, as what is no number
         paper_recursion.advance_paper(U, Y, *memory, *common, *options)
         return outcome
     R, row, scratch, peaks, prior = state.memory
     factor.advance_factor(
         U, Y, R, state.z, row, scratch, peaks, prior, state.scale, state.mean, state.variance, state.scalars,
         state.counts, config.past_window, int(config.direct_feedthrough), config.regularization[0],
-        config.forgetting_factor[0], mode, outcome)
+        config.forgetting_factor[0], mode, missing, outcome)
     return outcome
 
 

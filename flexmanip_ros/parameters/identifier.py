@@ -118,6 +118,9 @@ class IdentifierParameters:
     gap_factor: float = parameter(
         1.5, 'an interval between stamps longer than this many sample times is a gap, and so is one shorter by this '
         'factor', low=1.05, high=1000.0, live=True)
+    max_gap: float = parameter(
+        0.2, 'samples that are missing for longer than this begin the motion anew; over fewer the estimators go on',
+        unit='s', low=0.0, high=10.0, live=True)
     max_time_jump: float = parameter(
         1.0, 'stamps that jump back by more than this restart the identifier', unit='s', low=0.001, live=True)
     rewind_time: float = parameter(

@@ -18,6 +18,7 @@ from flexmanip_ros.payload.filter_state import (
     EFFECTIVE,
     FLOOR,
     HORIZON,
+    IN_A_ROW,
     IN_BATCH,
     IN_BLOCK,
     MOVE,
@@ -49,6 +50,8 @@ class MeasurementModel(NamedTuple):
 
     H: Array
     """(m, n) of q or qd."""
+    period: float
+    """Sample time [s]."""
     rate: NDArray[np.bool_]
     """(m,) whether H reads qd."""
     gain: NDArray[np.int64]
@@ -113,18 +116,19 @@ def measure(sensors: MeasurementModel, m: FilterState, y: Array) -> None:
         absorb_measurement(x, S, f, e, r, variance)
         white_noise(m, i, y[i])
     m.counts[SEEN] = min(m.counts[SEEN] + 1, 2000)
+    m.counts[IN_A_ROW] += 1
 
 
 @inlined
 def white_noise(m: FilterState, i: int, y: float) -> None:
     """Variance of sensor i's white noise, from fourth differences, in which slow motion has no part."""
     recent = m.recent[i]
-    if m.counts[SEEN] >= 4:
+    if m.counts[IN_A_ROW] >= 4:
         difference = y - 4.0 * recent[0] + 6.0 * recent[1] - 4.0 * recent[2] + recent[3]
         square = difference * difference / 70.0
         if m.counts[SEEN] > 50:
             square = min(square, 16.0 * m.noise[i, WHITE] + 1e-300)
-        m.noise[i, WHITE] += (square - m.noise[i, WHITE]) / (m.counts[SEEN] - 3)
+        m.noise[i, WHITE] += (square - m.noise[i, WHITE]) / max(m.counts[SEEN] - 3, 1)
     for p in range(3, 0, -1):
         recent[p] = recent[p - 1]
     recent[0] = y

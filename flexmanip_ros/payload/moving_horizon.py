@@ -26,11 +26,13 @@ from flexmanip_ros.payload.filter_state import (
     FLOOR,
     HELD,
     HORIZON,
+    IN_A_ROW,
     IN_BATCH,
     ITERATED,
     ITERATING,
     LAMBDA,
     LEARNED,
+    MEASURED,
     MOVE,
     NOW,
     POWER,
@@ -98,6 +100,7 @@ def begin_iteration(m: FilterState) -> None:
     for i in range(m.noise.shape[0]):
         m.noise[i, FIT] = 0.0
     m.counts[ITERATED] = 0
+    m.counts[MEASURED] = 0
     m.counts[ITERATING] = 1
 
 
@@ -112,7 +115,10 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
     links, f = motion.effort.size, sensors.f[:used]
     if not predict(motion, m.xr, m.Sr, used, sample[1:1 + links], sample[0]):
         return False
-    for i in range(m.noise.shape[0]):
+    measured = sample[1 + links] == sample[1 + links]
+    if measured:
+        m.counts[MEASURED] += 1
+    for i in range(m.noise.shape[0] if measured else 0):
         r = m.noise[i, EFFECTIVE]
         e = sample[1 + links + i] - observe(sensors, i, n, m.xr, m.Sr, f)
         weight = 1.0 / r
@@ -138,7 +144,7 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
         m.gradient[i] = m.g[i] - m.xi[i]
         for c in range(i + 1):
             m.normal[i, c] = m.N[i, c]
-    fits = m.score[COST] < FITS * (nx + m.noise.shape[0] * m.counts[ITERATED])
+    fits = m.score[COST] < FITS * (nx + m.noise.shape[0] * m.counts[MEASURED])
     m.counts[BEFORE] = m.counts[ITERATED]
     m.score[COST_BEFORE] = m.score[COST]
     m.score[LAMBDA] = m.score[LAMBDA] / 8.0 if m.score[LAMBDA] > LEAST_DAMPING and not fits else 0.0
@@ -152,7 +158,7 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
         if not factor_information(m.N):
             return False
         for i in range(m.noise.shape[0]):
-            m.noise[i, POWER] = m.noise[i, FIT] / m.counts[ITERATED]
+            m.noise[i, POWER] = m.noise[i, FIT] / max(m.counts[MEASURED], 1)
             m.noise[i, SLOW] = m.noise[i, POWER]
         if m.counts[ITERATED] >= ENOUGH and gained < 0.5 * nx:
             m.counts[STORED] = HORIZON
@@ -295,6 +301,14 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     duration, effort, y = table[k, 0], table[k, 1:1 + links], table[k, 1 + links:]
     if not predict(motion, m.x, m.S, m.counts[USED], effort, duration):
         return False
+    if y[0] != y[0]:  # it never came
+        m.counts[IN_A_ROW] = 0
+        for i in range(y.size):
+            m.innovation[i, 0] = 0.0
+        if not iterate(motion, sensors, m, table):
+            return False
+        diffuse(sensors, m, duration)
+        return True
     measure(sensors, m, y)
     confine(motion, m.x[m.x.size - motion.kind.size:])
     if not abs(m.x[2 * sensors.H.shape[1]]) < 1e9:

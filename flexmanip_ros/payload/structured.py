@@ -5,6 +5,7 @@ A Kalman filter with moving-horizon estimation (``moving_horizon``). States are 
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +46,10 @@ class StructuredState(NamedTuple):
     last_ns: int = 0
     effort: Array | None = None
     """(2,) torque held since then."""
+    missing: int = 0
+    """How many rows in a row were missing up to now."""
+    peak: Array = np.empty(0)
+    """(L,) largest size of each torque so far [N m]."""
     restarts: int = 0
     """How often numbers left the finite range."""
     refits: int = 0
@@ -86,12 +91,12 @@ def advance(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
             return state._replace(begin=begin, cursor=rows.until)
         state = _begin(config, state, rows.since(begin).between(begin, begin + FIRST_LOOK))
         rows = rows.since(begin + FIRST_LOOK)
-    for part in rows.stretches():
+    for broken, part in _parts(state, rows):
         if state.memory is None:  # it restarted meanwhile
             state = advance(config, state, part)
             continue
-        if part.gap[0]:
-            state = _resume(config, state, part)
+        if broken:
+            state = (_bridge if state.missing else _resume)(config, state, part)
         state = _run(config, state, part)
     return state
 
@@ -161,18 +166,26 @@ def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterSta
 
 
 def _set_arrival_cost(m: mem.FilterState) -> None:
+    """An event: the present state is the arrival cost, and what was gathered of its consistency is void."""
+    _begin_horizon(m)
+    for counter in (mem.SINCE_EVENT, mem.BATCHES):
+        m.counts[counter] = 0
+    m.counts[mem.BLOCKS] = min(m.counts[mem.BLOCKS], 40)
+    m.score[:mem.EMPTY_ARM_BIAS] = 0.0
+    m.score[mem.DRIFT] = 1.0
+    m.noise[:, mem.WEIGHT] = 0.0
+    m.power[:] = 1.0
+
+
+def _begin_horizon(m: mem.FilterState) -> None:
     """Begin a new moving horizon here: the present state is its arrival cost."""
     m.x0[:], m.S0[:] = m.x, m.S
     m.counts[mem.USED] = int(m.S.any(axis=1).sum())
     m.xi[:] = 0.0
-    for counter in (mem.STORED, mem.ITERATED, mem.ITERATING, mem.SINCE_EVENT, mem.SINCE_NOISE, mem.IN_BATCH,
-                    mem.BATCHES, mem.BEFORE, mem.REJECTED, mem.AGAIN):
+    for counter in (mem.STORED, mem.ITERATED, mem.ITERATING, mem.SINCE_NOISE, mem.IN_BATCH, mem.BEFORE, mem.REJECTED,
+                    mem.AGAIN):
         m.counts[counter] = 0
-    m.counts[mem.BLOCKS] = min(m.counts[mem.BLOCKS], 40)
-    m.score[:mem.EMPTY_ARM_BIAS] = 0.0
-    m.score[mem.DRIFT], m.score[mem.LAMBDA] = 1.0, 0.0
-    m.noise[:, mem.WEIGHT] = 0.0
-    m.power[:] = 1.0
+    m.score[mem.MOVE] = m.score[mem.VARIANCE] = m.score[mem.LAMBDA] = 0.0
 
 
 def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
@@ -208,11 +221,52 @@ def _part(config: IdentifierParameters, state: StructuredState, rows: Rows, unti
 
 def _resume(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
     """After a gap: start at the measurements of the first row."""
+    state = state._replace(missing=0)
     assert state.model is not None
     fresh = reopen(config, state, measurements(state.model, rows.between(rows.first, rows.first + 1))[0])
     assert fresh.memory is not None
     last_ns, effort = int(rows.stamp_ns[0]), rows.u[0].copy()
     return fresh._replace(last_ns=last_ns, effort=effort, horizon=Horizon(rows.first, last_ns, effort))
+
+
+def _bridge(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
+    """The torque changed, nobody knows when, while samples were missing: open the state by what that may have done."""
+    assert state.model is not None
+    assert state.memory is not None
+    assert state.effort is not None
+    assert state.sensors is not None
+    m = mem.copy(state.memory)
+    change = (state.missing + 1) * (rows.u[0] - state.effort)
+    columns = structured_model.unknown_torque(state.model, m, change, state.missing, state.sensors.period)
+    m.S[:] = structured_model.widen(m.S, columns)
+    if m.counts[mem.STORED] < mem.HORIZON:  # it has no process noise
+        _begin_horizon(m)
+    return state._replace(memory=m, missing=0, horizon=Horizon(state.cursor, state.last_ns, state.effort))
+
+
+UNKNOWN_TORQUE = 0.1
+"""Change of a torque over missing samples, over its peak, times their number, that is too small to matter: it leaves
+some 1e-4 of what a step of the whole torque does."""
+
+
+def _parts(state: StructuredState, rows: Rows) -> list[tuple[bool, Rows]]:
+    """Return the rows in pieces, and whether a gap or an unknown change of torque is before the first of each."""
+    if not len(rows):
+        return []
+    before = state.effort if state.effort is not None else rows.u[0]
+    absent = np.concatenate([[state.missing], rows.missing[:-1]]) * (rows.missing == 0)
+    broken = rows.gap
+    if absent.any():
+        change = (absent + 1)[:, None] * np.abs(np.diff(np.vstack([before, rows.u]), axis=0))
+        broken = broken | (absent[:, None] * change > UNKNOWN_TORQUE * _peaks(state, rows)).any(axis=1)
+    borders = [rows.first, *(np.flatnonzero(broken[1:]) + rows.first + 1).tolist(), rows.until]
+    return [(bool(broken[a - rows.first]), rows.between(a, b)) for a, b in pairwise(borders)]
+
+
+def _peaks(state: StructuredState, rows: Rows) -> Array:
+    """Return the largest size (N, L) of each torque up to each row [N m]."""
+    sizes = np.abs(rows.u)
+    return np.maximum.accumulate(np.vstack([state.peak, sizes]) if state.peak.size else sizes)[-len(rows):]
 
 
 def reopen(
@@ -243,13 +297,14 @@ def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> St
     taken = moving_horizon.advance(state.model.motion, state.sensors, m, table, first)
     if taken < len(table):
         return _restart(config, state, m, rows.since(rows.first + taken - first))
-    return state._replace(memory=m, cursor=rows.until, last_ns=int(rows.stamp_ns[-1]), effort=rows.u[-1].copy())
+    return state._replace(memory=m, cursor=rows.until, last_ns=int(rows.stamp_ns[-1]), effort=rows.u[-1].copy(),
+                          missing=int(rows.missing[-1]), peak=_peaks(state, rows)[-1])
 
 
 def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
     """Return what the kernel reads, (N, 1 + L + m), and the row of it that belongs to the first of ``rows``.
 
-    Columns: duration since the sample before [s], torques held meanwhile [N m], measurements. While the
+    Columns: duration since the sample before [s], torques held meanwhile [N m], measurements (NaN: missing). While the
     horizon is open the table reaches back to its first row.
     """
     assert state.model is not None
@@ -268,6 +323,7 @@ def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
     np.maximum(table[:, 0], 0.0, out=table[:, 0])
     table[:, 0] *= 1e-9
     table[:, 1 + links:] = y
+    table[reach.missing > 0, 1 + links:] = np.nan
     return table, rows.first - begin
 
 

@@ -8,6 +8,7 @@ from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import expm
 
 from flexmanip_ros.arm.capture import tip_jacobian
 from flexmanip_ros.arm.dynamics import mass_matrix
@@ -15,7 +16,7 @@ from flexmanip_ros.arm.manipulator import Manipulator, manipulator, modal, works
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.measurement_update import MeasurementModel
-from flexmanip_ros.payload.process_model import STEP_ANGLE, Kind, ProcessModel, set_parameters
+from flexmanip_ros.payload.process_model import STEP_ANGLE, Kind, ProcessModel, linearize, set_parameters
 from flexmanip_ros.types import Array
 
 
@@ -220,7 +221,7 @@ def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Ar
             offset[i] = -1 if rate[i] else _state(model.motion, Kind.BEND_OFFSET, role.link)
     nx = diffusion.size
     block = max(2, round(0.1 / (model.slowest * dt)))
-    return MeasurementModel(H=H, rate=rate, gain=gain, offset=offset, block=block, diffusion=diffusion,
+    return MeasurementModel(H=H, period=dt, rate=rate, gain=gain, offset=offset, block=block, diffusion=diffusion,
                             deviation=np.zeros(nx), f=np.zeros(nx), L=np.zeros((nx, nx)), W=np.zeros((nx, 2 * nx)))
 
 
@@ -426,6 +427,38 @@ def jump(config: IdentifierParameters, model: Model, m: mem.FilterState) -> Arra
     other = OTHER_JUMP * np.sqrt((rates ** 2).sum(axis=1))
     columns = np.zeros((m.x.size, rates.shape[1] + n))
     columns[n:2 * n] = np.hstack([rates, np.diag(other)])
+    return columns
+
+
+BRIDGE_TERMS = 64
+"""Terms of the series of a Brownian bridge at most; over 0.1 s they reach to 320 Hz, beyond the modes of the arm."""
+
+
+def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, dt: float) -> Array:
+    """Columns (nx, c) by which torques that change by ``change`` (L,) [N m] over ``count`` samples leave the state open.
+
+    Each torque jumped at an instant as likely as any other, and was interpolated linearly: the difference has the
+    covariance of a Brownian bridge, change^2 (min(s, t) - s t) over a time of 1. Its Karhunen-Loeve series has
+    the terms change sqrt(2) sin(k pi t) / (k pi); a column is what one of them does to the arm as it is now.
+    """
+    motion = model.motion
+    n = motion.arm.stiffness.size
+    set_parameters(motion, m.x)
+    motion.effort[:] = 0.0
+    linearize(motion, m.x[:n], m.x[n:2 * n], motion.k[0])
+    flow = np.zeros((2 * n + change.size, 2 * n + change.size))
+    flow[:n, n:2 * n], flow[n:2 * n, :n], flow[n:2 * n, n:2 * n] = np.eye(n), motion.dq, motion.dqd
+    M = motion.M0 + np.tensordot(motion.payload, motion.Mp, 1) if motion.frozen \
+        else mass_matrix(motion.arm, motion.payload, m.x[:n])
+    flow[n:2 * n, 2 * n:] = np.linalg.solve(M, motion.arm.torque * (motion.gain * change))
+    step = expm(flow * dt)
+    k = np.arange(1, min(count, BRIDGE_TERMS) + 1)
+    state = np.zeros((2 * n, change.size, k.size))
+    for t in (np.arange(count) + 0.5) / count:
+        profile = np.sqrt(2.0) * np.sin(np.pi * k * t) / (np.pi * k)
+        state = np.tensordot(step[:2 * n, :2 * n], state, 1) + step[:2 * n, 2 * n:, None] * profile
+    columns = np.zeros((m.x.size, change.size * k.size))
+    columns[:2 * n] = state.reshape(2 * n, -1)
     return columns
 
 

@@ -42,6 +42,7 @@ class _Buffer:
     stamp_ns: NDArray[np.int64]
     values: Array
     gap: NDArray[np.bool_]
+    missing: NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,11 +74,12 @@ class SampleLog:
         return first + int(np.searchsorted(stamps, stamp_ns, side='left'))
 
     def append(self, stamp_ns: NDArray[np.int64], u: Array, y: Array, angles: Array, gap: NDArray[np.bool_],
-               delay: int = 0) -> SampleLog:
+               delay: int = 0, missing: NDArray[np.int64] | None = None) -> SampleLog:
         """Return the log with N more rows.
 
         stamp_ns: (N,); u: (N, r), of which row k belongs to the row ``delay`` before k; y: (N, m);
-        angles: (N, a); gap: (N,). A row is shown once its inputs are there.
+        angles: (N, a); gap: (N,); missing: (N,), see ``Rows.missing``; None: all were measured. A row is shown once its
+        inputs are there.
         """
         buffer = self._with_room(len(stamp_ns))
         r, m = self.width.inputs, self.width.outputs
@@ -87,6 +89,7 @@ class SampleLog:
         buffer.values[at:stop, r:r + m] = y
         buffer.values[at:stop, r + m:] = angles
         buffer.gap[at:stop] = gap
+        buffer.missing[at:stop] = 0 if missing is None else missing
         earliest = self.end - buffer.first
         skipped = max(0, earliest - (at - delay))
         if skipped < len(u):
@@ -122,12 +125,13 @@ class SampleLog:
         kept = last - self.start
         size = max(SMALLEST, 2 * (kept + count))
         new = _Buffer(self.start, last, np.zeros(size, dtype=np.int64), np.zeros((size, sum(self.width))),
-                      np.zeros(size, dtype=np.bool_))
+                      np.zeros(size, dtype=np.bool_), np.zeros(size, dtype=np.int64))
         if old is not None and kept:
             a, b = self.start - old.first, last - old.first
             new.stamp_ns[:kept] = old.stamp_ns[a:b]
             new.values[:kept] = old.values[a:b]
             new.gap[:kept] = old.gap[a:b]
+            new.missing[:kept] = old.missing[a:b]
         return new
 
 
@@ -195,8 +199,19 @@ class Rows:
         return self._values(self.log.width.inputs + self.log.width.outputs, sum(self.log.width))
 
     @property
+    def missing(self) -> NDArray[np.int64]:
+        """(N,) 0: the row was measured; k: it is the k-th of a few rows in a row whose message never came.
+
+        Its values are interpolated between the messages around it. No estimator takes its outputs for measured.
+        """
+        buffer = self.log._buffer
+        if buffer is None:
+            return np.zeros(0, dtype=np.int64)
+        return buffer.missing[self.first - buffer.first:self.until - buffer.first]
+
+    @property
     def gap(self) -> NDArray[np.bool_]:
-        """(N,) a sample is missing before the row: no regressor may reach back over it."""
+        """(N,) the motion before the row is unknown, or its torques: no regressor may reach back over it."""
         buffer = self.log._buffer
         if buffer is None:
             return np.zeros(0, dtype=np.bool_)
@@ -216,7 +231,8 @@ class Rows:
 class Signals:
     """The samples of a run as named columns, for pictures, tables and scores.
 
-    stamp_ns: (N,); u: (N, r); y: (N, m); angles: (N, 2) or (N, 0); gap: (N,) a sample is missing before it.
+    stamp_ns: (N,); u: (N, r); y: (N, m); angles: (N, 2) or (N, 0); gap: (N,) the motion
+    before it is unknown; missing: (N,) not 0: its message never came, and its values are interpolated.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -224,6 +240,7 @@ class Signals:
     y: Array
     angles: Array
     gap: NDArray[np.bool_]
+    missing: NDArray[np.int64]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
 
@@ -235,11 +252,11 @@ class Signals:
 
 
 def log_of(u: Array, y: Array, angles: Array | None = None, stamp_ns: NDArray[np.int64] | None = None,
-           gap: NDArray[np.bool_] | None = None) -> SampleLog:
-    """Return a log of whole arrays: u (N, r), y (N, m), angles (N, a), stamp_ns (N,), gap (N,)."""
+           gap: NDArray[np.bool_] | None = None, missing: NDArray[np.int64] | None = None) -> SampleLog:
+    """Return a log of whole arrays: u (N, r), y (N, m), angles (N, a), stamp_ns (N,), gap (N,), missing (N,)."""
     u, y = np.atleast_2d(u), np.atleast_2d(y)
     count = len(y)
     angles = np.zeros((count, 0)) if angles is None else angles
     log = SampleLog(Width(u.shape[1], y.shape[1], angles.shape[1]))
     return log.append(np.zeros(count, dtype=np.int64) if stamp_ns is None else stamp_ns, u, y, angles,
-                      np.zeros(count, dtype=np.bool_) if gap is None else gap)
+                      np.zeros(count, dtype=np.bool_) if gap is None else gap, missing=missing)

@@ -30,7 +30,7 @@ def _signals(noise: float = 0.0, gap_at: int | None = None, count: int = 800) ->
     if gap_at is not None:
         gap[gap_at] = True
     stamps = np.arange(count, dtype=np.int64) * 10_000_000
-    return Signals(stamps, u, y, np.empty((count, 0)), gap, ('a/effort',), ('a/position',))
+    return Signals(stamps, u, y, np.empty((count, 0)), gap, np.zeros(count, int), ('a/effort',), ('a/position',))
 
 
 def test_the_true_model_scores_a_hundred_percent():
