@@ -238,8 +238,18 @@ def _bridge(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
     m = mem.copy(state.memory)
     change = (state.missing + 1) * (rows.u[0] - state.effort)
     columns = structured_model.unknown_torque(state.model, m, change, state.missing, state.sensors.period)
+    young = bool(m.counts[mem.STORED] < mem.HORIZON)
+    if young and m.counts[mem.HELD] and state.missing > state.sensors.block:
+        # the posterior is no Gaussian yet, and the motion is lost: what is held is learnt again from here on
+        model = state.model
+        body = slice(model.payload, model.payload + model.body)
+        known = m.S[body].any(axis=1)
+        opened = np.zeros((m.x.size, model.body))
+        opened[body] = np.diag(structured_model.body_std(config, model)[:model.body] * known)
+        m.S[body] = 0.0
+        columns = np.hstack([columns, opened])
     m.S[:] = structured_model.widen(m.S, columns)
-    if m.counts[mem.STORED] < mem.HORIZON:  # it has no process noise
+    if young:  # the horizon has no process noise
         _begin_horizon(m)
     return state._replace(memory=m, missing=0, horizon=Horizon(state.cursor, state.last_ns, state.effort))
 

@@ -435,7 +435,7 @@ BRIDGE_TERMS = 64
 
 
 def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, dt: float) -> Array:
-    """Columns (nx, c) by which torques that change by ``change`` (L,) [N m] over ``count`` samples leave the state open.
+    """Columns (nx, c) by which torques that change by ``change`` (L,) [N m] in ``count`` samples leave the state open.
 
     Each torque jumped at an instant as likely as any other, and was interpolated linearly: the difference has the
     covariance of a Brownian bridge, change^2 (min(s, t) - s t) over a time of 1. Its Karhunen-Loeve series has

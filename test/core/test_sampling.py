@@ -109,8 +109,9 @@ def test_nan_matters_only_in_configured_fields() -> None:
 
 
 @pytest.mark.parametrize('missing', [5, 45])
-def test_a_missing_message_marks_a_gap_before_and_after_the_sample_time_is_known(missing: int) -> None:
-    state, samples, _ = drive([record(k) for k in range(80) if k != missing])
+def test_beyond_max_gap_a_missing_message_marks_a_gap_before_and_after_the_sample_time_is_known(missing: int) -> None:
+    none = configure(IdentifierParameters, {'max_gap': 0.0})
+    state, samples, _ = drive([record(k) for k in range(80) if k != missing], none)
     assert [s.gap for s in samples].index(True) == missing
     assert sum(s.gap for s in samples) == 1 == state.counters.gaps
     assert state.dt == 1e-3
@@ -144,7 +145,7 @@ def test_effort_delay_gives_each_sample_the_torque_reported_later(delay: int) ->
 
 
 def test_effort_delay_never_takes_a_torque_from_across_a_gap() -> None:
-    config = configure(IdentifierParameters, {'arm.effort_delay': 1})
+    config = configure(IdentifierParameters, {'arm.effort_delay': 1, 'max_gap': 0.003})
     records = [record(k) for k in range(80) if not 40 <= k < 45]
     _, samples, _ = drive(records, config)
     stamps = [s.stamp_ns for s in samples]

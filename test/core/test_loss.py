@@ -1,0 +1,118 @@
+"""Messages that never came: rows without a measurement, and estimates as good as without loss."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from flexmanip_ros import pipeline
+from flexmanip_ros.arm.linearization import frequencies, vibration_model
+from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
+from flexmanip_ros.samples import sampling
+from flexmanip_ros.samples.sample_log import Rows
+from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Status
+
+COUNT, CAPTURE = 5000, 2000
+PLANT = PlantParameters()
+
+
+@pytest.fixture(scope='module')
+def messages() -> list[JointRecord | CaptureEvent]:
+    """5 s at 1 kHz, 20 kg caught at 2 s."""
+    events = (CaptureEvent(CAPTURE * 1_000_000, EventKind.CAPTURE),)
+    torque = excitation.sequence(ExcitationParameters(), COUNT)
+    return list(simulator.records(simulator.simulate(PLANT, torque, events), events))
+
+
+def surviving(messages: Sequence[JointRecord | CaptureEvent], lost: np.ndarray) -> list[JointRecord | CaptureEvent]:
+    return [item for item in messages if isinstance(item, CaptureEvent) or not lost[round(item.stamp_ns * 1e-6)]]
+
+
+def at_random(share: float) -> np.ndarray:
+    return np.random.default_rng(3).random(COUNT) < share
+
+
+def in_bursts(length: int) -> np.ndarray:
+    """One burst a second, at any time in it."""
+    lost = np.zeros(COUNT, dtype=bool)
+    for first in range(0, COUNT, 1000):
+        begin = first + int(np.random.default_rng(first).integers(50, 1000 - length))
+        lost[begin:begin + length] = True
+    return lost
+
+
+def later(items: Sequence[JointRecord | CaptureEvent]) -> list[Estimate]:
+    """Estimates from 1 s after the capture on."""
+    return [one for one in pipeline.run(IdentifierParameters(), items)
+            if one.stamp_ns >= (CAPTURE + 1000) * 1_000_000]
+
+
+@pytest.fixture(scope='module')
+def whole(messages: list[JointRecord | CaptureEvent]) -> list[Estimate]:
+    return later(messages)
+
+
+@pytest.mark.parametrize(('lost', 'wider'), [
+    (at_random(0.01), 1.5), (at_random(0.05), 2.0), (in_bursts(10), 2.0), (in_bursts(30), 2.0), (in_bursts(100), 6.0)],
+    ids=['1 %', '5 %', '10 ms a second', '30 ms a second', '100 ms a second'])
+def test_payload_and_modes_are_tracked_with_loss(
+        messages: list[JointRecord | CaptureEvent], whole: list[Estimate], lost: np.ndarray, wider: float) -> None:
+    found = later(surviving(messages, lost))
+    payloads = [one.payload for one in found if one.payload is not None]
+    assert np.mean([one.status is Status.TRACKING for one in payloads]) >= 0.95
+    assert max(abs(one.mass - 20.0) / one.std for one in payloads) < 4.0
+    known = np.median([one.payload.std for one in whole if one.payload is not None])
+    assert np.median([one.std for one in payloads]) < wider * known  # a torque that changed in a burst is unknown
+    assert np.mean([one.model_status is Status.TRACKING for one in found]) >= 0.95
+    true = frequencies(vibration_model(PLANT.arm, np.array(PLANT.initial_angles), 20.0)[0])[0]
+    read = [one.modes[0].frequency_hz for one in found]
+    assert abs(np.median(read) / true - 1.0) < 3e-3
+
+
+def rows_of(items: Sequence[JointRecord | CaptureEvent], **parameters: float) -> Rows:
+    config = configure(IdentifierParameters, parameters)
+    clock, log = sampling.Clock(), sampling.EMPTY
+    for item in items:
+        if isinstance(item, JointRecord):
+            clock, log, _ = sampling.push(config, clock, log, item)
+    return log.rows(0, log.end)
+
+
+def test_a_message_that_never_came_is_a_row_that_is_marked(messages: list[JointRecord | CaptureEvent]) -> None:
+    lost = np.zeros(COUNT, dtype=bool)
+    lost[[100, 200, 201, 202]] = True
+    every, rows = rows_of(messages), rows_of(surviving(messages, lost))
+    assert len(rows) == len(every)
+    assert (rows.stamp_ns == every.stamp_ns).all()
+    assert np.flatnonzero(rows.missing).tolist() == [100, 200, 201, 202]
+    assert rows.missing[199:204].tolist() == [0, 1, 2, 3, 0]
+    assert not rows.gap.any()
+    assert rows.y[201] == pytest.approx(0.5 * (every.y[199] + every.y[203]))
+
+
+def test_beyond_max_gap_or_where_the_torque_changed_the_window_begins_anew(
+        messages: list[JointRecord | CaptureEvent]) -> None:
+    lost = np.zeros(COUNT, dtype=bool)
+    lost[100:180] = lost[495:505] = True  # the torque changes at 0.5 s
+    rows = rows_of(surviving(messages, lost), max_gap=0.05)
+    first = int(np.flatnonzero(rows.gap)[0])
+    assert rows.stamp_ns[first] - rows.stamp_ns[first - 1] == 81_000_000
+    assert len(rows) == COUNT - 80
+    assert np.flatnonzero(rows.gap).tolist() == [100, 505 - 80]
+    assert np.count_nonzero(rows.missing) == 10
+
+
+def test_blocks_give_the_bits_of_single_messages_with_loss(messages: list[JointRecord | CaptureEvent]) -> None:
+    items = surviving(messages, at_random(0.05) | in_bursts(30))[:3000]
+    alone = list(pipeline.run(IdentifierParameters(), items))
+    state, found = pipeline.init(), []
+    for item in items:
+        state, some = pipeline.step(IdentifierParameters(), state, item, group=1)
+        found += some
+    state, some = pipeline.finish(IdentifierParameters(), state)
+    one = list(pipeline.one_a_stamp([*found, *some]))
+    assert [(e.stamp_ns, repr(e.payload), repr(e.modes)) for e in alone] == [
+        (e.stamp_ns, repr(e.payload), repr(e.modes)) for e in one]
