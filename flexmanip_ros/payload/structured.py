@@ -341,7 +341,7 @@ def _restart(config: IdentifierParameters, state: StructuredState, m: mem.Filter
     """Begin again after the first of the rows: numbers left the finite range, or a fit failed.
 
     The first fit is that of the simplest arm and of a point; the next ones learn all that they may, and a body. What is
-    held begins with its prior, and the arm with what was learned before the event.
+    held begins with its prior, and the arm with what was learned before the event, or as given if it fails at once again.
     """
     assert state.model is not None
     assert state.memory is not None
@@ -349,7 +349,8 @@ def _restart(config: IdentifierParameters, state: StructuredState, m: mem.Filter
     refits = int(m.counts[mem.REFITS])
     unfit = refits > state.memory.counts[mem.REFITS]
     following = rows.since(rows.first + 1)
-    if m.counts[mem.HELD] and m.counts[mem.LEARNED] and np.isfinite(m.S0).all():
+    at_once = m.counts[mem.SINCE_EVENT] < FIRST_LOOK  # what was learned moves as no arm does
+    if m.counts[mem.HELD] and m.counts[mem.LEARNED] and np.isfinite(m.S0).all() and not at_once:
         m = mem.copy(m)
         m.x[:], m.S[:] = m.x0, m.S0
         payload = model.payload
