@@ -4,7 +4,8 @@ subscribes  joint_states      sensor_msgs/JointState  best effort, depth 1000; m
             capture_event     std_msgs/Header         an event commanded or known
             capture_detected  std_msgs/Header         an event inferred from the signals
 publishes   ~/model           std_msgs/Float64MultiArray  [[A, B, K], [C, D, I]]; latched
-            ~/modes           std_msgs/Float64MultiArray  damped frequency [Hz], damping ratio
+            ~/modes           std_msgs/Float64MultiArray  damped frequency [Hz], damping ratio; order // 2 rows
+            ~/modes_interval  std_msgs/Float64MultiArray  their lower and upper 95 %
             ~/payload_mass    std_msgs/Float64            kg; nothing while nothing is known
             ~/payload_estimate std_msgs/Float64MultiArray mass, std, 95 % interval, consistency; latched
             ~/payload_body     std_msgs/Float64MultiArray mass, centre of mass, inertia, and their covariance; latched
@@ -50,6 +51,7 @@ from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, 
 NAME = 'rpbsid_identifier'
 TOPICS = {
     messages.MODEL: (Float64MultiArray, qos.latched), messages.MODES: (Float64MultiArray, qos.output),
+    messages.MODES_INTERVAL: (Float64MultiArray, qos.output),
     messages.PAYLOAD_MASS: (Float64, qos.output), messages.PAYLOAD_ESTIMATE: (Float64MultiArray, qos.latched),
     messages.PAYLOAD: (InertiaStamped, qos.latched), messages.PAYLOAD_BODY: (Float64MultiArray, qos.latched),
     messages.STATUS: (DiagnosticArray, qos.latched),
