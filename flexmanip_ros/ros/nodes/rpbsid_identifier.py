@@ -10,6 +10,7 @@ publishes   ~/model           std_msgs/Float64MultiArray  [[A, B, K], [C, D, I]]
             ~/payload_estimate std_msgs/Float64MultiArray mass, std, 95 % interval, consistency; latched
             ~/payload_body     std_msgs/Float64MultiArray mass, centre of mass, inertia, and their covariance; latched
             ~/payload         geometry_msgs/InertiaStamped at the stamp of the sample that gave it; latched
+            ~/arm             visualization_msgs/MarkerArray  25 Hz: links, object, its mass; only if somebody listens
             ~/status          diagnostic_msgs/DiagnosticArray stamp, status and numbers of payload or model; latched
             /diagnostics      diagnostic_msgs/DiagnosticArray  1 Hz
 services    rpbsid_identifier/reset   std_srvs/Trigger   forget everything
@@ -27,11 +28,13 @@ from geometry_msgs.msg import InertiaStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
 from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
 
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.errors import CheckpointError, FlexmanipError, SignalError
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.arm_markers import ArmMarkers
 from flexmanip_ros.ros.background import Background, CheckpointWriter, too_old, warm_up
 from flexmanip_ros.ros.conversions import JointStateReader, capture_event, to_message
 from flexmanip_ros.ros.diagnostics import (
@@ -57,6 +60,9 @@ TOPICS = {
     messages.STATUS: (DiagnosticArray, qos.latched),
 }
 """Type and quality of service of each output."""
+ARM = 'arm'
+ARM_RATE = 25.0
+"""Pictures of the arm a second [Hz]."""
 
 
 class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
@@ -80,6 +86,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self._resumed = False
         self._logged: dict[str, object] = {}
         """What was last logged of status, trusted payload and missing announcement."""
+        self._latest: JointRecord | None = None
+        """The latest joint state that is not drawn yet."""
 
     def make_entities(self) -> None:
         """Publishers, subscriptions and the reset service."""
@@ -89,6 +97,10 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         for topic in ('capture_event', 'capture_detected'):
             self.subscription(Header, topic, partial(self._on_event, topic), qos.latched_input())
         self.create_service(Trigger, '~/reset', self._on_reset)
+        self._markers = ArmMarkers(self.config)
+        if self._markers.drawn:
+            self.arm = self.publisher(MarkerArray, f'~/{ARM}', qos.output())
+            self.create_timer(1.0 / ARM_RATE, self._draw, clock=self._steady)
 
     def start(self) -> None:
         """Compile or load every kernel before the first sample; begin with nothing known, or from a checkpoint."""
@@ -142,6 +154,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             except SignalError as error:
                 self._reject('encoding', str(error))
                 return
+            self._latest = record
             if self._resumed:
                 self._check_age(record.stamp_ns)
             self._step(record)
@@ -184,6 +197,15 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
                 self.outputs[name].publish(to_message(value))
                 self.published += 1
             self.estimate = estimate
+
+    def _draw(self) -> None:
+        """Publish the arm as it is now, if anybody looks."""
+        record, self._latest = self._latest, None
+        if not self.active or record is None or self.arm.get_subscription_count() == 0:
+            return
+        payload = None if self.estimate is None else self.estimate.payload
+        if self._markers.update(record, payload):
+            self.arm.publish(self._markers.message)
 
     def _check_age(self, stamp_ns: int) -> None:
         """Drop a saved state that is too old for these samples: the arm may hold something else by now."""
