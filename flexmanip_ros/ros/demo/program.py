@@ -36,6 +36,7 @@ from flexmanip_ros.parameters.simulation import settings
 from flexmanip_ros.ros import rclpy_workarounds
 from flexmanip_ros.ros.demo.composition import Composition, foreign_arm
 from flexmanip_ros.ros.node import BAD_INPUT
+from flexmanip_ros.studies.summary import status_text
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, Status
 
 NAME = 'demo'
@@ -305,7 +306,7 @@ def _table(config: DemoParameters, estimates: Sequence[Estimate], items: Sequenc
         table.add_row('payload \\[kg]', f'{last.mass:.3f}' if known else 'not known',
                       f'{last.lower:.3f} .. {last.upper:.3f}' if known else '-', f'{true:.3f}')
         table.add_row('residual power / noise', f'{last.consistency:.2f}', '', '1')
-        table.add_row('status', last.status.value, '', '')
+        table.add_row('status', status_text(last.status), '', '')
     return table
 
 
