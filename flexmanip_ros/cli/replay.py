@@ -128,8 +128,7 @@ class _Messages:
         self.events: list[CaptureEvent] = []
         self.is_kept = request.report is not None or request.validate_from is not None
         self._clock, self._log = sampling.Clock(), sampling.EMPTY
-        self._found: list[CaptureEvent] = []
-        """Events found in the signals."""
+        self._findings = capture_detection.Findings()
         self._looked = False
         self._search = ''
         """Why events were not looked for, or what there was no need to."""
@@ -145,7 +144,7 @@ class _Messages:
         try:
             items: Iterable[pipeline.Item] = bag.read_blocks(request.bag, topics, self._progress)
             if watch is not None:
-                items = capture_detection.with_detected(watch, items, self._found)
+                items = capture_detection.with_detected(watch, items, self._findings)
             for item in items:
                 yield from self._event(item) if isinstance(item, CaptureEvent) else self._joint_states(item)
         except BagError as error:
@@ -179,11 +178,14 @@ class _Messages:
 
     def search(self) -> str:
         """Return what was found in the signals, or why nothing was looked for; empty where events are known."""
-        found = [event for event in self._found if event.stamp_ns < self._limit_ns()]
+        found = [event for event in self._findings.events if event.stamp_ns < self._limit_ns()]
         if found:
             first_ns = self.first_ns or 0
             listed = ', '.join(f'{event.kind.value} at {(event.stamp_ns - first_ns) * 1e-9:.3f} s' for event in found)
             return f'found in the signals: {listed}'
+        if self._looked and not self._findings.watched:
+            return ('the signals cannot tell: the empty arm does not move as its parameters say, or for too short a time; '
+                    'check the parameters arm.*, or give --capture-time')
         if self._looked:
             return ('none found in the signals, so the arm is taken as empty' if not self.events else
                     'no others found in the signals') + '; give --capture-time if it caught something'

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -199,6 +199,13 @@ class Watch(NamedTuple):
     state: DetectionState | None = None
     cursor: int = 0
 
+    @property
+    def is_on(self) -> bool:
+        """Whether the next sample can raise an alarm."""
+        if self.state is None or self.state.glr is None:
+            return False
+        return bool(self.state.glr.clock[kernel.QUIET] > round(SETTLE / self.state.dt))
+
 
 def watch(config: IdentifierParameters) -> Watch:
     """Start to look. Raises ParameterError when the configured signals cannot show a capture."""
@@ -213,20 +220,31 @@ def watch(config: IdentifierParameters) -> Watch:
     return Watch(config)
 
 
-def with_detected(start: Watch, items: Iterable[Item], found: list[CaptureEvent] | None = None) -> Iterator[Item]:
-    """Yield every message, and after the one that revealed it each event that was found; note those in ``found``.
+@dataclass
+class Findings:
+    """What was found in a recording, and how much of it could show an event."""
+
+    events: list[CaptureEvent] = field(default_factory=list)
+    watched: int = 0
+    """Messages for which the test was on: not just after the start or an event, and not while the parameters of the
+    empty arm are still being fitted."""
+
+
+def with_detected(start: Watch, items: Iterable[Item], findings: Findings | None = None) -> Iterator[Item]:
+    """Yield every message, and after the one that revealed it each event that was found; note those in ``findings``.
 
     The event carries the stamp of its onset; the pipeline goes back for it, as it does live. Blocks are looked at in
     pieces, with the result of single messages.
     """
     now = start
-    found = [] if found is None else found
+    findings = findings or Findings()
     for item in items:
         if isinstance(item, CaptureEvent):
             yield item
         elif isinstance(item, JointRecord):
             now, events = _look(now, item)
-            found += events
+            findings.events += events
+            findings.watched += now.is_on
             yield item
             yield from events
         else:
@@ -235,11 +253,13 @@ def with_detected(start: Watch, items: Iterable[Item], found: list[CaptureEvent]
                 after, events = _look(now, piece)
                 if not events and after.clock.counters.resets == now.clock.counters.resets:
                     now = after
+                    findings.watched += len(piece.stamp_ns) * now.is_on
                     yield piece
                     continue
                 for k in range(len(piece.stamp_ns)):
                     now, events = _look(now, piece.record(k))
-                    found += events
+                    findings.events += events
+                    findings.watched += now.is_on
                     yield piece.part(slice(k, k + 1))
                     yield from events
 

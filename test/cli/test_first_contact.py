@@ -82,6 +82,12 @@ def test_an_arm_that_caught_nothing_is_said_to_be_empty(
     assert 'payload      none: the arm is taken as empty, 95 % interval 0 .. ' in out
 
 
+def test_a_recording_too_short_to_tell_is_not_called_empty(
+        caught: list[JointRecord], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, out, _ = run(capsys, written(tmp_path / 'short', caught[:300]))
+    assert 'events       the signals cannot tell: ' in out
+
+
 def test_where_events_are_announced_nobody_looks_unless_asked(
         caught: list[JointRecord], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     looked = []
