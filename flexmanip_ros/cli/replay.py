@@ -184,8 +184,8 @@ class _Messages:
             listed = ', '.join(f'{event.kind.value} at {(event.stamp_ns - first_ns) * 1e-9:.3f} s' for event in found)
             return f'found in the signals: {listed}'
         if self._looked and not self._findings.watched:
-            return ('the signals cannot tell: the empty arm does not move as its parameters say, or for too short a time; '
-                    'check the parameters arm.*, or give --capture-time')
+            return ('the signals cannot tell: the empty arm does not move as its parameters say, or moves too '
+                    'shortly; check the parameters arm.*, or give --capture-time')
         if self._looked:
             return ('none found in the signals, so the arm is taken as empty' if not self.events else
                     'no others found in the signals') + '; give --capture-time if it caught something'
