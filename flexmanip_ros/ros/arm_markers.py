@@ -31,11 +31,12 @@ class ArmMarkers:
     """Fills the markers of one arm: links, joints, the object, its mass as text."""
 
     def __init__(self, config: IdentifierParameters) -> None:
-        """Make the messages. ``drawn`` is False where the signals are not those of a two-link arm."""
+        """Make the messages. ``drawn`` is False where the signals are not those of the arm."""
         self._config = config
         known = signals(config)
         self.drawn = known is not None and known.angles
-        self._bends: list[str | None] = [None, None]
+        links = len(config.arm.link_length)
+        self._bends: list[str | None] = [None] * links
         if known is not None:
             for role, name in zip(known.outputs, config.outputs, strict=True):
                 if role.quantity is Quantity.BEND:
@@ -43,11 +44,12 @@ class ArmMarkers:
         self._joints = [name.rpartition('/')[0] for name in config.angles]
         reach = sum(config.arm.link_length)
         width = THICKNESS * reach
-        self._links = [_marker('link', k, Marker.LINE_STRIP, (width, 0.0, 0.0), LINK_COLOURS[k]) for k in range(2)]
+        self._links = [_marker('link', k, Marker.LINE_STRIP, (width, 0.0, 0.0), LINK_COLOURS[k])
+                       for k in range(links)]
         for link in self._links:
             link.points = [Point() for _ in range(POINTS)]
         self._ends = _marker('joint', 0, Marker.SPHERE_LIST, (2.0 * width,) * 3, JOINT)
-        self._ends.points = [Point() for _ in range(3)]
+        self._ends.points = [Point() for _ in range(links + 1)]
         self._object = _marker('object', 0, Marker.SPHERE, (width,) * 3, TRUSTED)
         self._text = _marker('payload', 0, Marker.TEXT_VIEW_FACING, (0.0, 0.0, 2.0 * width), JOINT)
         self._above = 4.0 * width
@@ -69,9 +71,8 @@ class ArmMarkers:
             marker.header.frame_id = self._config.base_frame
         for marker, line in zip(self._links, drawing.links.tolist(), strict=True):
             _place(marker.points, line)
-        ends = [drawing.links[0, 0], drawing.links[0, -1], drawing.links[1, -1]]
-        _place(self._ends.points, [[float(x), float(y)] for x, y in ends])
-        self._held(payload, drawing.links[1, -1], drawing.tip_angle)
+        _place(self._ends.points, [[0.0, 0.0], *drawing.links[:, -1].tolist()])
+        self._held(payload, drawing.links[-1, -1], drawing.tip_angle)
         return True
 
     def _held(self, payload: Payload | None, tip: np.ndarray, angle: float) -> None:
