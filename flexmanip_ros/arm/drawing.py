@@ -9,7 +9,7 @@ import numpy as np
 from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
-POINTS = 17
+POINTS = 13
 """Points of each link."""
 
 

@@ -1,6 +1,6 @@
 """The arm and what it holds as markers for RViz, Lichtblick and Foxglove.
 
-The messages are made once and then only filled: a frame costs a tenth of a millisecond.
+The messages are made once and then only filled: that takes 0.1 ms, to publish them 0.2 ms.
 """
 
 from __future__ import annotations
