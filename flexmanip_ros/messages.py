@@ -18,6 +18,7 @@ from flexmanip_ros.types import ArmParameter, Array, Estimate, Mode, Payload, St
 
 MODEL = 'model'
 MODES = 'modes'
+MODES_INTERVAL = 'modes_interval'
 PAYLOAD_MASS = 'payload_mass'
 PAYLOAD_ESTIMATE = 'payload_estimate'
 PAYLOAD = 'payload'
@@ -25,6 +26,8 @@ PAYLOAD_BODY = 'payload_body'
 ARM_PARAMETERS = 'arm_parameters'
 STATUS = 'status'
 ROWS = re.compile(r'^rows: state=(\d+) output=(\d+) dt=(\S+)$')
+QUANTILE = 1.959963984540054
+"""Half width of a 95 % interval in standard deviations."""
 COLUMNS = re.compile(r'^columns: state=(\d+) input=(\d+) innovation=(\d+)$')
 
 
@@ -105,12 +108,43 @@ def read_model(matrix: LabelledArray) -> StateSpace:
     return StateSpace(A, B, block[n:, :n], block[n:, n:n + r], K, float(rows[3]))
 
 
-def modes_matrix(modes: tuple[Mode, ...]) -> LabelledArray:
-    """Return one mode a row in rising frequency: damped frequency [Hz], damping ratio."""
-    rows = sorted((mode.frequency_hz, mode.damping_ratio) for mode in modes
-                  if math.isfinite(mode.frequency_hz) and math.isfinite(mode.damping_ratio))
-    values = np.array(rows, dtype=np.float64).reshape(len(rows), 2)
-    return _matrix('modes', 'frequency_hz damping_ratio', values)
+def modes_matrix(modes: tuple[Mode, ...], order: int) -> LabelledArray:
+    """Return (order // 2, 2), one mode a row in rising frequency: damped frequency [Hz], damping ratio.
+
+    A model of order n has up to n // 2 modes; rows without one are NaN. The size never changes: a viewer that makes
+    one curve of each entry of the first message shows them all.
+    """
+    rows = [(mode.frequency_hz, mode.damping_ratio) for mode in _known(modes)]
+    return _matrix('modes', 'frequency_hz damping_ratio', _filled(rows, order // 2, 2))
+
+
+def modes_interval(modes: tuple[Mode, ...], order: int) -> LabelledArray:
+    """Return (order // 2, 4), rows as in ``modes_matrix``: lower and upper 95 % of frequency [Hz] and damping ratio.
+
+    NaN where there is no mode, or where its deviation is not known.
+    """
+    rows = []
+    for mode in _known(modes):
+        frequency, damping = QUANTILE * mode.frequency_std_hz, QUANTILE * mode.damping_ratio_std
+        rows.append((mode.frequency_hz - frequency, mode.frequency_hz + frequency,
+                     mode.damping_ratio - damping, mode.damping_ratio + damping))
+    return _matrix('modes', 'frequency_lower95_hz frequency_upper95_hz damping_lower95 damping_upper95',
+                   _filled(rows, order // 2, 4))
+
+
+def _known(modes: tuple[Mode, ...]) -> list[Mode]:
+    """Return the modes with a frequency and a damping ratio, rising frequency."""
+    return sorted((mode for mode in modes if math.isfinite(mode.frequency_hz) and math.isfinite(mode.damping_ratio)),
+                  key=lambda mode: (mode.frequency_hz, mode.damping_ratio))
+
+
+def _filled(rows: Sequence[tuple[float, ...]], height: int, width: int) -> Array:
+    """Return rows as (height, width); entries that are missing or not finite are NaN, always the same NaN."""
+    values = np.full((height, width), np.nan)
+    if rows:
+        given = np.array(rows[:height], dtype=np.float64)
+        values[:len(given)] = np.where(np.isfinite(given), given, np.nan)
+    return values
 
 
 def payload_row(payload: Payload) -> LabelledArray:
@@ -205,13 +239,17 @@ def outgoing_arm(estimate: Estimate) -> Iterator[tuple[str, Value]]:
 
 
 def outgoing_model(estimate: Estimate) -> Iterator[tuple[str, Value]]:
-    """Yield model, modes and their status if they were read with this estimate."""
+    """Yield model, modes and their status if they were read with this estimate.
+
+    Rows of modes and intervals that are not known are NaN; the model is finite.
+    """
     model = estimate.model
     if model is None or not estimate.model_is_new:
         return
     if all(np.isfinite(part).all() for part in model_parts(model)):
         yield MODEL, model_matrix(model)
-        yield MODES, modes_matrix(estimate.modes)
+        yield MODES, modes_matrix(estimate.modes, model.order)
+        yield MODES_INTERVAL, modes_interval(estimate.modes, model.order)
         yield STATUS, model_status(estimate)
 
 

@@ -55,6 +55,11 @@ class JointBlock(NamedTuple):
         """Return message number k."""
         return JointRecord(int(self.stamp_ns[k]), self.names, self.position[k], self.velocity[k], self.effort[k])
 
+    def part(self, taken: slice) -> JointBlock:
+        """Return some of the messages."""
+        return JointBlock(self.names, self.stamp_ns[taken], self.position[taken], self.velocity[taken],
+                          self.effort[taken])
+
 
 class Sample(NamedTuple):
     """One instant of the configured signals, in JointState units.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.messages import LabelledArray, model_matrix, modes_matrix, outgoing, read_model
+from flexmanip_ros.messages import LabelledArray, model_matrix, modes_interval, modes_matrix, outgoing, read_model
 from flexmanip_ros.types import Estimate, Mode, Payload, StateSpace, Status
 
 
@@ -49,9 +49,22 @@ def test_a_model_message_of_the_wrong_size_is_refused():
         read_model(LabelledArray((), matrix.data))
 
 
-def test_modes_are_sorted_and_finite():
-    matrix = modes_matrix((Mode(7.0, 0.1), Mode(math.nan, 0.1), Mode(5.0, 0.2)))
-    np.testing.assert_array_equal(matrix.data.reshape(-1, 2), [[5.0, 0.2], [7.0, 0.1]])
+def test_modes_are_sorted_and_always_as_many_rows_as_the_order_allows():
+    found = (Mode(7.0, 0.1), Mode(math.nan, 0.1), Mode(5.0, 0.2))
+    for modes, expected in ((found, [[5.0, 0.2], [7.0, 0.1], [math.nan] * 2]), ((), [[math.nan] * 2] * 3)):
+        matrix = modes_matrix(modes, 6)
+        np.testing.assert_array_equal(matrix.data.reshape(-1, 2), expected)
+        assert [item.size for item in matrix.dimensions] == [3, 2]
+    assert modes_matrix((), 1).data.size == 0
+
+
+def test_the_interval_of_a_mode_is_as_wide_as_its_deviation_says_and_nan_where_that_is_unknown():
+    modes = Mode(7.0, 0.1, 0.5, 0.01), Mode(5.0, 0.2), Mode(9.0, 0.3, math.inf, 0.1)
+    found = modes_interval(modes, 8).data.reshape(-1, 4)
+    nan, far = math.nan, 1.959963984540054
+    np.testing.assert_allclose(found, [
+        [nan] * 4, [7.0 - 0.5 * far, 7.0 + 0.5 * far, 0.1 - 0.01 * far, 0.1 + 0.01 * far],
+        [nan, nan, 0.3 - 0.1 * far, 0.3 + 0.1 * far], [nan] * 4], rtol=1e-15)
 
 
 def test_nothing_that_is_not_a_number_is_published():

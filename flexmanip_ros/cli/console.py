@@ -25,8 +25,16 @@ LONGEST = 1e9
 """Largest time that is accepted [s]; larger ones overflow a stamp in nanoseconds."""
 TRACEBACK = 'FLEXMANIP_TRACEBACK'
 """Environment variable; where it is set, a defect prints its traceback."""
-Report = Callable[[int, int | None], None]
-"""Called with the steps done and the steps in all (None: unknown)."""
+
+
+class Report:
+    """Where a program says how far it is: on a bar of the terminal, or nowhere."""
+
+    def __call__(self, done: int, total: int | None) -> None:
+        """Note the steps done and the steps in all (None: unknown)."""
+
+    def phase(self, words: str) -> None:
+        """Begin another part of the work, of which nobody knows how long it takes."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -78,16 +86,24 @@ def add_workers(made: Parser) -> None:
 def progress(words: str, unit: str) -> Iterator[Report]:
     """Show a bar on stderr when that is a terminal; otherwise nothing."""
     if not sys.stderr.isatty():
-        yield lambda done, total: None
+        yield Report()
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    bar = Progress(TextColumn(words), BarColumn(), MofNCompleteColumn(), TextColumn(unit), TimeRemainingColumn(),
-                   console=Console(stderr=True), transient=True)
+    bar = Progress(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(), TextColumn(unit),
+                   TimeRemainingColumn(), console=Console(stderr=True), transient=True)
     with bar:
         task = bar.add_task(words, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+        class Shown(Report):
+            def __call__(self, done: int, total: int | None) -> None:
+                bar.update(task, completed=done, total=total)
+
+            def phase(self, words: str) -> None:
+                bar.reset(task, description=words, total=None)
+
+        yield Shown()
 
 
 def print_error(prog: str, error: BaseException | str) -> None:

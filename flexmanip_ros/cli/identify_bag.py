@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 PROG = 'identify_bag'
 NODE = 'rpbsid_identifier'
 EXAMPLES = """examples:
-  identify_bag recording                                     the default arm, structured payload estimate
+  identify_bag recording                                     the default arm; captures are found in the signals
+                                                             where the recording has no topic of events
   identify_bag recording --params my_arm.yaml --report report.html
   identify_bag recording --set payload_method=none --set 'inputs=[motor/effort]' \\
       --set 'outputs=[arm/position]' --set order=4 --validate-from 5
@@ -52,7 +53,11 @@ def _parser() -> console.Parser:
         help='topic of the joint states; default: joint_states, in any namespace')
     add('--capture-event', metavar='TOPIC', action='append',
         help='topic of events; may be repeated; default: capture_event and capture_detected beside joint_states')
-    add('--detect', action='store_true', help='detect captures and releases from the signals')
+    looked = made.add_mutually_exclusive_group()
+    looked.add_argument('--detect', action='store_true', default=None, dest='detect', help=(
+        'look for captures and releases in the signals, whatever is recorded; default: where the recording has no '
+        'topic of events and no time is given'))
+    looked.add_argument('--no-detect', action='store_false', dest='detect', help='never look for them in the signals')
     for kind in ('capture', 'release'):
         add(f'--{kind}-time', metavar='SECONDS', type=console.seconds,
             help=f'add a {kind} at this time [s], counted from the first stamp')
@@ -93,16 +98,19 @@ def _main(given: argparse.Namespace) -> int:
 
 def describe(result: Result) -> list[str]:
     """Return the result as lines for people."""
+    from flexmanip_ros.studies.summary import status_text
     from flexmanip_ros.types import Status
 
     summary = result.summary
     lines = [f'samples      {summary.samples}, {summary.gaps} gaps, '
              f'sample time {_text(summary.sample_time_s)} s, identified in {summary.wall_s:.2f} s']
+    if result.events:
+        lines.append(f'events       {result.events}')
     lines += [f'{name:12s} at {time:.3f} s' for name, time in (
         ('capture', summary.capture_time_s), ('release', summary.release_time_s)) if time is not None]
-    lines.append(f'status       {summary.status}: {Status[summary.status].value}')
+    lines.append(f'status       {summary.status}: {status_text(Status[summary.status], result.config)}')
     if summary.model_status not in (summary.status, Status.TRACKING.name):
-        lines.append(f'model        {summary.model_status}: {Status[summary.model_status].value}')
+        lines.append(f'model        {summary.model_status}: {status_text(Status[summary.model_status])}')
     for k, mode in enumerate(result.modes):
         spread = f' +- {1.96 * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else ''
         lines.append(f'mode {k + 1}       {mode.frequency_hz:.4f}{spread} Hz, damping ratio {mode.damping_ratio:.4f}')
@@ -113,7 +121,7 @@ def describe(result: Result) -> list[str]:
     for words, values in (('simulation', summary.vaf_simulation_percent),
                           ('prediction', summary.vaf_prediction_percent)):
         if values is not None:
-            shares = [f'{name} {_text(value)} %' for name, value in zip(result.outputs, values, strict=True)]
+            shares = [f'{name} {_text(value)} %' for name, value in zip(result.config.outputs, values, strict=True)]
             lines.append(f'VAF {words:8s} {", ".join(shares)}')
     lines += [f'written      {place}' for place in result.written]
     return lines

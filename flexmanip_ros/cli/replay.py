@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 
 from flexmanip_ros import estimator, pipeline
-from flexmanip_ros.cli.console import require_matplotlib
+from flexmanip_ros.cli.console import Report, require_matplotlib
 from flexmanip_ros.errors import BagError, FlexmanipError, ParameterError, SignalError
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.outputs import TableOutput, check_place, open_output, write_text
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import yaml_text
+from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.payload.arm_parameters import as_parameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
@@ -41,8 +42,9 @@ class Request:
     """Whether a missing event topic is an error, as it is where the user named the topics."""
     capture_time: float | None = None
     release_time: float | None = None
-    detect: bool = False
-    """Find captures and releases in the signals."""
+    detect: bool | None = None
+    """Whether to look for captures and releases in the signals; None: where the recording has no topic of events, no
+    time is given, and the signals can show one."""
     validate_from: float | None = None
     output: str | None = None
     report: str | None = None
@@ -56,15 +58,18 @@ class Result:
 
     summary: Summary
     modes: tuple[Mode, ...]
-    outputs: tuple[str, ...]
+    config: IdentifierParameters
+    """With the outputs that the messages really carry."""
     written: tuple[str, ...]
     fault: FlexmanipError | None
     interrupted: bool = False
+    events: str = ''
+    """What was found in the signals where events were looked for, or why they were not; empty where they are known."""
     remark: str = ''
     """One line about messages that were left out and events that were not applied at their stamp; empty if none."""
 
 
-def identify(request: Request, progress: bag.Progress | None = None) -> Result:
+def identify(request: Request, progress: Report | None = None) -> Result:
     """Replay a recording through the identifier; write the output and the report that are asked for.
 
     Raises FlexmanipError when no message can be used and when a file cannot be written.
@@ -77,6 +82,7 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
             raise ParameterError(f"--output and --report are both '{request.report}'", 'give two names')
     if request.save_arm is not None:
         check_place(request.save_arm)
+    progress = progress or Report()
     messages = _Messages(request, progress)
     kept: list[Estimate] = []
     state, interrupted = pipeline.init(), False
@@ -97,11 +103,13 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
             output.start_ns = messages.first_ns
     if messages.fault is not None and state.counters.accepted == 0:
         raise messages.fault
+    progress.phase('fitting the last samples')
     last = pipeline.current(state)
     summary = summarize(state, last, time.perf_counter() - started)
     scores = None
     signals = messages.signals() if messages.is_kept else None
     if request.validate_from is not None and signals is not None:
+        progress.phase('scoring the model')
         scores = holdout.score(None if last is None else last.model, signals, request.validate_from)
         summary = replace(summary, vaf_simulation_percent=tuple(scores.simulation.tolist()),
                           vaf_prediction_percent=tuple(scores.prediction.tolist()))
@@ -109,17 +117,18 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
     if request.save_arm is not None:
         _save_arm(request, state, last)
     if request.report is not None and signals is not None:
+        progress.phase('drawing the report')
         _report(request, summary, messages, kept, signals, last, scores, state, fault)
     return Result(
-        summary, () if last is None else last.modes, state.clock.outputs or request.config.outputs,
+        summary, () if last is None else last.modes, state.config or request.config,
         tuple(str(place) for place in (request.output, request.report, request.save_arm) if place is not None), fault,
-        interrupted, _remark(state, messages.foreign))
+        interrupted, messages.search(), _remark(state, messages.foreign))
 
 
 class _Messages:
     """Iterates over the messages of a recording up to its fault; keeps the signals for scores and figures."""
 
-    def __init__(self, request: Request, progress: bag.Progress | None) -> None:
+    def __init__(self, request: Request, progress: Report) -> None:
         self.fault: FlexmanipError | None = None
         self.foreign = 0
         """Messages that hold none of the configured joints."""
@@ -127,6 +136,10 @@ class _Messages:
         self.events: list[CaptureEvent] = []
         self.is_kept = request.report is not None or request.validate_from is not None
         self._clock, self._log = sampling.Clock(), sampling.EMPTY
+        self._findings = capture_detection.Findings()
+        self._looked = False
+        self._search = ''
+        """Why events were not looked for, or what there was no need to."""
         self._request = request
         self._progress = progress
         config = request.config
@@ -135,18 +148,56 @@ class _Messages:
     def __iter__(self) -> Iterator[pipeline.Item]:
         request = self._request
         topics = bag.Topics(request.joint_states, request.events, request.events_required)
+        watch = self._watch(topics)
         try:
-            if request.detect:
-                from flexmanip_ros.payload.capture_detection import with_detected
-
-                items: Iterable[pipeline.Item] = with_detected(
-                    request.config, bag.read(request.bag, topics, self._progress))
-            else:
-                items = bag.read_blocks(request.bag, topics, self._progress)
+            items: Iterable[pipeline.Item] = bag.read_blocks(request.bag, topics, self._progress)
+            if watch is not None:
+                items = capture_detection.with_detected(watch, items, self._findings)
             for item in items:
                 yield from self._event(item) if isinstance(item, CaptureEvent) else self._joint_states(item)
         except BagError as error:
             self.fault = error
+
+    def _watch(self, topics: bag.Topics) -> capture_detection.Watch | None:
+        """Return the detector where events are to be looked for in the signals; say why where they are not.
+
+        It costs about as much time as the payload itself, so where events are announced it is asked for.
+        """
+        request = self._request
+        given = request.capture_time is not None or request.release_time is not None
+        if request.detect is None and (request.config.payload_method == 'none' or given):
+            return None
+        if request.detect is False:
+            self._search = 'none recorded, and not looked for (--no-detect)'
+            return None
+        try:
+            watch = capture_detection.watch(request.config)
+        except ParameterError as error:
+            if request.detect:
+                raise
+            self._search = f'none recorded, and {error.problem}'
+            return None
+        announced = bag.event_topics(request.bag, topics) if request.detect is None else ()
+        if announced:
+            self._search = f'none on {", ".join(announced)}; --detect looks for them in the signals'
+            return None
+        self._looked = True
+        return watch
+
+    def search(self) -> str:
+        """Return what was found in the signals, or why nothing was looked for; empty where events are known."""
+        found = [event for event in self._findings.events if event.stamp_ns < self._limit_ns()]
+        if found:
+            first_ns = self.first_ns or 0
+            listed = ', '.join(f'{event.kind.value} at {(event.stamp_ns - first_ns) * 1e-9:.3f} s' for event in found)
+            return f'found in the signals: {listed}'
+        if self._looked and not self._findings.watched:
+            return ('the signals cannot tell: the empty arm does not move as its parameters say, or moves too '
+                    'shortly; check the parameters arm.*, or give --capture-time')
+        if self._looked:
+            return ('none found in the signals, so the arm is taken as empty' if not self.events else
+                    'no others found in the signals') + '; give --capture-time if it caught something'
+        return '' if self.events else self._search
 
     def _event(self, event: CaptureEvent) -> Iterator[CaptureEvent]:
         if event.stamp_ns < self._limit_ns():
@@ -252,4 +303,5 @@ def _report(request: Request, summary: Summary, messages: _Messages, kept: list[
     counts: dict[str, Any] = {**state.counters._asdict(), 'dropped': state.counters.dropped}
     report.identification_report(
         request.report, Path(request.bag).name, config, summary, made,
-        None if last is None else last.model, scores, counts, bound, '' if fault is None else str(fault))
+        None if last is None else last.model, scores, counts, bound, '' if fault is None else str(fault),
+        modes=() if last is None else last.modes, events=messages.search())

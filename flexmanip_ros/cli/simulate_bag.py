@@ -97,8 +97,9 @@ def _main(given: argparse.Namespace) -> int:
     if target.exists():
         raise BagError(f"'{target}' exists already", 'remove it or give another name')
     check_place(truth_path)
-    trajectory = simulator.simulate(plant, excitation.sequence(torque, count), events, START_NS)
-    with (console.progress('simulating', 'samples') as progress, BagWriter(target, flush_period=None) as writer):
+    with console.progress('simulating', 'samples'):
+        trajectory = simulator.simulate(plant, excitation.sequence(torque, count), events, START_NS)
+    with (console.progress('writing', 'samples') as progress, BagWriter(target, flush_period=None) as writer):
         for k, item in enumerate(simulator.records(trajectory, events)):
             topic = '/joint_states' if isinstance(item, JointRecord) else '/capture_event'
             writer.write(topic, item.stamp_ns, item, latched=isinstance(item, CaptureEvent))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,6 +74,22 @@ def read_blocks(path: str | Path, topics: Topics | None = None, progress: Progre
     recording.check()
 
 
+def event_topics(path: str | Path, topics: Topics | None = None) -> tuple[str, ...]:
+    """Return the topics of events that a bag has, with or without messages on them.
+
+    Of a bag that cannot be opened as it is the messages are looked through. Nothing is raised: reading it will say what
+    is wrong.
+    """
+    recording: _Recording | None = None
+    with suppress(BagError):
+        recording = _Recording(Path(path), topics or Topics())
+        with closing(recording.messages()) as messages:
+            for _ in messages:
+                if not recording.is_damaged:  # every topic is known from the start
+                    break
+    return () if recording is None else recording.event_topics
+
+
 class _Recording:
     """One pass over one bag, and what was wrong on the way."""
 
@@ -116,7 +132,7 @@ class _Recording:
             return [self.path]
         return sorted(file for file in self.path.iterdir() if file.suffix in ('.mcap', '.db3'))
 
-    def messages(self) -> Iterator[tuple[str, bytes]]:
+    def messages(self) -> Generator[tuple[str, bytes]]:
         """Yield topic and bytes of the messages on the chosen topics: what the library reads, then what is left."""
         try:
             reader = Reader(self.path)
@@ -150,6 +166,16 @@ class _Recording:
                     yield raw.topic, raw.data
         except salvage.DamagedError as err:
             self._damage = str(err)
+
+    @property
+    def is_damaged(self) -> bool:
+        """Whether the library gave up on it."""
+        return bool(self._damage)
+
+    @property
+    def event_topics(self) -> tuple[str, ...]:
+        """Topics of events that were seen so far."""
+        return tuple(sorted(topic for topic, kind in self._kinds.items() if kind == HEADER))
 
     def joint_states(self, raws: list[bytes], first: int) -> Iterator[JointBlock]:
         """Decode joint states that follow one another, the first of which is message number ``first``."""

@@ -52,7 +52,7 @@ class BagWriter:
                  flush_period: float | None = FLUSH_PERIOD) -> None:
         self.path = Path(path)
         self._types = get_typestore(Stores.ROS2_JAZZY)
-        self._connections: dict[str, tuple[type, Connection]] = {}
+        self._connections: dict[str, tuple[str, Connection]] = {}
         self._lock = threading.Lock()
         self._flush_period = np.inf if flush_period is None else flush_period
         self._flushed = time.monotonic()
@@ -71,6 +71,10 @@ class BagWriter:
         if kind not in KINDS:
             raise TypeError(f'no message for a {kind.__name__}')
         data = bytes(self._types.serialize_cdr(_message(self._types.types, value), KINDS[kind]))
+        self.write_raw(topic, log_ns, data, KINDS[kind], latched=latched)
+
+    def write_raw(self, topic: str, log_ns: int, data: bytes, kind: str, *, latched: bool = False) -> None:
+        """Append a serialized message. kind: its type, such as std_msgs/msg/Header."""
         with self._lock:
             if not self._open:
                 raise BagError(f"bag '{self.path}' is closed", 'write before closing it')
@@ -88,15 +92,15 @@ class BagWriter:
             if self._open:
                 self._flush()
 
-    def _connection(self, topic: str, kind: type, latched: bool) -> Connection:
+    def _connection(self, topic: str, kind: str, latched: bool) -> Connection:
         known = self._connections.get(topic)
         if known is None:
             connection = self._writer.add_connection(
-                topic, KINDS[kind], typestore=self._types, offered_qos_profiles=[_qos(latched)])
+                topic, kind, typestore=self._types, offered_qos_profiles=[_qos(latched)])
             known = self._connections[topic] = (kind, connection)
-        if known[0] is not kind:
-            raise BagError(f"topic '{topic}' of bag '{self.path}' carries {KINDS[known[0]]}",
-                           f'use another topic for {KINDS[kind]}')
+        if known[0] != kind:
+            raise BagError(f"topic '{topic}' of bag '{self.path}' carries {known[0]}",
+                           f'use another topic for {kind}')
         return known[1]
 
     def _flush(self) -> None:

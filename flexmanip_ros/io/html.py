@@ -20,6 +20,7 @@ img{width:100%;height:auto}table{border-collapse:collapse;margin:.6rem 0;font-si
 th,td{padding:.2rem .7rem;text-align:left;border-bottom:1px solid #e6e6e6;vertical-align:top}
 td.n{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}
 nav a{margin-right:1rem}.note{color:#555}.changed{background:#fff3d6}div.wide{overflow-x:auto}
+.answer{font-size:1.25rem;font-weight:600}
 caption{text-align:left;font-weight:600;padding:.3rem 0}
 """
 

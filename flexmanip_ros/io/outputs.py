@@ -20,7 +20,7 @@ import numpy as np
 
 from flexmanip_ros.errors import BagError, FlexmanipError
 from flexmanip_ros.io.bag_writer import BagWriter
-from flexmanip_ros.messages import MODES, PAYLOAD_MASS, outgoing
+from flexmanip_ros.messages import MODES, MODES_INTERVAL, PAYLOAD_MASS, outgoing
 from flexmanip_ros.types import Array, Estimate
 
 PAYLOAD = ('mass', 'std', 'lower', 'upper', 'consistency')
@@ -212,7 +212,7 @@ class BagOutput(Output):
         """Append the messages that the node would have published."""
         super().write(estimate)
         for name, value in outgoing(estimate, self._frame_id):
-            latched = name not in (MODES, PAYLOAD_MASS)
+            latched = name not in (MODES, MODES_INTERVAL, PAYLOAD_MASS)
             self._opened().write(f'/{NODE}/{name}', estimate.stamp_ns, value, latched=latched)
 
     def close(self) -> None:

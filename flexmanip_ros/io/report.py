@@ -19,9 +19,9 @@ from flexmanip_ros.parameters.document import written
 from flexmanip_ros.parameters.field import leaves
 from flexmanip_ros.studies.holdout import Scores
 from flexmanip_ros.studies.metrics import Score, score
-from flexmanip_ros.studies.summary import Summary
+from flexmanip_ros.studies.summary import Summary, status_text
 from flexmanip_ros.studies.trial import Row
-from flexmanip_ros.types import StateSpace, Status
+from flexmanip_ros.types import Mode, StateSpace, Status
 
 SHOWN_FAILURES = 50
 """Failed runs listed at most."""
@@ -30,22 +30,25 @@ SHOWN_FAILURES = 50
 def identification_report(
     path: str | Path, source: str, config: IdentifierParameters, summary: Summary, made: plots.Run,
     model: StateSpace | None, scores: Scores | None, messages: dict[str, int], bound: float | None = None,
-    fault: str = '',
+    fault: str = '', *, modes: Sequence[Mode] = (), events: str = '',
 ) -> None:
-    """Write the report of identify_bag."""
-    sections = [Section('Result', _result(summary, made.signals.outputs, bound, fault)),
-                Section('Signals', picture(
-                    plots.signals_figure(made), 'torques and measured signals over time'))]
-    if any(estimate.modes for estimate in made.estimates):
-        sections.append(Section('Frequencies', picture(
-            plots.frequency_figure(made), 'identified frequencies with 95 % bands over time')))
+    """Write the report of identify_bag: the answer, then pictures, then tables.
+
+    events: what was found in the signals where captures were looked for; empty where they are known.
+    """
+    sections = [Section('Result', _answer(config, summary, modes, events, fault))]
     if any(estimate.payload is not None for estimate in made.estimates):
         sections.append(Section('Payload', picture(
             plots.payload_figure(made), 'payload with its 95 % interval, and residual power over time')))
+    if any(estimate.modes for estimate in made.estimates):
+        sections.append(Section('Frequencies', picture(
+            plots.frequency_figure(made), 'identified frequencies with 95 % bands over time')))
+    sections.append(Section('Signals', picture(plots.signals_figure(made), 'torques and measured signals over time')))
     if scores is not None:
         note = '' if not scores.until_gap else '<p class="note">Scored up to the first gap.</p>'
         drawn = plots.validation_figure(scores, made.signals.outputs, has_arm=made.has_arm)
         sections.append(Section('Validation', note + picture(drawn, 'measured, simulated and predicted outputs')))
+    sections.append(Section('Numbers', _result(config, summary, made.signals.outputs, bound)))
     if model is not None:
         sections.append(Section('Model', _model(model, made.signals.inputs, made.signals.outputs)))
     counts = [(name.replace('_', ' '), count) for name, count in messages.items()]
@@ -55,10 +58,36 @@ def identification_report(
     write_text(path, page(f'Identification of {source}', lead, sections))
 
 
-def _result(summary: Summary, outputs: Sequence[str], bound: float | None, fault: str) -> str:
-    rows: list[tuple[str, str]] = [('status', f'{summary.status}: {Status[summary.status].value}')]
+def _answer(config: IdentifierParameters, summary: Summary, modes: Sequence[Mode], events: str, fault: str) -> str:
+    """Say what the arm holds, since when, how sure that is, and its modes."""
+    status = Status[summary.status]
+    parts = [f'<p class="changed">{escape(fault)}</p>'] if fault else []
+    if summary.payload_ci95_kg is not None:
+        since = summary.held_since_s
+        held = '' if since is None else f', since {since:.3f} s'
+        if summary.release_time_s is not None and since is None:
+            held = f', since the release at {summary.release_time_s:.3f} s'
+        parts.append(f'<p class="answer">Payload: {escape(summary.payload_text())}{held}.</p>')
+    if events:
+        parts.append(f'<p>Captures and releases: {escape(events)}.</p>')
+    look = '' if status is Status.TRACKING else ' class="changed"'
+    parts.append(f'<p{look}>Status: {escape(status_text(status, config))}.</p>')
     if summary.model_status not in (summary.status, Status.TRACKING.name):
-        rows.append(('model', f'{summary.model_status}: {Status[summary.model_status].value}'))
+        parts.append(f'<p class="changed">Model: {escape(status_text(Status[summary.model_status]))}.</p>')
+    found = [mode for mode in modes if np.isfinite(mode.frequency_hz)]
+    if found:
+        shown = [f'{mode.frequency_hz:.4g}'
+                 + (f' &plusmn; {1.96 * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else '')
+                 + f' Hz (damping ratio {mode.damping_ratio:.3g})' for mode in found]
+        parts.append(f'<p>Modes (95 %): {", ".join(shown)}.</p>')
+    return ''.join(parts)
+
+
+def _result(config: IdentifierParameters, summary: Summary, outputs: Sequence[str], bound: float | None) -> str:
+    rows: list[tuple[str, str]] = [
+        ('status', f'{summary.status}: {status_text(Status[summary.status], config)}')]
+    if summary.model_status not in (summary.status, Status.TRACKING.name):
+        rows.append(('model', f'{summary.model_status}: {status_text(Status[summary.model_status])}'))
     modes = zip(summary.frequencies_hz, summary.damping_ratios, strict=True)
     for k, (frequency, damping) in enumerate(modes):
         rows.append((f'mode {k + 1}', f'{frequency:.4f} Hz, damping ratio {damping:.4f}'))
@@ -79,8 +108,7 @@ def _result(summary: Summary, outputs: Sequence[str], bound: float | None, fault
         if values is not None:
             shares = [f'{name} {number(value, 4)} %' for name, value in zip(outputs, values, strict=True)]
             rows.append((f'variance accounted for, {kind}', ', '.join(shares)))
-    warning = f'<p class="changed">{escape(fault)}</p>' if fault else ''
-    return warning + table(['', ''], rows)
+    return table(['', ''], rows)
 
 
 def _model(model: StateSpace, inputs: Sequence[str], outputs: Sequence[str]) -> str:

@@ -87,8 +87,11 @@ class AdapterParameters:
 
     service: str = parameter('io_and_status_controller/set_payload', 'service of the driver that takes a payload')
     service_type: str = parameter(
-        'ur_msgs/srv/SetPayload', 'type of that service; its request holds a geometry_msgs/Inertia, or mass and '
-        'center_of_gravity')
+        'ur_msgs/srv/SetPayload', 'type of that service; its request holds a geometry_msgs/Inertia, or a mass and, '
+        'where it has places for them, centre of mass, inertia and transition time')
+    transition_time: float = parameter(
+        0.5, 'time over which the driver is to go from the old payload to the new one, where its request says so',
+        unit='s', low=0.0, high=60.0, live=True)
     target_node: str = parameter(
         '', 'node whose parameter is set to the payload instead of calling the service; empty: none')
     mass_parameter: str = parameter('payload_mass', 'name of that parameter (a double)', unit='kg')

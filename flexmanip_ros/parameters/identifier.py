@@ -129,6 +129,8 @@ class IdentifierParameters:
         0.1, 'an event of the same kind within this time of the last one is the same event', unit='s', low=0.0,
         high=60.0, live=True)
     payload_frame: str = parameter('link2_tip', 'frame_id of the published payload', live=True)
+    base_frame: str = parameter(
+        'base_link', 'frame_id of the drawn arm (~/arm): joint 1 at its origin, angles from its x axis')
     checkpoint_file: str = parameter(
         '', 'file in which the live node saves its state and from which it resumes at start; empty: none')
     checkpoint_period: float = parameter(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -14,8 +15,8 @@ from flexmanip_ros.payload import capture_detection_kernel as kernel
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured
 from flexmanip_ros.samples import sampling
-from flexmanip_ros.samples.sample_log import Rows
-from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+from flexmanip_ros.samples.sample_log import Rows, SampleLog
+from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, JointRecord
 
 SETTLE = 0.5
 """Seconds after the start or an event before the next can be told."""
@@ -183,36 +184,99 @@ def _quiet(glr: kernel.GlrState) -> kernel.GlrState:
     return fresh
 
 
-Item = JointRecord | CaptureEvent
+Item = JointRecord | JointBlock | CaptureEvent
+PIECE = 256
+"""Messages of a block that are looked at together. Where an event is in them, they are looked at one by one."""
 
 
-def with_detected(config: IdentifierParameters, items: Iterable[Item]) -> Iterator[Item]:
-    """Yield every message, and after the one that revealed it each event that was found.
+class Watch(NamedTuple):
+    """The detector of a recording: its clock and sample log, and the row that it takes next."""
 
-    The event carries the stamp of its onset; the pipeline goes back for it, as it does live.
-    """
+    config: IdentifierParameters
+    clock: sampling.Clock = sampling.Clock()
+    log: SampleLog = sampling.EMPTY
+    trigger: TriggerParameters = TriggerParameters()
+    state: DetectionState | None = None
+    cursor: int = 0
+
+    @property
+    def is_on(self) -> bool:
+        """Whether the next sample can raise an alarm."""
+        if self.state is None or self.state.glr is None:
+            return False
+        return bool(self.state.glr.clock[kernel.QUIET] > round(SETTLE / self.state.dt))
+
+
+def watch(config: IdentifierParameters) -> Watch:
+    """Start to look. Raises ParameterError when the configured signals cannot show a capture."""
     if not config.angles:
         raise ParameterError('captures cannot be found in the signals without angles',
                              'name the joints in parameter angles, or give --capture-time')
     # The angles are needed here whether or not a payload is estimated.
     config = replace(config, payload_method='structured')
-    clock, log = sampling.Clock(), sampling.EMPTY
-    state: DetectionState | None = None
-    trigger = TriggerParameters()
-    cursor = 0
+    if structured.init(config).model is None:
+        raise ParameterError('captures cannot be found in these signals',
+                             'add the torques, angles and bends of both links to inputs, angles and outputs')
+    return Watch(config)
+
+
+@dataclass
+class Findings:
+    """What was found in a recording, and how much of it could show an event."""
+
+    events: list[CaptureEvent] = field(default_factory=list)
+    watched: int = 0
+    """Messages for which the test was on: not just after the start or an event, and not while the parameters of the
+    empty arm are still being fitted."""
+
+
+def with_detected(start: Watch, items: Iterable[Item], findings: Findings | None = None) -> Iterator[Item]:
+    """Yield every message, and after the one that revealed it each event that was found; note those in ``findings``.
+
+    The event carries the stamp of its onset; the pipeline goes back for it, as it does live. Blocks are looked at in
+    pieces, with the result of single messages.
+    """
+    now = start
+    findings = findings or Findings()
     for item in items:
-        yield item
         if isinstance(item, CaptureEvent):
-            continue
-        clock, log, reset = sampling.push(config, clock, log, item)
-        if clock.outputs is None:
-            continue
-        if state is None or reset:
-            trigger = TriggerParameters(
-                mode='auto', inputs=config.inputs, outputs=clock.outputs, angles=config.angles,
-                arm=config.arm, payload=config.payload)
-            state, cursor = init(trigger), 0
-        state, events = advance(trigger, state, log.rows(cursor, log.end))
-        cursor = log.end
-        log = log.from_row(first_needed(state))
-        yield from events
+            yield item
+        elif isinstance(item, JointRecord):
+            now, events = _look(now, item)
+            findings.events += events
+            findings.watched += now.is_on
+            yield item
+            yield from events
+        else:
+            for first in range(0, len(item.stamp_ns), PIECE):
+                piece = item.part(slice(first, first + PIECE))
+                after, events = _look(now, piece)
+                if not events and after.clock.counters.resets == now.clock.counters.resets:
+                    now = after
+                    findings.watched += len(piece.stamp_ns) * now.is_on
+                    yield piece
+                    continue
+                for k in range(len(piece.stamp_ns)):
+                    now, events = _look(now, piece.record(k))
+                    findings.events += events
+                    findings.watched += now.is_on
+                    yield piece.part(slice(k, k + 1))
+                    yield from events
+
+
+def _look(now: Watch, item: JointRecord | JointBlock) -> tuple[Watch, tuple[CaptureEvent, ...]]:
+    """Take a message, or a block of them without a reset; return the events that it revealed."""
+    config, trigger, state, cursor = now.config, now.trigger, now.state, now.cursor
+    if isinstance(item, JointRecord):
+        clock, log, reset = sampling.push(config, now.clock, now.log, item)
+    else:
+        clock, log, reset = sampling.push_whole(config, now.clock, now.log, item)
+    if clock.outputs is None:
+        return now._replace(clock=clock, log=log), ()
+    if state is None or reset:
+        trigger = TriggerParameters(
+            mode='auto', inputs=config.inputs, outputs=clock.outputs, angles=config.angles,
+            arm=config.arm, payload=config.payload)
+        state, cursor = init(trigger), 0
+    state, events = advance(trigger, state, log.rows(cursor, log.end))
+    return Watch(config, clock, log.from_row(first_needed(state)), trigger, state, log.end), events

@@ -341,7 +341,7 @@ def _restart(config: IdentifierParameters, state: StructuredState, m: mem.Filter
     """Begin again after the first of the rows: numbers left the finite range, or a fit failed.
 
     The first fit is that of the simplest arm and of a point; the next ones learn all that they may, and a body. What is
-    held begins with its prior, and the arm with what was learned before the event, or as given if it fails at once again.
+    held begins with its prior, and the arm with what was learned before the event, or as given if that fails at once.
     """
     assert state.model is not None
     assert state.memory is not None

@@ -82,6 +82,19 @@ def signals(config: IdentifierParameters) -> Signals | None:
     return Signals(tuple(roles), angles, torques)
 
 
+def unobservable_reason(config: IdentifierParameters) -> str:
+    """Return why these signals give no payload, in words."""
+    known = signals(config)
+    if known is None:
+        return ('the outputs are not those of a two-link arm: a name that is in neither inputs nor angles is a bend '
+                'sensor, of which there may be two, and no output may be an effort')
+    if not known.angles:
+        return 'angles does not name the position of two joints'
+    if not known.torques:
+        return 'inputs does not name the effort of both joints, in the order of angles'
+    return 'the outputs do not show the bending of both links'
+
+
 def _names(of: tuple[str, ...]) -> tuple[str, ...]:
     """Return the distinct names before the slash, in order of appearance."""
     return tuple(dict.fromkeys(name.rpartition('/')[0] for name in of))

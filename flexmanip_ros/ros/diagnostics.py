@@ -16,7 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from flexmanip_ros.identification.realization import suggested_order
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload.structured_model import signals
+from flexmanip_ros.payload.structured_model import unobservable_reason
 from flexmanip_ros.types import Estimate, Status
 
 OK = 0
@@ -174,19 +174,6 @@ ADVICE = {
 UNANNOUNCED = ('nothing is known of the payload and no capture was announced: publish capture_event, call '
                'capture_trigger/capture, or have captures found in the signals (trigger_mode:=auto)')
 """What to do about an interval of [0, inf] without any event."""
-
-
-def unobservable_reason(config: IdentifierParameters) -> str:
-    """Return why these signals give no payload, in words."""
-    known = signals(config)
-    if known is None:
-        return ('the outputs are not those of a two-link arm: a name that is in neither inputs nor angles is a bend '
-                'sensor, of which there may be two, and no output may be an effort')
-    if not known.angles:
-        return 'angles does not name the position of two joints'
-    if not known.torques:
-        return 'inputs does not name the effort of both joints, in the order of angles'
-    return 'the outputs do not show the bending of both links'
 
 
 def status_line(config: IdentifierParameters, status: Status) -> str:

@@ -10,19 +10,31 @@ from typing import Any
 import numpy as np
 
 from flexmanip_ros import pipeline
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.payload.structured_model import unobservable_reason
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, Payload, Status
 
 ADVICE: Mapping[Status, str] = {
     Status.WARMING_UP: 'record for longer, while the arm moves',
+    Status.TRACKING: 'the estimates can be used',
     Status.POORLY_EXCITED: 'move the arm more, or raise the torque',
     Status.ILL_CONDITIONED: 'lower the order or the past window',
     Status.ORDER_TOO_LOW: 'raise the order',
     Status.SAMPLE_GAP: 'record without losses',
     Status.INCONSISTENT: 'check the parameters arm.* and the time of the capture',
+    Status.NO_PAYLOAD_METHOD: 'for a payload set payload_method=structured and the parameters arm.*',
     Status.UNOBSERVABLE: 'add the torques, angles and bends of both links to inputs, outputs and angles',
     Status.DIVERGED: 'check the units of the signals and the parameters arm.*',
 }
-"""What a user can do where the payload is not reliable."""
+"""What a user can do next."""
+
+
+def status_text(status: Status, config: IdentifierParameters | None = None) -> str:
+    """Return a status in words, with its reason where the configuration shows it, and what to do next."""
+    reason = ''
+    if status is Status.UNOBSERVABLE and config is not None:
+        reason = f': {unobservable_reason(config)}'
+    return f'{status.value.partition(";")[0]}{reason}; {ADVICE[status]}'
 
 
 @dataclass(frozen=True)
@@ -62,12 +74,21 @@ class Summary:
             return 'not estimated'
         status = Status[self.status]
         mass, (low, high) = self.payload_mass_kg, self.payload_ci95_kg
-        reason = '' if status is Status.TRACKING else (
-            f'{status.value.partition(";")[0]}; {ADVICE.get(status, "record again")}')
+        reason = '' if status is Status.TRACKING else status_text(status)
         if mass is None or low is None or high is None:
             return f'not known: {reason or "its interval is unbounded; record for longer, while the arm moves"}'
-        text = f'{mass:.6g} kg, 95 % interval {low:.6g} .. {high:.6g} kg'
-        return f'{text}, not reliable: {reason}' if reason else text
+        interval = f'95 % interval {low:.6g} .. {high:.6g} kg'
+        if reason:
+            return f'not reliable: {mass:.6g} kg, {interval}; {reason}'
+        if self.held_since_s is None and mass == 0.0:
+            return f'none: the arm is taken as empty, {interval}'
+        return f'{mass:.6g} kg, {interval}'
+
+    @property
+    def held_since_s(self) -> float | None:
+        """Time of the capture of what is held at the end [s]; None where nothing is held."""
+        capture, release = self.capture_time_s, self.release_time_s
+        return None if capture is None or (release is not None and release >= capture) else capture
 
 
 def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -> Summary:

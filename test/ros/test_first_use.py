@@ -20,8 +20,9 @@ from std_srvs.srv import Trigger
 from flexmanip_ros import messages
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import yaml_text
+from flexmanip_ros.payload.structured_model import unobservable_reason
 from flexmanip_ros.ros import conversions, diagnostics, qos
-from flexmanip_ros.ros.diagnostics import WARN, LossCounter, Report, unobservable_reason
+from flexmanip_ros.ros.diagnostics import WARN, LossCounter, Report
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.nodes.excitation import Excitation
 from flexmanip_ros.ros.nodes.payload_adapter import PayloadAdapter

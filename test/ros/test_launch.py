@@ -103,6 +103,20 @@ def test_every_argument_is_declared_described_and_used(described: list[Any]) -> 
     assert all(item.kwargs['description'] for item in arguments)
 
 
+@pytest.mark.parametrize('described', [ROOT / 'launch' / 'view.launch.py'], indirect=True, ids=['view.launch.py'])
+def test_the_view_has_the_arm_of_the_parameters_and_a_layout_that_is_installed(described: list[Any]) -> None:
+    arguments = {item.args[0]: item.kwargs for item in described if isinstance(item, DeclareLaunchArgument)}
+    assert all(item['description'] for item in arguments.values())
+    assert Path(arguments['layout']['default_value']) == ROOT / 'config' / 'layouts' / 'arm.rviz'
+    (describe,) = [item.kwargs['function'] for item in described if isinstance(item, OpaqueFunction)]
+    given = {name: item['default_value'] for name, item in arguments.items()}
+    nodes = describe(given)
+    used = {item.args[0] for item in everything(nodes) if isinstance(item, LaunchConfiguration)}
+    assert used | {'params_file'} == set(arguments)
+    assert '<robot name' in nodes[0].kwargs['parameters'][0]['robot_description']
+    assert [node.kwargs['package'] for node in nodes] == ['robot_state_publisher', 'rviz2']
+
+
 @pytest.mark.parametrize('described', FILES, indirect=True, ids=lambda path: path.name)
 def test_what_the_nodes_log_is_seen_on_the_terminal(described: list[Any]) -> None:
     """The payload is logged when it is first trusted."""

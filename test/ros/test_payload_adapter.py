@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
 import rclpy
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Inertia, InertiaStamped, Vector3
 from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
@@ -13,10 +17,17 @@ from ros_harness import Ros, overrides
 from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.io.parameter_file import load
+from flexmanip_ros.messages import payload_status
+from flexmanip_ros.parameters import AdapterParameters, ControllerParameters, IdentifierParameters
 from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.conversions import diagnostic_array
 from flexmanip_ros.ros.nodes import payload_adapter
 from flexmanip_ros.ros.nodes.payload_adapter import PayloadAdapter, fill, rejection, service_class
 from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
+from flexmanip_ros.types import Payload, Status
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def say(ros: Ros, mass: float, std: float) -> tuple[Any, Any]:
@@ -138,11 +149,76 @@ def test_a_request_is_filled_by_its_fields() -> None:
         fill(WithNeither(), body)
 
 
+class Ur(WithInertia):
+    """ur_msgs/srv/SetPayload of Jazzy."""
+
+    fields = {'mass': 'float', 'center_of_gravity': 'geometry_msgs/Vector3', **dict.fromkeys(  # noqa: RUF012
+        ('ixx', 'iyy', 'izz', 'ixy', 'ixz', 'iyz'), 'double'), 'transition_time': 'builtin_interfaces/Duration'}
+
+
+class Franka(WithInertia):
+    """franka_msgs/srv/SetLoad."""
+
+    fields = {'mass': 'double', 'center_of_mass': 'double[3]', 'load_inertia': 'double[9]'}  # noqa: RUF012
+
+
+BODY = Inertia(m=2.0, com=Vector3(x=0.1, y=0.2, z=0.3), ixx=1.0, ixy=2.0, ixz=3.0, iyy=4.0, iyz=5.0, izz=6.0)
+
+
+def test_a_ur_driver_gets_inertia_and_transition_time() -> None:
+    filled = fill(Ur(), BODY, 0.25)
+    assert (filled.mass, filled.center_of_gravity) == (2.0, BODY.com)
+    assert [getattr(filled, name) for name in ('ixx', 'iyy', 'izz', 'ixy', 'ixz', 'iyz')] == [1, 4, 6, 2, 3, 5]
+    assert (filled.transition_time.sec, filled.transition_time.nanosec) == (0, 250_000_000)
+
+
+def test_a_franka_driver_gets_arrays() -> None:
+    filled = fill(Franka(), BODY)
+    assert (filled.mass, filled.center_of_mass) == (2.0, [0.1, 0.2, 0.3])
+    assert filled.load_inertia == [1, 2, 3, 2, 4, 5, 3, 5, 6]
+
+
+@pytest.mark.parametrize(('name', 'service', 'kind'), [
+    ('ur', 'io_and_status_controller/set_payload', 'ur_msgs/srv/SetPayload'),
+    ('franka', 'service_server/set_load', 'franka_msgs/srv/SetLoad')])
+def test_the_parameter_file_of_a_driver_is_one_of_the_adapter(name: str, service: str, kind: str) -> None:
+    config = load(AdapterParameters, 'payload_adapter', ROOT / 'config' / 'drivers' / f'{name}.yaml')
+    assert (config.service, config.service_type) == (service, kind)
+
+
+def test_the_example_for_ros2_control_has_the_names_and_topics_of_the_nodes() -> None:
+    found = yaml.safe_load((ROOT / 'config' / 'ros2_control.yaml').read_text(encoding='utf-8'))
+    manager = found['controller_manager']['ros__parameters']
+    assert {name for name, value in manager.items() if isinstance(value, dict)} == set(found) - {'controller_manager'}
+    efforts = found['effort_controller']['ros__parameters']
+    assert [f"{name}/{efforts['interface_name']}" for name in efforts['joints']] == list(IdentifierParameters().inputs)
+    assert tuple(efforts['joints']) == ControllerParameters().joints
+    assert manager['update_rate'] == ControllerParameters().rate
+
+
+def test_the_consumer_of_the_documentation_takes_a_payload_that_is_trusted_and_no_other(ros: Ros) -> None:
+    text = (ROOT / 'docs' / 'nodes.md').read_text(encoding='utf-8')
+    (code,) = re.findall(r'^```python\n(.*?)^```', text, re.MULTILINE | re.DOTALL)
+    assert code.count('\n') < 30
+    module: dict[str, Any] = {}
+    exec(code, module)
+    publisher = ros.helper.create_publisher(DiagnosticArray, 'rpbsid_identifier/status', qos.latched())
+    held = Payload(20.0, 0.1, 19.8, 20.2, 1.0, Status.TRACKING)
+    publisher.publish(diagnostic_array(payload_status(held, 0, 'tip')))
+    consumer = ros.add(module['Consumer'](context=ros.context))  # later than the payload
+    ros.wait(lambda: consumer.mass == 20.0, what='the latched payload')
+    publisher.publish(diagnostic_array(payload_status(held._replace(status=Status.INCONSISTENT), 0, 'tip')))
+    ros.wait(lambda: consumer.mass is None, what='the doubt')
+
+
 def test_answers_of_drivers_and_nodes_are_understood() -> None:
     class Answer:
         success = False
         message = 'too heavy'
 
     assert rejection(Answer()) == 'too heavy'
+    del Answer.message
+    Answer.error = 'the arm moves'
+    assert rejection(Answer()) == 'the arm moves'
     Answer.success = True
     assert rejection(Answer()) == ''

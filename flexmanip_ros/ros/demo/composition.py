@@ -8,12 +8,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import Executor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
+from visualization_msgs.msg import MarkerArray
 
 from flexmanip_ros import messages
 from flexmanip_ros.errors import BagError, FlexmanipError
@@ -31,6 +33,9 @@ from flexmanip_ros.ros.rclpy_workarounds import make_executor, sequence_number, 
 
 READERS = 4
 """Subscriptions to joint_states here: identifier, trigger, excitation, recorder."""
+SHOWN = {'/rpbsid_identifier/arm': (MarkerArray, 'visualization_msgs/msg/MarkerArray'),
+         '/diagnostics': (DiagnosticArray, 'diagnostic_msgs/msg/DiagnosticArray')}
+"""What is recorded for viewers alone, as it comes; a replay does not repeat it."""
 DISCOVERY_TIMEOUT_S = 20.0
 DRAIN_TIMEOUT_S = 30.0
 """A busy machine works off its backlog; an idle one needs milliseconds."""
@@ -42,7 +47,7 @@ class CompositionError(FlexmanipError):
 
 
 class Recorder(Node):
-    """Writes joint states, commands, events and the identifier's outputs into a bag; counts what it missed.
+    """Writes joint states, commands, events, outputs and diagnostics into a bag; counts what it missed.
 
     In the order of arrival, so that a replay meets events and samples as the identifier did. The bag is closed and
     readable whatever happens.
@@ -66,6 +71,8 @@ class Recorder(Node):
             self.create_subscription(Header, topic, partial(self._on_event, '/' + topic), qos.latched_input())
         for name, (kind, _) in TOPICS.items():
             self.create_subscription(kind, f'/rpbsid_identifier/{name}', partial(self._on_output, name), deep)
+        for topic, (shown, name) in SHOWN.items():
+            self.create_subscription(shown, topic, partial(self._on_shown, topic, name), deep, raw=True)
         self.create_timer(FLUSH_PERIOD_S, self._flush)
 
     def _on_joint_states(self, raw: bytes, info: object) -> None:
@@ -88,12 +95,18 @@ class Recorder(Node):
         self.published[name].append(value)
         self._write(f'/rpbsid_identifier/{name}', value)
 
+    def _on_shown(self, topic: str, kind: str, raw: bytes) -> None:
+        self._record(partial(self.writer.write_raw, data=raw, kind=kind), topic)
+
     def _write(self, topic: str, value: Value, *, latched: bool = False) -> None:
+        self._record(partial(self.writer.write, value=value, latched=latched), topic)
+
+    def _record(self, write: Callable[..., None], topic: str) -> None:
         if self.failure is not None:
             return
         self._log_ns = max(time.time_ns(), self._log_ns)
         try:
-            self.writer.write(topic, self._log_ns, value, latched=latched)
+            write(topic, self._log_ns)
         except BagError as error:
             self._fail(error)
 

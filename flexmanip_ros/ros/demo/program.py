@@ -36,7 +36,8 @@ from flexmanip_ros.parameters.simulation import settings
 from flexmanip_ros.ros import rclpy_workarounds
 from flexmanip_ros.ros.demo.composition import Composition, foreign_arm
 from flexmanip_ros.ros.node import BAD_INPUT
-from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord
+from flexmanip_ros.studies.summary import status_text
+from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, Status
 
 NAME = 'demo'
 LOOK_AROUND_S = 0.5
@@ -146,8 +147,16 @@ class Progress:
         if event is not None:
             words.append(event.kind.value)
         if estimate.payload is not None:
-            words.append(f'payload {estimate.payload.mass:.2f} +- {estimate.payload.std:.2g} kg')
+            words.append(payload_words(estimate.payload))
         return ', '.join(words)
+
+
+def payload_words(payload: Payload) -> str:
+    """Return a payload as the progress shows it; a number only where it is known."""
+    if not np.isfinite(payload.std):
+        return 'payload not known'
+    doubt = '' if payload.status is Status.TRACKING else f' ({payload.status.name})'
+    return f'payload {payload.mass:.2f} +- {payload.std:.2g} kg{doubt}'
 
 
 def parser() -> argparse.ArgumentParser:
@@ -293,9 +302,11 @@ def _table(config: DemoParameters, estimates: Sequence[Estimate], items: Sequenc
     held = [e.payload for e in estimates if e.payload is not None]
     if held and truth.payload is not None:
         last, true = held[-1], 0.0 if config.release_time >= 0.0 else truth.payload
-        table.add_row('payload \\[kg]', f'{last.mass:.3f}', f'{last.lower:.3f} .. {last.upper:.3f}', f'{true:.3f}')
+        known = np.isfinite(last.upper)
+        table.add_row('payload \\[kg]', f'{last.mass:.3f}' if known else 'not known',
+                      f'{last.lower:.3f} .. {last.upper:.3f}' if known else '-', f'{true:.3f}')
         table.add_row('residual power / noise', f'{last.consistency:.2f}', '', '1')
-        table.add_row('status', last.status.value, '', '')
+        table.add_row('status', status_text(last.status), '', '')
     return table
 
 

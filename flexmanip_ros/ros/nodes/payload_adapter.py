@@ -3,8 +3,9 @@
 subscribes  rpbsid_identifier/payload_estimate  std_msgs/Float64MultiArray   whether to trust it
             rpbsid_identifier/payload           geometry_msgs/InertiaStamped what to send
 publishes   /diagnostics                        diagnostic_msgs/DiagnosticArray  1 Hz
-calls       the driver's service (`service`, `service_type`), whose request has a geometry_msgs/Inertia, or
-            `mass` and `center_of_gravity`; with `target_node` its SetParameters for `mass_parameter`
+calls       the driver's service (`service`, `service_type`), whose request has a geometry_msgs/Inertia, or a mass and,
+            where it has places for them, centre of mass, inertia and transition time (UR, Franka);
+            with `target_node` its SetParameters for `mass_parameter`
 
 A payload is sent once it has been trusted for `settle_time`, and again when it changed by `min_change`.
 """
@@ -20,6 +21,7 @@ from typing import Any
 from geometry_msgs.msg import Inertia, InertiaStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
+from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from std_msgs.msg import Float64MultiArray
 
@@ -111,7 +113,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
 
     def _request(self, inertia: Inertia) -> Any:
         if not self.config.target_node:
-            return fill(self._client.srv_type.Request(), inertia)
+            return fill(self._client.srv_type.Request(), inertia, self.config.transition_time)
         parameter = Parameter(self.config.mass_parameter, value=float(inertia.m))
         return SetParameters.Request(parameters=[parameter.to_parameter_msg()])
 
@@ -160,21 +162,39 @@ def service_class(name: str) -> Any:
                              f'install and source the package {package}') from error
 
 
-def fill(request: Any, inertia: Inertia) -> Any:
-    """Put a payload into a driver's request. Raises ParameterError when it has no place for one."""
+INERTIA = ('ixx', 'iyy', 'izz', 'ixy', 'ixz', 'iyz')
+
+
+def fill(request: Any, inertia: Inertia, transition_time: float = 0.0) -> Any:
+    """Put a payload into a driver's request, by the fields that it has.
+
+    A geometry_msgs/Inertia; or a mass with, where there are places for them, the centre of mass (Vector3 or three
+    numbers), the inertia about it (six numbers by name, or nine of a matrix) and the transition time [s].
+    Raises ParameterError when it has no place for a payload.
+    """
     fields = request.get_fields_and_field_types()
     for name, kind in fields.items():
         if kind == 'geometry_msgs/Inertia':
             setattr(request, name, inertia)
             return request
     mass = next((name for name in ('mass', 'payload') if fields.get(name) in ('float', 'double')), None)
-    centre = next((name for name, kind in fields.items() if kind == 'geometry_msgs/Vector3'), None)
     if mass is None:
         raise ParameterError(f'a request with {", ".join(fields)} has no place for a payload',
                              'give a service_type with a geometry_msgs/Inertia or a mass')
     setattr(request, mass, float(inertia.m))
-    if centre is not None:
-        setattr(request, centre, inertia.com)
+    com = inertia.com
+    for name, kind in fields.items():
+        if kind == 'geometry_msgs/Vector3':
+            setattr(request, name, com)
+        elif kind == 'double[3]':
+            setattr(request, name, [com.x, com.y, com.z])
+        elif kind == 'double[9]':  # symmetric: by rows or by columns is the same
+            i = inertia
+            setattr(request, name, [i.ixx, i.ixy, i.ixz, i.ixy, i.iyy, i.iyz, i.ixz, i.iyz, i.izz])
+        elif kind == 'builtin_interfaces/Duration':
+            setattr(request, name, Duration(seconds=transition_time).to_msg())
+        elif name in INERTIA and kind in ('float', 'double'):
+            setattr(request, name, float(getattr(inertia, name)))
     return request
 
 
@@ -182,8 +202,10 @@ def rejection(response: Any) -> str:
     """Return why a driver or a node rejected a request; empty when it accepted it."""
     results = getattr(response, 'results', None)
     answer = results[0] if results else response
-    good = getattr(answer, 'success', getattr(answer, 'successful', True))
-    return '' if good else getattr(answer, 'reason', getattr(answer, 'message', '')) or 'no reason given'
+    if getattr(answer, 'success', getattr(answer, 'successful', True)):
+        return ''
+    return next((text for text in (getattr(answer, name, '') for name in ('reason', 'message', 'error')) if text),
+                'no reason given')
 
 
 def main(argv: list[str] | None = None) -> int:

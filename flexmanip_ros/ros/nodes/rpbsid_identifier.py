@@ -4,12 +4,14 @@ subscribes  joint_states      sensor_msgs/JointState  best effort, depth 1000; m
             capture_event     std_msgs/Header         an event commanded or known
             capture_detected  std_msgs/Header         an event inferred from the signals
 publishes   ~/model           std_msgs/Float64MultiArray  [[A, B, K], [C, D, I]]; latched
-            ~/modes           std_msgs/Float64MultiArray  damped frequency [Hz], damping ratio
+            ~/modes           std_msgs/Float64MultiArray  damped frequency [Hz], damping ratio; order // 2 rows
+            ~/modes_interval  std_msgs/Float64MultiArray  their lower and upper 95 %
             ~/payload_mass    std_msgs/Float64            kg; nothing while nothing is known
             ~/payload_estimate std_msgs/Float64MultiArray mass, std, 95 % interval, consistency; latched
             ~/payload_body     std_msgs/Float64MultiArray mass, centre of mass, inertia, and their covariance; latched
             ~/arm_parameters   std_msgs/Float64MultiArray what the empty arm taught: values, deviations; 1 Hz, latched
             ~/payload         geometry_msgs/InertiaStamped at the stamp of the sample that gave it; latched
+            ~/arm             visualization_msgs/MarkerArray  25 Hz: links, object, its mass; only if somebody listens
             ~/status          diagnostic_msgs/DiagnosticArray stamp, status and numbers of payload or model; latched
             /diagnostics      diagnostic_msgs/DiagnosticArray  1 Hz
 services    rpbsid_identifier/reset   std_srvs/Trigger   forget everything
@@ -27,11 +29,13 @@ from geometry_msgs.msg import InertiaStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
 from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
 
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.errors import CheckpointError, FlexmanipError, SignalError
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.arm_markers import ArmMarkers
 from flexmanip_ros.ros.background import Background, CheckpointWriter, too_old, warm_up
 from flexmanip_ros.ros.conversions import JointStateReader, capture_event, to_message
 from flexmanip_ros.ros.diagnostics import (
@@ -51,11 +55,15 @@ from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, 
 NAME = 'rpbsid_identifier'
 TOPICS = {
     messages.MODEL: (Float64MultiArray, qos.latched), messages.MODES: (Float64MultiArray, qos.output),
+    messages.MODES_INTERVAL: (Float64MultiArray, qos.output),
     messages.PAYLOAD_MASS: (Float64, qos.output), messages.PAYLOAD_ESTIMATE: (Float64MultiArray, qos.latched),
     messages.PAYLOAD: (InertiaStamped, qos.latched), messages.PAYLOAD_BODY: (Float64MultiArray, qos.latched),
     messages.STATUS: (DiagnosticArray, qos.latched), messages.ARM_PARAMETERS: (Float64MultiArray, qos.latched),
 }
 """Type and quality of service of each output."""
+ARM = 'arm'
+ARM_RATE = 25.0
+"""Pictures of the arm a second [Hz]."""
 
 
 class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
@@ -79,6 +87,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self._resumed = False
         self._logged: dict[str, object] = {}
         """What was last logged of status, trusted payload and missing announcement."""
+        self._latest: JointRecord | None = None
+        """The latest joint state that is not drawn yet."""
 
     def make_entities(self) -> None:
         """Publishers, subscriptions and the reset service."""
@@ -88,6 +98,10 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         for topic in ('capture_event', 'capture_detected'):
             self.subscription(Header, topic, partial(self._on_event, topic), qos.latched_input())
         self.create_service(Trigger, '~/reset', self._on_reset)
+        self._markers = ArmMarkers(self.config)
+        if self._markers.drawn:
+            self.arm = self.publisher(MarkerArray, f'~/{ARM}', qos.output())
+            self.create_timer(1.0 / ARM_RATE, self._draw, clock=self._steady)
 
     def start(self) -> None:
         """Compile or load every kernel before the first sample; begin with nothing known, or from a checkpoint."""
@@ -141,6 +155,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             except SignalError as error:
                 self._reject('encoding', str(error))
                 return
+            self._latest = record
             if self._resumed:
                 self._check_age(record.stamp_ns)
             self._step(record)
@@ -184,6 +199,15 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
                 self.outputs[name].publish(to_message(value))
                 self.published += 1
             self.estimate = estimate
+
+    def _draw(self) -> None:
+        """Publish the arm as it is now, if anybody looks."""
+        record, self._latest = self._latest, None
+        if not self.active or record is None or self.arm.get_subscription_count() == 0:
+            return
+        payload = None if self.estimate is None else self.estimate.payload
+        if self._markers.update(record, payload):
+            self.arm.publish(self._markers.message)
 
     def _check_age(self, stamp_ns: int) -> None:
         """Drop a saved state that is too old for these samples: the arm may hold something else by now."""

@@ -1,0 +1,126 @@
+"""The arm and what it holds as markers for RViz, Lichtblick and Foxglove.
+
+The messages are made once and then only filled: that takes 0.1 ms, to publish them 0.2 ms.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from geometry_msgs.msg import Point
+from visualization_msgs.msg import Marker, MarkerArray
+
+from flexmanip_ros.arm.drawing import POINTS, draw
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.payload.structured_model import Quantity, signals
+from flexmanip_ros.ros.conversions import time_message
+from flexmanip_ros.studies.summary import ADVICE
+from flexmanip_ros.types import JointRecord, Payload, Status
+
+LINK_COLOURS = (0.0, 0.45, 0.70), (0.84, 0.37, 0.0)
+TRUSTED, DOUBTFUL, JOINT = (0.0, 0.62, 0.45), (0.90, 0.62, 0.0), (0.3, 0.3, 0.3)
+"""Red, green and blue of Okabe and Ito's colours."""
+DENSITY = 1000.0
+"""The object is drawn as a ball of this density [kg/m^3], that of water."""
+THICKNESS = 1.0 / 60.0
+"""Width of a link and radius of a joint, as a fraction of the arm's length."""
+
+
+class ArmMarkers:
+    """Fills the markers of one arm: links, joints, the object, its mass as text."""
+
+    def __init__(self, config: IdentifierParameters) -> None:
+        """Make the messages. ``drawn`` is False where the signals are not those of the arm."""
+        self._config = config
+        known = signals(config)
+        self.drawn = known is not None and known.angles
+        links = len(config.arm.link_length)
+        self._bends: list[str | None] = [None] * links
+        if known is not None:
+            for role, name in zip(known.outputs, config.outputs, strict=True):
+                if role.quantity is Quantity.BEND:
+                    self._bends[role.link] = name.rpartition('/')[0]
+        self._joints = [name.rpartition('/')[0] for name in config.angles]
+        reach = sum(config.arm.link_length)
+        width = THICKNESS * reach
+        self._links = [_marker('link', k, Marker.LINE_STRIP, (width, 0.0, 0.0), LINK_COLOURS[k])
+                       for k in range(links)]
+        for link in self._links:
+            link.points = [Point() for _ in range(POINTS)]
+        self._ends = _marker('joint', 0, Marker.SPHERE_LIST, (2.0 * width,) * 3, JOINT)
+        self._ends.points = [Point() for _ in range(links + 1)]
+        self._object = _marker('object', 0, Marker.SPHERE, (width,) * 3, TRUSTED)
+        self._text = _marker('payload', 0, Marker.TEXT_VIEW_FACING, (0.0, 0.0, 2.0 * width), JOINT)
+        self._above = 4.0 * width
+        self.message = MarkerArray(markers=[*self._links, self._ends, self._object, self._text])
+
+    def update(self, record: JointRecord, payload: Payload | None) -> bool:
+        """Fill ``message``; return False where the record lacks an angle or has a value that is not finite."""
+        found = {name: k for k, name in enumerate(record.names) if k < record.position.size}
+        if any(name not in found for name in self._joints):
+            return False
+        angles = record.position[[found[name] for name in self._joints]]
+        bends = np.array([record.position[found[name]] if name in found else 0.0 for name in self._bends])
+        if not (np.isfinite(angles).all() and np.isfinite(bends).all()):
+            return False
+        drawing = draw(self._config.arm, angles, bends)
+        stamp = time_message(record.stamp_ns)
+        for marker in self.message.markers:
+            marker.header.stamp = stamp
+            marker.header.frame_id = self._config.base_frame
+        for marker, line in zip(self._links, drawing.links.tolist(), strict=True):
+            _place(marker.points, line)
+        _place(self._ends.points, [[0.0, 0.0], *drawing.links[:, -1].tolist()])
+        self._held(payload, drawing.links[-1, -1], drawing.tip_angle)
+        return True
+
+    def _held(self, payload: Payload | None, tip: np.ndarray, angle: float) -> None:
+        """Show the object where its mass is known, and what is known of it as text."""
+        known = payload is not None and math.isfinite(payload.std)
+        shown = payload is not None and known and payload.mass > 0.0
+        self._object.action = Marker.ADD if shown else Marker.DELETE
+        trusted = payload is not None and known and payload.status is Status.TRACKING
+        colour = TRUSTED if trusted else DOUBTFUL
+        x, y = float(tip[0]), float(tip[1])
+        if payload is not None and shown:
+            size = (6.0 * payload.mass / (math.pi * DENSITY)) ** (1.0 / 3.0)
+            c, s = math.cos(angle), math.sin(angle)
+            centre, scale = self._object.pose.position, self._object.scale
+            centre.x = x + c * payload.com[0] - s * payload.com[1]
+            centre.y = y + s * payload.com[0] + c * payload.com[1]
+            scale.x = scale.y = scale.z = size
+            _paint(self._object, colour)
+        _paint(self._text, colour)
+        self._text.pose.position.x, self._text.pose.position.y = x, y + self._above
+        self._text.text = words(payload)
+
+
+def words(payload: Payload | None) -> str:
+    """Return the payload as the text beside the arm; a number only where it is known."""
+    if payload is None:
+        return ''
+    if not math.isfinite(payload.std):
+        return f'payload not known: {ADVICE[payload.status]}'
+    text = f'{payload.mass:.2f} kg (95 %: {payload.lower:.2f} to {payload.upper:.2f})'
+    return text if payload.status is Status.TRACKING else f'not reliable: {text}'
+
+
+def _marker(space: str, number: int, kind: int, size: tuple[float, float, float], colour: tuple[float, float, float]
+            ) -> Marker:
+    made = Marker(ns=space, id=number, type=kind, action=Marker.ADD)
+    made.pose.orientation.w = 1.0
+    made.scale.x, made.scale.y, made.scale.z = size
+    _paint(made, colour)
+    return made
+
+
+def _paint(marker: Marker, colour: tuple[float, float, float]) -> None:
+    rgba = marker.color
+    rgba.r, rgba.g, rgba.b = colour
+    rgba.a = 1.0
+
+
+def _place(points: list[Point], line: list[list[float]]) -> None:
+    for point, (x, y) in zip(points, line, strict=True):
+        point.x, point.y = x, y
