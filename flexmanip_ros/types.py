@@ -55,6 +55,12 @@ class JointBlock(NamedTuple):
         """Return message number k."""
         return JointRecord(int(self.stamp_ns[k]), self.names, self.position[k], self.velocity[k], self.effort[k])
 
+    @classmethod
+    def of(cls, record: JointRecord) -> JointBlock:
+        """Return a block of one message."""
+        return cls(record.names, np.array([record.stamp_ns]), record.position[None], record.velocity[None],
+                   record.effort[None])
+
 
 class Sample(NamedTuple):
     """One instant of the configured signals, in JointState units.

@@ -146,8 +146,7 @@ class _Messages:
             yield event
 
     def _joint_states(self, item: JointBlock | JointRecord) -> Iterator[pipeline.Item]:
-        block = item if isinstance(item, JointBlock) else JointBlock(
-            item.names, np.array([item.stamp_ns]), item.position[None], item.velocity[None], item.effort[None])
+        block = item if isinstance(item, JointBlock) else JointBlock.of(item)
         self.foreign += len(block.stamp_ns) * self._joints.isdisjoint(block.names)
         if self.is_kept:
             self._clock, self._log, _ = sampling.push_whole(self._request.config, self._clock, self._log, block)

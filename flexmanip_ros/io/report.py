@@ -22,6 +22,7 @@ from flexmanip_ros.studies.metrics import Score, score
 from flexmanip_ros.studies.summary import Summary
 from flexmanip_ros.studies.trial import Row
 from flexmanip_ros.types import StateSpace, Status
+from flexmanip_ros.view import looks
 
 SHOWN_FAILURES = 50
 """Failed runs listed at most."""
@@ -141,8 +142,8 @@ def errors(rows: Sequence[Row]) -> Figure | None:
     relative = [100.0 * (part - true) / true for part in (mass, low, high)]
     covered = np.array([bool(row['covered']) for row in good])
     drawn, axes = plots.figure([3.4], share_time=False)
-    for chosen, colour, mark, label in ((covered, plots.PAYLOAD_COLOUR, 'o', 'truth inside\nthe 95 % interval'),
-                                        (~covered, plots.EVENT_COLOUR, 'x', 'truth outside')):
+    for chosen, colour, mark, label in ((covered, looks.PAYLOAD_COLOUR, 'o', 'truth inside\nthe 95 % interval'),
+                                        (~covered, looks.EVENT_COLOUR, 'x', 'truth outside')):
         if chosen.any():
             axes[0].vlines(true[chosen], relative[1][chosen], relative[2][chosen], color=colour, alpha=0.5)
             axes[0].plot(true[chosen], relative[0][chosen], mark, markersize=4, color=colour, label=label)

@@ -140,7 +140,7 @@ class IdentifierParameters:
     def __post_init__(self) -> None:
         check_all(self)
         for group in ('inputs', 'outputs', 'angles'):
-            _check_signals(group, getattr(self, group))
+            check_signals(group, getattr(self, group))
         for group in ('inputs', 'outputs'):
             if not getattr(self, group):
                 raise ParameterError(f"parameter '{group}' is empty", 'name at least one NAME/FIELD')
@@ -158,7 +158,7 @@ class IdentifierParameters:
                 f'it cannot exceed future_window x outputs ({self.future_window * len(self.outputs)})')
 
 
-def _check_signals(group: str, names: tuple[str, ...]) -> None:
+def check_signals(group: str, names: tuple[str, ...]) -> None:
     for name in names:
         joint, _, what = name.rpartition('/')
         if not joint or what not in FIELDS:
