@@ -6,6 +6,7 @@ import argparse
 import sys
 import threading
 from collections.abc import Sequence
+from pathlib import Path
 
 from flexmanip_ros.cli import console
 from flexmanip_ros.io.parameter_file import load
@@ -69,7 +70,7 @@ def _play(options: argparse.Namespace) -> int:
     from flexmanip_ros.view.server import Server
 
     config = load(IdentifierParameters, 'rpbsid_identifier', options.params, options.set)
-    source = of_identifier(config, options.bag)
+    source = of_identifier(config, Path(options.bag).name)
     with console.progress('identifying', 'messages') as progress:
         items = bag.read_blocks(options.bag, bag.Topics(options.joint_states), progress)
         found, fault = recording.read(config, items, source)
@@ -77,7 +78,7 @@ def _play(options: argparse.Namespace) -> int:
         console.print_error(PROG, fault)
     server = Server(page(source, found, options.speed), options.port)
     try:
-        print(f'open {server.url} in a browser on this machine; Ctrl-C ends', flush=True)
+        print(f'{server.invitation}; Ctrl-C ends', flush=True)
         threading.Event().wait()
     except KeyboardInterrupt:
         return console.SUCCESS

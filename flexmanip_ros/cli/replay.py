@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from flexmanip_ros import pipeline
 from flexmanip_ros.cli.console import require_matplotlib
 from flexmanip_ros.errors import BagError, FlexmanipError, ParameterError

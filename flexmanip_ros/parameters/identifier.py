@@ -159,6 +159,7 @@ class IdentifierParameters:
 
 
 def check_signals(group: str, names: tuple[str, ...]) -> None:
+    """Raise ParameterError for a signal that is not NAME/FIELD, or named twice in a group."""
     for name in names:
         joint, _, what = name.rpartition('/')
         if not joint or what not in FIELDS:

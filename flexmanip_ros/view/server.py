@@ -7,6 +7,7 @@ page that is slower than that is let go: it connects again by itself and begins 
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import socket
@@ -31,7 +32,8 @@ STUCK_S = 5.0
 """A page that takes no byte for so long is let go."""
 BEAT_S = 1.0
 """An event at least so often, so that a page that has gone is noticed."""
-POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'"
+POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; " \
+    "img-src data:"
 
 
 class ViewError(FlexmanipError):
@@ -130,6 +132,11 @@ class Server:
         """Where the page is."""
         return f'http://{HOST}:{self.port}/'
 
+    @property
+    def invitation(self) -> str:
+        """What to tell a person."""
+        return f'open {self.url} in a browser on this machine'
+
     def respond(self, handler: _Handler) -> None:
         """Answer one GET."""
         host = handler.headers.get('Host', '').rpartition(':')[0]
@@ -176,10 +183,8 @@ class Server:
         self._http.shutdown()
         with self._lock:
             for connection in self._connections:
-                try:
+                with contextlib.suppress(OSError):
                     connection.shutdown(socket.SHUT_RDWR)  # ends a write to a page that reads nothing
-                except OSError:
-                    pass
         self._http.server_close()  # joins the threads of the pages
         self._thread.join()
 

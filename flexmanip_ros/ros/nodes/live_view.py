@@ -64,7 +64,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
 
     def summary(self) -> str:
         """Say where the page is."""
-        return '' if self.server is None else f'open {self.server.url} in a browser on this machine'
+        return '' if self.server is None else self.server.invitation
 
     def activated(self) -> None:
         """Serve the page. Raises ViewError when the port cannot be had."""
@@ -73,6 +73,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
         self._heard: float | None = None
         self._beaten = self._asked = time.monotonic()
         self.server = Server(page(self._screen.source), self.config.port, self._state)
+        print(f'{NAME}: {self.server.invitation}', flush=True)
 
     def deactivated(self) -> None:
         """Let every page go."""
