@@ -20,6 +20,7 @@ from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies import holdout
 from flexmanip_ros.studies.summary import Summary, summarize
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Mode
+from flexmanip_ros.view.screen import Screen, of_identifier
 
 NEVER = (1 << 63) - 1
 """A stamp after all others [ns]."""
@@ -117,6 +118,8 @@ class _Messages:
         self.events: list[CaptureEvent] = []
         self.is_kept = request.report is not None or request.validate_from is not None
         self._clock, self._log = sampling.Clock(), sampling.EMPTY
+        self.screen = Screen(of_identifier(request.config, Path(request.bag).name))
+        """What the page in the report shows."""
         self._request = request
         self._progress = progress
         config = request.config
@@ -148,6 +151,8 @@ class _Messages:
         self.foreign += len(block.stamp_ns) * self._joints.isdisjoint(block.names)
         if self.is_kept:
             self._clock, self._log, _ = sampling.push_whole(self._request.config, self._clock, self._log, block)
+        if self._request.report is not None:
+            self.screen.joint_states(block)
         if self.first_ns is None:
             self.first_ns = int(block.stamp_ns[0])
             yield from self._known_events(self.first_ns)
@@ -216,6 +221,7 @@ def _report(request: Request, summary: Summary, messages: _Messages, kept: list[
             fault: FlexmanipError | None) -> None:
     from flexmanip_ros.io import plots, report
     from flexmanip_ros.studies.metrics import payload_bound
+    from flexmanip_ros.view import recording
 
     assert request.report is not None
     config = state.config or request.config
@@ -226,4 +232,5 @@ def _report(request: Request, summary: Summary, messages: _Messages, kept: list[
     counts: dict[str, Any] = {**state.counters._asdict(), 'dropped': state.counters.dropped}
     report.identification_report(
         request.report, Path(request.bag).name, config, summary, made,
-        None if last is None else last.model, scores, counts, bound, '' if fault is None else str(fault))
+        None if last is None else last.model, scores, counts, bound, '' if fault is None else str(fault),
+        recording.embedded(messages.screen, messages.events, kept))

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from flexmanip_ros.io import plots
-from flexmanip_ros.io.html import Section, matrix, number, page, picture, table
+from flexmanip_ros.io.html import Section, frame, matrix, number, page, picture, table
 from flexmanip_ros.io.outputs import write_text
 from flexmanip_ros.parameters import IdentifierParameters, flatten
 from flexmanip_ros.parameters.document import written
@@ -31,10 +31,12 @@ SHOWN_FAILURES = 50
 def identification_report(
     path: str | Path, source: str, config: IdentifierParameters, summary: Summary, made: plots.Run,
     model: StateSpace | None, scores: Scores | None, messages: dict[str, int], bound: float | None = None,
-    fault: str = '',
+    fault: str = '', player: str = '',
 ) -> None:
-    """Write the report of identify_bag."""
+    """Write the report of identify_bag. player: the page that plays the recording."""
     sections = [Section('Result', _result(summary, made.signals.outputs, bound, fault)),
+                *([Section('Replay', frame(player, 'the arm, its signals, modes and payload over time'))] if player
+                  else []),
                 Section('Signals', picture(
                     plots.signals_figure(made), 'torques and measured signals over time'))]
     if any(estimate.modes for estimate in made.estimates):

@@ -9,10 +9,12 @@ from flexmanip_ros import messages, pipeline
 from flexmanip_ros.errors import BagError
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.types import CaptureEvent, Estimate, JointBlock
-from flexmanip_ros.view.screen import Screen, Source
+from flexmanip_ros.view.screen import Screen, Source, page
 
 MOST_ROWS = 1_000_000
 """Samples that a page on this machine gets: a quarter of an hour at 1 kHz without thinning."""
+EMBEDDED_ROWS = 40_000
+"""Samples inside a report, which is to stay below some megabytes."""
 
 
 def show(screen: Screen, estimate: Estimate) -> None:
@@ -23,7 +25,7 @@ def show(screen: Screen, estimate: Estimate) -> None:
 
 
 def read(config: IdentifierParameters, items: Iterable[JointBlock | CaptureEvent], source: Source
-         ) -> tuple[dict[str, Any] | None, BagError | None]:
+         ) -> tuple[dict[str, Any], BagError | None]:
     """Identify a recording; return what the page shows of it, and what was wrong with it.
 
     Of a damaged recording everything before the damage is shown. Raises SignalError when no message can be used, and
@@ -49,4 +51,13 @@ def read(config: IdentifierParameters, items: Iterable[JointBlock | CaptureEvent
     for _, estimate in pipeline.replay(config, tapped()):
         if estimate is not None:
             show(screen, estimate)
-    return screen.frame(MOST_ROWS), fault
+    return screen.frame(MOST_ROWS) or {}, fault
+
+
+def embedded(screen: Screen, events: Iterable[CaptureEvent], estimates: Iterable[Estimate]) -> str:
+    """Return a page with a recording inside, for a report. screen: it has the joint states already."""
+    for event in events:
+        screen.event(event)
+    for estimate in estimates:
+        show(screen, estimate)
+    return page(screen.source, screen.frame(EMBEDDED_ROWS) or {}, playing=False)

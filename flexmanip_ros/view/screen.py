@@ -31,9 +31,8 @@ SAME_EVENT_S = 0.2
 """An event that is announced and also found in the signals is shown once."""
 LATEST_INTERVALS = 64
 """Intervals whose median is the sample time."""
-MOST_ROWS = 40_000
-"""Samples of a recording inside a report: more are reduced to their extremes."""
 MOST_ESTIMATES = 10_000
+"""Payloads, and models, of a recording: of more every n-th is shown."""
 PAYLOAD_NUMBERS = ('mass_kg', 'std_kg', 'lower95_kg', 'upper95_kg', 'consistency')
 STATUSES = {status.name: index for index, status in enumerate(Status)}
 SPACE_FOR = '"insert the layout here"', '"insert the recording here"'
@@ -234,10 +233,13 @@ def thinned(rows: Array, most: int) -> Array:
     return np.concatenate([made.reshape(-1, rows.shape[1]), rows[count * size:][-1:]])
 
 
-def page(source: Source, recording: dict[str, Any] | None = None, speed: float = 1.0) -> str:
-    """Return the whole page; with a recording inside it needs no server."""
+def page(source: Source, recording: dict[str, Any] | None = None, speed: float = 1.0, *, playing: bool = True) -> str:
+    """Return the whole page; with a recording inside it needs no server.
+
+    playing: a recording begins at once; else its end is shown first.
+    """
     text = resources.files('flexmanip_ros.view').joinpath('page.html').read_text(encoding='utf-8')
-    layout = source.layout() | {'speed': speed}
+    layout = source.layout() | {'speed': speed, 'playing': playing}
     for place, value in zip(SPACE_FOR, (layout, recording), strict=True):
         # A text that ends the script element would end it inside a string too.
         text = text.replace(place, encoded(value).replace('<', '\\u003c'), 1)
