@@ -11,6 +11,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+from collections import deque
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -33,6 +34,9 @@ LATEST_INTERVALS = 64
 """Intervals whose median is the sample time."""
 MOST_ESTIMATES = 10_000
 """Payloads, and models, of a recording: of more every n-th is shown."""
+MOST_EVENTS = 200
+LARGEST = 3e38
+"""What a float32 can hold."""
 PAYLOAD_NUMBERS = ('mass_kg', 'std_kg', 'lower95_kg', 'upper95_kg', 'consistency')
 STATUSES = {status.name: index for index, status in enumerate(Status)}
 SPACE_FOR = '"insert the layout here"', '"insert the recording here"'
@@ -98,7 +102,7 @@ def of_identifier(config: IdentifierParameters, words: str) -> Source:
 
 
 class Screen:
-    """Takes messages, gives frames. Nothing is kept beyond the next frame but the events of the run."""
+    """Takes messages, gives frames. Nothing is kept beyond the next frame but the latest events."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -117,8 +121,8 @@ class Screen:
         self._rows: list[Array] = []
         self._payloads: list[tuple[int, list[Any]]] = []
         self._models: list[tuple[int, list[Any]]] = []
-        self._events: list[CaptureEvent] = []
-        self._shown_events = 0
+        self._known: deque[CaptureEvent] = deque(maxlen=MOST_EVENTS)
+        self._events: deque[CaptureEvent] = deque(maxlen=MOST_EVENTS)
 
     def joint_states(self, block: JointBlock) -> None:
         """Take joint states. Stamps that do not advance are left out; a jump back begins a new run."""
@@ -129,9 +133,10 @@ class Screen:
             k = int(back[0])
             if k:
                 self.joint_states(_part(block, slice(0, k)))
-            events = [event for event in self._events if event.stamp_ns >= stamps[k]]
+            ahead = [event for event in self._known if event.stamp_ns >= stamps[k]]
             self._begin()
-            self._events = events
+            for event in ahead:
+                self.event(event)
             self.joint_states(_part(block, slice(k, None)))
             return
         self.samples += len(stamps)
@@ -158,7 +163,7 @@ class Screen:
         for column, place in enumerate(self._places[1]):
             if place is not None and place[1] < getattr(block, place[0]).shape[1]:
                 values[:, column] = getattr(block, place[0])[:, place[1]]
-        values[~np.isfinite(values)] = np.nan
+        values[~(np.abs(values) <= LARGEST)] = np.nan
         return values
 
     def _with_gaps(self, rows: Array, before_ns: int | None) -> Array:
@@ -180,7 +185,8 @@ class Screen:
     def event(self, event: CaptureEvent) -> None:
         """Take a capture or release, announced or found in the signals."""
         if not any(known.kind is event.kind and abs(known.stamp_ns - event.stamp_ns) <= SAME_EVENT_S * 1e9
-                   for known in self._events):
+                   for known in self._known):
+            self._known.append(event)
             self._events.append(event)
 
     def status(self, message: Diagnostics) -> None:
@@ -193,6 +199,7 @@ class Screen:
     def frame(self, most_rows: int | None = None) -> dict[str, Any] | None:
         """Return what came since the frame before; None when that is nothing. most_rows: thin a longer run out."""
         if self.first_ns is None:  # without a first sample there is no time 0
+            del self._payloads[:-1], self._models[:-1]
             return None
         first_ns, frame = self.first_ns, dict[str, Any]()
         if self._rows:
@@ -206,11 +213,11 @@ class Screen:
             if found:
                 step = 1 if most_rows is None else -(-len(found) // MOST_ESTIMATES)
                 frame[name] = [[(stamp - first_ns) * 1e-9, *row] for stamp, row in found[::-step][::-1]]
-        if len(self._events) > self._shown_events:
+        if self._events:
             frame['events'] = [[(event.stamp_ns - first_ns) * 1e-9, event.kind is EventKind.CAPTURE]
-                               for event in self._events[self._shown_events:]]
+                               for event in self._events]
         self._rows, self._payloads, self._models = [], [], []
-        self._shown_events = len(self._events)
+        self._events.clear()
         return frame or None
 
 

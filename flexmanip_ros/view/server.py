@@ -27,6 +27,7 @@ HISTORY_S = 35.0
 """A page that opens late is shown at least its longest window."""
 MOST_BYTES = 64_000_000
 """Bytes of history at most."""
+MOST_LASTING = 200
 MOST_PAGES = 16
 STUCK_S = 5.0
 """A page that takes no byte for so long is let go."""
@@ -45,7 +46,7 @@ class Feed:
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._lasting: list[bytes] = []
+        self._lasting: deque[bytes] = deque(maxlen=MOST_LASTING)
         """Events that a page needs whenever it opens."""
         self._recent: deque[tuple[float, bytes]] = deque()
         self._bytes = 0
@@ -70,8 +71,9 @@ class Feed:
     def reset(self) -> None:
         """Begin again: what was sent before is of another run."""
         with self._changed:
-            self._lasting, self._bytes = [], 0
+            self._lasting.clear()
             self._recent.clear()
+            self._bytes = 0
         self.publish('reset', '{}')
 
     def greeting(self) -> tuple[int, bytes]:

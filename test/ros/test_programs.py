@@ -19,7 +19,7 @@ from flexmanip_ros.errors import BagError
 from flexmanip_ros.io import bag
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
-NODES = ('plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier')
+NODES = ('plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'live_view')
 
 
 def module(name: str) -> str:

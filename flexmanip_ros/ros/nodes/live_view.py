@@ -18,6 +18,7 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
@@ -54,7 +55,8 @@ class LiveView(FlexmanipNode[ViewParameters]):
         self._joint_states = Batches(self, self.subscription(
             JointState, 'joint_states', _unused, qos.sensor_input(), raw=True, matched=self.losses.matched))
         self._statuses = Batches(self, self.subscription(
-            DiagnosticArray, f'{self.config.identifier}/status', _unused, qos.latched_input(qos.SENSOR_DEPTH)))
+            DiagnosticArray, f'{self.config.identifier}/status', _unused, qos.latched_input(qos.SENSOR_DEPTH),
+            raw=True))
         for topic in ('capture_event', 'capture_detected'):
             self.subscription(Header, topic, self._on_event, qos.latched_input())
         self._timer = self.create_timer(1.0 / self.config.rate, self._update, clock=self._steady)
@@ -122,7 +124,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
         for raw, info in self._joint_states.take():
             self.losses.note(sequence_number(info))
             raws.append(raw)
-        statuses = [message for message, _ in self._statuses.take()]
+        statuses = [raw for raw, _ in self._statuses.take()]
         if not self.active:
             return
         while raws:
@@ -133,8 +135,11 @@ class LiveView(FlexmanipNode[ViewParameters]):
                 continue
             self._screen.joint_states(block)
             raws = raws[len(block.stamp_ns):]
-        for message in statuses:
-            self._screen.status(diagnostics(message))
+        for raw in statuses:
+            try:
+                self._screen.status(diagnostics(deserialize_message(raw, DiagnosticArray)))
+            except (RuntimeError, MemoryError):  # the errors of the middleware
+                self.log_throttled('status', 'a status that is no DiagnosticArray was dropped')
 
     def _take_one(self, raw: bytes) -> None:
         """Hand over a message of another encoding."""
