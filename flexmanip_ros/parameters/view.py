@@ -19,7 +19,7 @@ class ViewParameters:
     """What the live page shows and where. Signals and arm have the names that they have for the identifier."""
 
     port: int = parameter(PORT, 'port of the page on this machine; 0: any that is free', low=0, high=65535)
-    rate: float = parameter(30.0, 'updates of the page a second', unit='Hz', low=1.0, high=60.0)
+    rate: float = parameter(25.0, 'updates of the page a second', unit='Hz', low=1.0, high=60.0)
     window: int = parameter(10, 'time that the plots show at first: 5, 10 or 30', unit='s', low=5, high=30)
     exaggeration: float = parameter(
         20.0, 'factor by which the links are drawn more bent than they are, at first', low=1.0, high=100.0)

@@ -29,9 +29,9 @@ def latched() -> QoSProfile:
     return _profile(1, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def latched_input(depth: int = 10) -> QoSProfile:
+def latched_input() -> QoSProfile:
     """Read what is latched, deeper than it is written: two events in quick succession both arrive."""
-    return _profile(depth, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
+    return _profile(10, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def output() -> QoSProfile:

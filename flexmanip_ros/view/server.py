@@ -114,6 +114,8 @@ class Server:
         self._page = page.encode()
         self._state = state
         self._lock = threading.Lock()
+        self._closed = threading.Condition(self._lock)
+        """Notified when a page has gone."""
         self._connections: set[socket.socket] = set()
         self.pages = 0
         """Pages that are open."""
@@ -169,8 +171,9 @@ class Server:
                 number, data = found
                 handler.wfile.write(data)
         finally:
-            with self._lock:
+            with self._closed:
                 self.pages -= 1
+                self._closed.notify_all()
 
     def connected(self, connection: socket.socket, is_open: bool) -> None:
         """Note a connection that came or went."""
@@ -187,16 +190,18 @@ class Server:
             for connection in self._connections:
                 with contextlib.suppress(OSError):
                     connection.shutdown(socket.SHUT_RDWR)  # ends a write to a page that reads nothing
-        self._http.server_close()  # joins the threads of the pages
+        self._http.server_close()
         self._thread.join()
+        with self._closed:
+            self._closed.wait_for(lambda: self.pages == 0, STUCK_S)
 
 
 class _Http(socketserver.ThreadingTCPServer):
     """Not HTTPServer, which looks up the name of the machine when it starts."""
 
     allow_reuse_address = True
-    daemon_threads = False
-    block_on_close = True
+    daemon_threads = True  # a process that ends in a hurry waits for no page
+    block_on_close = False
 
     def __init__(self, owner: Server, port: int) -> None:
         self.owner = owner

@@ -55,8 +55,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
         self._joint_states = Batches(self, self.subscription(
             JointState, 'joint_states', _unused, qos.sensor_input(), raw=True, matched=self.losses.matched))
         self._statuses = Batches(self, self.subscription(
-            DiagnosticArray, f'{self.config.identifier}/status', _unused, qos.latched_input(qos.SENSOR_DEPTH),
-            raw=True))
+            DiagnosticArray, f'{self.config.identifier}/status', _unused, qos.sensor_input(), raw=True))
         for topic in ('capture_event', 'capture_detected'):
             self.subscription(Header, topic, self._on_event, qos.latched_input())
         self._timer = self.create_timer(1.0 / self.config.rate, self._update, clock=self._steady)
@@ -84,7 +83,8 @@ class LiveView(FlexmanipNode[ViewParameters]):
             self.server = None
 
     def destroy_node(self) -> None:
-        """Take along what the executor does not know of."""
+        """Take along what the executor does not know of; a page too, where a signal came while it was made."""
+        self.deactivated()
         for name in ('_joint_states', '_statuses'):
             batches = self.__dict__.pop(name, None)
             if batches is not None:
