@@ -2,8 +2,8 @@
 
     ros2 launch flexmanip_ros demo.launch.py capture_time:=3.0 payload_mass:=20.0 view:=true
 
-With view:=true a browser on this machine shows the run; the log has the address. The identifier logs the payload when it
-is first trusted. With the executable `demo` the same nodes share one process, a bag is recorded and a picture drawn.
+With view:=true a browser on this machine shows the run; the log has the address. The identifier logs the payload when
+it is first trusted. With the executable `demo` the same nodes share one process, a bag is recorded and a picture drawn.
 """
 
 from launch import LaunchDescription

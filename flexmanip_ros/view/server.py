@@ -14,6 +14,7 @@ import socket
 import socketserver
 import threading
 import time
+import zlib
 from collections import deque
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
@@ -44,8 +45,10 @@ class ViewError(FlexmanipError):
 class Feed:
     """Events in order, numbered; pages read them as they can."""
 
-    def __init__(self) -> None:
+    def __init__(self, page: bytes = b'') -> None:
         self._changed = threading.Condition()
+        # A page that finds another one at its address when it connects again loads that one.
+        self._reset = f'{{"page":{zlib.crc32(page)}}}'
         self._lasting: deque[bytes] = deque(maxlen=MOST_LASTING)
         """Events that a page needs whenever it opens."""
         self._recent: deque[tuple[float, bytes]] = deque()
@@ -74,13 +77,13 @@ class Feed:
             self._lasting.clear()
             self._recent.clear()
             self._bytes = 0
-        self.publish('reset', '{}')
+        self.publish('reset', self._reset)
 
     def greeting(self) -> tuple[int, bytes]:
         """Return the number to go on with, and what a page that opens now has to know."""
         with self._changed:
-            return self._next, b''.join([b'event: reset\ndata: {}\n\n', *self._lasting,
-                                         *(event for _, event in self._recent)])
+            reset = f'event: reset\ndata: {self._reset}\n\n'.encode()
+            return self._next, b''.join([reset, *self._lasting, *(event for _, event in self._recent)])
 
     def after(self, number: int) -> tuple[int, bytes] | None:
         """Return the events from a number on, waiting up to ``BEAT_S`` for one; None when they are gone or at the end.
@@ -110,8 +113,8 @@ class Server:
     """
 
     def __init__(self, page: str, port: int, state: Callable[[], Mapping[str, Any]] = dict) -> None:
-        self.feed = Feed()
         self._page = page.encode()
+        self.feed = Feed(self._page)
         self._state = state
         self._lock = threading.Lock()
         self._closed = threading.Condition(self._lock)

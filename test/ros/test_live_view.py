@@ -210,8 +210,8 @@ def test_at_1_khz_it_takes_at_most_8_percent_of_a_core_and_loses_nothing(
         held = Payload(20.0, 0.01, 19.9, 20.1, 1.0, Status.TRACKING)
         states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
         statuses = ros.publisher(DiagnosticArray, 'rpbsid_identifier/status', qos.latched())
-        page = subprocess.Popen(  # reads as a browser does, in a process of its own
-            [sys.executable, '-c', f'from urllib.request import urlopen\nfor line in urlopen({url!r} + "events"): pass'])
+        reading = f'from urllib.request import urlopen\nfor line in urlopen({url!r} + "events"): pass'
+        page = subprocess.Popen([sys.executable, '-c', reading])  # as a browser, in a process of its own
         ros.wait(lambda: state()['pages'] == 1)
         send(1.0)
         shares = []
@@ -257,8 +257,13 @@ def test_a_person_sees_status_mass_and_silence(live: Live, tmp_path: Path) -> No
         assert browser.text('where') == '/joint_states · 0.70 s'
         browser.value("document.getElementById('pause').click()")
         browser.wait("document.getElementById('where').innerText === '/joint_states · 1.70 s'")
+        port = live.server.port
         live.ros.remove(live.node)
         browser.wait("document.getElementById('alarm').innerText.startsWith('the live view has ended')")
+        browser.value('window.old = true')  # another view on that port: the page finds it, and is made anew
+        live.ros.managed(LiveView(context=live.ros.context, overrides=overrides(port=port, angles=[''])))
+        browser.wait("!window.old && document.getElementById('alarm').innerText.startsWith('waiting')")
+        assert browser.value("document.body.className") == 'no-arm'
         assert [said for said in browser.complaints if 'ERR_' not in said] == []
     finally:
         browser.close()
