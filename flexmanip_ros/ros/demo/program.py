@@ -13,7 +13,7 @@ import struct
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -129,7 +129,8 @@ def _run(config: DemoParameters, folder: Path, console: Console, view: Viewer | 
                   f"again    identify_bag {folder / 'bag'} --params {folder / 'identifier.yaml'}")
     if view is not None and sys.stdout.isatty():
         console.print(f'\nthe live view stays open at {view.url} until Ctrl-C')
-        view.wait()
+        with suppress(KeyboardInterrupt):
+            view.wait()
     return FAILED if different else 0
 
 
