@@ -52,8 +52,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; return its exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     if not given or given[0] == '--ros-args':
-        from flexmanip_ros.ros.nodes import live_view
-
+        try:
+            from flexmanip_ros.ros.nodes import live_view
+        except ModuleNotFoundError as error:
+            console.print_error(PROG, f'the live view is a ROS node, and {error.name} is not installed; install ROS, '
+                                'or give a recording, which needs none')
+            return console.BAD_INPUT
         return live_view.main([sys.argv[0], *given])
     options = _parser().parse_args(given)
     if options.bag is None:

@@ -130,6 +130,7 @@ class Batches:
     def __init__(self, node: Node, subscription: Subscription) -> None:
         self._subscription = subscription
         node._subscriptions.remove(subscription)
+        node._wake_executor()  # one that runs on another thread may have seen it already
 
     def take(self) -> Iterator[tuple[Any, Any]]:
         """Yield each waiting message with its information, as many as its queue can hold."""

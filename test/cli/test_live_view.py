@@ -19,10 +19,14 @@ import pytest
 from browser import Browser
 
 from flexmanip_ros.cli import identify_bag, live_view
+from flexmanip_ros.errors import BagError
+from flexmanip_ros.io import bag
 from flexmanip_ros.io.bag_writer import BagWriter
-from flexmanip_ros.parameters import ExcitationParameters, PlantParameters
+from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, JointRecord
+from flexmanip_ros.view import recording as playable
+from flexmanip_ros.view.screen import of_identifier
 
 START = 1_700_000_000_000_000_000
 COUNT = 3000
@@ -31,7 +35,7 @@ import sys
 class Block:
     def find_spec(self, name, path=None, target=None):
         if name.split('.')[0] in ('rclpy', 'sensor_msgs', 'std_msgs', 'matplotlib'):
-            raise ImportError(f'{name} is blocked here')
+            raise ModuleNotFoundError(f'{name} is blocked here', name=name)
 sys.meta_path.insert(0, Block())
 from flexmanip_ros.cli.live_view import main
 sys.exit(main())
@@ -87,6 +91,28 @@ def test_a_page_holds_the_recording_and_what_is_identified_without_ros(
     assert low < 20.0 < high
     assert abs(mass - 20.0) < 4.0 * std
     assert frame['models']
+
+
+def test_without_a_recording_it_says_that_ros_is_needed() -> None:
+    done = subprocess.run([sys.executable, '-c', WITHOUT_ROS], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (2, '')
+    assert 'is not installed; install ROS, or give a recording' in done.stderr
+    assert done.stderr.count('\n') == 1
+
+
+def test_of_a_damaged_recording_everything_before_the_damage_is_shown(recording: Path) -> None:
+    def damaged() -> Iterator[JointBlock | CaptureEvent]:
+        for count, item in enumerate(bag.read_blocks(recording)):
+            if count == 2:
+                raise BagError('it ends here', 'record again')
+            yield item
+
+    config = IdentifierParameters()
+    frame, fault = playable.read(config, damaged(), of_identifier(config, 'damaged'))
+    assert 'it ends here' in str(fault)
+    assert frame['samples']
+    with pytest.raises(BagError, match='does not exist'):
+        playable.read(config, bag.read_blocks('nowhere'), of_identifier(config, 'nowhere'))
 
 
 def test_a_browser_plays_it(playing: tuple[subprocess.Popen[str], str], tmp_path: Path) -> None:
