@@ -1,6 +1,6 @@
 # Every target makes what it needs first; nothing has to be activated or sourced.
 #   make setup   .venv with the locked dependencies and the package in it
-#   make demo    the arm catches 20 kg, live: picture, bag and numbers in demo_output/
+#   make demo    the arm catches 20 kg, live: picture, bag and numbers in demo_output/; DEMO_ARGS=--view: in a browser
 #   make test    the test suite; among it a colcon build whose executables are started
 #   make lint    ruff and mypy
 #   make bench   every benchmark; table and JSON in benchmarks/results/
@@ -65,7 +65,7 @@ $(VENV)/.benchmark: requirements/benchmark.txt $(VENV)/.development
 	@touch $@
 
 demo: setup
-	@$(BIN)/demo
+	@$(BIN)/demo $(DEMO_ARGS)
 
 test: setup $(VENV)/.development
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)

@@ -16,7 +16,7 @@ HERE = Path(__file__).resolve().parent
 NODES = (
     'plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'payload_controller', 'payload_adapter',
 )
-PROGRAMS = ('identify_bag', 'simulate_bag', 'reproduce_paper', 'monte_carlo', 'write_urdf')
+PROGRAMS = ('identify_bag', 'simulate_bag', 'live_view', 'reproduce_paper', 'monte_carlo', 'write_urdf')
 
 
 def share_files() -> list[tuple[str, list[str]]]:
@@ -74,7 +74,7 @@ setup(
     name=NAME,
     version='0.1.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed']},
+    package_data={NAME: ['py.typed', 'view/page.html']},
     data_files=share_files(),
     install_requires=['setuptools'],
     maintainer='flexmanip_ros maintainers',

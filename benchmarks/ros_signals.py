@@ -122,6 +122,8 @@ PROGRAMS = (
     Program('reproduce_paper', 'reproduce_paper', (
         '--runs', '1', '--case', 'payload_20', '--workers', '1', '--output', '{out}/paper'), 8.0),
     Program('write_urdf', 'write_urdf', (), 0.6),
+    Program('live_view', 'live_view', ('--ros-args', '-p', 'port:=0'), 2.0),
+    Program('live_view of a bag', 'live_view', ('{bag}', '--port', '0'), 4.0),
 )
 
 

@@ -60,6 +60,12 @@ class JointBlock(NamedTuple):
         return JointBlock(self.names, self.stamp_ns[taken], self.position[taken], self.velocity[taken],
                           self.effort[taken])
 
+    @classmethod
+    def of(cls, record: JointRecord) -> JointBlock:
+        """Return a block of one message."""
+        return cls(record.names, np.array([record.stamp_ns]), record.position[None], record.velocity[None],
+                   record.effort[None])
+
 
 class Sample(NamedTuple):
     """One instant of the configured signals, in JointState units.

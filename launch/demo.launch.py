@@ -1,13 +1,14 @@
 """The four nodes, one process each: the arm, its excitation, the capture and the identifier.
 
-    ros2 launch flexmanip_ros demo.launch.py capture_time:=3.0 payload_mass:=20.0
+    ros2 launch flexmanip_ros demo.launch.py capture_time:=3.0 payload_mass:=20.0 view:=true
 
-The identifier logs the payload when it is first trusted. With the executable `demo` the same nodes share one
-process, a bag is recorded and a picture drawn.
+With view:=true a browser on this machine shows the run; the log has the address. The identifier logs the payload when
+it is first trusted. With the executable `demo` the same nodes share one process, a bag is recorded and a picture drawn.
 """
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
+from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -20,6 +21,8 @@ ARGUMENTS = (
     ('capture_time', '3.0', 'capture this long after the first sample [s]; negative: never'),
     ('release_time', '-1.0', 'release this long after the first sample [s]; negative: never'),
     ('payload_method', 'structured', 'none | block | structured'),
+    ('view', 'false', 'show the run live in a browser on this machine (node live_view)'),
+    ('view_port', '8765', 'port of that page; 0: any that is free'),
     ('namespace', '', 'namespace of all nodes'),
     ('prefix', '', "command before the identifier's own, such as 'taskset -c 1' or 'chrt -f 20'"),
     ('log_level', 'info', 'debug | info | warn | error'),
@@ -47,5 +50,7 @@ def generate_launch_description():
         _node('capture_trigger', {
             'mode': 'time', 'capture_time': _number('capture_time'), 'release_time': _number('release_time')}),
         _node('excitation', {'rate': _number('rate'), 'clock': 'joint_states'}),
+        _node('live_view', {'port': ParameterValue(LaunchConfiguration('view_port'), value_type=int)},
+              condition=IfCondition(LaunchConfiguration('view'))),
         _node('plant_simulator', {'rate': _number('rate'), 'payload_mass': _number('payload_mass')}),
     ])

@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from flexmanip_ros import estimator, pipeline
 from flexmanip_ros.cli.console import Report, require_matplotlib
 from flexmanip_ros.errors import BagError, FlexmanipError, ParameterError, SignalError
@@ -25,6 +23,7 @@ from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies import holdout
 from flexmanip_ros.studies.summary import Summary, summarize
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Mode
+from flexmanip_ros.view.screen import Screen, of_identifier
 
 NEVER = (1 << 63) - 1
 """A stamp after all others [ns]."""
@@ -140,6 +139,8 @@ class _Messages:
         self._looked = False
         self._search = ''
         """Why events were not looked for, or what there was no need to."""
+        self.screen = Screen(of_identifier(request.config, Path(request.bag).name))
+        """What the page in the report shows."""
         self._request = request
         self._progress = progress
         config = request.config
@@ -205,11 +206,12 @@ class _Messages:
             yield event
 
     def _joint_states(self, item: JointBlock | JointRecord) -> Iterator[pipeline.Item]:
-        block = item if isinstance(item, JointBlock) else JointBlock(
-            item.names, np.array([item.stamp_ns]), item.position[None], item.velocity[None], item.effort[None])
+        block = item if isinstance(item, JointBlock) else JointBlock.of(item)
         self.foreign += len(block.stamp_ns) * self._joints.isdisjoint(block.names)
         if self.is_kept:
             self._clock, self._log, _ = sampling.push_whole(self._request.config, self._clock, self._log, block)
+        if self._request.report is not None:
+            self.screen.joint_states(block)
         if self.first_ns is None:
             self.first_ns = int(block.stamp_ns[0])
             yield from self._known_events(self.first_ns)
@@ -293,6 +295,7 @@ def _report(request: Request, summary: Summary, messages: _Messages, kept: list[
             fault: FlexmanipError | None) -> None:
     from flexmanip_ros.io import plots, report
     from flexmanip_ros.studies.metrics import payload_bound
+    from flexmanip_ros.view import recording
 
     assert request.report is not None
     config = state.config or request.config
@@ -304,4 +307,5 @@ def _report(request: Request, summary: Summary, messages: _Messages, kept: list[
     report.identification_report(
         request.report, Path(request.bag).name, config, summary, made,
         None if last is None else last.model, scores, counts, bound, '' if fault is None else str(fault),
-        modes=() if last is None else last.modes, events=messages.search())
+        modes=() if last is None else last.modes, events=messages.search(),
+        player=recording.embedded(messages.screen, messages.events, kept))

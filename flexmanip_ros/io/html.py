@@ -16,7 +16,8 @@ from flexmanip_ros.types import Array
 STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;color:#1a1a1a;max-width:1100px;margin:2rem auto;padding:0 1rem}
 h1{font-size:1.6rem;margin-bottom:.2rem}h2{font-size:1.2rem;margin-top:2.2rem;border-bottom:1px solid #ddd}
-img{width:100%;height:auto}table{border-collapse:collapse;margin:.6rem 0;font-size:.9rem}
+img{width:100%;height:auto}iframe{width:100%;height:760px;border:1px solid #ddd}
+table{border-collapse:collapse;margin:.6rem 0;font-size:.9rem}
 th,td{padding:.2rem .7rem;text-align:left;border-bottom:1px solid #e6e6e6;vertical-align:top}
 td.n{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}
 nav a{margin-right:1rem}.note{color:#555}.changed{background:#fff3d6}div.wide{overflow-x:auto}
@@ -58,6 +59,11 @@ def image(data: bytes, words: str) -> str:
     """Return a PNG as an inline image. words: its description for readers who cannot see it."""
     text = base64.b64encode(data).decode('ascii')
     return f'<img alt="{escape(words)}" src="data:image/png;base64,{text}">'
+
+
+def frame(page: str, words: str) -> str:
+    """Return a whole page inside another, with scripts and styles of its own. words: its description."""
+    return f'<iframe title="{escape(words)}" srcdoc="{escape(page)}"></iframe>'
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = '', digits: int = 5) -> str:

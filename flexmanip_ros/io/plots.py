@@ -1,7 +1,7 @@
 """Figures of a run: first the parts that all figures share, then the figures of one run.
 
-Every axis has its unit, and every event is marked. The colours are those of Okabe and Ito, which people with any
-colour vision can tell apart. matplotlib is imported only here and in other modules that draw.
+Every axis has its unit, and every event is marked. The colours are those of ``view/looks.py``. matplotlib is imported
+only here and in other modules that draw.
 """
 
 from __future__ import annotations
@@ -23,28 +23,16 @@ from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.holdout import Scores
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointRecord, Status
+from flexmanip_ros.view.looks import COLOURS, EVENT_COLOUR, MODES_APART, PAYLOAD_COLOUR, STATUS_LOOKS
 
-COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#7F7F7F', '#000000')
 LINES: tuple[Any, ...] = ('-', (0, (4, 1.2)), (0, (1.2, 1)), (0, (6, 1.2, 1.2, 1.2)))
 """Line styles, so that signals in one plot differ by more than their colour."""
-PAYLOAD_COLOUR = '#009E73'
 TRUTH_COLOUR = '#000000'
-EVENT_COLOUR = '#AA0000'
-STATUS_LOOKS: dict[Status, tuple[str, str]] = {
-    Status.WARMING_UP: ('#C8C8C8', '..'), Status.TRACKING: ('#009E73', ''), Status.POORLY_EXCITED: ('#E69F00', '//'),
-    Status.ILL_CONDITIONED: ('#CC79A7', 'xx'), Status.SAMPLE_GAP: ('#56B4E9', '||'),
-    Status.INCONSISTENT: ('#D55E00', '\\\\'), Status.NO_PAYLOAD_METHOD: ('#56B4E9', '--'),
-    Status.UNOBSERVABLE: ('#7F7F7F', '++'), Status.DIVERGED: ('#000000', 'OO'), Status.ORDER_TOO_LOW: ('#F0E442', '**'),
-}
-"""Colour and hatch of each status, so that they differ by more than their colour."""
 WIDTH = 10.0
 """Width of a figure [inches], about that of a page."""
 DPI = 120
 POINTS = 2000
 """Points above which a line is reduced to its envelope."""
-
-MODES_APART = 4.0
-"""Ratio to the lowest frequency above which a mode does not set the range of a plot [-]."""
 
 Event = tuple[float, EventKind]
 Known = tuple[float, float, Sequence[float]]

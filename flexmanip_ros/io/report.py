@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from flexmanip_ros.io import plots
-from flexmanip_ros.io.html import Section, matrix, number, page, picture, table
+from flexmanip_ros.io.html import Section, frame, matrix, number, page, picture, table
 from flexmanip_ros.io.outputs import write_text
 from flexmanip_ros.parameters import IdentifierParameters, flatten
 from flexmanip_ros.parameters.document import written
@@ -22,6 +22,7 @@ from flexmanip_ros.studies.metrics import Score, score
 from flexmanip_ros.studies.summary import Summary, status_text
 from flexmanip_ros.studies.trial import Row
 from flexmanip_ros.types import Mode, StateSpace, Status
+from flexmanip_ros.view import looks
 
 SHOWN_FAILURES = 50
 """Failed runs listed at most."""
@@ -30,13 +31,16 @@ SHOWN_FAILURES = 50
 def identification_report(
     path: str | Path, source: str, config: IdentifierParameters, summary: Summary, made: plots.Run,
     model: StateSpace | None, scores: Scores | None, messages: dict[str, int], bound: float | None = None,
-    fault: str = '', *, modes: Sequence[Mode] = (), events: str = '',
+    fault: str = '', *, modes: Sequence[Mode] = (), events: str = '', player: str = '',
 ) -> None:
     """Write the report of identify_bag: the answer, then pictures, then tables.
 
-    events: what was found in the signals where captures were looked for; empty where they are known.
+    events: what was found in the signals where captures were looked for; empty where they are known. player: the page
+    that plays the recording.
     """
     sections = [Section('Result', _answer(config, summary, modes, events, fault))]
+    if player:
+        sections.append(Section('Replay', frame(player, 'the arm, its signals, modes and payload over time')))
     if any(estimate.payload is not None for estimate in made.estimates):
         sections.append(Section('Payload', picture(
             plots.payload_figure(made), 'payload with its 95 % interval, and residual power over time')))
@@ -169,8 +173,8 @@ def errors(rows: Sequence[Row]) -> Figure | None:
     relative = [100.0 * (part - true) / true for part in (mass, low, high)]
     covered = np.array([bool(row['covered']) for row in good])
     drawn, axes = plots.figure([3.4], share_time=False)
-    for chosen, colour, mark, label in ((covered, plots.PAYLOAD_COLOUR, 'o', 'truth inside\nthe 95 % interval'),
-                                        (~covered, plots.EVENT_COLOUR, 'x', 'truth outside')):
+    for chosen, colour, mark, label in ((covered, looks.PAYLOAD_COLOUR, 'o', 'truth inside\nthe 95 % interval'),
+                                        (~covered, looks.EVENT_COLOUR, 'x', 'truth outside')):
         if chosen.any():
             axes[0].vlines(true[chosen], relative[1][chosen], relative[2][chosen], color=colour, alpha=0.5)
             axes[0].plot(true[chosen], relative[0][chosen], mark, markersize=4, color=colour, label=label)

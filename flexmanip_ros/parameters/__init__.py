@@ -12,9 +12,10 @@ from flexmanip_ros.parameters.simulation import (
     SensorParameters,
 )
 from flexmanip_ros.parameters.trigger import TriggerParameters
+from flexmanip_ros.parameters.view import ViewParameters
 
 __all__ = [
     'ActuatorParameters', 'AdapterParameters', 'ArmParameters', 'ControllerParameters', 'DemoParameters',
     'ExcitationParameters', 'IdentifierParameters', 'Leaf', 'PayloadParameters', 'PlantParameters', 'SensorParameters',
-    'TriggerParameters', 'check', 'configure', 'flatten', 'leaves',
+    'TriggerParameters', 'ViewParameters', 'check', 'configure', 'flatten', 'leaves',
 ]

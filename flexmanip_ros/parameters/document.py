@@ -14,6 +14,7 @@ from flexmanip_ros.parameters.field import LINKS, Leaf, leaves
 from flexmanip_ros.parameters.identifier import IdentifierParameters
 from flexmanip_ros.parameters.simulation import ExcitationParameters, PlantParameters
 from flexmanip_ros.parameters.trigger import TriggerParameters
+from flexmanip_ros.parameters.view import ViewParameters
 
 NODES: Mapping[str, type] = {
     'plant_simulator': PlantParameters,
@@ -22,6 +23,7 @@ NODES: Mapping[str, type] = {
     'rpbsid_identifier': IdentifierParameters,
     'payload_controller': ControllerParameters,
     'payload_adapter': AdapterParameters,
+    'live_view': ViewParameters,
 }
 """Each node and the class that declares its parameters."""
 WIDTH = 100

@@ -148,7 +148,7 @@ class IdentifierParameters:
             raise ParameterError(f"parameter 'payload.working_point' has {len(self.payload.working_point)} elements",
                                  f'give {links}, or [] for the measured ones')
         for group in ('inputs', 'outputs', 'angles'):
-            _check_signals(group, getattr(self, group))
+            check_signals(group, getattr(self, group))
         for group in ('inputs', 'outputs'):
             if not getattr(self, group):
                 raise ParameterError(f"parameter '{group}' is empty", 'name at least one NAME/FIELD')
@@ -175,7 +175,8 @@ def fit_signals(config: Any, links: int) -> None:
             object.__setattr__(config, item.name, of_links(value, links))
 
 
-def _check_signals(group: str, names: tuple[str, ...]) -> None:
+def check_signals(group: str, names: tuple[str, ...]) -> None:
+    """Raise ParameterError for a signal that is not NAME/FIELD, or named twice in a group."""
     for name in names:
         joint, _, what = name.rpartition('/')
         if not joint or what not in FIELDS:

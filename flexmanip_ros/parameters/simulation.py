@@ -169,6 +169,7 @@ class DemoParameters:
         -1.0, 'time of the release after the first sample; negative: no release', unit='s', low=-1.0)
     snr_db: float = parameter(40.0, 'signal-to-noise ratio of every output', unit='dB', low=-20.0, high=200.0)
     seed: int = parameter(1, 'seed of the noise', low=0)
+    view: bool = parameter(False, 'show the run live in a browser (node live_view)')
 
     def __post_init__(self) -> None:
         check_all(self)

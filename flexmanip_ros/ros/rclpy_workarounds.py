@@ -21,6 +21,7 @@ from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedE
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.subscription import Subscription
 
 POLL_S = 0.1
 """Longest wait inside the executor, hence the longest delay of a signal on an idle node."""
@@ -117,6 +118,33 @@ def sequence_number(info: Any) -> int | None:
     """Return the publisher's number of a message; None where the middleware has none, which rclpy gives as NaN."""
     number = info['publication_sequence_number']
     return None if number is None or math.isnan(number) else int(number)
+
+
+class Batches:
+    """A subscription that the executor does not know: its waiting messages are taken at once, when they are asked for.
+
+    A Python callback for each of 1000 messages a second takes a fifth of a core, taking them thirty times a second a
+    twentieth. rclpy has no subscription without a callback, so this one is withdrawn from its node after it was made.
+    """
+
+    def __init__(self, node: Node, subscription: Subscription) -> None:
+        self._subscription = subscription
+        node._subscriptions.remove(subscription)
+        node._wake_executor()  # one that runs on another thread may have seen it already
+
+    def take(self) -> Iterator[tuple[Any, Any]]:
+        """Yield each waiting message with its information, as many as its queue can hold."""
+        subscription = self._subscription
+        with subscription.handle:
+            for _ in range(max(subscription.qos_profile.depth, 1)):
+                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+                if taken is None:
+                    return
+                yield taken
+
+    def give_back(self, node: Node) -> None:
+        """Let the node destroy it with its others; call it before ``destroy_node``."""
+        node._subscriptions.append(self._subscription)
 
 
 def first_line(error: BaseException) -> str:

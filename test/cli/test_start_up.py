@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-PROGRAMS = ('identify_bag', 'simulate_bag', 'monte_carlo', 'reproduce_paper', 'write_urdf')
+PROGRAMS = ('identify_bag', 'simulate_bag', 'live_view', 'monte_carlo', 'reproduce_paper', 'write_urdf')
 SLOW = ('scipy', 'numba', 'rosbags', 'matplotlib', 'rich', 'rclpy')
 LOADED = """
 import sys

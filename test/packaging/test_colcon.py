@@ -61,6 +61,7 @@ def test_the_index_and_the_share_folder_are_there_for_ros2_pkg_and_launch(instal
     assert (prefix / 'share/ament_index/resource_index/packages/flexmanip_ros').is_file()
     share = prefix / 'share/flexmanip_ros'
     assert (share / 'package.xml').is_file()
+    assert list((installed / 'install').rglob('flexmanip_ros/view/page.html'))  # not beside, but in the package
     for folder in ('config', 'launch'):
         files = [path for path in (ROOT / folder).rglob('*.*') if path.is_file() and path.suffix != '.pyc']
         assert [path for path in files if not (share / path.relative_to(ROOT)).is_file()] == []

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted(str(path.relative_to(ROOT)) for path in (ROOT / 'docs').rglob('*.md'))
 ALL = ['README.md', 'CONTRIBUTING.md', *PAGES]
 SETUP = (ROOT / 'setup.py').read_text(encoding='utf-8')
-PROGRAMS = ('identify_bag', 'simulate_bag', 'monte_carlo', 'reproduce_paper', 'write_urdf')
+PROGRAMS = ('identify_bag', 'simulate_bag', 'live_view', 'monte_carlo', 'reproduce_paper', 'write_urdf')
 """Programs of ``cli/``; their --help is cheap."""
 OF_EVERY_NODE = {'autostart', 'use_sim_time'}
 PARAMETERS = {leaf.name for declared in NODES.values() for leaf in leaves(declared)}

@@ -18,7 +18,7 @@ MODULES = sorted(PACKAGE.rglob('*.py'))
 FORBIDDEN_TO_BAGS = ('flexmanip_ros.ros', 'flexmanip_ros.cli')
 LEAVES = {'', 'types', 'errors', 'parameters'}
 PIPELINE = {'estimator', 'event_replay', 'pipeline', 'studies'}
-DOORS = {'io', 'ros', 'cli', 'paper'}
+DOORS = {'io', 'ros', 'cli', 'paper', 'view'}
 ROS_LIBRARIES = {
     'rclpy', 'launch', 'launch_ros', 'ament_index_python', 'rosidl_runtime_py', 'rosbag2_py',
     'action_msgs', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'lifecycle_msgs',

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import InertiaStamped
 from hypothesis import strategies as st
 from joint_states import NAMES, joint_state
@@ -91,12 +92,25 @@ def payloads(draw: st.DrawFn) -> InertiaStamped:
     return message
 
 
+@st.composite
+def statuses(draw: st.DrawFn) -> DiagnosticArray:
+    """Return entries like those of a payload or a model."""
+    texts = st.one_of(st.floats().map(repr), words, st.sampled_from(('TRACKING', '1e999', '-inf')))
+    keys = st.sampled_from(('status', 'mass_kg', 'std_kg', 'lower95_kg', 'frequency_hz_1', 'frequency_hz_2'))
+    pairs = st.lists(st.builds(lambda key, text: KeyValue(key=key, value=text), keys, texts), max_size=6)
+    entry = st.builds(lambda name, values: DiagnosticStatus(name=name, values=values),
+                      st.sampled_from(('payload', 'model', 'other')), pairs)
+    return DiagnosticArray(header=Header(stamp=draw(stamps)), status=draw(st.lists(entry, max_size=3)))
+
+
 GOOD: dict[type, Any] = {
     JointState: joint_state(3), Header: Header(frame_id='capture'),
     Float64MultiArray: Float64MultiArray(data=[20.0, 0.1, 19.8, 20.2, 1.0]), InertiaStamped: InertiaStamped(),
+    DiagnosticArray: DiagnosticArray(status=[DiagnosticStatus(name='payload', values=[
+        KeyValue(key='status', value='TRACKING'), KeyValue(key='mass_kg', value='20.0')])]),
 }
 TYPED = {JointState: joint_states(), Header: events(), Float64MultiArray: arrays(),
-         InertiaStamped: payloads()}
+         InertiaStamped: payloads(), DiagnosticArray: statuses()}
 
 
 @st.composite

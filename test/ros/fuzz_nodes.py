@@ -21,6 +21,7 @@ from std_msgs.msg import Empty, Float64, Float64MultiArray, Header
 from flexmanip_ros.ros.conversions import time_message
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.nodes.excitation import Excitation
+from flexmanip_ros.ros.nodes.live_view import LiveView
 from flexmanip_ros.ros.nodes.payload_adapter import PayloadAdapter
 from flexmanip_ros.ros.nodes.payload_controller import PayloadController
 from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
@@ -65,6 +66,8 @@ SUBJECTS = {
     'payload_adapter': Subject(
         PayloadAdapter, {'target_node': 'nobody', 'settle_time': 0.0, 'min_period': 0.01},
         {ESTIMATE: Float64MultiArray, 'rpbsid_identifier/payload': InertiaStamped}, {}),
+    'live_view': Subject(
+        LiveView, {'port': 0}, {'joint_states': JointState, 'rpbsid_identifier/status': DiagnosticArray, **EVENTS}, {}),
     'excitation': Subject(
         Excitation, {'clock': 'joint_states', 'shape': 'multisine'}, {'joint_states': JointState},
         {'effort_controller/commands': Float64MultiArray}),

@@ -25,12 +25,13 @@ from flexmanip_ros.ros import conversions, diagnostics, qos
 from flexmanip_ros.ros.diagnostics import WARN, LossCounter, Report
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.nodes.excitation import Excitation
+from flexmanip_ros.ros.nodes.live_view import LiveView
 from flexmanip_ros.ros.nodes.payload_adapter import PayloadAdapter
 from flexmanip_ros.ros.nodes.payload_controller import PayloadController
 from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
 from flexmanip_ros.ros.nodes.rpbsid_identifier import RpbsidIdentifier
 
-NODES = (PlantSimulator, Excitation, CaptureTrigger, PayloadController, PayloadAdapter, RpbsidIdentifier)
+NODES = (PlantSimulator, Excitation, CaptureTrigger, PayloadController, PayloadAdapter, RpbsidIdentifier, LiveView)
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from sensor_msgs.msg import JointState
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.nodes.excitation import Excitation
+from flexmanip_ros.ros.nodes.live_view import LiveView
 from flexmanip_ros.ros.nodes.payload_adapter import PayloadAdapter
 from flexmanip_ros.ros.nodes.payload_controller import PayloadController
 from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
@@ -30,7 +31,7 @@ ALLOWED = {('unconfigured', 0): 'inactive', ('inactive', 1): 'unconfigured', ('i
 NODES = {
     PlantSimulator: {'rate': 100.0, 'noise': 'none', 'arm__modes': 1}, Excitation: {}, CaptureTrigger: {},
     PayloadController: {'arm__modes': 1}, PayloadAdapter: {'target_node': 'nobody'},
-    RpbsidIdentifier: {'payload_method': 'none', 'checkpoint_period': 0.1},
+    RpbsidIdentifier: {'payload_method': 'none', 'checkpoint_period': 0.1}, LiveView: {'port': 0},
 }
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import importlib
+import json
 import os
 import resource
 import signal
@@ -12,6 +14,8 @@ import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from urllib.error import URLError
+from urllib.request import urlopen
 
 import pytest
 
@@ -19,7 +23,7 @@ from flexmanip_ros.errors import BagError
 from flexmanip_ros.io import bag
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
-NODES = ('plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier')
+NODES = ('plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'live_view')
 
 
 def module(name: str) -> str:
@@ -125,6 +129,28 @@ def test_the_demonstration_records_draws_and_replays_bit_for_bit(tmp_path: Path)
     assert {b.stamp_ns - a.stamp_ns for a, b in pairwise(samples)} == {2_000_000}
     assert event == CaptureEvent(samples[0].stamp_ns + 600_000_000, EventKind.CAPTURE)
     assert (folder / 'overview.png').stat().st_size > 20_000
+
+
+def test_the_demonstration_is_seen_live_by_a_node_in_a_process_of_its_own(tmp_path: Path) -> None:
+    process = start('demo', str(tmp_path), '--view', '--duration', '2', '--capture-time', '1', '--rate', '500',
+                    '--ros-args', '-p', 'live_view:port:=0')
+    assert process.stdout is not None
+    url = next(word for line in process.stdout for word in line.split() if word.startswith('http://'))
+    samples, events = 0, []
+    with urlopen(url + 'events', timeout=60) as stream:
+        for line in stream:
+            if line.startswith(b'data: {') and not events:
+                frame = json.loads(line[6:])
+                samples += len(base64.b64decode(frame.get('samples', {'data': ''})['data'])) // 28
+                events += frame.get('events', [])
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, out + err
+    assert 'bit for bit' in out
+    assert '0 lost' in out
+    assert samples > 100
+    assert events == [[1.0, True]]
+    with pytest.raises(URLError):  # it ended with the demonstration
+        urlopen(url, timeout=5)
 
 
 def test_an_interrupted_demonstration_leaves_a_readable_bag(tmp_path: Path) -> None:

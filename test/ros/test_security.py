@@ -11,13 +11,15 @@ from ros_harness import Ros, overrides
 
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.nodes.excitation import Excitation
+from flexmanip_ros.ros.nodes.live_view import LiveView
 from flexmanip_ros.ros.nodes.payload_adapter import PayloadAdapter
 from flexmanip_ros.ros.nodes.payload_controller import PayloadController
 from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
 from flexmanip_ros.ros.nodes.rpbsid_identifier import RpbsidIdentifier
 
 POLICY = Path(__file__).resolve().parents[2] / 'config' / 'sros2' / 'policy.xml'
-NODES = (PlantSimulator, Excitation, CaptureTrigger, RpbsidIdentifier, PayloadController, PayloadAdapter)
+NODES = (PlantSimulator, Excitation, CaptureTrigger, RpbsidIdentifier, PayloadController, PayloadAdapter,
+         LiveView)
 DRIVER = 'io_and_status_controller/set_payload'
 
 
@@ -51,7 +53,7 @@ def opened(node: Any) -> dict[str, set[str]]:
 @pytest.mark.parametrize('cls', NODES)
 def test_the_policy_allows_exactly_what_a_node_opens(ros: Ros, cls: Any) -> None:
     # The driver's service type is not installed here; a parameter service stands at its place.
-    given = overrides(target_node='driver') if cls is PayloadAdapter else None
+    given = {PayloadAdapter: overrides(target_node='driver'), LiveView: overrides(port=0)}.get(cls)
     node = ros.managed(cls(context=ros.context, overrides=given))
     real = opened(node)
     if cls is PayloadAdapter:

@@ -171,20 +171,23 @@ class Composition:
             if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
                 raise CompositionError(f'{node.get_name()} could not be configured', 'see its log above')
 
-    def connect(self) -> None:
-        """Open the bag, wait until every reader is matched with its writer, and that nobody else is there."""
+    def connect(self, others: int = 0) -> None:
+        """Open the bag, wait until every reader is matched with its writer, and that nobody else is there.
+
+        others: further readers of the joint states, in other processes.
+        """
         self._recorder = self._add(Recorder(self._bag))
-        if not self._spin_until(self._matched, DISCOVERY_TIMEOUT_S):
+        if not self.wait(lambda: self._matched(others), DISCOVERY_TIMEOUT_S):
             raise CompositionError(f'the nodes did not find each other within {DISCOVERY_TIMEOUT_S:.0f} s',
                                    'unset ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS')
         if foreign_arm(self.recorder, own_writers=1, own_readers=2):
             raise CompositionError('another arm or controller is on these topics',
                                    'run again, or set ROS_DOMAIN_ID to a free number')
 
-    def _matched(self) -> bool:
+    def _matched(self, others: int) -> bool:
         commands, events = self.excitation.commands, self.trigger.events_publisher
-        return (self.plant.joint_states.get_subscription_count() >= READERS
-                and commands.get_subscription_count() >= 2 and events.get_subscription_count() >= 3
+        return (self.plant.joint_states.get_subscription_count() >= READERS + others
+                and commands.get_subscription_count() >= 2 and events.get_subscription_count() >= 3 + others
                 and all(item.get_subscription_count() >= 1 for item in self.identifier.outputs.values()))
 
     def start(self) -> None:
@@ -213,12 +216,13 @@ class Composition:
         self.plant.trigger_deactivate()
         self.excitation.trigger_deactivate()
         sent, recorder, identifier = self.plant.samples, self.recorder, self.identifier
-        self._spin_until(lambda: recorder.joint_states + recorder.losses.lost >= sent
+        self.wait(lambda: recorder.joint_states + recorder.losses.lost >= sent
                          and identifier.state.counters.received + identifier.losses.lost >= sent)
         identifier.trigger_deactivate()  # publishes the last model
-        self._spin_until(lambda: sum(map(len, recorder.published.values())) >= identifier.published)
+        self.wait(lambda: sum(map(len, recorder.published.values())) >= identifier.published)
 
-    def _spin_until(self, condition: Callable[[], bool], seconds: float = DRAIN_TIMEOUT_S) -> bool:
+    def wait(self, condition: Callable[[], bool], seconds: float = DRAIN_TIMEOUT_S) -> bool:
+        """Run callbacks until a condition holds, at most so long; return whether it does."""
         limit = time.monotonic() + seconds
         while time.monotonic() < limit and not condition():
             self.executor.spin_once(timeout_sec=0.02)

@@ -13,6 +13,7 @@ import struct
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +36,13 @@ from flexmanip_ros.parameters.document import NODES, written, yaml_text
 from flexmanip_ros.parameters.simulation import settings
 from flexmanip_ros.ros import rclpy_workarounds
 from flexmanip_ros.ros.demo.composition import Composition, foreign_arm
+from flexmanip_ros.ros.demo.viewer import Viewer, viewer
 from flexmanip_ros.ros.node import BAD_INPUT
 from flexmanip_ros.studies.summary import status_text
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, Status
 
 NAME = 'demo'
+PAGE_TIMEOUT_S = 20.0
 LOOK_AROUND_S = 0.5
 """Time in which an arm that is on the domain already is noticed."""
 FAILED, INTERRUPTED = 1, 130
@@ -58,7 +61,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         config = configure(DemoParameters, {
             leaf.name: getattr(options, leaf.name) for leaf in leaves(DemoParameters)})
         folder = new_folder(Path(options.output))
-        _init([arguments[0], *node_arguments(config), *arguments[1:]], console)
+        given = [arguments[0], *node_arguments(config), *arguments[1:]]
+        _init(given, console)
     except KeyboardInterrupt:
         return INTERRUPTED
     except OSError as error:
@@ -66,7 +70,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:  # rcl raises types of its C extension for --ros-args and parameter files
         return _reject(rclpy_workarounds.first_line(error), BAD_INPUT)
     try:
-        return _run(config, folder, console)
+        with viewer(given) if config.view else nullcontext() as view:
+            return _run(config, folder, console, view)
     except KeyboardInterrupt:
         console.print(f"interrupted; the bag so far is '{folder / 'bag'}'")
         return INTERRUPTED
@@ -74,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _reject(str(error), BAD_INPUT if isinstance(error, ParameterError) else FAILED)
 
 
-def _run(config: DemoParameters, folder: Path, console: Console) -> int:
+def _run(config: DemoParameters, folder: Path, console: Console, view: Viewer | None) -> int:
     console.print('Starting the nodes (the first time, kernels are compiled)')
     began = time.monotonic()
     composition: Composition | None = None
@@ -82,9 +87,12 @@ def _run(config: DemoParameters, folder: Path, console: Console) -> int:
         composition = Composition(config, folder / 'bag')
         rclpy_workarounds.interrupt_on_signals()
         composition.configure()
-        composition.connect()
+        composition.connect(others=0 if view is None else 1)
         console.print(f'Ready after {time.monotonic() - began:.1f} s: plant_simulator, excitation, capture_trigger, '
                       f'rpbsid_identifier over {rclpy.utilities.get_rmw_implementation_identifier()}')
+        if view is not None:
+            console.print(f'\nlive view: open {view.url} in a browser on this machine')
+            _wait_for_a_page(view, composition, console)
         began = time.monotonic()
         composition.start()
         rclpy_workarounds.spin(composition.executor, until=Progress(console, composition).update)
@@ -120,7 +128,18 @@ def _run(config: DemoParameters, folder: Path, console: Console) -> int:
         encoding='utf-8')
     console.print(f"\nbag      {folder / 'bag'}\npicture  {folder / 'overview.png'}\n"
                   f"again    identify_bag {folder / 'bag'} --params {folder / 'identifier.yaml'}")
+    if view is not None and sys.stdout.isatty():
+        console.print(f'\nthe live view stays open at {view.url} until Ctrl-C')
+        with suppress(KeyboardInterrupt):
+            view.wait()
     return FAILED if different else 0
+
+
+def _wait_for_a_page(view: Viewer, composition: Composition, console: Console) -> None:
+    """On a terminal, where a person opens the page, start the run with it."""
+    if sys.stdout.isatty():
+        console.print(f'the run starts when the page is open, at the latest after {PAGE_TIMEOUT_S:.0f} s')
+        composition.wait(lambda: view.pages() > 0, PAGE_TIMEOUT_S)
 
 
 class Progress:
@@ -168,8 +187,12 @@ def parser() -> argparse.ArgumentParser:
                       help='folder that gets a new numbered folder for this run (default: %(default)s)')
     for leaf in leaves(DemoParameters):
         unit = f' [{leaf.unit}]' if leaf.unit else ''
-        made.add_argument('--' + leaf.name.replace('_', '-'), type=leaf.kind, default=leaf.default,
-                          metavar=leaf.name.upper(), help=f'{leaf.words}{unit} (default: %(default)s)')
+        name = '--' + leaf.name.replace('_', '-')
+        if leaf.kind is bool:
+            made.add_argument(name, action='store_true', help=leaf.words)
+            continue
+        made.add_argument(name, type=leaf.kind, default=leaf.default, metavar=leaf.name.upper(),
+                          help=f'{leaf.words}{unit} (default: %(default)s)')
     return made
 
 

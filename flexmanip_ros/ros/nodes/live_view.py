@@ -1,0 +1,187 @@
+"""Node ``live_view``: the arm, its signals, modes and payload live in a browser, on this machine alone.
+
+It only listens: nothing on the page moves the arm or changes another node. The address of the page is in the log.
+
+subscribes  joint_states      sensor_msgs/JointState  best effort, depth 1000; matched by name
+            capture_event     std_msgs/Header         an event commanded or known
+            capture_detected  std_msgs/Header         an event inferred from the signals
+            rpbsid_identifier/status  diagnostic_msgs/DiagnosticArray  payload, modes, and what they are worth
+publishes   /diagnostics      diagnostic_msgs/DiagnosticArray  1 Hz
+
+A recording: live_view BAG [--params FILE.yaml] [--set name=value] [--speed 2] [--port 8765], without ROS.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+
+from flexmanip_ros.errors import SignalError
+from flexmanip_ros.io import cdr
+from flexmanip_ros.parameters import ViewParameters
+from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.conversions import JointStateReader, capture_event, diagnostics
+from flexmanip_ros.ros.diagnostics import LossCounter, Meter, Report
+from flexmanip_ros.ros.node import FlexmanipNode, run
+from flexmanip_ros.ros.rclpy_workarounds import Batches, sequence_number
+from flexmanip_ros.types import JointBlock
+from flexmanip_ros.view.screen import Screen, Source, encoded, page
+from flexmanip_ros.view.server import BEAT_S, Server
+
+NAME = 'live_view'
+
+
+class LiveView(FlexmanipNode[ViewParameters]):
+    """Takes what has come some thirty times a second, and sends it to the pages that are open."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(NAME, ViewParameters, **options)
+        self.server: Server | None = None
+        """There is one while the node is active."""
+        self.losses = LossCounter()
+        self._meter = Meter()
+        self._layout: cdr.Layout | None = None
+        self._reader = JointStateReader()
+
+    def make_entities(self) -> None:
+        """Subscriptions, and the timer that empties them."""
+        self._screen = self._new_screen()
+        self._joint_states = Batches(self, self.subscription(
+            JointState, 'joint_states', _unused, qos.sensor_input(), raw=True, matched=self.losses.matched))
+        self._statuses = Batches(self, self.subscription(
+            DiagnosticArray, f'{self.config.identifier}/status', _unused, qos.sensor_input(), raw=True))
+        for topic in ('capture_event', 'capture_detected'):
+            self.subscription(Header, topic, self._on_event, qos.latched_input())
+        self._timer = self.create_timer(1.0 / self.config.rate, self._update, clock=self._steady)
+
+    def _new_screen(self) -> Screen:
+        return Screen(Source('Live', self.resolve_topic_name('joint_states'), self.config))
+
+    def summary(self) -> str:
+        """Say where the page is."""
+        return '' if self.server is None else self.server.invitation
+
+    def activated(self) -> None:
+        """Serve the page. Raises ViewError when the port cannot be had."""
+        self._screen = self._new_screen()
+        self._counted = self._runs = self._reported = 0
+        self._heard: float | None = None
+        self._beaten = self._asked = time.monotonic()
+        self.server = Server(page(self._screen.source), self.config.port, self._state)
+        print(f'{NAME}: {self.server.invitation}', flush=True)
+
+    def deactivated(self) -> None:
+        """Let every page go."""
+        if self.server is not None:
+            self.server.close()
+            self.server = None
+
+    def destroy_node(self) -> None:
+        """Take along what the executor does not know of; a page too, where a signal came while it was made."""
+        self.deactivated()
+        for name in ('_joint_states', '_statuses'):
+            batches = self.__dict__.pop(name, None)
+            if batches is not None:
+                batches.give_back(self)
+        super().destroy_node()
+
+    def _state(self) -> dict[str, Any]:
+        return {'samples': self._screen.samples, 'lost': self.losses.lost, 'runs': self._screen.runs}
+
+    def _update(self) -> None:
+        """Take every waiting message; send what is new."""
+        with self._meter:
+            self._take()
+            if not self.active or self.server is None:
+                return
+            feed, now, screen = self.server.feed, time.monotonic(), self._screen
+            if screen.runs != self._runs:
+                self._runs = screen.runs
+                feed.reset()
+            frame = screen.frame()
+            if frame is not None:
+                events = {'events': frame.pop('events')} if 'events' in frame else None
+                if events is not None:
+                    feed.publish('frame', encoded(events), lasting=True)
+                if frame:
+                    feed.publish('frame', encoded(frame))
+            if screen.samples != self._counted:
+                self._counted, self._heard, self._beaten = screen.samples, now, now
+            elif now - self._beaten >= BEAT_S / 2:
+                self._beaten = now
+                silent = None if self._heard is None else round(now - self._heard, 3)
+                feed.publish('silence', encoded({'seconds': silent}))
+
+    def _take(self) -> None:
+        """Hand the waiting messages to the screen; a node that is not active drops them."""
+        raws: list[bytes] = []
+        for raw, info in self._joint_states.take():
+            self.losses.note(sequence_number(info))
+            raws.append(raw)
+        statuses = [raw for raw, _ in self._statuses.take()]
+        if not self.active:
+            return
+        while raws:
+            try:
+                block, self._layout = cdr.joint_block(raws, self._layout)
+            except (cdr.CdrError, UnicodeDecodeError):
+                self._take_one(raws.pop(0))
+                continue
+            self._screen.joint_states(block)
+            raws = raws[len(block.stamp_ns):]
+        for raw in statuses:
+            try:
+                self._screen.status(diagnostics(deserialize_message(raw, DiagnosticArray)))
+            except (RuntimeError, MemoryError):  # the errors of the middleware
+                self.log_throttled('status', 'a status that is no DiagnosticArray was dropped')
+
+    def _take_one(self, raw: bytes) -> None:
+        """Hand over a message of another encoding."""
+        try:
+            record = self._reader(raw)
+        except SignalError as error:
+            self.log_throttled('encoding', f'message dropped: {error}')
+            return
+        self._screen.joint_states(JointBlock.of(record))
+
+    def _on_event(self, message: Header) -> None:
+        if not self.active:
+            return
+        try:
+            self._screen.event(capture_event(message))
+        except SignalError as error:
+            self.log_throttled('event', str(error))
+
+    def report(self, report: Report) -> None:
+        """Rate of the joint states, losses, and how many pages are open."""
+        now, samples = time.monotonic(), self._screen.samples
+        report.values.update(self._meter.window())
+        report.values['updates_hz'] = report.values['rate_hz']
+        self.losses.report(report, 'lost', 'messages')
+        if self.server is None:
+            return
+        report.values['rate_hz'] = (samples - self._reported) / max(now - self._asked, 1e-3)
+        self._reported, self._asked = samples, now
+        report.values['samples'] = samples
+        report.values['pages'] = self.server.pages
+        if report.values['rate_hz'] == 0.0:
+            report.silent('joint_states')
+
+
+def _unused(message: Any) -> None:
+    """Stand where rclpy wants a callback."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(LiveView, NAME, __doc__, ViewParameters, argv)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

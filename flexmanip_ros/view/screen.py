@@ -1,0 +1,297 @@
+"""What the page shows of a run, without ROS: messages in, compact JSON out.
+
+A ``Screen`` takes joint states in blocks, events and the identifier's status messages, and gives frames: everything
+since the frame before. A live page gets a frame some thirty times a second, a recorded one a single frame with all.
+Times are seconds since the first sample, by the stamps. Samples go as rows of float32 in base64: each value with seven
+digits, and NaN stays NaN, which the page draws as a gap.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections import deque
+from importlib import resources
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexmanip_ros.messages import Diagnostics, DiagnosticStatus
+from flexmanip_ros.parameters import IdentifierParameters, ViewParameters
+from flexmanip_ros.parameters.view import WINDOWS
+from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointBlock, Status
+from flexmanip_ros.view.looks import COLOURS, EVENT_COLOUR, MODES_APART, PAYLOAD_COLOUR, STATUS_LOOKS
+
+LOOPED_NS = 1_000_000_000
+"""Stamps that go back further than this are a new run, and the page begins again."""
+GAP = 3.0
+"""Sample times after which a line has a gap."""
+SAME_EVENT_S = 0.2
+"""An event that is announced and also found in the signals is shown once."""
+LATEST_INTERVALS = 64
+"""Intervals whose median is the sample time."""
+MOST_ESTIMATES = 10_000
+"""Payloads, and models, of a recording: of more every n-th is shown."""
+MOST_EVENTS = 200
+LARGEST = 3e38
+"""What a float32 can hold."""
+PAYLOAD_NUMBERS = ('mass_kg', 'std_kg', 'lower95_kg', 'upper95_kg', 'consistency')
+STATUSES = {status.name: index for index, status in enumerate(Status)}
+SPACE_FOR = '"insert the layout here"', '"insert the recording here"'
+"""Where the page takes its data."""
+
+
+class Source(NamedTuple):
+    """Which signals are shown, and of which arm."""
+
+    title: str
+    words: str
+    """Where the samples come from: a topic, or the name of a recording."""
+    config: ViewParameters
+
+    @property
+    def torques(self) -> tuple[str, ...]:
+        """The signals of the first plot."""
+        return self.config.inputs
+
+    @property
+    def bends(self) -> tuple[str, ...]:
+        """The signals of the second plot: positions that are no joint angles, else whatever outputs there are."""
+        positions = tuple(name for name in self.config.outputs
+                          if name.endswith('/position') and name not in self.config.angles)
+        return positions or self.config.outputs
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The signals of a row, behind its time."""
+        return (*self.torques, *self.bends, *self.config.angles)
+
+    @property
+    def is_arm(self) -> bool:
+        """Whether a two-link arm can be drawn."""
+        return len(self.config.angles) == 2 and len(self.bends) == 2
+
+    def layout(self) -> dict[str, Any]:
+        """Return what a page has to know before the first sample."""
+        config, arm, r, m = self.config, self.config.arm, len(self.torques), len(self.bends)
+        torques = all(name.endswith('/effort') for name in self.torques)
+        positions = all(name.endswith('/position') for name in self.bends)
+        return {
+            'title': self.title, 'words': self.words, 'columns': len(self.columns),
+            'torques': {'title': 'torque' if torques else 'input', 'unit': 'N m' if torques else '', 'scale': 1,
+                        'lines': [[_short(name, torques), k] for k, name in enumerate(self.torques)]},
+            'bends': {'title': 'bend' if self.is_arm else 'position' if positions else 'output',
+                      'unit': 'mm' if self.is_arm else '', 'scale': 1000 if self.is_arm else 1,
+                      'lines': [[_short(name, positions), r + k] for k, name in enumerate(self.bends)]},
+            'arm': {'length': arm.link_length, 'sensor': arm.sensor_position, 'bends': [r, r + 1],
+                    'angles': [r + m, r + m + 1], 'chords': arm.angle_convention == 'chord'} if self.is_arm else None,
+            'statuses': [[status.name, status.value, STATUS_LOOKS[status][0]] for status in Status],
+            'colours': COLOURS, 'payload_colour': PAYLOAD_COLOUR, 'event_colour': EVENT_COLOUR,
+            'modes_apart': MODES_APART, 'stale_after': config.stale_after, 'exaggeration': config.exaggeration,
+            'window': config.window, 'windows': WINDOWS,
+        }
+
+
+def of_identifier(config: IdentifierParameters, words: str) -> Source:
+    """Return what is shown of a recording. words: its name."""
+    angles = config.angles if config.payload_method != 'none' else ()
+    return Source('Recording', words, ViewParameters(
+        inputs=config.inputs, outputs=config.outputs, angles=angles, arm=config.arm))
+
+
+class Screen:
+    """Takes messages, gives frames. Nothing is kept beyond the next frame but the latest events."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self.samples = 0
+        """Joint states taken since the start."""
+        self.runs = 0
+        """Runs begun; the frames of another run have another time 0."""
+        self._places: tuple[tuple[str, ...], list[tuple[str, int] | None]] = ((), [])
+        self._begin()
+
+    def _begin(self) -> None:
+        """Forget the run."""
+        self.first_ns: int | None = None
+        self._last_ns = -1
+        self._intervals: Array = np.zeros(0)
+        self._rows: list[Array] = []
+        self._payloads: list[tuple[int, list[Any]]] = []
+        self._models: list[tuple[int, list[Any]]] = []
+        self._known: deque[CaptureEvent] = deque(maxlen=MOST_EVENTS)
+        self._events: deque[CaptureEvent] = deque(maxlen=MOST_EVENTS)
+
+    def joint_states(self, block: JointBlock) -> None:
+        """Take joint states. Stamps that do not advance are left out; a jump back begins a new run."""
+        stamps = block.stamp_ns
+        highest = np.maximum.accumulate(np.concatenate([[self._last_ns], stamps]))[:-1]
+        back = np.flatnonzero(stamps < highest - LOOPED_NS)
+        if self.first_ns is not None and back.size:
+            k = int(back[0])
+            if k:
+                self.joint_states(_part(block, slice(0, k)))
+            ahead = [event for event in self._known if event.stamp_ns >= stamps[k]]
+            self._begin()
+            for event in ahead:
+                self.event(event)
+            self.joint_states(_part(block, slice(k, None)))
+            return
+        self.samples += len(stamps)
+        if self.first_ns is None and len(stamps):
+            self.first_ns = int(stamps[0])
+            self.runs += 1
+            highest[0] = self.first_ns - 1
+        advancing = stamps > highest
+        if not advancing.any():
+            return
+        assert self.first_ns is not None
+        values = self._values(block)[advancing]
+        stamps = stamps[advancing]
+        before = self._last_ns if self._last_ns >= 0 else None
+        self._last_ns = int(stamps[-1])
+        time = (stamps - self.first_ns) * 1e-9
+        self._rows.append(self._with_gaps(np.column_stack([time, values]), before))
+
+    def _values(self, block: JointBlock) -> Array:
+        """Return the signals (N, c), NaN for one that is not in the messages."""
+        if self._places[0] != block.names:
+            self._places = block.names, [_place(name, block) for name in self.source.columns]
+        values = np.full((len(block.stamp_ns), len(self.source.columns)), np.nan)
+        for column, place in enumerate(self._places[1]):
+            if place is not None and place[1] < getattr(block, place[0]).shape[1]:
+                values[:, column] = getattr(block, place[0])[:, place[1]]
+        values[~(np.abs(values) <= LARGEST)] = np.nan
+        return values
+
+    def _with_gaps(self, rows: Array, before_ns: int | None) -> Array:
+        """Return rows with one of NaN wherever samples are missing."""
+        assert self.first_ns is not None
+        earlier = rows[:1, 0] if before_ns is None else [(before_ns - self.first_ns) * 1e-9]
+        intervals = np.diff(np.concatenate([earlier, rows[:, 0]]))
+        known = intervals[intervals > 0.0]
+        self._intervals = np.concatenate([self._intervals, known])[-LATEST_INTERVALS:]
+        if not self._intervals.size:
+            return rows
+        missing = np.flatnonzero(intervals > GAP * float(np.median(self._intervals)))
+        if not missing.size:
+            return rows
+        gaps = np.full((missing.size, rows.shape[1]), np.nan)
+        gaps[:, 0] = rows[missing, 0] - 0.5 * intervals[missing]
+        return np.insert(rows, missing, gaps, axis=0)
+
+    def event(self, event: CaptureEvent) -> None:
+        """Take a capture or release, announced or found in the signals."""
+        if not any(known.kind is event.kind and abs(known.stamp_ns - event.stamp_ns) <= SAME_EVENT_S * 1e9
+                   for known in self._known):
+            self._known.append(event)
+            self._events.append(event)
+
+    def status(self, message: Diagnostics) -> None:
+        """Take a message of the identifier's ``~/status``."""
+        for status in message.statuses:
+            row = _numbers(status)
+            if row is not None:
+                (self._payloads if status.name == 'payload' else self._models).append((message.stamp_ns, row))
+
+    def frame(self, most_rows: int | None = None) -> dict[str, Any] | None:
+        """Return what came since the frame before; None when that is nothing. most_rows: thin a longer run out."""
+        if self.first_ns is None:  # without a first sample there is no time 0
+            del self._payloads[:-1], self._models[:-1]
+            return None
+        first_ns, frame = self.first_ns, dict[str, Any]()
+        if self._rows:
+            rows = np.concatenate(self._rows)
+            if most_rows is not None:
+                rows = thinned(rows, most_rows)
+            start = float(rows[0, 0])
+            rows[:, 0] -= start
+            frame['samples'] = {'start': start, 'data': base64.b64encode(rows.astype('<f4').tobytes()).decode('ascii')}
+        for name, found in (('payloads', self._payloads), ('models', self._models)):
+            if found:
+                step = 1 if most_rows is None else -(-len(found) // MOST_ESTIMATES)
+                frame[name] = [[(stamp - first_ns) * 1e-9, *row] for stamp, row in found[::-step][::-1]]
+        if self._events:
+            frame['events'] = [[(event.stamp_ns - first_ns) * 1e-9, event.kind is EventKind.CAPTURE]
+                               for event in self._events]
+        self._rows, self._payloads, self._models = [], [], []
+        self._events.clear()
+        return frame or None
+
+
+def thinned(rows: Array, most: int) -> Array:
+    """Return about ``most`` rows (N, 1 + c) that draw the same lines: the extremes of each stretch, in order.
+
+    A stretch that holds a NaN is a gap in that column.
+    """
+    if len(rows) <= most:
+        return rows
+    size = -(-2 * len(rows) // most)
+    count = len(rows) // size
+    blocks = rows[:count * size].reshape(count, size, -1)
+    values = blocks[:, :, 1:]
+    low, high = values.argmin(axis=1), values.argmax(axis=1)  # of NaN where there is one
+    pair = np.sort(np.stack([low, high], axis=1), axis=1)
+    made = np.empty((count, 2, rows.shape[1]))
+    made[:, :, 1:] = np.take_along_axis(values, pair, axis=1)
+    made[:, 0, 0], made[:, 1, 0] = blocks[:, size // 4, 0], blocks[:, 3 * size // 4, 0]
+    return np.concatenate([made.reshape(-1, rows.shape[1]), rows[count * size:][-1:]])
+
+
+def page(source: Source, recording: dict[str, Any] | None = None, speed: float = 1.0, *, playing: bool = True) -> str:
+    """Return the whole page; with a recording inside it needs no server.
+
+    playing: a recording begins at once; else its end is shown first.
+    """
+    text = resources.files('flexmanip_ros.view').joinpath('page.html').read_text(encoding='utf-8')
+    layout = source.layout() | {'speed': speed, 'playing': playing}
+    for place, value in zip(SPACE_FOR, (layout, recording), strict=True):
+        # A text that ends the script element would end it inside a string too.
+        text = text.replace(place, encoded(value).replace('<', '\\u003c'), 1)
+    return text
+
+
+def encoded(value: Any) -> str:
+    """Return a value as JSON without spaces."""
+    return json.dumps(value, separators=(',', ':'), allow_nan=False)
+
+
+def _short(name: str, by_joint: bool) -> str:
+    """Return the name of a line; where all lines have one field, the joint's is enough."""
+    return name.rpartition('/')[0] if by_joint else name
+
+
+def _place(name: str, block: JointBlock) -> tuple[str, int] | None:
+    joint, _, field = name.rpartition('/')
+    return (field, block.names.index(joint)) if joint in block.names else None
+
+
+def _part(block: JointBlock, taken: slice) -> JointBlock:
+    stamps: NDArray[np.int64] = block.stamp_ns[taken]
+    return JointBlock(block.names, stamps, block.position[taken], block.velocity[taken], block.effort[taken])
+
+
+def _numbers(status: DiagnosticStatus) -> list[Any] | None:
+    """Return the number of the status, then those of a payload or, by mode, of a model; None for other entries."""
+    texts = dict(status.values)
+    index = STATUSES.get(texts.get('status', ''))
+    if index is None or status.name not in ('payload', 'model'):
+        return None
+    if status.name == 'payload':
+        return [index, *(_finite(texts.get(name)) for name in PAYLOAD_NUMBERS)]
+    numbers: list[Any] = [index]
+    while f'frequency_hz_{1 + len(numbers) // 2}' in texts:
+        k = 1 + len(numbers) // 2
+        numbers += [_finite(texts[f'frequency_hz_{k}']), _finite(texts.get(f'frequency_std_hz_{k}'))]
+    return numbers
+
+
+def _finite(text: str | None) -> float | None:
+    """Return a number of a status message, with seven digits; None where there is none or it is infinite."""
+    try:
+        value = float(text or 'nan')
+    except ValueError:
+        return None
+    return float(f'{value:.7g}') if math.isfinite(value) else None

@@ -1,0 +1,255 @@
+"""The page and its events over HTTP, on this machine alone, read-only, with the standard library.
+
+``/`` is the page, ``/events`` a stream of Server-Sent Events, ``/state`` a few counts as JSON. The events of the last
+``HISTORY_S`` seconds are kept once for all pages, and each page reads them at its own pace on a thread of its own. A
+page that is slower than that is let go: it connects again by itself and begins with the history.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import socket
+import socketserver
+import threading
+import time
+import zlib
+from collections import deque
+from collections.abc import Callable, Mapping
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler
+from typing import Any
+
+from flexmanip_ros.errors import FlexmanipError
+
+HOST = '127.0.0.1'
+HISTORY_S = 35.0
+"""A page that opens late is shown at least its longest window."""
+MOST_BYTES = 64_000_000
+"""Bytes of history at most."""
+MOST_LASTING = 200
+MOST_PAGES = 16
+STUCK_S = 5.0
+"""A page that takes no byte for so long is let go."""
+BEAT_S = 1.0
+"""An event at least so often, so that a page that has gone is noticed."""
+POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; " \
+    "img-src data:"
+
+
+class ViewError(FlexmanipError):
+    """The page cannot be served."""
+
+
+class Feed:
+    """Events in order, numbered; pages read them as they can."""
+
+    def __init__(self, page: bytes = b'') -> None:
+        self._changed = threading.Condition()
+        # A page that finds another one at its address when it connects again loads that one.
+        self._reset = f'{{"page":{zlib.crc32(page)}}}'
+        self._lasting: deque[bytes] = deque(maxlen=MOST_LASTING)
+        """Events that a page needs whenever it opens."""
+        self._recent: deque[tuple[float, bytes]] = deque()
+        self._bytes = 0
+        self._next = 0
+        """Number of the next event."""
+        self.closed = False
+
+    def publish(self, name: str, text: str, *, lasting: bool = False) -> None:
+        """Send an event to every page. text: JSON in one line; lasting: keep it for pages that open later."""
+        event = f'event: {name}\ndata: {text}\n\n'.encode()
+        now = time.monotonic()
+        with self._changed:
+            if lasting:
+                self._lasting.append(event)
+            self._recent.append((now, event))
+            self._bytes += len(event)
+            self._next += 1
+            while self._recent and (self._recent[0][0] < now - HISTORY_S or self._bytes > MOST_BYTES):
+                self._bytes -= len(self._recent.popleft()[1])
+            self._changed.notify_all()
+
+    def reset(self) -> None:
+        """Begin again: what was sent before is of another run."""
+        with self._changed:
+            self._lasting.clear()
+            self._recent.clear()
+            self._bytes = 0
+        self.publish('reset', self._reset)
+
+    def greeting(self) -> tuple[int, bytes]:
+        """Return the number to go on with, and what a page that opens now has to know."""
+        with self._changed:
+            reset = f'event: reset\ndata: {self._reset}\n\n'.encode()
+            return self._next, b''.join([reset, *self._lasting, *(event for _, event in self._recent)])
+
+    def after(self, number: int) -> tuple[int, bytes] | None:
+        """Return the events from a number on, waiting up to ``BEAT_S`` for one; None when they are gone or at the end.
+
+        An event that a page has twice, as one that lasts, is shown once.
+        """
+        with self._changed:
+            if not self.closed and number == self._next:
+                self._changed.wait(BEAT_S)
+            count = self._next - number
+            if self.closed or count > len(self._recent):
+                return None
+            waiting = [self._recent[k][1] for k in range(-count, 0)]
+            return self._next, b''.join(waiting) or b': nothing new\n\n'
+
+    def close(self) -> None:
+        """Let every page go."""
+        with self._changed:
+            self.closed = True
+            self._changed.notify_all()
+
+
+class Server:
+    """Serves a page until it is closed. Raises ViewError when the port cannot be had.
+
+    page: the HTML; state: numbers for ``/state``, called on a thread of the server.
+    """
+
+    def __init__(self, page: str, port: int, state: Callable[[], Mapping[str, Any]] = dict) -> None:
+        self._page = page.encode()
+        self.feed = Feed(self._page)
+        self._state = state
+        self._lock = threading.Lock()
+        self._closed = threading.Condition(self._lock)
+        """Notified when a page has gone."""
+        self._connections: set[socket.socket] = set()
+        self.pages = 0
+        """Pages that are open."""
+        try:
+            self._http = _Http(self, port)
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                raise ViewError(f'port {port} of this machine is in use',
+                                'end the program that has it, or give another port (0: any that is free)') from error
+            raise ViewError(f'port {port} cannot be opened: {error.strerror}',
+                            'give a port from 1024 up (0: any that is free)') from error
+        self.port = int(self._http.server_address[1])
+        self._thread = threading.Thread(target=self._http.serve_forever, args=(0.2,), name='http', daemon=True)
+        self._thread.start()
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return f'http://{HOST}:{self.port}/'
+
+    @property
+    def invitation(self) -> str:
+        """What to tell a person."""
+        return f'open {self.url} in a browser on this machine'
+
+    def respond(self, handler: _Handler) -> None:
+        """Answer one GET."""
+        host = handler.headers.get('Host', '').rpartition(':')[0]
+        if host not in (HOST, 'localhost'):  # a page of another site whose name leads here would read along
+            handler.send_error(HTTPStatus.FORBIDDEN, f'open {self.url}')
+            return
+        path = handler.path.partition('?')[0]
+        if path == '/':
+            handler.answer('text/html; charset=utf-8', self._page)
+        elif path == '/state':
+            handler.answer('application/json', json.dumps({'pages': self.pages, **self._state()}).encode())
+        elif path == '/events':
+            self._stream(handler)
+        else:
+            handler.send_error(HTTPStatus.NOT_FOUND)
+
+    def _stream(self, handler: _Handler) -> None:
+        with self._lock:
+            if self.pages >= MOST_PAGES:
+                handler.send_error(HTTPStatus.SERVICE_UNAVAILABLE, f'{MOST_PAGES} pages are open already')
+                return
+            self.pages += 1
+        try:
+            handler.answer('text/event-stream')
+            number, data = self.feed.greeting()
+            handler.wfile.write(data)
+            while (found := self.feed.after(number)) is not None:
+                number, data = found
+                handler.wfile.write(data)
+        finally:
+            with self._closed:
+                self.pages -= 1
+                self._closed.notify_all()
+
+    def connected(self, connection: socket.socket, is_open: bool) -> None:
+        """Note a connection that came or went."""
+        with self._lock:
+            (self._connections.add if is_open else self._connections.discard)(connection)
+
+    def close(self) -> None:
+        """Let every page go and give the port back. Calling it again does nothing."""
+        if self.feed.closed:
+            return
+        self.feed.close()
+        self._http.shutdown()
+        with self._lock:
+            for connection in self._connections:
+                with contextlib.suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)  # ends a write to a page that reads nothing
+        self._http.server_close()
+        self._thread.join()
+        with self._closed:
+            self._closed.wait_for(lambda: self.pages == 0, STUCK_S)
+
+
+class _Http(socketserver.ThreadingTCPServer):
+    """Not HTTPServer, which looks up the name of the machine when it starts."""
+
+    allow_reuse_address = True
+    daemon_threads = True  # a process that ends in a hurry waits for no page
+    block_on_close = False
+
+    def __init__(self, owner: Server, port: int) -> None:
+        self.owner = owner
+        super().__init__((HOST, port), _Handler)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A page that went away is no error of ours."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """One connection, one answer."""
+
+    server: _Http
+    timeout = STUCK_S
+    server_version, sys_version = 'flexmanip_ros', ''
+
+    def setup(self) -> None:
+        """Note the connection, so that it can be ended."""
+        super().setup()
+        self.server.owner.connected(self.connection, True)
+
+    def finish(self) -> None:
+        """Forget it."""
+        self.server.owner.connected(self.connection, False)
+        super().finish()
+
+    def do_GET(self) -> None:
+        """Answer; every other method is answered with 501."""
+        try:
+            self.server.owner.respond(self)
+        except OSError:  # gone, or stuck for STUCK_S
+            self.close_connection = True
+
+    def answer(self, kind: str, body: bytes | None = None) -> None:
+        """Send the head and, where there is one, the body."""
+        self.send_response(HTTPStatus.OK)
+        self.send_header('Content-Type', kind)
+        if body is not None:
+            self.send_header('Content-Length', str(len(body)))
+        self.send_header('Cache-Control', 'no-store')
+        self.send_header('Content-Security-Policy', POLICY)
+        self.send_header('X-Content-Type-Options', 'nosniff')
+        self.end_headers()
+        if body is not None:
+            self.wfile.write(body)
+
+    def log_message(self, format: str, *arguments: Any) -> None:
+        """Say nothing: the log is the node's."""
