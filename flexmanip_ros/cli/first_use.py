@@ -15,7 +15,7 @@ from typing import Any
 
 from numba.core import event
 
-PATIENCE = 1.0
+PATIENCE = 2.0
 """Time [s] for which a kernel is compiled before the user is told; one that takes less is not worth a line."""
 WORDS = ('flexmanip_ros: compiling the kernels for this machine. This happens once after an installation and takes '
          'a minute or two.')
