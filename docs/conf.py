@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-
 project = 'flexmanip_ros'
 copyright = 'the flexmanip_ros maintainers, Apache-2.0'
-version = release = re.findall(r"version='([\d.]+)'", (ROOT / 'setup.py').read_text(encoding='utf-8'))[0]
+# rosdoc2 runs this file from another folder, and sets the version itself.
+declared = Path(__file__).resolve().parents[1] / 'setup.py'
+if declared.is_file():
+    version = release = re.findall(r"version='([\d.]+)'", declared.read_text(encoding='utf-8'))[0]
 
 extensions = ['myst_parser']
 source_suffix = {'.md': 'markdown'}
