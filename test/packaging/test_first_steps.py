@@ -11,7 +11,7 @@ from fresh_environment import Fresh, blocks
 WORD = 'compiling the kernels for this machine'
 Done = list[tuple[str, subprocess.CompletedProcess[str]]]
 
-pytestmark = pytest.mark.timeout(1500)  # libraries are downloaded and kernels compiled, on a machine that may be busy
+pytestmark = pytest.mark.timeout(2400)  # libraries are downloaded and kernels compiled, on a machine that may be busy
 
 
 def carried_out(fresh: Fresh, commands: list[str]) -> Done:

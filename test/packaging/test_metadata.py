@@ -107,6 +107,14 @@ def test_every_import_has_a_rosdep_key() -> None:
         assert key in declared(), f'{sorted(files)} import {name}: package.xml lacks {key}'
 
 
+def test_every_rosdep_key_was_looked_up_for_ubuntu_noble() -> None:
+    """The notebook has the table; a new key is looked up and added there."""
+    notebook = (ROOT / 'docs/lab/jazzy.md').read_text(encoding='utf-8')
+    table = notebook.split('## rosdep')[1].split('\n## ')[0]
+    found = {key for row in re.findall(r'^\| (`.*?) \|', table, re.MULTILINE) for key in re.findall(r'`([^`]+)`', row)}
+    assert declared() - found == set()
+
+
 def launched() -> set[str]:
     """Return the other packages whose executables our launch files start."""
     texts = [path.read_text(encoding='utf-8') for path in (ROOT / 'launch').glob('*.py')]

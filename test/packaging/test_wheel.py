@@ -14,7 +14,7 @@ from fresh_environment import Fresh
 NODES = ('plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'payload_controller')
 OFFLINE = ('identify_bag', 'simulate_bag', 'reproduce_paper', 'monte_carlo', 'write_urdf')
 
-pytestmark = pytest.mark.timeout(1500)  # libraries are downloaded and kernels compiled, on a machine that may be busy
+pytestmark = pytest.mark.timeout(2400)  # libraries are downloaded and kernels compiled, on a machine that may be busy
 
 
 def metadata(wheel: Path) -> list[str]:
