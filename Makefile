@@ -4,13 +4,18 @@
 #   make test    the test suite; among it a colcon build whose executables are started
 #   make lint    ruff and mypy
 #   make bench   every benchmark; table and JSON in benchmarks/results/
-#   make docs    what in docs/, config/ and README.md is generated from the code
+#   make docs    the pages that are generated from the code, then the site: build/html/index.html
+#   make test-jazzy  the test suite on the versions of Ubuntu 24.04; needs a Python 3.12
 #   make lock    the dependencies anew, from requirements/*.in
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --quiet
+# Two environments of their own: what builds the site, and the versions of Ubuntu 24.04.
+DOCS := .venv-docs
+JAZZY := .venv-jazzy
+QUIETLY := -m pip --disable-pip-version-check --quiet --quiet
+PIP := $(BIN)/python $(QUIETLY)
 
 # A sourced ROS must not mix its libraries with the locked ones in the venv.
 unexport PYTHONPATH LD_LIBRARY_PATH AMENT_PREFIX_PATH COLCON_PREFIX_PATH CMAKE_PREFIX_PATH
@@ -26,9 +31,9 @@ SOURCES := $(shell find flexmanip_ros -name '*.py')
 SHARED := $(shell find config launch resource -type f -not -path '*/__pycache__/*')
 
 # A venv that was moved, or whose interpreter has gone, is made again with its stamps.
-$(shell requirements/make_venv.sh --drop-broken $(VENV))
+$(foreach folder,$(VENV) $(DOCS) $(JAZZY),$(shell requirements/make_venv.sh --drop-broken $(folder)))
 
-.PHONY: help setup demo test lint bench docs lock clean
+.PHONY: help setup demo test test-jazzy lint bench docs lock clean
 help:
 	@sed -n 's/^#   make/  make/p' Makefile
 
@@ -77,13 +82,34 @@ lint: setup $(VENV)/.development
 bench: setup $(VENV)/.benchmark
 	@$(BIN)/python benchmarks/run_all.py $(BENCH)
 
-docs: setup
+$(DOCS)/.ready: requirements/docs.txt
+	@requirements/make_venv.sh $(DOCS)
+	@echo 'Installing what builds the site'
+	@$(DOCS)/bin/python $(QUIETLY) install --require-hashes -r $<
+	@touch $@
+
+# A warning is an error: a link to a page or heading that is not there, a page that is in no contents.
+docs: setup $(DOCS)/.ready
 	@$(BIN)/python -m flexmanip_ros.cli.write_parameters
 	@$(BIN)/python benchmarks/tables.py
+	@$(BIN)/python docs/write_reference.py
+	@$(DOCS)/bin/sphinx-build -W --keep-going --nitpicky --quiet -b html -d build/doctrees docs build/html
+	@echo 'The site is in build/html/index.html'
+
+$(JAZZY)/.ready: requirements/jazzy.txt setup.py setup.cfg package.xml pyproject.toml $(SHARED)
+	@requirements/make_venv.sh $(JAZZY) 3.12
+	@echo 'Installing the versions of Ubuntu 24.04'
+	@$(JAZZY)/bin/python $(QUIETLY) install --require-hashes -r $<
+	@FLEXMANIP_WARM_UP=0 $(JAZZY)/bin/python $(QUIETLY) install --no-deps --no-build-isolation --editable .
+	@touch $@
+
+test-jazzy: $(JAZZY)/.ready
+	@$(JAZZY)/bin/python -m flexmanip_ros.cli.warm_up
+	@$(JAZZY)/bin/python -m pytest $(PYTEST_ARGS)
 
 lock: $(VENV)/.python
 	@$(PIP) install uv
 	@PATH="$(CURDIR)/$(BIN):$$PATH" requirements/lock.sh
 
 clean:
-	rm -rf $(VENV) build install log demo_output
+	rm -rf $(VENV) $(DOCS) $(JAZZY) build install log demo_output

@@ -1,4 +1,8 @@
-"""The ament_python package: what is installed where, and the names `ros2 run` knows."""
+"""The ament_python package: what is installed where, and the names `ros2 run` knows.
+
+The same file makes the wheel that needs no ROS: there the names are ordinary console scripts in bin/, and the shared
+files lie in share/flexmanip_ros of the environment.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,13 @@ HERE = Path(__file__).resolve().parent
 NODES = (
     'plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'payload_controller', 'payload_adapter',
 )
+# What the offline programs import; rosdep's names for the same are in package.xml.
+LIBRARIES = ('numpy', 'scipy', 'numba>=0.59', 'matplotlib', 'PyYAML', 'rich', 'rosbags', 'lz4',
+             'backports.zstd; python_version < "3.14"',
+             'scikit-fem')  # reproduce_paper alone; it has no rosdep key
+# rclpy and the messages as wheels (Linux x86-64); nobody needs them who has sourced a ROS installation.
+ROS = ('ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-diagnostic-msgs', 'ros-jazzy-geometry-msgs',
+       'ros-jazzy-sensor-msgs', 'ros-jazzy-std-msgs', 'ros-jazzy-std-srvs', 'ros-jazzy-visualization-msgs')
 PROGRAMS = ('identify_bag', 'simulate_bag', 'live_view', 'reproduce_paper', 'monte_carlo', 'write_urdf')
 
 
@@ -76,11 +87,12 @@ setup(
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     package_data={NAME: ['py.typed', 'view/page.html']},
     data_files=share_files(),
-    install_requires=['setuptools'],
+    install_requires=list(LIBRARIES),
     maintainer='flexmanip_ros maintainers',
     maintainer_email='maintainers@flexmanip-ros.example',
     python_requires='>=3.11',
     extras_require={
+        'ros': list(ROS),
         'test': ['pytest', 'pytest-timeout', 'hypothesis'],
         'finite_element': ['scikit-fem'],
         'cluster': ['dask', 'distributed'],
@@ -89,6 +101,8 @@ setup(
     zip_safe=False,
     cmdclass={'install': InstallAndCompile, 'develop': DevelopAndCompile},
     description='Online identification of a flexible two-link arm and of the payload it catches.',
+    long_description=(HERE / 'README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
     license='Apache-2.0',
     entry_points={
         'console_scripts': [

@@ -3,9 +3,14 @@
 set -eu
 cd "$(dirname "$0")/.."
 compile() {
-    UV_PYTHON_DOWNLOADS=never uv pip compile --quiet --universal --python-version 3.11 --fork-strategy fewest \
+    oldest=$1
+    shift
+    UV_PYTHON_DOWNLOADS=never uv pip compile --quiet --universal --python-version "$oldest" --fork-strategy fewest \
         --generate-hashes --no-annotate --no-emit-index-url --custom-compile-command requirements/lock.sh "$@"
 }
-compile requirements/runtime.in --output-file requirements/runtime.txt
-compile requirements/development.in --constraints requirements/runtime.txt --output-file requirements/development.txt
-compile requirements/benchmark.in --constraints requirements/development.txt --output-file requirements/benchmark.txt
+compile 3.11 requirements/runtime.in --output-file requirements/runtime.txt
+compile 3.11 requirements/development.in --constraints requirements/runtime.txt --output-file requirements/development.txt
+compile 3.11 requirements/benchmark.in --constraints requirements/development.txt --output-file requirements/benchmark.txt
+# In environments of their own: the page builder, and the versions of Ubuntu 24.04.
+compile 3.11 requirements/docs.in --output-file requirements/docs.txt
+compile 3.12 requirements/jazzy.in --output-file requirements/jazzy.txt

@@ -1,9 +1,16 @@
 #!/bin/sh
-# make_venv.sh FOLDER: a virtual environment of a Python this project runs on.
+# make_venv.sh FOLDER [VERSION]: a virtual environment of a Python this project runs on, or of one version such as 3.12.
 # make_venv.sh --drop-broken FOLDER: take away one that was moved, or whose interpreter has gone.
 set -eu
 
-fits() { "$1" -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; }
+wanted=${2:-}
+[ "$1" = --drop-broken ] && wanted=
+
+fits() {
+    "$1" -c 'import sys, venv, ensurepip; here = sys.version_info[:2]
+wanted = tuple(int(part) for part in sys.argv[1].split(".")) if sys.argv[1] else here
+sys.exit(not (here == wanted and (3, 11) <= here <= (3, 13)))' "$wanted" 2>/dev/null
+}
 
 # pip's own script names the interpreter it was made for, which lies elsewhere after a move.
 works() {
@@ -31,6 +38,6 @@ for python in ${PYTHON:-} python3 python3.12 python3.13 python3.11 python /usr/b
         exec "$python" -m venv "$venv"
     fi
 done
-echo 'No Python 3.11, 3.12 or 3.13 with its venv module was found; install one (Debian, Ubuntu:' \
+echo "No Python ${wanted:-3.11, 3.12 or 3.13} with its venv module was found; install one (Debian, Ubuntu:" \
     'apt install python3 python3-venv) or name yours: make PYTHON=/path/to/python3.12' >&2
 exit 1

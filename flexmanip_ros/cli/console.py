@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
-from flexmanip_ros.errors import FlexmanipError
+from flexmanip_ros.errors import FlexmanipError, ModelError
 
 SUCCESS, DEFECT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 LONGEST = 1e9
@@ -121,6 +121,13 @@ def require_matplotlib() -> None:
     if importlib.util.find_spec('matplotlib') is None:
         raise FlexmanipError('a report needs matplotlib, which is not installed',
                              "run 'pip install matplotlib', or leave --report away")
+
+
+def require_scikit_fem() -> None:
+    """Raise ModelError before the work when it ends with the finite element plant, which needs scikit-fem."""
+    if importlib.util.find_spec('skfem') is None:
+        raise ModelError('the finite element plant needs scikit-fem, which is not installed',
+                         "run 'pip install scikit-fem'")
 
 
 def run(prog: str, body: Callable[[], int]) -> int:

@@ -71,6 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(given: argparse.Namespace) -> int:
+    from flexmanip_ros.cli import first_use
     from flexmanip_ros.cli.replay import Request, identify
 
     config = load(IdentifierParameters, NODE, given.params, given.set)
@@ -81,7 +82,7 @@ def _main(given: argparse.Namespace) -> int:
         capture_time=given.capture_time, release_time=given.release_time, detect=given.detect,
         validate_from=given.validate_from,
         output=given.output, report=given.report, save_arm=given.save_arm)
-    with console.progress('identifying', 'messages') as progress:
+    with console.progress('identifying', 'messages') as progress, first_use.announced():
         result = identify(request, progress)
     if not given.json:
         print('\n'.join(describe(result)))

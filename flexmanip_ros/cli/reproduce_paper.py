@@ -74,6 +74,7 @@ def _main(given: argparse.Namespace) -> int:
     if given.runs < 1:
         raise ParameterError(f'--runs is {given.runs}', 'give at least 1')
     console.require_matplotlib()
+    console.require_scikit_fem()
     from flexmanip_ros.paper import report, summary
 
     folder = Path(given.output)

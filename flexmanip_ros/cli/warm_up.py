@@ -17,6 +17,8 @@ import numpy as np
 
 SAMPLES = 1200
 """Enough for the prediction-error fit to begin."""
+REFINED = 2600
+"""Enough for the fit to go on block by block, and for a test of a drift."""
 PERIOD_NS = 1_000_000
 
 
@@ -37,8 +39,9 @@ def simulator_and_identifier() -> None:
     state = simulator.init(plant)
     for torques in efforts[:3]:
         state, _ = simulator.step(plant, state, torques)
-    messages = list(simulator.records(simulator.simulate(plant, efforts, events), events))
-    for method in ('none', 'block'):
+    longer = excitation.sequence(ExcitationParameters(), REFINED)
+    for method, torques, happens in (('none', longer, ()), ('block', efforts, events)):
+        messages = simulator.records(simulator.simulate(plant, torques, happens), happens)
         for _ in pipeline.run(replace(IdentifierParameters(), payload_method=method), messages):
             pass
     column = np.ones((2, 1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import importlib
 import json
@@ -17,9 +18,11 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from flexmanip_ros.cli import first_use
 from flexmanip_ros.errors import BagError, FlexmanipError
 from flexmanip_ros.io import bag
 from flexmanip_ros.parameters import IdentifierParameters
@@ -135,13 +138,14 @@ def compute(work: Work, tasks: Iterable[Task], count: int | None) -> Iterator[Ou
 
 def serial(work: Work, tasks: Iterable[Task]) -> Iterator[Outcome]:
     """Compute here, one after the other."""
-    for task in tasks:
-        try:
-            result = work(task)
-        except Exception as error:  # a failed run is a result
-            yield Outcome(task, None, error)
-        else:
-            yield Outcome(task, result, None)
+    with first_use.announced():
+        for task in tasks:
+            try:
+                result = work(task)
+            except Exception as error:  # a failed run is a result
+                yield Outcome(task, None, error)
+            else:
+                yield Outcome(task, result, None)
 
 
 def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome]:
@@ -153,8 +157,10 @@ def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome
         os.environ.setdefault(name, '1')  # one run per core leaves no core for more threads
     waiting = iter(tasks)
     again: list[tuple[Task, int]] = []
+    spawn = multiprocessing.get_context('spawn')
+    told = spawn.Value(ctypes.c_bool, False)
     while True:
-        pool = ProcessPoolExecutor(count, multiprocessing.get_context('spawn'), _serve)
+        pool = ProcessPoolExecutor(count, spawn, _serve, (told,))
         running: dict[Future[Any], tuple[Task, int]] = {}
         try:
             if again:  # alone, so that it is known which run the worker dies of
@@ -182,10 +188,11 @@ def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _serve() -> None:
+def _serve(told: Synchronized[bool]) -> None:
     """Set up a worker: it ignores Ctrl-C, which its parent handles, and ends when its parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.set_threshold(GARBAGE)
+    first_use.announce_in_worker(told)
     warnings.simplefilter('ignore')  # as in the parent: numbers out of range are told by the status
     parent = multiprocessing.parent_process()
     if parent is not None:

@@ -107,13 +107,16 @@ def test_an_interrupt_keeps_what_was_done_and_the_same_command_goes_on(scenario_
                '--output', str(out)]
     process = subprocess.Popen([*command, '--runs', '100000'], stdout=subprocess.DEVNULL,
                                stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60.0
-    journal = tmp_path / 'out.csv.journal'
-    while not journal.exists() or journal.read_bytes().count(b'\n') < 3:
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    assert 'the same command continues' in process.communicate(timeout=60)[1]
+    try:
+        deadline = time.monotonic() + 100.0
+        journal = tmp_path / 'out.csv.journal'
+        while not journal.exists() or journal.read_bytes().count(b'\n') < 3:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        assert 'the same command continues' in process.communicate(timeout=60)[1]
+    finally:
+        process.kill()  # nothing, where it has ended as it should
     assert process.returncode == 130
     done = len(rows_of(out))
     assert done >= 2

@@ -45,7 +45,8 @@ DECLARED = """
 import json, setuptools
 from distutils.core import run_setup
 it = run_setup('setup.py', stop_after='init')
-print(json.dumps([it.get_version(), it.entry_points, it.packages, it.data_files]))
+print(json.dumps([it.get_version(), it.entry_points, it.packages, it.data_files,
+                  it.install_requires, it.extras_require]))
 """
 
 
@@ -56,6 +57,8 @@ class Distribution(NamedTuple):
     entry_points: dict[str, list[str]]
     packages: list[str]
     data_files: list[tuple[str, list[str]]]
+    libraries: list[str]
+    extras: dict[str, list[str]]
 
 
 @pytest.fixture(scope='module')
@@ -102,6 +105,14 @@ def test_every_import_has_a_rosdep_key() -> None:
     for name, files in third_party().items():
         key = LIBRARIES.get(name, (name, ''))[0]
         assert key in declared(), f'{sorted(files)} import {name}: package.xml lacks {key}'
+
+
+def test_every_rosdep_key_was_looked_up_for_ubuntu_noble() -> None:
+    """The notebook has the table; a new key is looked up and added there."""
+    notebook = (ROOT / 'docs/lab/jazzy.md').read_text(encoding='utf-8')
+    table = notebook.split('## rosdep')[1].split('\n## ')[0]
+    found = {key for row in re.findall(r'^\| (`.*?) \|', table, re.MULTILINE) for key in re.findall(r'`([^`]+)`', row)}
+    assert declared() - found == set()
 
 
 def launched() -> set[str]:
@@ -164,6 +175,19 @@ def test_locks_pin_every_version_with_hashes_and_name_no_host(name: str) -> None
     assert all('==' in pin and '--hash=sha256:' in pin for pin in pins)
     assert '://' not in lock
     assert not re.search(r'^\s*--(extra-)?(index|find)', lock, re.MULTILINE)
+
+
+def test_pip_installs_what_is_imported(distribution: Distribution) -> None:
+    """The wheel asks for each library that a program imports, and its extra for each ROS package."""
+    ros = {name.partition('[')[0] for name in distribution.extras['ros']}
+    for name, files in third_party().items():
+        if name in ('launch', 'launch_ros', 'ament_index_python', 'compression'):
+            continue  # launch files run on a full ROS installation; compression is Python's own from 3.14 on
+        pypi = LIBRARIES.get(name, ('', ''))[1]
+        brought = ('builtin_interfaces', 'rcl_interfaces', 'lifecycle_msgs', 'rosidl_runtime_py', 'rosgraph_msgs')
+        known = any(item.startswith(pypi) for item in distribution.libraries) if pypi else (
+            f'ros-jazzy-{name.replace("_", "-")}' in ros or name in brought)
+        assert known, f'{sorted(files)} import {name}: setup.py lacks it'
 
 
 def test_the_three_locks_agree() -> None:
