@@ -42,6 +42,8 @@ def _parser() -> console.Parser:
     console.add_parameters(made, 'rpbsid_identifier')
     add('--validate-from', metavar='SECONDS', type=console.seconds,
         help='identify on the samples before this time [s] from the first stamp; score the model on the rest')
+    add('--horizon', metavar='SECONDS', type=console.positive_seconds, default=0.25,
+        help='with --validate-from, score the prediction this far ahead too [s]; default: 0.25')
     add('--output', metavar='OUT',
         help='write the estimates: a table where the name ends in .csv or .npz, else a rosbag2 recording')
     add('--report', metavar='REPORT.html', help='write a report: one HTML page with figures and tables')
@@ -72,7 +74,7 @@ def _main(given: argparse.Namespace) -> int:
         events=tuple(given.capture_event or ('capture_event', 'capture_detected')),
         events_required=given.capture_event is not None,
         capture_time=given.capture_time, release_time=given.release_time, detect=given.detect,
-        validate_from=given.validate_from,
+        validate_from=given.validate_from, horizon=given.horizon,
         output=given.output, report=given.report)
     with console.progress('identifying', 'messages') as progress:
         result = identify(request, progress)
@@ -109,7 +111,8 @@ def describe(result: Result) -> list[str]:
         if summary.consistency is not None and summary.payload_std_kg is not None:
             lines.append(f'residuals    power {summary.consistency:.6g} times that of the noise (1: noise only)')
     for words, values in (('simulation', summary.vaf_simulation_percent),
-                          ('prediction', summary.vaf_prediction_percent)):
+                          ('prediction', summary.vaf_prediction_percent),
+                          ('ahead', summary.vaf_horizon_percent)):
         if values is not None:
             shares = [f'{name} {_text(value)} %' for name, value in zip(result.outputs, values, strict=True)]
             lines.append(f'VAF {words:8s} {", ".join(shares)}')

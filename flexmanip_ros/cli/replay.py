@@ -42,6 +42,8 @@ class Request:
     detect: bool = False
     """Find captures and releases in the signals."""
     validate_from: float | None = None
+    horizon: float = holdout.HORIZON_S
+    """How far ahead the held-out samples are predicted [s]."""
     output: str | None = None
     report: str | None = None
 
@@ -96,9 +98,11 @@ def identify(request: Request, progress: bag.Progress | None = None) -> Result:
     scores = None
     signals = messages.signals() if messages.is_kept else None
     if request.validate_from is not None and signals is not None:
-        scores = holdout.score(None if last is None else last.model, signals, request.validate_from)
+        scores = holdout.score(None if last is None else last.model, signals, request.validate_from,
+                               factor=request.config.decimation, horizon_s=request.horizon)
         summary = replace(summary, vaf_simulation_percent=tuple(scores.simulation.tolist()),
-                          vaf_prediction_percent=tuple(scores.prediction.tolist()))
+                          vaf_prediction_percent=tuple(scores.prediction.tolist()),
+                          vaf_horizon_percent=tuple(scores.horizon.tolist()))
     fault = messages.fault or _dropped(state)
     if request.report is not None and signals is not None:
         _report(request, summary, messages, kept, signals, last, scores, state, fault)

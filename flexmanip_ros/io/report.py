@@ -75,7 +75,8 @@ def _result(summary: Summary, outputs: Sequence[str], bound: float | None, fault
             rows.append((name, f'{value:.3f} s'))
     rows.append(('sample time', f'{number(summary.sample_time_s)} s, {summary.gaps} gaps'))
     for kind, values in (('simulation', summary.vaf_simulation_percent),
-                         ('one-step prediction', summary.vaf_prediction_percent)):
+                         ('one-step prediction', summary.vaf_prediction_percent),
+                         ('prediction ahead', summary.vaf_horizon_percent)):
         if values is not None:
             shares = [f'{name} {number(value, 4)} %' for name, value in zip(outputs, values, strict=True)]
             rows.append((f'variance accounted for, {kind}', ', '.join(shares)))

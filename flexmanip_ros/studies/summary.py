@@ -48,6 +48,7 @@ class Summary:
     payload_inertia_std_kgm2: float | None = None
     vaf_simulation_percent: tuple[float | None, ...] | None = None
     vaf_prediction_percent: tuple[float | None, ...] | None = None
+    vaf_horizon_percent: tuple[float | None, ...] | None = None
     model_status: str = 'TRACKING'
     """Status of the model, where ``status`` is that of the payload. It is not in the JSON."""
 
