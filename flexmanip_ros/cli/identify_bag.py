@@ -23,6 +23,7 @@ EXAMPLES = """examples:
   identify_bag recording --params my_arm.yaml --report report.html
   identify_bag recording --set payload_method=none --set 'inputs=[motor/effort]' \\
       --set 'outputs=[arm/position]' --set order=4 --validate-from 5
+  identify_bag recording --suggest my_machine.yaml --validate-from 30     any machine: what to identify it with
   identify_bag recording --output estimates.csv --json
 
 exit status: 0 on success (stderr then tells in one line which messages were left out); 2 on bad input or
@@ -40,6 +41,9 @@ def _parser() -> console.Parser:
     add = made.add_argument
     add('bag', metavar='BAG', help='rosbag2 directory, or the .mcap or .db3 file itself')
     console.add_parameters(made, 'rpbsid_identifier')
+    add('--suggest', metavar='FILE.yaml',
+        help='look at the recording, before --validate-from if that is given; choose the parameters that predict it '
+        'best, those of --params and --set kept; write them and identify with them')
     add('--validate-from', metavar='SECONDS', type=console.seconds,
         help='identify on the samples before this time [s] from the first stamp; score the model on the rest')
     add('--horizon', metavar='SECONDS', type=console.positive_seconds, default=0.25,
@@ -68,7 +72,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.cli.replay import Request, identify
 
-    config = load(IdentifierParameters, NODE, given.params, given.set)
+    if given.suggest is not None:
+        from flexmanip_ros.cli.suggest import suggest_for
+
+        config, lines = suggest_for(given)
+        print('\n'.join(lines), flush=True)
+    else:
+        config = load(IdentifierParameters, NODE, given.params, given.set)
     request = Request(
         given.bag, config, joint_states=given.joint_states,
         events=tuple(given.capture_event or ('capture_event', 'capture_detected')),
