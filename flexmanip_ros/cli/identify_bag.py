@@ -48,6 +48,8 @@ def _parser() -> console.Parser:
         help='identify on the samples before this time [s] from the first stamp; score the model on the rest')
     add('--horizon', metavar='SECONDS', type=console.positive_seconds, default=0.25,
         help='with --validate-from, score the prediction this far ahead too [s]; default: 0.25')
+    add('--smooth', action='store_true',
+        help='also fit each stretch between events with all of its samples, later ones too')
     add('--output', metavar='OUT',
         help='write the estimates: a table where the name ends in .csv or .npz, else a rosbag2 recording')
     add('--report', metavar='REPORT.html', help='write a report: one HTML page with figures and tables')
@@ -84,7 +86,7 @@ def _main(given: argparse.Namespace) -> int:
         events=tuple(given.capture_event or ('capture_event', 'capture_detected')),
         events_required=given.capture_event is not None,
         capture_time=given.capture_time, release_time=given.release_time, detect=given.detect,
-        validate_from=given.validate_from, horizon=given.horizon,
+        validate_from=given.validate_from, horizon=given.horizon, smooth=given.smooth,
         output=given.output, report=given.report)
     with console.progress('identifying', 'messages') as progress:
         result = identify(request, progress)
@@ -126,6 +128,9 @@ def describe(result: Result) -> list[str]:
         if values is not None:
             shares = [f'{name} {_text(value)} %' for name, value in zip(result.outputs, values, strict=True)]
             lines.append(f'VAF {words:8s} {", ".join(shares)}')
+    for part in summary.smoothed or ():
+        told = ', '.join(f'{mode.frequency_hz:.4f} +- {1.96 * mode.frequency_std_hz:.2g} Hz' for mode in part.modes)
+        lines.append(f'smoothed     {part.start_s:.3f} to {part.end_s:.3f} s, {part.method}: {told or "no mode"}')
     lines += [f'written      {place}' for place in result.written]
     return lines
 

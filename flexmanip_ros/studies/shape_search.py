@@ -1,7 +1,8 @@
 """Which decimation, windows, order and direct term predict best what they have not seen.
 
 For each decimation and past window the moments of a recording are gathered in one factor for each fold. Every order,
-future window and direct term is read off sums of these: a model of two folds predicts the third, a given time ahead.
+future window and direct term is read off sums of these: a model of the other folds predicts a fold, a given time
+ahead.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ COARSE = (4, 6, 8, 10, 12, 16)
 """Orders of the first pass."""
 FINALISTS = 3
 """Pairs of decimation and past window that are looked at closely."""
-FOLDS, BLOCKS = 3, 9
+FOLDS, BLOCKS = 4, 12
 """The recording is cut into blocks, dealt out to the folds in turn: each fold sees every kind of motion."""
 STEPS = 4
 """Steps of the model that the horizon has at least: a lower rate than that predicts nothing."""
@@ -46,6 +47,8 @@ PRIOR = 1e-3
 """Ridge on the regression, on signals of unit peak."""
 BRIDGED_S = 0.02
 """Samples missing for at most so long are interpolated, in the search alone [s]."""
+WORST = 1e9
+"""Share that stands for a model that runs away."""
 CHUNK = 4096
 """Regressors that are formed at once."""
 Progress = Callable[[int, int | None], None]
@@ -97,8 +100,8 @@ class Search:
         return [decimation.whole(part.raw, factor) for part in self.stretches]
 
     def error(self, shape: Shape) -> float:
-        """Return the mean over the outputs of what a shape left unexplained."""
-        return float(np.nanmean(self.tried[shape]))
+        """Return the loss of what a shape left unexplained."""
+        return loss(self.tried[shape])
 
     def best(self, **fixed: object) -> Shape:
         """Return the shape of the least error, among those with the given parts."""
@@ -201,7 +204,7 @@ def _simplest(search: Search) -> Shape:
 
 def _try(search: Search, factor: int, past: int, futures: Sequence[int], directs: Sequence[bool],
          orders: Sequence[int]) -> None:
-    """Identify on two thirds and predict the third, for each third."""
+    """Identify on the other folds and predict each fold."""
     kept = search.kept(factor)
     sums = moments(search, kept, past)
     for future in futures:
@@ -283,7 +286,12 @@ def powers(search: Search, model: StateSpace, kept: list[Kept], factor: int, pas
 
 
 def share(powers: Array) -> Array:
-    """Return the share of each output (m,) that is left unexplained, at most 1; nan where it stands still."""
+    """Return the variance of each output (m,) that is left over, over its own; nan where it stands still."""
     left, spread = powers
     share = np.divide(left, spread, out=np.full(len(left), np.nan), where=spread > 0.0)
-    return np.asarray(np.minimum(share, 1.0), dtype=np.float64)
+    return np.asarray(np.minimum(share, WORST), dtype=np.float64)
+
+
+def loss(left: Array) -> float:
+    """Return one number for shares (m,): their mean while they are small; one wild output does not hide the rest."""
+    return float(np.nanmean(np.log1p(left)))

@@ -16,7 +16,7 @@ from flexmanip_ros.identification import recursive_fit, rpbsid
 from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.samples.sample_log import Signals, log_of
 from flexmanip_ros.studies import holdout, shape_search
-from flexmanip_ros.studies.shape_search import FOLDS, PRIOR, Progress, Search, Shape
+from flexmanip_ros.studies.shape_search import PRIOR, Progress, Search, Shape
 
 PLAIN = 1.03
 """A departure from the plain settings is taken where it divides the error by this at least."""
@@ -27,6 +27,8 @@ SHOWN = 5
 """Values that the reason of a choice compares."""
 TRIALS = 5
 """Runs of the identifier itself."""
+FORGOTTEN = 3
+"""Time constants of the constant forgetting that is tried, in the length of the recording."""
 PARTS = 6
 """The model of the first half predicts the fourth sixth of the recording, and so on."""
 
@@ -85,8 +87,9 @@ def _shape_reasons(search: Search, shape: Shape) -> list[tuple[str, str]]:
     return found
 
 
-def _percent(share: float) -> str:
-    return f'{100.0 * share:.3g} %'
+def _percent(loss: float) -> str:
+    """Return a loss as the share of the variance that it stands for."""
+    return f'{100.0 * min(np.expm1(loss), 1.0):.3g} %'
 
 
 def _prior(search: Search, shape: Shape) -> float:
@@ -96,7 +99,7 @@ def _prior(search: Search, shape: Shape) -> float:
     errors = {}
     for alpha in (PRIOR, *PRIORS):
         found = shape_search.shares(search, kept, sums, shape, (shape.order,), alpha)
-        errors[alpha] = float(np.nanmean(found[shape.order])) if found else np.inf
+        errors[alpha] = shape_search.loss(found[shape.order]) if found else np.inf
     best = min(errors, key=lambda alpha: errors[alpha])
     return best if errors[best] * PLAIN < errors[PRIOR] else PRIOR
 
@@ -104,7 +107,7 @@ def _prior(search: Search, shape: Shape) -> float:
 def _settings(search: Search, shape: Shape, step: Callable[[], None]
               ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
     """Settle what the moments cannot tell, with the identifier itself; return all values, and why."""
-    memory = max(0.5, 1.0 - FOLDS * shape.factor / search.count)
+    memory = max(0.5, 1.0 - FORGOTTEN * shape.factor / search.count)
     alpha = _prior(search, shape)
     plain: dict[str, Any] = {
         **_values(shape), 'forgetting': 'innovation', 'forgetting_factor': (1.0,) * 3, 'regularization': (alpha,) * 3,
@@ -127,20 +130,22 @@ def _settings(search: Search, shape: Shape, step: Callable[[], None]
         error = np.inf
         if values != plain:
             error = _identified_error(search, values)
-            told.append(f'{words} {_percent(min(error, 1.0))}')
+            told.append(f'{words} {_percent(error)}')
         if error * gain < least:
             settled, name, least = values, words, error
         step()
     beside = '' if refined else '; no refinement, which needs a smaller order than these signals do'
+    ridge = 'given' if 'regularization' in search.given else (
+        f'best of {", ".join(f"{value:g}" for value in sorted((PRIOR, *PRIORS)))} by the same error')
     return settled, [
-        ('forgetting, refinement', f'{name}: run through the recording, unexplained {search.horizon_s:g} s ahead with {", ".join(told)}{beside}'),
-        ('regularization', f'{settled["regularization"][0]:g}: '
-                           + ('given' if 'regularization' in search.given else f'best of {", ".join(f"{a:g}" for a in sorted((PRIOR, *PRIORS)))} by the same error'))]
+        ('forgetting, refinement', f'{name}: run through the recording, unexplained {search.horizon_s:g} s ahead with '
+                                   f'{", ".join(told)}{beside}'),
+        ('regularization', f'{settled["regularization"][0]:g}: {ridge}')]
 
 
 def _memory_s(search: Search) -> float:
     """Return the time constant of the constant forgetting that is tried [s]."""
-    return search.count * search.dt / FOLDS
+    return search.count * search.dt / FORGOTTEN
 
 
 def _values(shape: Shape) -> dict[str, Any]:
@@ -174,5 +179,4 @@ def _identified_error(search: Search, values: Mapping[str, Any]) -> float:
             return np.inf
         powers += shape_search.powers(search, found.model, kept, config.decimation, config.past_window,
                           (number >= now) & (number < later))
-    error = float(np.nanmean(shape_search.share(powers)))
-    return error if np.isfinite(error) else np.inf
+    return shape_search.loss(shape_search.share(powers))
