@@ -19,6 +19,7 @@ from flexmanip_ros.parameters.document import written
 from flexmanip_ros.parameters.field import leaves
 from flexmanip_ros.studies.holdout import Scores
 from flexmanip_ros.studies.metrics import Score, score
+from flexmanip_ros.studies.smoothing import Smoothed
 from flexmanip_ros.studies.summary import Summary
 from flexmanip_ros.studies.trial import Row
 from flexmanip_ros.types import StateSpace, Status
@@ -38,7 +39,8 @@ def identification_report(
                     plots.signals_figure(made), 'torques and measured signals over time'))]
     if any(estimate.modes for estimate in made.estimates):
         sections.append(Section('Frequencies', picture(
-            plots.frequency_figure(made), 'identified frequencies with 95 % bands over time')))
+            plots.frequency_figure(made), 'identified frequencies with 95 % bands over time')
+            + _smoothed(summary.smoothed or ())))
     if any(estimate.payload is not None for estimate in made.estimates):
         sections.append(Section('Payload', picture(
             plots.payload_figure(made), 'payload with its 95 % interval, and residual power over time')))
@@ -82,6 +84,15 @@ def _result(summary: Summary, outputs: Sequence[str], bound: float | None, fault
             rows.append((f'variance accounted for, {kind}', ', '.join(shares)))
     warning = f'<p class="changed">{escape(fault)}</p>' if fault else ''
     return warning + table(['', ''], rows)
+
+
+def _smoothed(parts: Sequence[Smoothed]) -> str:
+    """Return the models of whole stretches as a table, those of the grey bands; empty without any."""
+    rows = [(f'{part.start_s:.3f} to {part.end_s:.3f} s', part.method, f'{mode.frequency_hz:.4f} Hz',
+             f'{1.96 * mode.frequency_std_hz:.2g} Hz', f'{mode.damping_ratio:.4f}')
+            for part in parts for mode in part.modes]
+    note = '<p class="note">Grey: the model of each stretch from all of its samples.</p>'
+    return note + table(['stretch', 'method', 'frequency', '95 % +-', 'damping ratio'], rows) if rows else ''
 
 
 def _model(model: StateSpace, inputs: Sequence[str], outputs: Sequence[str]) -> str:

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.identification import decimation, model_output, rpbsid, validation
+from flexmanip_ros.identification import decimation, model_output, rpbsid
 from flexmanip_ros.identification.batch_fit import fit_stretch
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Signals, log_of
-from flexmanip_ros.studies.holdout import HORIZON_S
 from flexmanip_ros.types import Array, Mode, Status
 
 WORK = 2e9
@@ -63,60 +62,47 @@ def smooth(config: IdentifierParameters, signals: Signals, events_ns: Sequence[i
 
 def _stretch(config: IdentifierParameters, signals: Signals, a: int, b: int, dt: float) -> Smoothed:
     u, y, gap = signals.u[a:b], signals.y[a:b], signals.gap[a:b]
+    noise = 'sensor' if config.refinement == 'output_error' else 'any'
     config = replace(config, estimator='factor', forgetting='innovation', forgetting_factor=(1.0,) * 3,
                      refinement='none', state_basis='fixed' if config.state_basis == 'fixed' else 'singular')
     log = log_of(u, y, stamp_ns=signals.stamp_ns[a:b], gap=gap)
-    start_s, end_s = float(signals.time[a]), float(signals.time[b - 1])
-    best, method, parts = None, 'none', _parts(config, u, y, gap)
+    found, method = None, 'none'
     try:
         state = rpbsid.advance(config, rpbsid.init(config), log.rows(0, b - a))
-        best = rpbsid.identified(config, state, dt)
-        if best is not None:
-            method, fitted = 'subspace', _fit(config, state, parts, b - a, dt)
-            if fitted is not None and _left(fitted, parts) < _left(best, parts):
-                best, method = fitted, 'maximum likelihood'
+        found = _fit(config, state, _longest(config, u, y, gap), noise, b - a, dt)
+        method = 'maximum likelihood'
+        if found is None:
+            found, method = rpbsid.identified(config, state, dt), 'subspace'
     except np.linalg.LinAlgError:
-        best, method = None, 'none'
-    if best is None:
-        return Smoothed(start_s, end_s, b - a, method, Status.WARMING_UP, ())
-    return Smoothed(start_s, end_s, b - a, method, best.status, modes(best))
+        found = None
+    start_s, end_s = float(signals.time[a]), float(signals.time[b - 1])
+    if found is None:
+        return Smoothed(start_s, end_s, b - a, 'none', Status.WARMING_UP, ())
+    return Smoothed(start_s, end_s, b - a, method, found.status, modes(found))
 
 
-def _parts(config: IdentifierParameters, u: Array, y: Array, gap: NDArray[np.bool_]) -> list[tuple[Array, Array]]:
-    """Return inputs and outputs between gaps as the identifier sees them, the longest part first."""
+def _longest(config: IdentifierParameters, u: Array, y: Array, gap: NDArray[np.bool_]) -> Array:
+    """Return inputs and outputs (N, r + m) of the longest part without a gap, as the identifier sees them."""
     borders = [0, *(k for k in np.flatnonzero(gap).tolist() if k), len(u)]
-    kept = [decimation.whole(np.hstack([u[a:b], y[a:b]]), config.decimation)[0] for a, b in pairwise(borders)]
-    r = u.shape[1]
-    return sorted(((part[:, :r], part[:, r:]) for part in kept), key=lambda part: -len(part[0]))
+    a, b = max(pairwise(borders), key=lambda part: part[1] - part[0])
+    return decimation.whole(np.hstack([u[a:b], y[a:b]]), config.decimation)[0]
 
 
-def _fit(config: IdentifierParameters, state: rpbsid.RpbsidState, parts: list[tuple[Array, Array]], count: int,
-         dt: float) -> Identified | None:
-    """Return the maximum-likelihood fit; None where it is too large, or no model simulates the stretch."""
+def _fit(config: IdentifierParameters, state: rpbsid.RpbsidState, samples: Array, noise: str, count: int, dt: float
+         ) -> Identified | None:
+    """Return the maximum-likelihood fit; None where it would take too long, or no model simulates the stretch."""
     n, r, m = config.order, len(config.inputs), len(config.outputs)
     size = n * (n + r + 2 * m + 1) + m * r
-    samples = np.hstack(parts[0])
-    if len(samples) * config.decimation < WHOLE * count or len(samples) * m * size ** 2 > WORK:
+    if len(samples) * config.decimation < WHOLE * count or not 2 * size < len(samples) < WORK / (m * size ** 2):
         return None
-    if len(samples) < 2 * size:
+    starts = [model_output.from_factor(config, state.memory[0], state.scale)]
+    if n > m and config.past_window > config.future_window:
+        longer = replace(config, future_window=config.past_window)
+        starts.append(model_output.from_factor(longer, state.memory[0], state.scale))
+    fit = fit_stretch(samples, [realized for realized, _, _ in starts if realized is not None], [], starts[0][2],
+                      config.direct_feedthrough, noise)
+    if fit is None:
         return None
-    realized, R, scale = model_output.from_factor(config, state.memory[0], state.scale)
-    if realized is None:
-        return None
-    found = fit_stretch(samples, [realized], [], scale, config.direct_feedthrough, 'any')
-    if found is None:
-        return None
-    d = R.shape[1] - r - m
-    return model_output.from_fit(config, found, state.scalars, model_output.excitation(R[:d, :d]),
+    d = state.memory[4].shape[1]
+    return model_output.from_fit(config, fit, state.scalars, model_output.excitation(state.memory[0][:d, :d]),
                                  dt * config.decimation)
-
-
-def _left(found: Identified, parts: list[tuple[Array, Array]]) -> float:
-    """Return the share of the outputs that a prediction ahead leaves unexplained in the longest part."""
-    U, Y = parts[0]
-    steps = max(1, round(HORIZON_S / found.model.dt))
-    with np.errstate(all='ignore'):
-        ahead = validation.predict_ahead(found.model, U, Y, steps)
-    if len(ahead) < 2:
-        return np.inf
-    return 1.0 - float(np.nanmean(validation.vaf(Y[steps - 1:], ahead))) / 100.0
