@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -106,11 +106,15 @@ def suggest(source: str, place: str, given: Mapping[str, Any], topics: bag.Topic
         found = suggestion.suggest({**given, **chosen}, collected, dt, horizon_s=horizon_s, progress=shown)
     words = [f'{name}: {why}' for name, why in (*reasons, *found.reasons)]
     heading = f'Suggested by identify_bag --suggest for {Path(source).resolve().name}.'
-    text = '\n'.join(['# ' + heading, *(f'# * {line}' for line in words), yaml_text(NODE, found.values)])
-    write_text(place, text)
+    write_text(place, file_text(heading, words, found.values))
     lines = [*(f'signal       {signal.text()}' for signal in signals), *(f'suggested    {line}' for line in words),
              f'written      {place}']
     return configure(IdentifierParameters, found.values), lines
+
+
+def file_text(heading: str, words: Sequence[str], values: Mapping[str, Any]) -> str:
+    """Return a parameter file for any node name, with the reasons in front."""
+    return '\n'.join([f'# {heading}', *(f'# * {line}' for line in words), yaml_text(NODE, values)])
 
 
 def _recording(source: str, topics: bag.Topics, until_s: float | None, progress: bag.Progress) -> _Recording:
