@@ -1,13 +1,15 @@
 """Claim: told names alone, identify_bag --suggest predicts measured arms 0.25 s ahead as well as the best of a grid.
 
 The first half of each recording is looked at and identified, the second is predicted 0.25 s ahead of the last sample
-used. The grid is batch PBSID over decimation 1, 2, 5, 10, order 4 to 10 and windows of 0.1 and 0.3 s, each model with
-the state of its predictor and with that of its last window; its best is chosen knowing the second half, which the
-suggestion does not. Records: folder FLEXMANIP_DATA or ../shared/data.
+used. The grid is batch PBSID over decimation 1, 2, 5, 10, order 4 to 10 and windows of 0.1 and 0.3 s, with both weights
+of the state and a short future window too where the past is of bearable length; each model with the state of its
+predictor and with that of its last window. Its best is chosen knowing the second half, which the suggestion does
+not. Records: folder FLEXMANIP_DATA or ../shared/data.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import time
@@ -39,6 +41,8 @@ CASES = {
     'daisy_robot_arm': (('arm/effort',), ('arm/position',)),
 }
 FACTORS, ORDERS, WINDOWS_S = (1, 2, 5, 10), range(4, 11), (0.1, 0.3)
+BEARABLE = 320
+"""Regressors beyond which one batch takes seconds."""
 
 
 def windowed(model: StateSpace, U: Array, Y: Array, past: int, steps: int) -> tuple[Array, int]:
@@ -66,10 +70,14 @@ def grid(u: Array, y: Array, dt: float, half: int) -> tuple[list[float], str]:
         steps = max(1, round(HORIZON_S / (factor * dt))) + (decimation.LAG if factor > 1 else 0)
         for window in WINDOWS_S:
             past = max(2, round(window / (factor * dt)))
-            for order in ORDERS:
+            short = past * joint.shape[1] <= BEARABLE
+            kinds = itertools.product(ORDERS, sorted({past, min(past, 10)} if short else {past}),
+                                      (True, False) if short else (True,))
+            for order, future, weighted in kinds:
                 try:
-                    model, _ = pbsid(learned[:, :r], learned[:, r:], n=order, p=past, f=past, dt=factor * dt)
-                except ModelError:
+                    model, _ = pbsid(learned[:, :r], learned[:, r:], n=order, p=past, f=future, dt=factor * dt,
+                                     weighted=weighted)
+                except (ModelError, np.linalg.LinAlgError):
                     continue
                 with np.errstate(all='ignore'):
                     filtered = validation.predict_ahead(model, whole[:, :r], whole[:, r:], steps)
@@ -77,7 +85,7 @@ def grid(u: Array, y: Array, dt: float, half: int) -> tuple[list[float], str]:
                                          windowed(model, whole[:, :r], whole[:, r:], past, steps)):
                         at = rows[first:]
                         scores = validation.vaf(y[at[at >= half]], ahead[at >= half])
-                        if scores.mean() > best[0]:
+                        if len(scores) and scores.mean() > best[0]:
                             name = f'decimation {factor}, order {order}, window {window:g} s'
                             best = (float(scores.mean()), scores.tolist(), name)
     return best[1], best[2]
