@@ -27,6 +27,10 @@ class SignalError(FlexmanipError):
     """A configured signal is not in the data, or arrays have unequal sizes."""
 
 
+class MissingSignalError(SignalError):
+    """No message carries a configured signal."""
+
+
 class BagError(FlexmanipError):
     """A bag is missing, empty, truncated, of the wrong type, or cannot be written."""
 

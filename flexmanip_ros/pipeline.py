@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros import estimator, event_replay
-from flexmanip_ros.errors import SignalError
+from flexmanip_ros.errors import MissingSignalError, SignalError
 from flexmanip_ros.estimator import ModelEstimator, PayloadEstimator
 from flexmanip_ros.event_replay import EventReplay
 from flexmanip_ros.identification import rpbsid
@@ -239,7 +239,8 @@ def check_used(state: State) -> None:
     """Raise SignalError when messages came and none, or just one, could be used."""
     rejection = state.clock.rejection
     if state.counters.accepted <= 1 and rejection is not None:
-        raise SignalError(rejection.problem, rejection.remedy)
+        kind = MissingSignalError if rejection.reason == 'missing_signal' else SignalError
+        raise kind(rejection.problem, rejection.remedy)
 
 
 def reconfigure(config: IdentifierParameters, state: State, background: Background = INLINE) -> State:

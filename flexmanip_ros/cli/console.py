@@ -56,6 +56,14 @@ def seconds(text: str) -> float:
     return value
 
 
+def positive_seconds(text: str) -> float:
+    """Return an argument as a time above 0 [s]. Raises ArgumentTypeError."""
+    value = seconds(text)
+    if not value > 0.0:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a time above 0 s")
+    return value
+
+
 def whole(text: str) -> int:
     """Return an argument as a seed or count. Raises ArgumentTypeError."""
     if not text.strip().isdecimal():

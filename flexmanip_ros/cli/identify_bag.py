@@ -24,6 +24,7 @@ EXAMPLES = """examples:
   identify_bag recording --params my_arm.yaml --report report.html
   identify_bag recording --set payload_method=none --set 'inputs=[motor/effort]' \\
       --set 'outputs=[arm/position]' --set order=4 --validate-from 5
+  identify_bag recording --suggest my_machine.yaml --validate-from 30     any machine: what to identify it with
   identify_bag recording --output estimates.csv --json
 
 exit status: 0 on success (stderr then tells in one line which messages were left out); 2 on bad input or
@@ -41,8 +42,15 @@ def _parser() -> console.Parser:
     add = made.add_argument
     add('bag', metavar='BAG', help='rosbag2 directory, or the .mcap or .db3 file itself')
     console.add_parameters(made, 'rpbsid_identifier')
+    add('--suggest', metavar='FILE.yaml',
+        help='look at the recording, before --validate-from if that is given; choose the parameters that predict it '
+        'best, those of --params and --set kept; write them and identify with them')
     add('--validate-from', metavar='SECONDS', type=console.seconds,
         help='identify on the samples before this time [s] from the first stamp; score the model on the rest')
+    add('--horizon', metavar='SECONDS', type=console.positive_seconds, default=0.25,
+        help='with --validate-from, score the prediction this far ahead too [s]; default: 0.25')
+    add('--smooth', action='store_true',
+        help='also fit each stretch between events with all of its samples, later ones too')
     add('--output', metavar='OUT',
         help='write the estimates: a table where the name ends in .csv or .npz, else a rosbag2 recording')
     add('--report', metavar='REPORT.html', help='write a report: one HTML page with figures and tables')
@@ -74,13 +82,19 @@ def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.cli import first_use
     from flexmanip_ros.cli.replay import Request, identify
 
-    config = load(IdentifierParameters, NODE, given.params, given.set)
+    if given.suggest is not None:
+        from flexmanip_ros.cli.suggest import suggest_for
+
+        config, lines = suggest_for(given)
+        print('\n'.join(lines), flush=True)
+    else:
+        config = load(IdentifierParameters, NODE, given.params, given.set)
     request = Request(
         given.bag, config, joint_states=given.joint_states,
         events=tuple(given.capture_event or ('capture_event', 'capture_detected')),
         events_required=given.capture_event is not None,
         capture_time=given.capture_time, release_time=given.release_time, detect=given.detect,
-        validate_from=given.validate_from,
+        validate_from=given.validate_from, horizon=given.horizon, smooth=given.smooth,
         output=given.output, report=given.report, save_arm=given.save_arm)
     with console.progress('identifying', 'messages') as progress, first_use.announced():
         result = identify(request, progress)
@@ -120,10 +134,14 @@ def describe(result: Result) -> list[str]:
         if summary.consistency is not None and summary.payload_std_kg is not None:
             lines.append(f'residuals    power {summary.consistency:.6g} times that of the noise (1: noise only)')
     for words, values in (('simulation', summary.vaf_simulation_percent),
-                          ('prediction', summary.vaf_prediction_percent)):
+                          ('prediction', summary.vaf_prediction_percent),
+                          ('ahead', summary.vaf_horizon_percent)):
         if values is not None:
             shares = [f'{name} {_text(value)} %' for name, value in zip(result.config.outputs, values, strict=True)]
             lines.append(f'VAF {words:8s} {", ".join(shares)}')
+    for part in summary.smoothed or ():
+        told = ', '.join(f'{mode.frequency_hz:.4f} +- {1.96 * mode.frequency_std_hz:.2g} Hz' for mode in part.modes)
+        lines.append(f'smoothed     {part.start_s:.3f} to {part.end_s:.3f} s, {part.method}: {told or "no mode"}')
     lines += [f'written      {place}' for place in result.written]
     return lines
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from flexmanip_ros import estimator, pipeline
 from flexmanip_ros.cli.console import Report, require_matplotlib
-from flexmanip_ros.errors import BagError, FlexmanipError, ParameterError, SignalError
+from flexmanip_ros.errors import BagError, FlexmanipError, MissingSignalError, ParameterError, SignalError
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.outputs import TableOutput, check_place, open_output, write_text
 from flexmanip_ros.parameters import IdentifierParameters
@@ -20,7 +20,7 @@ from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.payload.arm_parameters import as_parameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
-from flexmanip_ros.studies import holdout
+from flexmanip_ros.studies import holdout, smoothing
 from flexmanip_ros.studies.summary import Summary, summarize
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Mode
 from flexmanip_ros.view.screen import Screen, of_identifier
@@ -45,6 +45,10 @@ class Request:
     """Whether to look for captures and releases in the signals; None: where the recording has no topic of events, no
     time is given, and the signals can show one."""
     validate_from: float | None = None
+    horizon: float = holdout.HORIZON_S
+    """How far ahead the held-out samples are predicted [s]."""
+    smooth: bool = False
+    """Fit each stretch between events with all of its samples too."""
     output: str | None = None
     report: str | None = None
     save_arm: str | None = None
@@ -96,6 +100,9 @@ def identify(request: Request, progress: Report | None = None) -> Result:
                     output.write(estimate)
                 if request.report is not None:
                     kept.append(estimate)
+        except MissingSignalError as err:
+            raise MissingSignalError(
+                err.problem, f"{err.remedy}, or let 'identify_bag {request.bag} --suggest FILE.yaml' choose") from err
         except KeyboardInterrupt:
             messages.fault, interrupted = BagError('interrupted', 'the messages until then are reported'), True
         if isinstance(output, TableOutput):
@@ -109,9 +116,15 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     signals = messages.signals() if messages.is_kept else None
     if request.validate_from is not None and signals is not None:
         progress.phase('scoring the model')
-        scores = holdout.score(None if last is None else last.model, signals, request.validate_from)
+        scores = holdout.score(None if last is None else last.model, signals, request.validate_from,
+                               factor=request.config.decimation, horizon_s=request.horizon)
         summary = replace(summary, vaf_simulation_percent=tuple(scores.simulation.tolist()),
-                          vaf_prediction_percent=tuple(scores.prediction.tolist()))
+                          vaf_prediction_percent=tuple(scores.prediction.tolist()),
+                          vaf_horizon_percent=tuple(scores.horizon.tolist()))
+    if request.smooth and signals is not None:
+        events = [event.stamp_ns for event in messages.events]
+        summary = replace(summary, smoothed=smoothing.smooth(
+            state.config or request.config, signals, events, state.clock.dt, request.validate_from))
     fault = messages.fault or _dropped(state)
     if request.save_arm is not None:
         _save_arm(request, state, last)
@@ -133,7 +146,7 @@ class _Messages:
         """Messages that hold none of the configured joints."""
         self.first_ns: int | None = None
         self.events: list[CaptureEvent] = []
-        self.is_kept = request.report is not None or request.validate_from is not None
+        self.is_kept = request.report is not None or request.validate_from is not None or request.smooth
         self._clock, self._log = sampling.Clock(), sampling.EMPTY
         self._findings = capture_detection.Findings()
         self._looked = False
@@ -299,7 +312,7 @@ def _report(request: Request, summary: Summary, messages: _Messages, kept: list[
 
     assert request.report is not None
     config = state.config or request.config
-    made = plots.run(config, signals, kept, messages.events)
+    made = replace(plots.run(config, signals, kept, messages.events), smoothed=summary.smoothed or ())
     bound, mass = None, summary.payload_mass_kg
     if summary.capture_time_s is not None and mass is not None:
         bound = payload_bound(config, signals, summary.capture_time_s, mass, state.clock.dt)

@@ -9,11 +9,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexmanip_ros.types import Array
 
 TAPS = 8
 """Length of the filter in kept sample times."""
+LAG = TAPS // 2
+"""Kept sample times from the instant that a filtered sample describes to the last sample that it is made of."""
 
 
 class Decimator(NamedTuple):
@@ -58,6 +61,17 @@ def decimate(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimat
             at.append(k)
         begin = k + 1
     return decimator, np.vstack(kept), at
+
+
+def whole(samples: Array, factor: int) -> tuple[Array, NDArray[np.int64]]:
+    """Filter one stretch (N, w) at once; return the kept samples (k, w) and the row (k,) that each describes.
+
+    factor 1: the samples themselves. The last row that kept sample i is made of is LAG * factor rows later.
+    """
+    if factor == 1:
+        return samples, np.arange(len(samples))
+    _, kept, due = decimate(start(factor, samples.shape[1]), samples, factor)
+    return kept, np.array(due, dtype=np.int64) - LAG * factor
 
 
 def _run(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimator, Array, list[int]]:

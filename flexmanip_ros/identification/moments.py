@@ -8,6 +8,7 @@ same weights to round-off, and no state is ever stale.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -135,6 +136,15 @@ def realize(
     leading n left singular vectors of their product with the data. riccati: the gain K solves the Riccati
     equation of the residuals, which makes the predictor stable; otherwise it is regressed like A and B.
     """
+    return realize_orders(
+        R, r, m, (n,), f, feedthrough=feedthrough, weighted=weighted, fixed=fixed, riccati=riccati)[0]
+
+
+def realize_orders(
+    R: Array, r: int, m: int, orders: Sequence[int], f: int, *, feedthrough: bool, weighted: bool,
+    fixed: bool = False, riccati: bool = False,
+) -> list[Realized | None]:
+    """Models of several orders from one factor, see ``realize``: regression and decomposition are made once."""
     width = r + m
     past = R.shape[0] - width
     d = past + r if feedthrough else past
@@ -149,29 +159,34 @@ def realize(
         power = float(np.linalg.norm(R[:, past + r:]))
         whiten = row_whitening(R[:past, :past], head, residual, power, f, width)
     left, values, _ = np.linalg.svd(whiten @ (G @ R[:past, :past].T), full_matrices=False)
-    if not np.all(np.isfinite(values)) or values.size < n or values[n - 1] <= 1e-14 * values[0]:
-        return None
-    S = np.eye(n, f * m) if fixed else (left[:, :n] / np.sqrt(values[:n])).T @ whiten
-    if weighted:
-        S = S @ open_loop_weight(Xi, f, r)
-        G = observability_controllability(Xi, f, r, False)
-    T = S @ G
-    state = R[:, :past] @ T.T
-    u, y = R[:, past:past + r], R[:, past + r:]
-    output = np.hstack([state, u]) if feedthrough else state
-    CD = regress(output, y)
-    innovation = y - output @ CD.T
-    following = R[:, width:] @ T.T
-    ABK = regress(np.hstack([state, u, innovation]), following)
-    K = ABK[:, n + r:]
-    if riccati:
-        rest = following - np.hstack([state, u]) @ ABK[:, :n + r].T
-        K = riccati_gain(ABK[:, :n], CD[:, :n], rest, innovation, K)
-    D = CD[:, n:] if feedthrough else np.zeros((m, r))
-    most = np.einsum('ij,ij->j', residual, residual)
-    extra = np.einsum('ij,ij->j', innovation, innovation) - most
-    return Realized(
-        A=ABK[:, :n], B=ABK[:, n:n + r], C=CD[:, :n], D=D, K=K, Xi=Xi, xi_u=xi_u, S=S, T=T,
-        state=state, residual=residual, regression=head, singular_values=values,
-        neglected=np.divide(np.maximum(extra, 0.0), most, out=np.zeros(m), where=most > 0.0),
-    )
+    weight = open_loop_weight(Xi, f, r) if weighted else np.eye(f * m)
+    own = observability_controllability(Xi, f, r, False) if weighted else G
+    found: list[Realized | None] = []
+    for n in orders:
+        if not np.all(np.isfinite(values)) or values.size < n or values[n - 1] <= 1e-14 * values[0]:
+            found.append(None)
+            continue
+        S = np.eye(n, f * m) if fixed else (left[:, :n] / np.sqrt(values[:n])).T @ whiten
+        if weighted:
+            S = S @ weight
+        T = S @ own
+        state = R[:, :past] @ T.T
+        u, y = R[:, past:past + r], R[:, past + r:]
+        output = np.hstack([state, u]) if feedthrough else state
+        CD = regress(output, y)
+        innovation = y - output @ CD.T
+        following = R[:, width:] @ T.T
+        ABK = regress(np.hstack([state, u, innovation]), following)
+        K = ABK[:, n + r:]
+        if riccati:
+            rest = following - np.hstack([state, u]) @ ABK[:, :n + r].T
+            K = riccati_gain(ABK[:, :n], CD[:, :n], rest, innovation, K)
+        D = CD[:, n:] if feedthrough else np.zeros((m, r))
+        most = np.einsum('ij,ij->j', residual, residual)
+        extra = np.einsum('ij,ij->j', innovation, innovation) - most
+        found.append(Realized(
+            A=ABK[:, :n], B=ABK[:, n:n + r], C=CD[:, :n], D=D, K=K, Xi=Xi, xi_u=xi_u, S=S, T=T,
+            state=state, residual=residual, regression=head, singular_values=values,
+            neglected=np.divide(np.maximum(extra, 0.0), most, out=np.zeros(m), where=most > 0.0),
+        ))
+    return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from flexmanip_ros.identification.realization import markov
 from flexmanip_ros.types import Array, StateSpace
 
 
@@ -48,6 +49,37 @@ def predict(model: StateSpace, U: Array, Y: Array, x0: Array | None = None) -> A
     """One-step predictions (N, m) of outputs Y (N, m) by the innovation form (eqs. 22-23)."""
     x = np.zeros(model.order) if x0 is None else np.array(x0, dtype=float)
     return _filter(model, U, Y, x)
+
+
+@njit(cache=True)
+def _states(A: Array, B: Array, C: Array, D: Array, K: Array, U: Array, Y: Array, x: Array) -> Array:
+    out = np.zeros((U.shape[0] + 1, A.shape[0]))
+    for k in range(U.shape[0]):
+        out[k] = x
+        x = A @ x + B @ U[k] + K @ (Y[k] - C @ x - D @ U[k])
+    out[U.shape[0]] = x
+    return out
+
+
+def predict_ahead(model: StateSpace, U: Array, Y: Array, steps: int, x0: Array | None = None) -> Array:
+    """Predictions (N - steps + 1, m) of outputs Y (N, m), ``steps`` >= 1 ahead of the last output that each uses.
+
+    Row k predicts Y[k + steps - 1] from the state that the outputs before k give, and from all inputs U (N, r).
+    """
+    m, n = model.C.shape
+    count = U.shape[0] - steps + 1
+    if count < 1:
+        return np.zeros((0, m))
+    x = np.zeros(n) if x0 is None else np.array(x0, dtype=float)
+    A, B, C, D, K, inputs, outputs = (
+        np.ascontiguousarray(a) for a in (model.A, model.B, model.C, model.D, model.K, U, Y))
+    X = _states(A, B, C, D, K, inputs, outputs, x)[:count]
+    response = markov(model, steps)
+    ahead = X @ (model.C @ np.linalg.matrix_power(model.A, steps - 1)).T
+    for o in range(m):
+        for i in range(U.shape[1]):
+            ahead[:, o] += np.convolve(U[:, i], response[:, o, i], mode='valid')
+    return np.asarray(ahead, dtype=np.float64)
 
 
 def state_at_end(model: StateSpace, U: Array, Y: Array) -> Array:

@@ -22,12 +22,14 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.holdout import Scores
+from flexmanip_ros.studies.smoothing import Smoothed
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointRecord, Status
 from flexmanip_ros.view.looks import COLOURS, EVENT_COLOUR, MODES_APART, PAYLOAD_COLOUR, STATUS_LOOKS
 
 LINES: tuple[Any, ...] = ('-', (0, (4, 1.2)), (0, (1.2, 1)), (0, (6, 1.2, 1.2, 1.2)))
 """Line styles, so that signals in one plot differ by more than their colour."""
 TRUTH_COLOUR = '#000000'
+SMOOTHED_COLOUR = '#404040'
 WIDTH = 10.0
 """Width of a figure [inches], about that of a page."""
 DPI = 120
@@ -241,6 +243,8 @@ class Run:
     has_arm: bool
     """Whether the signals are those of the two-link arm, so that positions of bends are in metres."""
     truth: Truth = Truth()
+    smoothed: Sequence[Smoothed] = ()
+    """Models of whole stretches."""
 
     @property
     def start_ns(self) -> int:
@@ -326,6 +330,13 @@ def frequency_figure(made: Run) -> Figure:
     """Draw the frequencies with their bands, and the status."""
     drawn, axes = figure([3.2, 0.35])
     _estimates(axes, made, with_payload=False)
+    for part in made.smoothed:
+        for mode in part.modes:
+            wide = 1.96 * mode.frequency_std_hz
+            axes[0].fill_between([part.start_s, part.end_s], mode.frequency_hz - wide, mode.frequency_hz + wide,
+                                 color=SMOOTHED_COLOUR, alpha=0.25, linewidth=0.0)
+            axes[0].plot([part.start_s, part.end_s], [mode.frequency_hz] * 2, color=SMOOTHED_COLOUR, linewidth=1.0,
+                         linestyle=LINES[1])
     events(axes, made.events)
     return drawn
 

@@ -19,6 +19,7 @@ from flexmanip_ros.parameters.document import written
 from flexmanip_ros.parameters.field import leaves
 from flexmanip_ros.studies.holdout import Scores
 from flexmanip_ros.studies.metrics import Score, score
+from flexmanip_ros.studies.smoothing import Smoothed
 from flexmanip_ros.studies.summary import Summary, status_text
 from flexmanip_ros.studies.trial import Row
 from flexmanip_ros.types import Mode, StateSpace, Status
@@ -46,7 +47,8 @@ def identification_report(
             plots.payload_figure(made), 'payload with its 95 % interval, and residual power over time')))
     if any(estimate.modes for estimate in made.estimates):
         sections.append(Section('Frequencies', picture(
-            plots.frequency_figure(made), 'identified frequencies with 95 % bands over time')))
+            plots.frequency_figure(made), 'identified frequencies with 95 % bands over time')
+            + _smoothed(summary.smoothed or ())))
     sections.append(Section('Signals', picture(plots.signals_figure(made), 'torques and measured signals over time')))
     if scores is not None:
         note = '' if not scores.until_gap else '<p class="note">Scored up to the first gap.</p>'
@@ -108,11 +110,21 @@ def _result(config: IdentifierParameters, summary: Summary, outputs: Sequence[st
             rows.append((name, f'{value:.3f} s'))
     rows.append(('sample time', f'{number(summary.sample_time_s)} s, {summary.gaps} gaps'))
     for kind, values in (('simulation', summary.vaf_simulation_percent),
-                         ('one-step prediction', summary.vaf_prediction_percent)):
+                         ('one-step prediction', summary.vaf_prediction_percent),
+                         ('prediction ahead', summary.vaf_horizon_percent)):
         if values is not None:
             shares = [f'{name} {number(value, 4)} %' for name, value in zip(outputs, values, strict=True)]
             rows.append((f'variance accounted for, {kind}', ', '.join(shares)))
     return table(['', ''], rows)
+
+
+def _smoothed(parts: Sequence[Smoothed]) -> str:
+    """Return the models of whole stretches as a table, those of the grey bands; empty without any."""
+    rows = [(f'{part.start_s:.3f} to {part.end_s:.3f} s', part.method, f'{mode.frequency_hz:.4f} Hz',
+             f'{1.96 * mode.frequency_std_hz:.2g} Hz', f'{mode.damping_ratio:.4f}')
+            for part in parts for mode in part.modes]
+    note = '<p class="note">Grey: the model of each stretch from all of its samples.</p>'
+    return note + table(['stretch', 'method', 'frequency', '95 % +-', 'damping ratio'], rows) if rows else ''
 
 
 def _model(model: StateSpace, inputs: Sequence[str], outputs: Sequence[str]) -> str:

@@ -7,20 +7,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexmanip_ros.errors import ModelError, ParameterError
-from flexmanip_ros.identification import validation
+from flexmanip_ros.identification import decimation, validation
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.types import Array, StateSpace
+
+HORIZON_S = 0.25
+"""How far ahead the prediction is scored where nobody says [s]: what a controller of a flexible arm looks ahead."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
     """Variance accounted for (VAF) per output (m,) [%], and the outputs it is of.
 
+    horizon: of the prediction a given time ahead of the last sample used, nan where too few samples are left.
     time: (N,) [s]; measured, simulated, predicted (one step ahead): (N, m).
     """
 
     simulation: Array
     prediction: Array
+    horizon: Array
     time: Array
     measured: Array
     simulated: Array
@@ -29,11 +34,15 @@ class Scores:
     """Whether a gap ended the scored stretch before the end of the recording."""
 
 
-def score(model: StateSpace | None, signals: Signals, start_s: float) -> Scores:
+def score(model: StateSpace | None, signals: Signals, start_s: float, *, factor: int = 1,
+          horizon_s: float = HORIZON_S) -> Scores:
     """Score a model that is not adapted further on the samples from ``start_s`` [s] on, up to the first gap.
 
     The state at the start is estimated on the samples before it, by least squares over a free run of the
     model and of its predictor; simulation then uses no measured output.
+    factor: decimation of the model, whose signals are then filtered as the identifier filters them; simulation and
+    one-step prediction are scored on these, the prediction ``horizon_s`` [s] ahead on the samples as they were
+    measured, from those that were there by then.
     Raises ParameterError when nothing is left to score, ModelError when there is no model.
     """
     time = signals.time
@@ -47,16 +56,31 @@ def score(model: StateSpace | None, signals: Signals, start_s: float) -> Scores:
     gaps = np.flatnonzero(signals.gap)
     before = int(gaps[gaps <= first][-1]) if (gaps <= first).any() else 0
     after = int(gaps[gaps > first][0]) if (gaps > first).any() else time.size
-    u, y = signals.u[first:after], signals.y[first:after]
-    x0 = validation.state_at_end(model, signals.u[before:first], signals.y[before:first])
-    with np.errstate(over='ignore', invalid='ignore'):  # an unstable model overflows and scores 0
+    measured = signals.y[before:after]
+    kept, rows = decimation.whole(np.hstack([signals.u[before:after], measured]), factor)
+    if factor > 1:  # the last of the samples that a filtered one is made of decides
+        lag = decimation.LAG
+        split = int(np.searchsorted(rows, first - before - lag * factor))
+    else:
+        lag, split = 0, first - before
+    if len(rows) - split < 2:
+        raise ParameterError(f'validation from {start_s:g} s leaves no samples to score at a decimation of {factor}',
+                             'choose an earlier time')
+    r = signals.u.shape[1]
+    U, Y = kept[:, :r], kept[:, r:]
+    u, y = U[split:], Y[split:]
+    steps = max(1, round(horizon_s / model.dt)) + lag
+    x0 = validation.state_at_end(model, U[:split], Y[:split])
+    with np.errstate(all='ignore'):  # an unstable model overflows and scores 0
         simulated = validation.simulate(model, u, x0)
-        seen = np.hstack([signals.u[before:first], signals.y[before:first]])
-        filtered = validation.state_at_end(_predictor(model), seen, signals.y[before:first])
+        filtered = validation.state_at_end(_predictor(model), kept[:split], Y[:split])
         predicted = validation.predict(model, u, y, filtered)
+        ahead = validation.predict_ahead(model, u, y, steps, filtered)
+    target = measured[rows[split + steps - 1:]]
+    horizon = validation.vaf(target, ahead) if len(target) > 1 else np.full(y.shape[1], np.nan)
     return Scores(
-        validation.vaf(y, simulated), validation.vaf(y, predicted), time[first:after], y, simulated,
-        predicted, after < time.size)
+        validation.vaf(y, simulated), validation.vaf(y, predicted), horizon, time[before:after][rows[split:]], y,
+        simulated, predicted, after < time.size)
 
 
 def _predictor(model: StateSpace) -> StateSpace:

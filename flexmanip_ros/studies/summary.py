@@ -12,6 +12,7 @@ import numpy as np
 from flexmanip_ros import pipeline
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload.structured_model import unobservable_reason
+from flexmanip_ros.studies.smoothing import Smoothed
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, Payload, Status
 
 ADVICE: Mapping[Status, str] = {
@@ -60,13 +61,16 @@ class Summary:
     payload_inertia_std_kgm2: float | None = None
     vaf_simulation_percent: tuple[float | None, ...] | None = None
     vaf_prediction_percent: tuple[float | None, ...] | None = None
+    vaf_horizon_percent: tuple[float | None, ...] | None = None
+    smoothed: tuple[Smoothed, ...] | None = None
+    """Models of whole stretches, where they are asked for; in the JSON then, too."""
     model_status: str = 'TRACKING'
     """Status of the model, where ``status`` is that of the payload. It is not in the JSON."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the values as JSON has them: no NaN, no infinity, lists instead of tuples."""
         return {item.name: _json(getattr(self, item.name)) for item in fields(self)
-                if item.name != 'model_status'}
+                if item.name != 'model_status' and (item.name != 'smoothed' or self.smoothed is not None)}
 
     def payload_text(self) -> str:
         """Return payload and interval in words; where they are not reliable, the reason and what to do next."""
@@ -135,6 +139,8 @@ def _known(value: float) -> float | None:
 
 
 def _json(value: Any) -> Any:
+    if isinstance(value, Smoothed):
+        return {name: _json(part) for name, part in value.as_json().items()}
     if isinstance(value, tuple):
         return [_json(item) for item in value]
     if isinstance(value, float):

@@ -83,7 +83,7 @@ def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_k
     row: Row = summarize(state, last, wall).as_json()
     interval: tuple[float | None, float | None] = row.pop('payload_ci95_kg') or (None, None)
     low, high = interval
-    for name in ('vaf_simulation_percent', 'vaf_prediction_percent', 'wall_s'):
+    for name in ('vaf_simulation_percent', 'vaf_prediction_percent', 'vaf_horizon_percent', 'wall_s'):
         row.pop(name)
     for kind in ('payload_com_m', 'payload_com_std_m'):
         row[f'{kind}_x'], row[f'{kind}_y'] = row.pop(kind) or (None, None)

@@ -24,7 +24,7 @@ START = 1_700_000_000_000_000_000
 KEYS = ['samples', 'gaps', 'sample_time_s', 'wall_s', 'status', 'frequencies_hz', 'damping_ratios',
         'payload_mass_kg', 'payload_std_kg', 'payload_ci95_kg', 'consistency', 'capture_time_s',
         'release_time_s', 'payload_com_m', 'payload_com_std_m', 'payload_inertia_kgm2', 'payload_inertia_std_kgm2',
-        'vaf_simulation_percent', 'vaf_prediction_percent']
+        'vaf_simulation_percent', 'vaf_prediction_percent', 'vaf_horizon_percent']
 OTHER = {'payload_method': 'none', 'inputs': ['motor/effort'], 'outputs': ['arm/position', 'arm/velocity'],
          'angles': [], 'order': 2, 'past_window': 6, 'future_window': 4}
 SETTINGS = [f'--set={name}={json.dumps(value)}' for name, value in OTHER.items()]
@@ -81,6 +81,7 @@ def test_json_has_exactly_the_promised_keys_on_the_last_line(recording, capsys):
     assert found['capture_time_s'] is None
     assert all(score > 80.0 for score in found['vaf_simulation_percent'])
     assert all(score > 80.0 for score in found['vaf_prediction_percent'])
+    assert all(score > 80.0 for score in found['vaf_horizon_percent'])
 
 
 def test_without_json_the_result_is_written_for_people(recording, capsys):
@@ -230,7 +231,8 @@ def test_bad_arguments_are_one_line_and_exit_2(recording, capsys, arguments, wor
     assert err.count('\n') == 1
 
 
-@pytest.mark.parametrize('arguments', [[], ['a', 'b'], ['bag', '--unknown'], ['bag', '--validate-from', 'x']])
+@pytest.mark.parametrize('arguments', [[], ['a', 'b'], ['bag', '--unknown'], ['bag', '--validate-from', 'x'],
+                                       ['bag', '--horizon', '0']])
 def test_a_command_line_that_cannot_be_read_exits_2(capsys, arguments):
     with pytest.raises(SystemExit) as caught:
         main(arguments)

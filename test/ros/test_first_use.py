@@ -18,6 +18,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from flexmanip_ros import messages
+from flexmanip_ros.cli.suggest import file_text
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import yaml_text
 from flexmanip_ros.payload.structured_model import unobservable_reason
@@ -67,6 +68,18 @@ def test_a_written_parameter_file_holds_in_any_namespace_and_under_any_name(
     node = ros.add(PlantSimulator(
         context=ros.context, cli_args=['--ros-args', '--params-file', str(file), *remapping]))
     assert (node.config.rate, node.config.arm.tip_mass) == (250.0, 3.0)
+
+
+def test_the_identifier_takes_a_suggested_file(ros: Ros, tmp_path: Path) -> None:
+    values = {'inputs': ('hub/effort',), 'outputs': ('hub/position',), 'angles': (), 'payload_method': 'none',
+              'decimation': 5, 'order': 6, 'past_window': 40, 'future_window': 20, 'direct_feedthrough': True,
+              'forgetting': 'constant', 'forgetting_factor': (0.999,) * 3, 'regularization': (1e-5,) * 3,
+              'refinement': 'none'}
+    file = tmp_path / 'suggested.yaml'
+    file.write_text(file_text('Suggested.', ['order: 6: smallest within 3 % of the best'], values), encoding='utf-8')
+    node = ros.managed(RpbsidIdentifier(
+        context=ros.context, cli_args=['--ros-args', '--params-file', str(file)]))
+    assert {name: getattr(node.config, name) for name in values} == values
 
 
 @pytest.mark.parametrize('name', ['rpbsid_identifier', 'plant_simulator', 'capture_trigger', 'quanser_2dsfl'])

@@ -41,6 +41,42 @@ def test_the_true_model_scores_a_hundred_percent():
     assert not found.until_gap
 
 
+def test_a_prediction_ahead_uses_no_output_in_between():
+    signals, steps = _signals(noise=0.3), 25
+    known = _signals().y[:, 0]
+    found = score(_system(), signals, 4.0, horizon_s=steps * DT)
+    expected = 100.0 * (1.0 - np.var(signals.y[424:, 0] - known[424:]) / np.var(signals.y[424:]))
+    assert found.horizon == pytest.approx([expected], abs=0.5)
+
+
+def test_one_step_ahead_is_the_prediction():
+    signals, model = _signals(noise=0.3), _system()
+    model = StateSpace(model.A, model.B, model.C, model.D, np.array([[0.2], [0.1]]), DT)
+    found = score(model, signals, 4.0, horizon_s=DT)
+    assert found.horizon == pytest.approx(found.prediction)
+
+
+def test_a_horizon_beyond_the_recording_has_no_score():
+    assert np.isnan(score(_system(), _signals(), 4.0, horizon_s=100.0).horizon).all()
+
+
+def test_a_decimated_model_is_scored_at_its_own_rate():
+    """A slow plant, excited slowly: every fifth sample tells it all, and the model steps five sample times."""
+    rng = np.random.default_rng(4)
+    u = np.repeat(rng.normal(size=(80, 1)), 20, axis=0)
+    pole, y = 0.99, np.zeros((1600, 1))
+    for k in range(1, 1600):
+        y[k] = pole * y[k - 1] + u[k - 1]
+    signals = Signals(np.arange(1600) * 10_000_000, u, y, np.empty((1600, 0)), np.zeros(1600, dtype=np.bool_),
+                      ('a/effort',), ('a/position',))
+    slow = StateSpace(np.array([[pole ** 5]]), np.array([[(1.0 - pole ** 5) / (1.0 - pole)]]), np.eye(1),
+                      np.zeros((1, 1)), np.zeros((1, 1)), 5 * DT)
+    found = score(slow, signals, 8.0, factor=5)
+    assert min(found.simulation[0], found.prediction[0], found.horizon[0]) > 98.0
+    assert np.diff(found.time) == pytest.approx(5 * DT)
+    assert found.time[0] == pytest.approx(8.0 - 4 * 5 * DT, abs=5 * DT)
+
+
 def test_noise_costs_what_its_variance_is():
     signals = _signals(noise=0.3)
     expected = 100.0 * (1.0 - 0.09 / np.var(signals.y[400:]))

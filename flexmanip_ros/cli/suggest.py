@@ -1,0 +1,231 @@
+"""What a recording holds, and the parameter file that suits it: ``identify_bag --suggest``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexmanip_ros.cli import console
+from flexmanip_ros.errors import BagError, ParameterError
+from flexmanip_ros.io import bag
+from flexmanip_ros.io.outputs import check_place, write_text
+from flexmanip_ros.io.parameter_file import parse_overrides, read
+from flexmanip_ros.parameters import IdentifierParameters, configure
+from flexmanip_ros.parameters.document import yaml_text
+from flexmanip_ros.parameters.field import check, leaves
+from flexmanip_ros.parameters.identifier import FIELDS
+from flexmanip_ros.samples import sampling
+from flexmanip_ros.samples.sample_log import Signals
+from flexmanip_ros.studies import suggestion
+from flexmanip_ros.types import Array, CaptureEvent, JointBlock
+
+NODE = 'rpbsid_identifier'
+STILL = 1e-9
+"""A signal that varies by less than this share of its size stands still."""
+MOST_OUTPUTS = 8
+"""Outputs chosen at most: the effort of the identifier grows with their square."""
+DEFAULTS = IdentifierParameters()
+
+
+@dataclass(frozen=True)
+class Found:
+    """One signal of a recording. low, high: its range; std: standard deviation; rate: samples a second [Hz]."""
+
+    name: str
+    low: float
+    high: float
+    std: float
+    rate: float
+    broken: int
+    """Values that are not finite."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether it can be an input or an output."""
+        return self.broken == 0 and self.std > STILL * max(abs(self.low), abs(self.high))
+
+    def text(self) -> str:
+        """Return it as a line for people."""
+        what = f'{self.broken} values are not finite' if self.broken else (
+            f'{self.low:.4g} .. {self.high:.4g}, standard deviation {self.std:.3g}' if self.moves
+            else f'stands still at {self.low:.4g}')
+        return f'{self.name:28s} {self.rate:.4g} Hz   {what}'
+
+
+@dataclass
+class _Recording:
+    """The blocks of a recording up to a time, and the stamps of its events [ns]."""
+
+    blocks: list[JointBlock] = field(default_factory=list)
+    events: list[int] = field(default_factory=list)
+
+
+def given_values(path: str | None, overrides: list[str]) -> dict[str, Any]:
+    """Return what --params and --set say, each value checked on its own. Raises ParameterError."""
+    values = {**({} if path is None else read(path, NODE)), **parse_overrides(overrides)}
+    declared = {leaf.name: leaf for leaf in leaves(IdentifierParameters)}
+    for name in values:
+        if name not in declared:
+            configure(IdentifierParameters, {name: values[name]})
+    return {name: check(declared[name], value) for name, value in values.items()}
+
+
+def suggest_for(arguments: argparse.Namespace) -> tuple[IdentifierParameters, list[str]]:
+    """Do what identify_bag was asked for; return the configuration and the lines for people."""
+    topics = bag.Topics(arguments.joint_states, arguments.capture_event or bag.Topics().events,
+                        arguments.capture_event is not None)
+    return suggest(arguments.bag, arguments.suggest, given_values(arguments.params, arguments.set), topics,
+                   arguments.validate_from, arguments.horizon)
+
+
+def suggest(source: str, place: str, given: Mapping[str, Any], topics: bag.Topics, until_s: float | None,
+            horizon_s: float) -> tuple[IdentifierParameters, list[str]]:
+    """Look at a recording and write the parameters to identify it with; return them and the lines for people.
+
+    given: parameters that stay as they are; until_s: the samples from there on are not looked at [s].
+    Raises FlexmanipError where the recording tells too little, and where the file cannot be written.
+    """
+    check_place(place)
+    with console.progress('looking at the signals', 'messages') as shown:
+        recording = _recording(source, topics, until_s, shown)
+    signals = observe(recording.blocks)
+    chosen, reasons = choose_signals(signals, given)
+    config = configure(IdentifierParameters, chosen)
+    collected, dt = _collect(config, recording)
+    for name, values in (('inputs', collected.u), ('outputs', collected.y)):
+        if not np.any(np.ptp(values, axis=0) > 0.0):
+            raise ParameterError(f'no signal of {name} moves: {", ".join(getattr(config, name))}',
+                                 f'name others with --set {name}=[NAME/FIELD, ...]')
+    with console.progress('trying models', 'steps') as shown:
+        found = suggestion.suggest({**given, **chosen}, collected, dt, horizon_s=horizon_s, progress=shown)
+    words = [f'{name}: {why}' for name, why in (*reasons, *found.reasons)]
+    heading = f'Suggested by identify_bag --suggest for {Path(source).resolve().name}.'
+    write_text(place, file_text(heading, words, found.values))
+    lines = [*(f'signal       {signal.text()}' for signal in signals), *(f'suggested    {line}' for line in words),
+             f'written      {place}']
+    return configure(IdentifierParameters, found.values), lines
+
+
+def file_text(heading: str, words: Sequence[str], values: Mapping[str, Any]) -> str:
+    """Return a parameter file for any node name, with the reasons in front."""
+    return '\n'.join([f'# {heading}', *(f'# * {line}' for line in words), yaml_text(NODE, values)])
+
+
+def _recording(source: str, topics: bag.Topics, until_s: float | None, progress: bag.Progress) -> _Recording:
+    """Read up to a time; of a damaged recording what comes before the damage."""
+    found = _Recording()
+    try:
+        for item in bag.read_blocks(source, topics, progress):
+            if isinstance(item, CaptureEvent):
+                found.events.append(item.stamp_ns)
+                continue
+            first = found.blocks[0].stamp_ns[0] if found.blocks else item.stamp_ns[0]
+            used = item.stamp_ns < first + (1e18 if until_s is None else round(until_s * 1e9))
+            if used.any():
+                found.blocks.append(item if used.all() else JointBlock(
+                    item.names, item.stamp_ns[used], item.position[used], item.velocity[used], item.effort[used]))
+    except BagError:
+        if not found.blocks:
+            raise
+    if not found.blocks:
+        raise ParameterError(f'the recording has no sample before {until_s:g} s', 'choose a later time')
+    return found
+
+
+def observe(blocks: list[JointBlock]) -> list[Found]:
+    """Return every signal of a recording, in the order of the messages."""
+    columns: dict[str, list[Array]] = {}
+    stamps: dict[str, list[Array]] = {}
+    for block in blocks:
+        for kind in FIELDS:
+            values = getattr(block, kind)
+            for k, joint in enumerate(block.names) if values.shape[1] == len(block.names) else ():
+                columns.setdefault(f'{joint}/{kind}', []).append(values[:, k])
+                stamps.setdefault(f'{joint}/{kind}', []).append(block.stamp_ns.astype(np.float64))
+    found = []
+    for name, parts in columns.items():
+        values, at = np.concatenate(parts), np.concatenate(stamps[name])
+        good = values[np.isfinite(values)]
+        interval = float(np.median(np.diff(at))) * 1e-9 if len(at) > 1 else 0.0
+        found.append(Found(
+            name, *((float(good.min()), float(good.max()), float(good.std())) if len(good) else (0.0, 0.0, 0.0)),
+            1.0 / interval if interval > 0.0 else 0.0, len(values) - len(good)))
+    return found
+
+
+def choose_signals(signals: list[Found], given: Mapping[str, Any]
+                   ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+    """Return inputs, outputs, angles and payload_method, and why. Raises ParameterError where nothing serves."""
+    moving = [signal.name for signal in signals if signal.moves]
+    chosen: dict[str, Any] = {}
+    reasons: list[tuple[str, str]] = []
+    for name in ('inputs', 'outputs'):
+        if name in given:
+            _check_there(name, given[name], signals)
+            names, why = given[name], 'given'
+        else:
+            names, why = _inputs(moving) if name == 'inputs' else _outputs(moving, chosen['inputs'])
+        if not names:
+            raise ParameterError(f'nothing in the recording serves for {name}: they would be {why}',
+                                 f'name them with --set {name}=[NAME/FIELD, ...]')
+        chosen[name] = names
+        reasons.append((name, f'{", ".join(names)}: {why}'))
+    is_arm = any(name.startswith('arm.') for name in given)
+    chosen['payload_method'] = given.get('payload_method', DEFAULTS.payload_method if is_arm else 'none')
+    chosen['angles'] = given.get('angles', DEFAULTS.angles if chosen['payload_method'] != 'none' else ())
+    reasons.append(('payload_method', chosen['payload_method'] + (
+        ': given' if 'payload_method' in given else ': the parameters arm.* are given' if is_arm
+        else ': a recording does not tell the parameters arm.*')))
+    return chosen, reasons
+
+
+def _inputs(moving: list[str]) -> tuple[tuple[str, ...], str]:
+    if set(DEFAULTS.inputs) <= set(moving):
+        return DEFAULTS.inputs, 'the names say it'
+    return tuple(name for name in moving if name.endswith('/effort')), 'every effort that moves'
+
+
+def _outputs(moving: list[str], inputs: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
+    if inputs == DEFAULTS.inputs:
+        kept = tuple(name for name in DEFAULTS.outputs if name in moving)
+        if kept:
+            return kept, 'the names say it'
+    joints = dict.fromkeys(name.rpartition('/')[0] for name in moving)
+    kinds = [next((f'{joint}/{kind}' for kind in ('position', 'velocity') if f'{joint}/{kind}' in moving), '')
+             for joint in joints]
+    kept = tuple(name for name in kinds if name and name not in inputs)
+    why = 'every position that moves, else the velocity'
+    if len(kept) <= MOST_OUTPUTS:
+        return kept, why
+    return kept[:MOST_OUTPUTS], f'{why}; the first {MOST_OUTPUTS} of {len(kept)}'
+
+
+def _check_there(group: str, names: tuple[str, ...], signals: list[Found]) -> None:
+    there = {signal.name for signal in signals}
+    missing = [name for name in names if name not in there]
+    if missing:
+        raise ParameterError(f"'{missing[0]}' of parameter '{group}' is not in the messages",
+                             f'the signals there are: {", ".join(sorted(there))}')
+
+
+def _collect(config: IdentifierParameters, recording: _Recording) -> tuple[Signals, float]:
+    """Return the signals of the longest time between two events, and the sample time [s]."""
+    clock, log = sampling.Clock(), sampling.EMPTY
+    for block in recording.blocks:
+        clock, log, _ = sampling.push_whole(config, clock, log, block)
+    clock, log, _ = sampling.flush(config, clock, log)
+    whole = sampling.signals(config, clock, log)
+    if len(whole.stamp_ns) < 2:
+        raise ParameterError(f'{len(whole.stamp_ns)} samples are too few to choose parameters from',
+                             'record for longer')
+    borders = np.searchsorted(whole.stamp_ns, sorted(recording.events)).tolist()
+    borders = [0, *borders, len(whole.stamp_ns)]
+    a, b = max(pairwise(borders), key=lambda pair: pair[1] - pair[0])
+    return replace(whole, stamp_ns=whole.stamp_ns[a:b], u=whole.u[a:b], y=whole.y[a:b], angles=whole.angles[a:b],
+                   gap=whole.gap[a:b]), clock.dt

@@ -1,0 +1,297 @@
+"""Which decimation, windows, order and direct term predict best what they have not seen.
+
+For each decimation and past window the moments of a recording are gathered in one factor for each fold. Every order,
+future window and direct term is read off sums of these: a model of the other folds predicts a fold, a given time
+ahead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.identification import decimation, validation
+from flexmanip_ros.identification.moments import realize_orders, triangle
+from flexmanip_ros.samples.sample_log import Signals
+from flexmanip_ros.types import Array, StateSpace
+
+DECIMATIONS = (1, 2, 3, 5, 10, 20, 50, 100)
+WINDOWS_S = (0.05, 0.1, 0.2, 0.3, 0.5)
+"""Lengths of the past window that are tried [s]; those of ``WINDOWS`` samples too."""
+WINDOWS = (6, 10, 20)
+LONGEST_WINDOW = 200
+ORDERS = tuple(range(2, 17))
+COARSE = (4, 6, 8, 10, 12, 16)
+"""Orders of the first pass."""
+FINALISTS = 3
+"""Pairs of decimation and past window that are looked at closely."""
+FOLDS, BLOCKS = 4, 12
+"""The recording is cut into blocks, dealt out to the folds in turn: each fold sees every kind of motion."""
+STEPS = 4
+"""Steps of the model that the horizon has at least: a lower rate than that predicts nothing."""
+ROWS = 2.0
+"""Samples to learn from, for each regressor, below which a window is not tried."""
+WORK = 2.5e7
+"""Squared length of the regressor times the rate [1/s] that a live node bears: 15 % of a core."""
+LONGEST = 300
+"""Length of the regressor beyond which the factor takes minutes."""
+MARGIN = 1.03
+"""The smallest order whose error is at most this many times the least one is taken."""
+PRIOR = 1e-3
+"""Ridge on the regression, on signals of unit peak."""
+BRIDGED_S = 0.02
+"""Samples missing for at most so long are interpolated, in the search alone [s]."""
+WORST = 1e9
+"""Share that stands for a model that runs away."""
+CHUNK = 4096
+"""Regressors that are formed at once."""
+Progress = Callable[[int, int | None], None]
+Kept = tuple[Array, NDArray[np.int64]]
+
+
+class Shape(NamedTuple):
+    """What the moments decide."""
+
+    factor: int
+    past: int
+    future: int
+    direct: bool
+    order: int
+
+
+class Stretch(NamedTuple):
+    """Samples without a gap: raw (N, r + m) at unit peak, number (N,) of each in the recording."""
+
+    raw: Array
+    number: NDArray[np.int64]
+
+
+@dataclass
+class Search:
+    """The recording, what is given, and what was found so far."""
+
+    given: Mapping[str, Any]
+    stretches: list[Stretch]
+    r: int
+    m: int
+    dt: float
+    horizon_s: float
+    tried: dict[Shape, Array] = field(default_factory=dict)
+    """Unexplained share of each output (m,), the mean over the folds."""
+
+    @property
+    def count(self) -> int:
+        """Number of samples."""
+        return sum(len(part.raw) for part in self.stretches)
+
+    @property
+    def fold(self) -> NDArray[np.int64]:
+        """Fold (N,) that each sample belongs to."""
+        return np.arange(self.count) * BLOCKS // self.count % FOLDS
+
+    def kept(self, factor: int) -> list[Kept]:
+        """Return the samples (k, r + m) of each stretch that a decimation keeps, and the row (k,) each describes."""
+        return [decimation.whole(part.raw, factor) for part in self.stretches]
+
+    def error(self, shape: Shape) -> float:
+        """Return the loss of what a shape left unexplained."""
+        return loss(self.tried[shape])
+
+    def best(self, **fixed: object) -> Shape:
+        """Return the shape of the least error, among those with the given parts."""
+        kept = [s for s in self.tried if all(getattr(s, name) == value for name, value in fixed.items())]
+        return min(kept, key=lambda s: (self.error(s), s))
+
+
+def search_shapes(search: Search, step: Callable[[], None]) -> Shape:
+    """Try every shape that is not given; return the best. ``step`` is called ``steps_of(search)`` times.
+
+    Raises ParameterError when the recording is too short for any model, or carries none.
+    """
+    runs = _plan(search)
+    if not runs:
+        raise ParameterError(f'{search.count} samples without a gap are too few to choose parameters from',
+                             'record for longer, or set the parameters by hand')
+    directs = _choices(search.given, 'direct_feedthrough', (True,))
+    for factor, past in runs:
+        _try(search, factor, past, _futures(search, past)[:1], directs, _orders(search, COARSE))
+        step()
+    if not search.tried:
+        raise ParameterError('no model of these signals can be computed', 'check that every input and output moves')
+    for factor, past in _finalists(search):
+        directs = _choices(search.given, 'direct_feedthrough', (True, False))
+        _try(search, factor, past, _futures(search, past), directs, _orders(search, ORDERS))
+        step()
+    return _simplest(search)
+
+
+def steps_of(search: Search) -> int:
+    """Return how many steps the search has."""
+    return len(_plan(search)) + FINALISTS
+
+
+def stretches_of(signals: Signals, dt: float) -> list[Stretch]:
+    """Return the samples between gaps at unit peak, short gaps bridged."""
+    stamps = signals.stamp_ns * 1e-9
+    joint = np.hstack([signals.u, signals.y])
+    peak = np.max(np.abs(joint), axis=0, initial=0.0)
+    joint = joint / np.where(peak > 0.0, peak, 1.0)
+    wide = np.flatnonzero(signals.gap & (np.diff(stamps, prepend=stamps[:1]) > BRIDGED_S + 1.5 * dt))
+    parts = []
+    for a, b in pairwise([0, *wide[wide > 0].tolist(), len(joint)]):
+        part = joint[a:b]
+        if signals.gap[a + 1:b].any():
+            at = np.arange(stamps[a], stamps[b - 1] + 0.5 * dt, dt)
+            part = np.column_stack([np.interp(at, stamps[a:b], column) for column in part.T])
+        parts.append(part)
+    begin, found = 0, []
+    for part in parts:
+        found.append(Stretch(part, np.arange(begin, begin + len(part))))
+        begin += len(part)
+    return found
+
+
+def _plan(search: Search) -> list[tuple[int, int]]:
+    """Return the pairs of decimation and past window to try, the cheap ones first."""
+    width, plan = search.r + search.m, []
+    for factor in _choices(search.given, 'decimation', DECIMATIONS):
+        dt = factor * search.dt
+        if 'decimation' not in search.given and factor > 1 and dt * STEPS > search.horizon_s:
+            continue
+        kept = sum(max(0, len(part.raw) // factor - decimation.TAPS) for part in search.stretches)
+        most = min(LONGEST, (WORK * dt) ** 0.5, kept * (FOLDS - 1) / FOLDS / ROWS)
+        windows = {max(1, round(window / dt)) for window in WINDOWS_S} | set(WINDOWS)
+        for past in _choices(search.given, 'past_window', sorted(windows)):
+            least = -(-min(_orders(search, COARSE)) // search.m)
+            if past >= max(least, search.given.get('future_window', 1)) and (
+                    (past + 1) * width <= most or 'past_window' in search.given) and past <= 200:
+                plan.append((factor, past))
+    return plan[::-1]
+
+
+def _choices(given: Mapping[str, Any], name: str, otherwise: Sequence[Any]) -> tuple[Any, ...]:
+    return (given[name],) if name in given else tuple(otherwise)
+
+
+def _orders(search: Search, otherwise: Sequence[int]) -> tuple[int, ...]:
+    return _choices(search.given, 'order', otherwise)
+
+
+def _futures(search: Search, past: int) -> tuple[int, ...]:
+    """Return future windows to try, the first one before all others."""
+    enough = min(past, -(-max(_orders(search, ORDERS)) // search.m))
+    tried = (min(past, 30), max(past // 2, enough), max(min(past, 10), enough), past)
+    return _choices(search.given, 'future_window', tuple(dict.fromkeys(tried)))
+
+
+def _finalists(search: Search) -> list[tuple[int, int]]:
+    ranked = sorted(search.tried, key=lambda s: (search.error(s), s))
+    return list(dict.fromkeys((s.factor, s.past) for s in ranked))[:FINALISTS]
+
+
+def _simplest(search: Search) -> Shape:
+    """Return the smallest order that is nearly as good as the best."""
+    least = min(map(search.error, search.tried))
+    good = [s for s in search.tried if search.error(s) <= MARGIN * least]
+    return min(good, key=lambda s: (s.order, search.error(s), s))
+
+
+def _try(search: Search, factor: int, past: int, futures: Sequence[int], directs: Sequence[bool],
+         orders: Sequence[int]) -> None:
+    """Identify on the other folds and predict each fold."""
+    kept = search.kept(factor)
+    sums = moments(search, kept, past)
+    for future in futures:
+        able = [n for n in orders if n <= future * search.m]
+        for direct in directs:
+            shape = Shape(factor, past, future, direct, 0)
+            found = shares(search, kept, sums, shape, able, PRIOR)
+            search.tried.update({shape._replace(order=n): share for n, share in found.items()})
+
+
+def shares(search: Search, kept: list[Kept], sums: list[Array], shape: Shape, orders: Sequence[int], alpha: float
+            ) -> dict[int, Array]:
+    """Return the unexplained share (m,) of each order that there is a model of for every fold."""
+    d = shape.past * (search.r + search.m)
+    prior = np.zeros((d, d + search.r + search.m))
+    prior[:, :d] = alpha ** 0.5 * np.eye(d)
+    found: dict[int, list[Array]] = {n: [] for n in orders}
+    for fold in range(FOLDS):
+        R = triangle(np.vstack([prior, *(sums[k] for k in range(FOLDS) if k != fold)]))
+        for n, model in zip(orders, _models(R, search, orders, shape), strict=True):
+            if model is not None:
+                found[n].append(powers(search, model, kept, shape.factor, shape.past, search.fold == fold))
+    return {n: share(np.sum(parts, axis=0)) for n, parts in found.items() if len(parts) == FOLDS}
+
+
+def moments(search: Search, kept: list[Kept], past: int) -> list[Array]:
+    """Return the factor of the moments of [z; u; y] of each fold."""
+    sums, folds = [], search.fold
+    for fold in range(FOLDS):
+        R = np.zeros((0, (past + 1) * (search.r + search.m)))
+        for (samples, rows), part in zip(kept, search.stretches, strict=True):
+            ends = np.flatnonzero(folds[part.number[rows]] == fold)
+            ends = ends[ends >= past]
+            for some in np.array_split(ends, len(ends) // 4096 + 1):
+                if len(some):
+                    phi = np.hstack([samples[some - past + i] for i in range(past + 1)])
+                    R = triangle(np.vstack([R, phi]))
+        sums.append(R)
+    return sums
+
+
+def _models(R: Array, search: Search, orders: Sequence[int], shape: Shape) -> list[StateSpace | None]:
+    """Return the model of each order, in the units of the stretches."""
+    width = search.r + search.m
+    power = np.linalg.norm(R[:, -width:], axis=0)
+    unit = np.divide(1.0, power, out=np.ones(width), where=power > 0.0)
+    try:
+        found = realize_orders(R * np.tile(unit, R.shape[1] // width), search.r, search.m, orders, shape.future,
+                               feedthrough=shape.direct, weighted=True, riccati=True)
+    except np.linalg.LinAlgError:
+        return [None] * len(orders)
+    su, sy = unit[:search.r], unit[search.r:]
+    return [None if part is None else StateSpace(
+        part.A, part.B * su, part.C / sy[:, None], part.D * su / sy[:, None], part.K * sy, shape.factor * search.dt)
+        for part in found]
+
+
+def powers(search: Search, model: StateSpace, kept: list[Kept], factor: int, past: int,
+            chosen: NDArray[np.bool_]) -> Array:
+    """Return the variances (2, m) of what the prediction ahead leaves of the samples chosen (N,), and of these."""
+    steps = max(1, round(search.horizon_s / model.dt)) + (decimation.LAG if factor > 1 else 0)
+    targets, errors = [np.empty((0, search.m))], [np.empty((0, search.m))]
+    with np.errstate(all='ignore'):
+        for (samples, rows), part in zip(kept, search.stretches, strict=True):
+            if len(samples) < steps + past:
+                continue
+            ahead = validation.predict_ahead(model, samples[:, :search.r], samples[:, search.r:], steps)[past:]
+            at = rows[past + steps - 1:]
+            among = chosen[part.number[at]]
+            target = part.raw[at[among], search.r:]
+            targets.append(target)
+            errors.append(target - ahead[among])
+        joint = np.vstack(targets)
+        if len(joint) < 2:
+            return np.zeros((2, search.m))
+        spread = np.var(joint, axis=0)
+        left = np.var(np.vstack(errors), axis=0)
+    return np.array([np.where(np.isfinite(left), left, np.inf), spread])
+
+
+def share(powers: Array) -> Array:
+    """Return the variance of each output (m,) that is left over, over its own; nan where it stands still."""
+    left, spread = powers
+    share = np.divide(left, spread, out=np.full(len(left), np.nan), where=spread > 0.0)
+    return np.asarray(np.minimum(share, WORST), dtype=np.float64)
+
+
+def loss(left: Array) -> float:
+    """Return one number for shares (m,): their mean while they are small; one wild output does not hide the rest."""
+    return float(np.nanmean(np.log1p(left)))

@@ -1,0 +1,182 @@
+"""The parameters to identify a recording with, and why.
+
+``shape_search`` chooses decimation, windows, order and direct term on moments. What the moments cannot tell (prior,
+forgetting, refinement) is tried here with the identifier itself, which runs through the recording and predicts on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flexmanip_ros.identification import recursive_fit, rpbsid
+from flexmanip_ros.parameters import IdentifierParameters, configure
+from flexmanip_ros.samples.sample_log import Signals, log_of
+from flexmanip_ros.studies import holdout, shape_search
+from flexmanip_ros.studies.shape_search import PRIOR, Progress, Search, Shape
+
+PLAIN = 1.03
+"""A departure from the plain settings is taken where it divides the error by this at least."""
+NEARLY, REFINED = 1.3, 1.1
+"""A refined model, whose order is small, is tried where the order costs less than this, taken where it gains more."""
+PRIORS = (1e-5, 0.1)
+SHOWN = 5
+"""Values that the reason of a choice compares."""
+TRIALS = 5
+"""Runs of the identifier itself."""
+FORGOTTEN = 3
+"""Time constants of the constant forgetting that is tried, in the length of the recording."""
+PARTS = 6
+"""The model of the first half predicts the fourth sixth of the recording, and so on."""
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """Parameters by dotted name; for each choice its name and why, in one line."""
+
+    values: dict[str, Any]
+    reasons: tuple[tuple[str, str], ...]
+
+
+def suggest(given: Mapping[str, Any], signals: Signals, dt: float, *, horizon_s: float = holdout.HORIZON_S,
+            progress: Progress | None = None) -> Suggestion:
+    """Choose the parameters for a recording of one machine that does not change meanwhile.
+
+    given: dotted names and values that stay as they are, ``inputs`` and ``outputs`` among them; signals: of these;
+    dt: sample time [s]; horizon_s: how far ahead the models are to predict [s].
+    Raises ParameterError when the recording is too short for any model, or carries none.
+    """
+    stretches = shape_search.stretches_of(signals, dt)
+    search = Search(given, stretches, signals.u.shape[1], signals.y.shape[1], dt, horizon_s)
+    total, done = shape_search.steps_of(search) + TRIALS, 0
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, total)
+
+    shape = shape_search.search_shapes(search, step)
+    values, told = _settings(search, shape, step)
+    if progress is not None:
+        progress(total, total)
+    return Suggestion(values, (*_shape_reasons(search, shape), *told))
+
+
+def _shape_reasons(search: Search, shape: Shape) -> list[tuple[str, str]]:
+    """Return why each part of the shape, with what the others would leave unexplained."""
+    found = []
+    for name, part, text in (
+            ('decimation', 'factor', lambda factor: f'{1.0 / (factor * search.dt):.4g} Hz'),
+            ('past_window', 'past', lambda past: f'{past * shape.factor * search.dt:.3g} s'),
+            ('future_window', 'future', str), ('order', 'order', str), ('direct_feedthrough', 'direct', str)):
+        value = getattr(shape, part)
+        same: dict[str, object] = {} if part == 'factor' else {'factor': shape.factor}
+        if part not in ('factor', 'past'):
+            same['past'] = shape.past
+        kinds = sorted({getattr(s, part) for s in search.tried if all(getattr(s, k) == v for k, v in same.items())})
+        near = sorted(kinds, key=lambda kind: abs(kinds.index(kind) - kinds.index(value)))[:SHOWN]
+        shares = ', '.join(f'{text(kind)} {_percent(search.error(search.best(**same, **{part: kind})))}'
+                           for kind in sorted(near))
+        why = 'given; ' if name in search.given else (
+            f'smallest within {100.0 * (shape_search.MARGIN - 1.0):.0f} % of the best; ' if part == 'order' else '')
+        found.append((name, f'{text(value)}: {why}unexplained {search.horizon_s:g} s ahead at {shares}'))
+    return found
+
+
+def _percent(loss: float) -> str:
+    """Return a loss as the share of the variance that it stands for."""
+    return f'{100.0 * min(np.expm1(loss), 1.0):.3g} %'
+
+
+def _prior(search: Search, shape: Shape) -> float:
+    """Return the ridge on the regression, PRIOR unless another one predicts better."""
+    kept = search.kept(shape.factor)
+    sums = shape_search.moments(search, kept, shape.past)
+    errors = {}
+    for alpha in (PRIOR, *PRIORS):
+        found = shape_search.shares(search, kept, sums, shape, (shape.order,), alpha)
+        errors[alpha] = shape_search.loss(found[shape.order]) if found else np.inf
+    best = min(errors, key=lambda alpha: errors[alpha])
+    return best if errors[best] * PLAIN < errors[PRIOR] else PRIOR
+
+
+def _settings(search: Search, shape: Shape, step: Callable[[], None]
+              ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+    """Settle what the moments cannot tell, with the identifier itself; return all values, and why."""
+    memory = max(0.5, 1.0 - FORGOTTEN * shape.factor / search.count)
+    alpha = _prior(search, shape)
+    plain: dict[str, Any] = {
+        **_values(shape), 'forgetting': 'innovation', 'forgetting_factor': (1.0,) * 3, 'regularization': (alpha,) * 3,
+        'refinement': 'none', **search.given}
+    trials: list[tuple[str, float, dict[str, Any]]] = [
+        ('forgetting where the model ceases to fit', PLAIN, {'forgetting_factor': (0.99,) * 3}),
+        (f'forgetting beyond {_memory_s(search):.3g} s', PLAIN,
+         {'forgetting': 'constant', 'forgetting_factor': (memory,) * 3})]
+    light = [s for s in search.tried if _is_refinable(search, s)]
+    own = min(light, key=lambda s: (search.error(s), s), default=None)
+    refined = own is not None and search.error(own) < NEARLY * search.error(shape)
+    if own is not None and refined:
+        trials += [(f'{kind} of order {own.order}', REFINED, {**_values(own), 'refinement': kind})
+                   for kind in ('output_error', 'prediction_error')]
+    settled, name, least = plain, 'no forgetting', _identified_error(search, plain)
+    told = [f'no forgetting {_percent(least)}']
+    step()
+    for words, gain, trial in trials:
+        values = {**plain, **trial, **search.given}
+        error = np.inf
+        if values != plain:
+            error = _identified_error(search, values)
+            told.append(f'{words} {_percent(error)}')
+        if error * gain < least:
+            settled, name, least = values, words, error
+        step()
+    beside = '' if refined else '; no refinement, which needs a smaller order than these signals do'
+    ridge = 'given' if 'regularization' in search.given else (
+        f'best of {", ".join(f"{value:g}" for value in sorted((PRIOR, *PRIORS)))} by the same error')
+    return settled, [
+        ('forgetting, refinement', f'{name}: run through the recording, unexplained {search.horizon_s:g} s ahead with '
+                                   f'{", ".join(told)}{beside}'),
+        ('regularization', f'{settled["regularization"][0]:g}: {ridge}')]
+
+
+def _memory_s(search: Search) -> float:
+    """Return the time constant of the constant forgetting that is tried [s]."""
+    return search.count * search.dt / FORGOTTEN
+
+
+def _values(shape: Shape) -> dict[str, Any]:
+    return {'decimation': shape.factor, 'order': shape.order, 'past_window': shape.past,
+            'future_window': shape.future, 'direct_feedthrough': shape.direct}
+
+
+def _is_refinable(search: Search, shape: Shape) -> bool:
+    n, r, m = shape.order, search.r, search.m
+    return n * (n + r + 2 * m + 1) + m * r <= recursive_fit.PARAMETERS
+
+
+def _identified_error(search: Search, values: Mapping[str, Any]) -> float:
+    """Return what the identifier leaves unexplained ahead, the mean over outputs: it predicts each later part.
+
+    It runs through the recording once; the model of the first half predicts the fourth sixth, and so on.
+    """
+    config = configure(IdentifierParameters, values)
+    raw = np.vstack([part.raw for part in search.stretches])
+    gap = np.zeros(search.count, dtype=np.bool_)
+    gap[[part.number[0] for part in search.stretches[1:]]] = True
+    stamps = (np.arange(search.count) * round(search.dt * 1e9)).astype(np.int64)
+    log = log_of(raw[:, :search.r], raw[:, search.r:], stamp_ns=stamps, gap=gap)
+    kept, number = search.kept(config.decimation), np.arange(search.count)
+    state, powers = rpbsid.init(config), np.zeros((2, search.m))
+    borders = [0, *(search.count * part // PARTS for part in range(PARTS // 2, PARTS + 1))]
+    for before, now, later in zip(borders, borders[1:], borders[2:], strict=False):
+        state = rpbsid.advance(config, state, log.rows(before, now))
+        found = rpbsid.identified(config, rpbsid.finish(config, state), search.dt)
+        if found is None:
+            return np.inf
+        powers += shape_search.powers(search, found.model, kept, config.decimation, config.past_window,
+                          (number >= now) & (number < later))
+    return shape_search.loss(shape_search.share(powers))

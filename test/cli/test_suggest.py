@@ -1,0 +1,201 @@
+"""identify_bag --suggest and --smooth on machines that nobody described."""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag, expm
+
+from flexmanip_ros.cli.identify_bag import main
+from flexmanip_ros.cli.suggest import Found, choose_signals
+from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.io.bag_writer import BagWriter
+from flexmanip_ros.io.parameter_file import load
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+
+START = 1_700_000_000_000_000_000
+DT = 0.004
+NAMES = ('hub', 'gauge', 'lamp')
+MODES = ((1.5, 0.05), (9.0, 0.02))
+"""Frequency [Hz] and damping ratio of each mode of the machine; both sensors see both."""
+
+
+@lru_cache
+def _machine(count: int = 2500, slower_from: int | None = None) -> tuple[JointRecord, ...]:
+    """Return a hub that is driven by steps, with a strain gauge behind it, 250 Hz, noise of 1 %."""
+    rng = np.random.default_rng(8)
+
+    def discrete(scale: float) -> tuple[np.ndarray, np.ndarray]:
+        blocks, inputs = [], []
+        for frequency, damping in MODES:
+            omega = 2.0 * np.pi * frequency * scale
+            blocks.append(np.array([[0.0, 1.0], [-omega ** 2, -2.0 * damping * omega]]))
+            inputs.append([[0.0], [omega]])
+        full = np.zeros((5, 5))
+        full[:4, :4], full[:4, 4:] = block_diag(*blocks), np.vstack(inputs)
+        stepped = expm(full * DT)
+        return stepped[:4, :4], stepped[:4, 4]
+
+    seen = np.array([[9.0, 0.0, 12.0, 0.0], [-4.0, 0.0, 24.0, 0.0]])
+    x, records = np.zeros(4), []
+    A, B = discrete(1.0)
+    u = np.repeat(rng.choice([-1.0, 1.0], size=count // 12 + 1), 12)[:count]
+    for k in range(count):
+        if k == slower_from:
+            A, B = discrete(0.8)
+        y = seen @ x + rng.normal(size=2) * [0.03, 0.05]
+        records.append(JointRecord(START + round(k * DT * 1e9), NAMES, np.array([*y, 7.0]), np.empty(0),
+                                   np.array([u[k], 0.0, 0.0])))
+        x = A @ x + B * u[k]
+    return tuple(records)
+
+
+def _bag(path: Path, records: tuple[JointRecord, ...], *events: CaptureEvent) -> Path:
+    with BagWriter(path, flush_period=None) as writer:
+        for event in events:
+            writer.write('/capture_event', records[0].stamp_ns, event)
+        for record in records:
+            writer.write('/joint_states', record.stamp_ns, record)
+    return path
+
+
+@pytest.fixture(scope='module')
+def recording(tmp_path_factory):
+    return _bag(tmp_path_factory.mktemp('bags') / 'machine', _machine())
+
+
+@pytest.fixture(scope='module')
+def suggested(recording, tmp_path_factory):
+    """The file that was suggested for the first half, and what is told while it is."""
+    place = tmp_path_factory.mktemp('suggested') / 'machine.yaml'
+    with pytest.MonkeyPatch.context() as patch:
+        said: list[str] = []
+        patch.setattr('builtins.print', lambda *parts, **_: said.append(' '.join(map(str, parts))))
+        status = main([str(recording), '--suggest', str(place), '--validate-from', '5', '--json'])
+    assert status == 0
+    return place, '\n'.join(said)
+
+
+def _json(capsys, *arguments: object) -> dict:
+    assert main([*map(str, arguments), '--json']) == 0
+    return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+def test_every_signal_is_listed_with_its_rate(suggested):
+    _, said = suggested
+    assert 'hub/effort                   250 Hz   -1 .. 1' in said
+    assert 'lamp/position                250 Hz   stands still at 7' in said
+
+
+def test_what_moves_is_chosen_and_every_choice_has_a_line_in_the_file_too(suggested):
+    place, said = suggested
+    config = load(IdentifierParameters, 'rpbsid_identifier', place)
+    assert config.inputs == ('hub/effort',)
+    assert config.outputs == ('hub/position', 'gauge/position')
+    assert (config.angles, config.payload_method) == ((), 'none')
+    text = place.read_text(encoding='utf-8')
+    for name in ('inputs', 'outputs', 'payload_method', 'decimation', 'past_window', 'future_window', 'order',
+                 'direct_feedthrough', 'forgetting, refinement', 'regularization'):
+        assert f'suggested    {name}: ' in said
+        assert f'# * {name}: ' in text
+
+
+def test_the_suggested_file_predicts_better_than_the_defaults_and_finds_the_modes(recording, suggested, capsys):
+    place, said = suggested
+    found = _json(capsys, recording, '--params', place, '--validate-from', 5)
+    plain = _json(capsys, recording, '--set=inputs=[hub/effort]', '--set=outputs=[hub/position, gauge/position]',
+                  '--set=payload_method=none', '--set=angles=[]', '--validate-from', 5)
+    assert min(found['vaf_horizon_percent']) > 90.0
+    assert np.mean(found['vaf_horizon_percent']) >= np.mean(plain['vaf_horizon_percent']) - 0.1
+    for frequency, _ in MODES:
+        assert min(abs(np.array(found['frequencies_hz']) - frequency)) < 0.05 * frequency
+    at_once = json.loads(said.splitlines()[-1])
+    assert at_once['vaf_horizon_percent'] == found['vaf_horizon_percent']
+
+
+def test_what_is_set_stays_as_it_is(recording, tmp_path, capsys):
+    place = tmp_path / 'set.yaml'
+    _json(capsys, recording, '--suggest', place, '--set=order=4', '--set=decimation=5', '--set=model_rate=2.0',
+          '--set=outputs=[gauge/position]')
+    config = load(IdentifierParameters, 'rpbsid_identifier', place)
+    assert (config.order, config.decimation, config.model_rate, config.outputs) == (4, 5, 2.0, ('gauge/position',))
+
+
+def test_a_recording_of_other_joints_names_them_and_the_command(recording, capsys):
+    assert main([str(recording)]) == 2
+    err = capsys.readouterr().err
+    assert 'the joints there are: hub, gauge, lamp' in err
+    assert f'identify_bag {recording} --suggest FILE.yaml' in err
+    assert err.count('\n') == 1
+
+
+@pytest.mark.parametrize(('arguments', 'words'), [
+    (['--set=inputs=[motor/effort]'], 'the signals there are: gauge/effort'),
+    (['--set=inputs=[lamp/effort]'], 'no signal of inputs moves'),
+    (['--set=ordre=4'], "did you mean 'order'"),
+    (['--set=order=1000'], "parameter 'order'"),
+    (['--validate-from', '0'], 'no sample before 0 s'),
+    (['--validate-from', '0.2'], 'too few'),
+])
+def test_what_cannot_be_suggested_is_one_line(recording, tmp_path, capsys, arguments, words):
+    assert main([str(recording), '--suggest', str(tmp_path / 'no.yaml'), *arguments]) == 2
+    err = capsys.readouterr().err
+    assert words in err
+    assert err.count('\n') == 1
+    assert not (tmp_path / 'no.yaml').exists()
+
+
+def test_a_place_that_cannot_be_written_is_said_before_the_work(recording, capsys):
+    assert main([str(recording), '--suggest', 'no/such/folder/file.yaml']) == 2
+    assert 'does not exist' in capsys.readouterr().err
+
+
+def _found(*names: str) -> list[Found]:
+    return [Found(name, -1.0, 1.0, 0.5, 100.0, 0) for name in names]
+
+
+def test_signals_whose_names_say_what_they_are_are_taken_by_name():
+    chosen, _ = choose_signals(_found(
+        'joint1/position', 'joint1/effort', 'joint2/effort', 'link1_bend/position', 'link2_bend/position'), {})
+    assert chosen['inputs'] == ('joint1/effort', 'joint2/effort')
+    assert chosen['outputs'] == ('link1_bend/position', 'link2_bend/position')
+
+
+def test_a_given_arm_keeps_its_payload_method():
+    signals = _found('joint1/effort', 'joint2/effort', 'link1_bend/position')
+    assert choose_signals(signals, {'arm.tip_mass': 3.0})[0]['payload_method'] == 'structured'
+    assert choose_signals(signals, {})[0]['payload_method'] == 'none'
+
+
+def test_without_an_effort_that_moves_the_inputs_are_asked_for():
+    with pytest.raises(ParameterError, match=r'--set inputs='):
+        choose_signals(_found('a/position', 'b/velocity'), {})
+
+
+def test_smooth_gives_each_stretch_its_modes_with_a_band(tmp_path, capsys):
+    change = 1300
+    path = _bag(tmp_path / 'bag', _machine(2500, change),
+                CaptureEvent(START + round(change * DT * 1e9), EventKind.CAPTURE))
+    page = tmp_path / 'report.html'
+    found = _json(capsys, path, '--smooth', '--report', page, '--set=inputs=[hub/effort]',
+                  '--set=outputs=[hub/position, gauge/position]', '--set=payload_method=none', '--set=angles=[]',
+                  '--set=past_window=20', '--set=future_window=10')
+    assert [part['samples'] for part in found['smoothed']] == [change, 2500 - change]
+    for part, scale in zip(found['smoothed'], (1.0, 0.8), strict=True):
+        assert part['method'] == 'maximum likelihood'
+        for (frequency, damping), hz, std, ratio in zip(
+                MODES, part['frequencies_hz'], part['frequencies_std_hz'], part['damping_ratios'], strict=True):
+            assert abs(hz - scale * frequency * np.sqrt(1.0 - damping ** 2)) < 4.0 * std
+            assert std < 0.01 * frequency
+            assert ratio == pytest.approx(damping, rel=0.2)
+    assert 'maximum likelihood' in page.read_text(encoding='utf-8')
+
+
+def test_without_smooth_the_json_has_no_such_key(recording, capsys):
+    assert 'smoothed' not in _json(capsys, recording, '--set=inputs=[hub/effort]', '--set=outputs=[hub/position]',
+                                   '--set=payload_method=none', '--set=angles=[]')
