@@ -29,7 +29,7 @@ def drive(records: list[JointRecord], config: IdentifierParameters | None = None
     clock, log, reset = sampling.flush(config, clock, log)
     rows = log.rows(0, log.end)
     samples = [Sample(int(rows.stamp_ns[k]), rows.u[k], rows.y[k], rows.angles[k], bool(rows.gap[k]))
-               for k in range(len(rows))]
+               for k in np.flatnonzero(rows.missing == 0)]
     return clock, samples, resets + reset
 
 

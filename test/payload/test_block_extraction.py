@@ -65,7 +65,7 @@ def test_any_basis_is_brought_back_to_the_modal_one(seen):
 
 
 def test_a_model_of_another_order_is_refused():
-    with pytest.raises(ModelError, match='order must be 4 kappa'):
+    with pytest.raises(ModelError, match='order must be 2 L kappa'):
         extract(ArmParameters(), np.eye(6), np.ones((6, 2)), np.zeros(2), 1)
 
 

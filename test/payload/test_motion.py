@@ -58,7 +58,7 @@ def error(arm, x: np.ndarray, exact: np.ndarray, n: int, duration: float, h: flo
     state = x.copy()
     for _ in range(round(duration / h)):
         assert process_model.linearize(arm, state[:n], state[n:2 * n], arm.k[0])
-        assert process_model.exponential_step(arm, state, h)
+        assert process_model.exponential_step(arm, state, h, process_model.SERIES)
     return float(np.abs(state[:n] - exact[:n]).max())
 
 

@@ -21,7 +21,7 @@ from flexmanip_ros.parameters import (
     PlantParameters,
     TriggerParameters,
 )
-from flexmanip_ros.payload.capture_detection import with_detected
+from flexmanip_ros.payload.capture_detection import watch, with_detected
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, Status
 
@@ -79,7 +79,7 @@ def test_the_identified_model_alone_tells_it_within_10_percent(run: list, method
 
 def test_its_capture_is_found_in_the_signals(run: list) -> None:
     messages = [item for item in run if not isinstance(item, CaptureEvent)]
-    found = [item for item in with_detected(IdentifierParameters(arm=LINK), messages)
+    found = [item for item in with_detected(watch(IdentifierParameters(arm=LINK)), messages)
              if isinstance(item, CaptureEvent)]
     assert [event.kind for event in found] == [EventKind.CAPTURE]
     assert found[0].stamp_ns == pytest.approx(2e9, abs=20e6)
