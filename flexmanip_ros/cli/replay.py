@@ -22,7 +22,7 @@ from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies import holdout, smoothing
 from flexmanip_ros.studies.summary import Summary, summarize
-from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Mode
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Mode, Status
 from flexmanip_ros.view.screen import Screen, of_identifier
 
 NEVER = (1 << 63) - 1
@@ -134,7 +134,7 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     return Result(
         summary, () if last is None else last.modes, state.config or request.config,
         tuple(str(place) for place in (request.output, request.report, request.save_arm) if place is not None), fault,
-        interrupted, messages.search(), _remark(state, messages.foreign))
+        interrupted, messages.search(summary.status), _remark(state, messages.foreign))
 
 
 class _Messages:
@@ -198,13 +198,17 @@ class _Messages:
         self._looked = True
         return watch
 
-    def search(self) -> str:
-        """Return what was found in the signals, or why nothing was looked for; empty where events are known."""
+    def search(self, status: str) -> str:
+        """Return what was found in the signals, or why nothing was looked for; empty where events are known.
+
+        status: of the last estimate.
+        """
         found = [event for event in self._findings.events if event.stamp_ns < self._limit_ns()]
         if found:
             first_ns = self.first_ns or 0
             listed = ', '.join(f'{event.kind.value} at {(event.stamp_ns - first_ns) * 1e-9:.3f} s' for event in found)
-            return f'found in the signals: {listed}'
+            doubt = '' if status == Status.TRACKING.name else '; while the status is not TRACKING this is a guess'
+            return f'found in the signals: {listed}{doubt}'
         if self._looked and not self._findings.watched:
             return ('the signals cannot tell: the empty arm does not move as its parameters say, or moves too '
                     'shortly; check the parameters arm.*, or give --capture-time')
@@ -320,5 +324,5 @@ def _report(request: Request, summary: Summary, messages: _Messages, kept: list[
     report.identification_report(
         request.report, Path(request.bag).name, config, summary, made,
         None if last is None else last.model, scores, counts, bound, '' if fault is None else str(fault),
-        modes=() if last is None else last.modes, events=messages.search(),
+        modes=() if last is None else last.modes, events=messages.search(summary.status),
         player=recording.embedded(messages.screen, messages.events, kept))

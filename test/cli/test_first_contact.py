@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from flexmanip_ros.cli import replay
+from flexmanip_ros.cli.console import Report
 from flexmanip_ros.cli.identify_bag import main
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io import bag
@@ -80,6 +81,14 @@ def test_an_arm_that_caught_nothing_is_said_to_be_empty(
     _, out, _ = run(capsys, written(tmp_path / 'empty', caught[:1100]))
     assert 'none found in the signals, so the arm is taken as empty; give --capture-time' in out
     assert 'payload      none: the arm is taken as empty, 95 % interval 0 .. ' in out
+
+
+def test_what_is_found_while_the_residuals_do_not_fit_is_called_a_guess(unannounced: Path) -> None:
+    messages = replay._Messages(replay.Request(unannounced, IdentifierParameters()), Report())
+    messages.first_ns = START
+    messages._findings.events.append(CAPTURE)
+    assert messages.search('TRACKING') == 'found in the signals: capture at 1.200 s'
+    assert messages.search('INCONSISTENT').endswith('while the status is not TRACKING this is a guess')
 
 
 def test_a_recording_too_short_to_tell_is_not_called_empty(
