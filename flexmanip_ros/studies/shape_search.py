@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,6 +62,7 @@ class Shape(NamedTuple):
     past: int
     future: int
     direct: bool
+    weighted: bool
     order: int
 
 
@@ -119,14 +120,16 @@ def search_shapes(search: Search, step: Callable[[], None]) -> Shape:
         raise ParameterError(f'{search.count} samples without a gap are too few to choose parameters from',
                              'record for longer, or set the parameters by hand')
     directs = _choices(search.given, 'direct_feedthrough', (True,))
+    weights = _choices(search.given, 'weighted_observability', (True,))
     for factor, past in runs:
-        _try(search, factor, past, _futures(search, past)[:1], directs, _orders(search, COARSE))
+        _try(search, factor, past, _futures(search, past)[:1], directs, weights, _orders(search, COARSE))
         step()
     if not search.tried:
         raise ParameterError('no model of these signals can be computed', 'check that every input and output moves')
     for factor, past in _finalists(search):
         directs = _choices(search.given, 'direct_feedthrough', (True, False))
-        _try(search, factor, past, _futures(search, past), directs, _orders(search, ORDERS))
+        weights = _choices(search.given, 'weighted_observability', (True, False))
+        _try(search, factor, past, _futures(search, past)[1:], directs, weights, _orders(search, ORDERS))
         step()
     return _simplest(search)
 
@@ -184,10 +187,12 @@ def _orders(search: Search, otherwise: Sequence[int]) -> tuple[int, ...]:
 
 
 def _futures(search: Search, past: int) -> tuple[int, ...]:
-    """Return future windows to try, the first one before all others."""
+    """Return the future window of the first pass, then those of the second."""
     enough = min(past, -(-max(_orders(search, ORDERS)) // search.m))
-    tried = (min(past, 30), max(past // 2, enough), max(min(past, 10), enough), past)
-    return _choices(search.given, 'future_window', tuple(dict.fromkeys(tried)))
+    fine = (max(min(past, 10), enough), max(past // 2, enough), past)
+    if 'future_window' in search.given:
+        return (search.given['future_window'],) * 2
+    return min(past, 30), *dict.fromkeys(fine)
 
 
 def _finalists(search: Search) -> list[tuple[int, int]]:
@@ -203,14 +208,14 @@ def _simplest(search: Search) -> Shape:
 
 
 def _try(search: Search, factor: int, past: int, futures: Sequence[int], directs: Sequence[bool],
-         orders: Sequence[int]) -> None:
+         weights: Sequence[bool], orders: Sequence[int]) -> None:
     """Identify on the other folds and predict each fold."""
     kept = search.kept(factor)
     sums = moments(search, kept, past)
     for future in futures:
         able = [n for n in orders if n <= future * search.m]
-        for direct in directs:
-            shape = Shape(factor, past, future, direct, 0)
+        for direct, weighted in product(directs, weights):
+            shape = Shape(factor, past, future, direct, weighted, 0)
             found = shares(search, kept, sums, shape, able, PRIOR)
             search.tried.update({shape._replace(order=n): share for n, share in found.items()})
 
@@ -253,7 +258,7 @@ def _models(R: Array, search: Search, orders: Sequence[int], shape: Shape) -> li
     unit = np.divide(1.0, power, out=np.ones(width), where=power > 0.0)
     try:
         found = realize_orders(R * np.tile(unit, R.shape[1] // width), search.r, search.m, orders, shape.future,
-                               feedthrough=shape.direct, weighted=True, riccati=True)
+                               feedthrough=shape.direct, weighted=shape.weighted, riccati=True)
     except np.linalg.LinAlgError:
         return [None] * len(orders)
     su, sy = unit[:search.r], unit[search.r:]

@@ -72,7 +72,8 @@ def _shape_reasons(search: Search, shape: Shape) -> list[tuple[str, str]]:
     for name, part, text in (
             ('decimation', 'factor', lambda factor: f'{1.0 / (factor * search.dt):.4g} Hz'),
             ('past_window', 'past', lambda past: f'{past * shape.factor * search.dt:.3g} s'),
-            ('future_window', 'future', str), ('order', 'order', str), ('direct_feedthrough', 'direct', str)):
+            ('future_window', 'future', str), ('order', 'order', str), ('direct_feedthrough', 'direct', str),
+            ('weighted_observability', 'weighted', str)):
         value = getattr(shape, part)
         same: dict[str, object] = {} if part == 'factor' else {'factor': shape.factor}
         if part not in ('factor', 'past'):
@@ -150,7 +151,8 @@ def _memory_s(search: Search) -> float:
 
 def _values(shape: Shape) -> dict[str, Any]:
     return {'decimation': shape.factor, 'order': shape.order, 'past_window': shape.past,
-            'future_window': shape.future, 'direct_feedthrough': shape.direct}
+            'future_window': shape.future, 'direct_feedthrough': shape.direct,
+            'weighted_observability': shape.weighted}
 
 
 def _is_refinable(search: Search, shape: Shape) -> bool:
