@@ -17,6 +17,7 @@ from flexmanip_ros.identification import decimation, factor, model_output, paper
 from flexmanip_ros.identification.factor import FILLED, POWER, PRIOR, USED, WEIGHT, WEIGHT2, Outcomes
 from flexmanip_ros.identification.moments import solve_regressor
 from flexmanip_ros.identification.uncertainty import Identified
+from flexmanip_ros.identification.varying_model import Configurations
 from flexmanip_ros.numerics.background import INLINE, Background
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Rows, SampleLog, Width
@@ -247,6 +248,12 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> I
     dt *= config.decimation
     d = _regressors(config, len(config.inputs), len(config.outputs))
     refined = state.refined
+    if refined is not None and refined.varying is not None:
+        last = refined.recursion
+        return Configurations(
+            config, refined.varying, dt, model_output.excitation(state.memory[0][:d, :d]), float(state.scalars[POWER]),
+            np.zeros(0) if last is None else last.singular_values, float('nan') if last is None else last.condition,
+        ).now(state.cursor - refined.seen)
     if refined is not None and refined.recursion and FRESH * refined.recursion.weight >= state.counts[USED]:
         return model_output.from_fit(
             config, refined.recursion, state.scalars, model_output.excitation(state.memory[0][:d, :d]), dt)

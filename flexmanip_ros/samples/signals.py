@@ -52,7 +52,8 @@ def resolve(
         kept = (name for name in wanted if not _is_unfilled(name, record))
         wanted = tuple(kept) or wanted
     groups: list[tuple[tuple[str, int], ...]] = []
-    needs_angles = config.payload_method != 'none'
+    chosen = config.angles != type(config)().angles  # the default ones are no joints of any other machine
+    needs_angles = config.payload_method != 'none' or chosen
     for group, names in (('inputs', config.inputs), ('outputs', wanted),
                          ('angles', config.angles if needs_angles else ())):
         places = []
