@@ -61,6 +61,8 @@ UNPREDICTED = 0.7
 """Share of an output's amplitude that the prediction of a block may miss before it counts against the model."""
 STRIKES = 3
 """Such blocks in a row that end the fit."""
+SAME = 0.3
+"""Factor on prior deviations around the model before an event: the same arm, with another object."""
 UNKNOWN = 3.0
 """Standard deviation of a state of which nothing is known, in signals of unit power."""
 AT_REST = np.array([1.0, 0.0, 0.0])
@@ -258,6 +260,8 @@ def start(config: IdentifierParameters, rows: Rows, old: Recursion | None, befor
     more_u, more_y = unit[:r] / begun.scale_u, unit[r:] / begun.scale_y
     ratio = more_y[:, None] / more_y
     theta, root = _around(G * ratio, H * more_y[:, None] / more_u, D * ratio)
+    if before is not None:  # the same arm, with another object
+        root[:len(theta), :len(theta)] *= SAME
     return _fit_stretch(
         config, begun._replace(dt=dt, theta=theta, root=root, scale_u=unit[:r], scale_y=unit[r:]), rows, role)
 

@@ -19,7 +19,7 @@ AHEAD_S = 1.0
 """Time over which the configuration is extrapolated at most [s]."""
 MISSED = 0.5
 """Share of an output's amplitude that the predictions of the last blocks may miss."""
-VAGUE = 0.005
+VAGUE = 0.008
 """Relative standard deviation of a frequency above which the model is not published as tracking."""
 EARLY = 16
 """Blocks before which a vague model is still warming up."""
@@ -76,9 +76,10 @@ def judge(found: Identified, v: Varying) -> Status:
 def unmodelled(v: Varying) -> float:
     """Return the relative error of frequencies that explains what predictions over a block miss.
 
-    A frequency off by the share e turns the phase by shift T e in the time T of a block.
+    A frequency off by the share e turns the phase by shift t e in a time t, in the mean over a block of the time T
+    by shift T e / sqrt(3) (root of the mean square).
     """
-    return float(v.share.mean()) / (v.shift * BLOCK * v.dt)
+    return math.sqrt(3.0) * float(v.share.mean()) / (v.shift * BLOCK * v.dt)
 
 
 def _innovations(read: Configurations, role: Roles) -> Array:
