@@ -12,45 +12,27 @@ above the modes; blocks of ``BLOCK`` of them update parameters and state togethe
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from flexmanip_ros.errors import ModelError
-from flexmanip_ros.identification.batch_fit import BLOCK, Recursion
 from flexmanip_ros.identification.moments import triangle
 from flexmanip_ros.identification.prediction_error import condition
-from flexmanip_ros.identification.realization import known_output_basis, to_continuous, transform
 from flexmanip_ros.identification.varying_kernel import basis, low_pass, simulate_block
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Rows
-from flexmanip_ros.types import Array, StateSpace
+from flexmanip_ros.samples.signals import reads_angles
+from flexmanip_ros.types import Array
 
 FUNCTIONS = 3
 """Functions of the configuration, see ``varying_kernel.basis``."""
-CUTOFF = 2.0
-"""Corner of the low-pass filter over the highest frequency of the model."""
-FINE = 18.0
-"""Samples kept per period of the corner frequency, at least; between them torques are taken for straight lines."""
-SETTLE = 2.0
-"""Periods of the corner frequency after which a filter that began anew is trusted."""
-WINDOW = 1024
-"""Samples of the longest stretch that is fitted at once, as one block."""
-GROWTH = (256, 512, WINDOW)
-"""Samples of the stretches that lead there, each started from the one before."""
-LATE = 16.0
-"""Times the noise by which the first stretches may miss, as their start may be far off."""
-ITERATIONS = 8
 LONGEST_STEP = 3.0
 """Largest step of an iteration in units of the prior deviations."""
 VARIES, KNOWN = 0.12, 1.0
 """Prior deviations, as shares of the largest entry: of the parts of G and H that vary with c, and of the rest."""
 DIRECT, DAMPED, TURNING, OFFSET, SHARED = 0.05, 0.05, 2.0, 0.3, 1.0
 """Prior deviations of E and F, D, its terms with rates, b and zeta; signals at unit power, time in 1 / shift."""
-ZETA = 0.8
 WALK = 0.001
 """Standard deviation by which a parameter may move in a block, as a share of its prior one."""
 STATE_WALK, OFFSET_WALK = 0.005, 0.01
@@ -61,8 +43,6 @@ UNPREDICTED = 0.7
 """Share of an output's amplitude that the prediction of a block may miss before it counts against the model."""
 STRIKES = 3
 """Such blocks in a row that end the fit."""
-SAME = 0.3
-"""Factor on prior deviations around the model before an event: the same arm, with another object."""
 UNKNOWN = 3.0
 """Standard deviation of a state of which nothing is known, in signals of unit power."""
 AT_REST = np.array([1.0, 0.0, 0.0])
@@ -82,11 +62,11 @@ class Varying(NamedTuple):
     """The fit and what it remembers, constant in size; h displacements, r inputs, k parameters.
 
     shift: unit of time [1/s]; scale_u (r,), scale_y (h,): factors on signals; theta: (k,) see ``parts``; x: (2h,);
-    root: (k + 2h, k + 2h) S with S S' their covariance; noise: (h, h); share: (h,) of the outputs' amplitude that
-    the prediction of a block misses, averaged over the last blocks; corner [Hz], every: the filter and the samples that it keeps one of; filtered:
-    (4, r + h + 2) its state; dt: sample time [s]; angle, rate: relative angle of the links at the end [rad, rad/s];
-    blocks: number taken; strikes: bad ones in a row; lost: samples were missing, so filter and state begin anew;
-    gain: (n, m) published K.
+    root: (k + 2h, k + 2h) S with S S' their covariance; noise: (h, h); share: (h,) of the outputs' amplitude that the
+    prediction of a block misses, averaged over the last blocks; corner [Hz], every: the filter and the samples that it
+    keeps one of; filtered: (4, r + h + 2) its state; dt: sample time [s]; angle, rate: relative angle of the links at
+    the end [rad, rad/s]; blocks: number taken; strikes: bad ones in a row; lost: samples were missing, so filter and
+    state begin anew; gain: (n, m) published K.
     """
 
     shift: float
@@ -132,7 +112,7 @@ def roles(config: IdentifierParameters) -> Roles | None:
     """
     names = config.outputs
     shown = tuple(k for k, name in enumerate(names) if name.endswith('/position'))
-    if not config.angles or 2 * len(shown) != config.order or config.decimation > 1:
+    if not reads_angles(config) or 2 * len(shown) != config.order or config.decimation > 1:
         return None
     joints = [names[k].rpartition('/')[0] for k in shown]
     states = []
@@ -181,15 +161,15 @@ def walk(theta: Array, h: int, r: int, size: Array) -> Array:
     return np.concatenate([found, STATE_WALK * size, STATE_WALK * size])
 
 
-def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array) -> tuple[Array, ...]:
+def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array
+          ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """G, G1, H, H1, D, E of ``simulate_block`` at c, where c changes by ``by_s`` towards the end of the block."""
     value, by_c, _ = basis(c, float(theta[-1]))
     G, H, E = (part(theta, name, h, r) for name in 'GHE')
     D = np.tensordot(rates, part(theta, 'D', h, r), 1)
     direct = np.hstack([np.tensordot(value, E, 1), part(theta, 'F', h, r), part(theta, 'b', h, r)[:, None]])
-    found = (np.tensordot(value, G, 1), np.tensordot(by_c * by_s, G, 1), np.tensordot(value, H, 1),
-             np.tensordot(by_c * by_s, H, 1), D, direct)
-    return tuple(np.ascontiguousarray(matrix) for matrix in found)
+    return (np.tensordot(value, G, 1), np.tensordot(by_c * by_s, G, 1), np.tensordot(value, H, 1),
+            np.tensordot(by_c * by_s, H, 1), D, direct)
 
 
 def to_local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array) -> Array:
@@ -217,86 +197,6 @@ def to_local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array) 
     return T
 
 
-def from_model(model: StateSpace, role: Roles) -> tuple[Array, Array, Array] | None:
-    """G, D, H of a model of one configuration, in its own units; None where it does not swing as it should."""
-    h = len(role.displacements)
-    seen = model.C[list(role.displacements)]  # x = [w; w'] by these alone: then w' is the derivative of w
-    W = known_output_basis(replace(model, C=seen, D=model.D[list(role.displacements)]))
-    if W is None:
-        return None
-    moved = transform(model, W)
-    try:
-        A, B = to_continuous(moved.A, moved.B, model.dt)
-    except (ModelError, np.linalg.LinAlgError):
-        return None
-    G, D, H = -A[h:, :h], -A[h:, h:], B[h:]
-    values = np.linalg.eigvals(np.block([[np.zeros((h, h)), np.eye(h)], [-G, -D]]))
-    swings = values[values.imag > 0.0]
-    if len(swings) != h or not np.all(np.abs(swings.real) < 0.3 * swings.imag):
-        return None
-    return G, D, H
-
-
-def start(config: IdentifierParameters, rows: Rows, old: Recursion | None, before: Varying | None) -> Varying | None:
-    """Begin with a stretch of samples, from the fit of one configuration or from the model before an event."""
-    role = roles(config)
-    if role is None or len(rows) < GROWTH[0] or rows.angles.shape[1] != 2 or (old is None and before is None):
-        return None
-    stamps = rows.stamp_ns
-    dt = float(stamps[-1] - stamps[0]) * 1e-9 / (len(rows) - 1)
-    h, r = len(role.displacements), len(config.inputs)
-    if before is not None:
-        begun: Varying | None = before._replace(x=np.zeros(2 * h), blocks=0, strikes=0, lost=False)
-    else:
-        assert old is not None
-        begun = _from_recursion(old, role, r, dt)
-    if begun is None or begun.every < 1 or GROWTH[0] % begun.every:
-        return None
-    power = np.concatenate([np.mean(rows.u ** 2, axis=0), np.var(rows.y[:, list(role.displacements)], axis=0)])
-    if not np.all(power > 0.0) or not np.all(np.isfinite(power)):
-        return None
-    G, _, H, _, D, _ = local(begun.theta, h, r, math.cos(begun.angle), 0.0, AT_REST)
-    unit = 1.0 / np.sqrt(power)
-    more_u, more_y = unit[:r] / begun.scale_u, unit[r:] / begun.scale_y
-    ratio = more_y[:, None] / more_y
-    theta, root = _around(G * ratio, H * more_y[:, None] / more_u, D * ratio)
-    if before is not None:  # the same arm, with another object
-        root[:len(theta), :len(theta)] *= SAME
-    return _fit_stretch(
-        config, begun._replace(dt=dt, theta=theta, root=root, scale_u=unit[:r], scale_y=unit[r:]), rows, role)
-
-
-def _around(G: Array, H: Array, D: Array) -> tuple[Array, Array]:
-    """Theta of a model that does not vary, and the root of its prior covariance, that of the state included."""
-    h, r = H.shape
-    at_rest = (np.concatenate([X.ravel(), np.zeros(2 * X.size)]) for X in (G, H, D))
-    g, b, d = at_rest
-    theta = np.concatenate([g, b, np.zeros(4 * h * r), d, np.zeros(h), np.full(1, ZETA)])
-    return theta, np.diag(np.concatenate([prior(G, H), np.full(2 * h, UNKNOWN)]))
-
-
-def _from_recursion(old: Recursion, role: Roles, r: int, dt: float) -> Varying | None:
-    fit, scale = old.theta, old.scale
-    found = from_model(StateSpace(fit.A, fit.B, fit.C, fit.D, fit.K, dt), role)
-    if found is None:
-        return None
-    G, D, H = found
-    h = len(G)
-    # of the state [y; dy/dt] in the order of the displacements
-    frequencies = np.sqrt(np.abs(np.linalg.eigvals(G)))
-    shift = float(frequencies.mean())
-    corner = CUTOFF * float(frequencies.max()) / (2.0 * np.pi)
-    every = 2 ** max(math.floor(math.log2(1.0 / (dt * corner * FINE))), -1) if corner * dt > 0.0 else 0
-    if every < 1:
-        return None
-    theta, root = _around(G / shift ** 2, H / shift ** 2, D / shift)
-    return Varying(
-        shift=shift, scale_u=scale[:r].copy(), scale_y=scale[r:][list(role.displacements)].copy(), theta=theta,
-        x=np.zeros(2 * h), root=root, noise=np.zeros((h, h)), share=np.zeros(h), corner=corner,
-        every=every, filtered=np.zeros((4, r + h + 2)), dt=dt, angle=0.0, rate=0.0, blocks=0, strikes=0, lost=False,
-        gain=np.zeros((0, 0)))
-
-
 def _filter(v: Varying) -> tuple[Array, Array, Array]:
     w = 2.0 * np.pi * v.corner
     A, B, C = np.zeros((5, 5)), np.zeros(4), np.zeros((2, 4))
@@ -309,14 +209,14 @@ def _filter(v: Varying) -> tuple[Array, Array, Array]:
     return np.ascontiguousarray(step[:4, :4]), np.ascontiguousarray(step[:4, 4]), C
 
 
-def _signals(config: IdentifierParameters, rows: Rows, role: Roles) -> Array:
+def signals_of(config: IdentifierParameters, rows: Rows, role: Roles) -> Array:
     """(N, r + h + 2) inputs, displacements, relative angle of the links and absolute angle of the first."""
     angles = rows.angles
     relative = angles[:, 1] - angles[:, 0] if config.arm.angle_convention == 'chord' else angles[:, 1]
     return np.ascontiguousarray(np.column_stack([rows.u, rows.y[:, list(role.displacements)], relative, angles[:, 0]]))
 
 
-def _passed(v: Varying, signals: Array, anew: bool) -> tuple[Array, Array, Array]:
+def passed(v: Varying, signals: Array, anew: bool) -> tuple[Array, Array, Array]:
     """Filter signals (N, w): those that are kept, their second derivatives, and the state of the filter."""
     state = np.zeros_like(v.filtered) if anew else v.filtered.copy()
     if anew:
@@ -327,14 +227,14 @@ def _passed(v: Varying, signals: Array, anew: bool) -> tuple[Array, Array, Array
     return out, second, state
 
 
-def _block(v: Varying, out: Array, second: Array) -> Block:
+def block_of(v: Varying, out: Array, second: Array) -> Block:
     """Scale filtered signals (N, w) and find the configuration in them.
 
     The angles are straight lines and what goes with the displacements: encoders see the slopes of bent links.
     """
     r, h, n = len(v.scale_u), len(v.scale_y), len(out)
     U, Y = out[:, :r] * v.scale_u, out[:, r:r + h] * v.scale_y
-    s = (np.arange(n) - 0.5 * (n - 1)) / (0.5 * n)
+    s = np.asarray((np.arange(n) - 0.5 * (n - 1)) / (0.5 * n), dtype=np.float64)
     lines = np.linalg.lstsq(np.column_stack([np.ones(n), s, Y - Y.mean(axis=0)]), out[:, r + h:], rcond=None)[0]
     half = 0.5 * n * v.every * v.dt
     middle, relative, first = float(lines[0, 0]), float(lines[1, 0]) / half, float(lines[1, 1]) / half
@@ -357,12 +257,13 @@ def _run(v: Varying, block: Block, theta: Array, x: Array, noise: Array) -> tupl
     X[:, width - 2 * h:] = np.eye(2 * h)
     end = x.copy()
     whiten = np.linalg.inv(np.linalg.cholesky(noise))
-    matrices = local(theta, h, r, block.c, block.by_s, block.rates)
-    simulate_block(block.U, block.slope, block.V, block.Y, block.s, block.dt, *matrices, end, whiten, N, g, moments, X)
+    G, G1, H, H1, D, E = local(theta, h, r, block.c, block.by_s, block.rates)
+    simulate_block(block.U, block.slope, block.V, block.Y, block.s, block.dt, G, G1, H, H1, D, E, end, whiten, N, g,
+                   moments, X)
     return N, g, moments / len(block.U), X, end
 
 
-def _noise_of(signals: Array, v: Varying) -> Array:
+def noise_of(signals: Array, v: Varying) -> Array:
     """(h, h) covariance of the sensors' white noise behind the filter, by fourth differences of signals (N, w)."""
     r, h = len(v.scale_u), len(v.scale_y)
     white = np.median(np.abs(np.diff(signals[:, r:r + h], 4, axis=0)), axis=0) / (0.6745 * math.sqrt(70.0))
@@ -371,7 +272,7 @@ def _noise_of(signals: Array, v: Varying) -> Array:
     return np.diag(np.maximum(white * v.scale_y * inside, 1e-4 * size + 1e-12) ** 2)
 
 
-def _update(v: Varying, block: Block, noise: Array, iterations: int) -> Varying | None:
+def updated(v: Varying, block: Block, noise: Array, iterations: int) -> Varying | None:
     """Update parameters and state by one block; None where the numbers leave the finite range."""
     h, r, k = len(v.scale_y), len(v.scale_u), len(v.theta)
     wide = max(1.0, 1.0 / (2.1 * v.corner * v.dt * v.every))  # filtered noise: that many samples say what one says
@@ -416,64 +317,26 @@ def _update(v: Varying, block: Block, noise: Array, iterations: int) -> Varying 
         strikes=v.strikes + 1 if v.blocks and float(share.max()) > UNPREDICTED else 0)
 
 
-def _fit_stretch(config: IdentifierParameters, v: Varying, rows: Rows, role: Roles) -> Varying | None:
-    """Fit a whole stretch: its first second at once, the rest block by block."""
-    signals = _signals(config, rows, role)
-    if not np.all(np.isfinite(signals)):
-        return None
-    out, second, state = _passed(v, signals, True)
-    quiet = math.ceil(SETTLE / (v.corner * v.dt * v.every))
-    least = _noise_of(signals, v)
-    power = np.diag(np.var(out[quiet:, len(v.scale_u):len(v.scale_u) + len(v.scale_y)] * v.scale_y, axis=0))
-    begin, last = v, 0
-    for count in (length for length in GROWTH if length <= len(rows)):
-        last = count // v.every
-        if last < quiet + 24:
-            continue
-        block = _block(v, out[quiet:last], second[quiet:last])
-        noise = (LATE if count < WINDOW else 4.0) * least + 1e-4 * power
-        found = _update(begin, block, noise, ITERATIONS)
-        if found is not None:  # once more, with the noise that it leaves
-            begin = begin._replace(theta=found.theta)
-            found = _update(begin, block, 1.5 * found.noise + least, ITERATIONS)
-        if found is None:
-            return None
-        begin, v = begin._replace(theta=found.theta), found
-    if not v.blocks:
-        return None
-    length = BLOCK // v.every
-    for first in range(last, len(out) - length + 1, length):
-        done = _update(v, _block(v, out[first:first + length], second[first:first + length]),
-                       v.noise + 0.05 * least, 1)
-        if done is None:
-            return None
-        v = done
-    return v._replace(filtered=state)
-
-
 def advance(config: IdentifierParameters, v: Varying, rows: Rows) -> Varying | None:
     """Take a block of ``BLOCK`` samples; None where the fit has come to its end."""
     role = roles(config)
     assert role is not None
-    signals = _signals(config, rows, role)
+    signals = signals_of(config, rows, role)
     if not np.all(np.isfinite(signals)):
         return v._replace(lost=True)
-    out, second, state = _passed(v, signals, v.lost)
+    out, second, state = passed(v, signals, v.lost)
     v = v._replace(filtered=state)
     if v.lost:  # the filter settles; the state is unknown
         k, n = len(v.theta), len(v.x)
         root = np.zeros_like(v.root)
         root[:k, :k] = triangle(v.root[:k].T).T
         root[k:, k:] = UNKNOWN * np.eye(n)
-        block = _block(v, out, second)
+        block = block_of(v, out, second)
         return v._replace(lost=False, root=root, x=np.zeros(n), angle=block.angle, rate=block.rate)
-    done = _update(v, _block(v, out, second), v.noise + 0.05 * _noise_of(signals, v), 1)
+    done = updated(v, block_of(v, out, second), v.noise + 0.05 * noise_of(signals, v), 1)
     return None if done is None or done.strikes >= STRIKES else done
 
 
 def lost(v: Varying) -> Varying:
     """Samples are missing: what was learnt is kept, the state is unknown."""
     return v._replace(lost=True)
-
-
-Stamps = NDArray[np.int64]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from flexmanip_ros.identification import model_output, parameter_varying
+from flexmanip_ros.identification import model_output, parameter_varying, varying_start
 from flexmanip_ros.identification.batch_fit import BLOCK, UNEXPLAINED, Recursion, arrive, fit_stretch, unexplained
 from flexmanip_ros.identification.factor import Outcomes
 from flexmanip_ros.identification.moments import triangle
@@ -275,9 +275,9 @@ def _stretch(request: FitRequest, R: Array, scale: Array) -> Recursion | None:
 
 def _varying(request: FitRequest, found: Recursion | None) -> Varying | None:
     """Fit the whole stretch with a parameter-varying model: from that of before the event, and from the fit."""
-    tried = [parameter_varying.start(request.config, request.rows, None, request.varying)]
-    if found is not None and len(request.rows) >= parameter_varying.WINDOW:
-        tried.append(parameter_varying.start(request.config, request.rows, found, None))
+    tried = [varying_start.start(request.config, request.rows, None, request.varying)]
+    if found is not None and len(request.rows) >= varying_start.WINDOW:
+        tried.append(varying_start.start(request.config, request.rows, found, None))
     good = [one for one in tried if one is not None and float(one.share.max()) ** 2 < UNEXPLAINED]
     return min(good, key=lambda one: float(one.share.max())) if good else None
 

@@ -258,11 +258,11 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> I
             np.zeros(0) if last is None else last.singular_values, float('nan') if last is None else last.condition,
         ).now(state.cursor - refined.seen)
     if refined is not None and refined.recursion and FRESH * refined.recursion.weight >= state.counts[USED]:
-        found = model_output.from_fit(
+        fitted = model_output.from_fit(
             config, refined.recursion, state.scalars, model_output.excitation(state.memory[0][:d, :d]), dt)
         # it is followed by a model of the configuration, which starts from displacements alone
         early = refined.batch and roles(config) is not None and refined.total < LATEST_VARYING
-        return found._replace(status=Status.WARMING_UP) if early and found.status is Status.TRACKING else found
+        return fitted._replace(status=Status.WARMING_UP) if early and fitted.status is Status.TRACKING else fitted
     few = state.counts[USED] <= max(config.past_window, config.order)
     if few or not np.all(np.isfinite(state.memory[0])):
         return None
