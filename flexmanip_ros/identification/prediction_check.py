@@ -40,11 +40,11 @@ def white_noise(Y: Array) -> Array:
 def missed(model: StateSpace, U: Array, Y: Array, horizon: int) -> Array:
     """(m,) share of the power of Y (N, m) that predictions up to ``horizon`` samples ahead miss, beyond white noise.
 
-    Each begins at the state that fits the ``horizon`` samples before it; no output after that is used. nan where an
+    Each begins at the state that fits twice as many samples before it; no output after that is used. nan where an
     output is silent.
     """
     n, m = model.order, model.C.shape[0]
-    before = max(horizon, 2 * n)
+    before = 2 * max(horizon, n)
     free, row = np.empty((before, m, n)), model.C
     for k in range(before):
         free[k], row = row, row @ model.A
@@ -74,8 +74,8 @@ def judged(found: Identified, rows: Rows) -> Identified:
         return found
     model = found.model
     slowest = min((mode.frequency_hz for mode in modes(found)), default=1.0)
-    horizon = max(2, min(round(0.25 / (slowest * model.dt)), len(rows) // 4))
-    if len(rows) < 4 * max(horizon, 2 * model.order) or rows.gap[1:].any():
+    horizon = max(2, min(round(0.25 / (slowest * model.dt)), len(rows) // 6))
+    if 2 * len(rows) < length(model.dt) or len(rows) < 6 * max(horizon, model.order) or rows.gap[1:].any():
         return found
     with np.errstate(over='ignore', invalid='ignore'):
         shares = missed(model, np.ascontiguousarray(rows.u), np.ascontiguousarray(rows.y), horizon)
