@@ -12,6 +12,7 @@ above the modes; blocks of ``BLOCK`` of them update parameters and state togethe
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -126,6 +127,7 @@ def roles(config: IdentifierParameters) -> Roles | None:
     return Roles(shown, tuple(states))
 
 
+@cache
 def parts(h: int, r: int) -> dict[str, tuple[slice, tuple[int, ...]]]:
     """Return where each part of theta stands, and its shape: G, H, E by functions of c, F, D by rates, b, zeta."""
     shapes = {'G': (FUNCTIONS, h, h), 'H': (FUNCTIONS, h, r), 'E': (FUNCTIONS, h, r), 'F': (h, r), 'D': (3, h, h),
