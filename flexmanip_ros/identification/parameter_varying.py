@@ -312,11 +312,15 @@ def updated(v: Varying, block: Block, noise: Array, iterations: int) -> Varying 
     after[k:] = arrival @ after
     fresh = max(1.0 / (v.blocks + 1.0), 1.0 / NOISE_BLOCKS)
     known = (1.0 - fresh) * v.noise + fresh * moments if v.blocks else moments
-    lately = max(1.0 / max(v.blocks, 1), 1.0 / SHARE_BLOCKS)
-    return v._replace(
-        theta=theta, x=end, root=after, noise=known, angle=block.angle, rate=block.rate, blocks=v.blocks + 1,
-        share=v.share + (share - v.share) * lately if v.blocks else np.sqrt(np.diag(moments) / np.var(block.Y, axis=0)),
-        strikes=v.strikes + 1 if v.blocks and float(share.max()) > UNPREDICTED else 0)
+    if not v.blocks:
+        share, strikes = np.sqrt(np.diag(moments) / np.var(block.Y, axis=0)), 0
+    elif not v.x.any():  # after a loss the state was unknown: that was no prediction
+        share, strikes = v.share, 0
+    else:
+        strikes = v.strikes + 1 if float(share.max()) > UNPREDICTED else 0
+        share = v.share + (share - v.share) * max(1.0 / v.blocks, 1.0 / SHARE_BLOCKS)
+    return v._replace(theta=theta, x=end, root=after, noise=known, share=share, angle=block.angle, rate=block.rate,
+                      blocks=v.blocks + 1, strikes=strikes)
 
 
 def advance(config: IdentifierParameters, v: Varying, rows: Rows) -> Varying | None:

@@ -193,3 +193,18 @@ def test_a_prediction_is_judged_against_white_noise_and_not_against_its_own_resi
     wrong = replace(model, A=model.A @ model.A, B=2.0 * model.B)
     assert np.nanmax(prediction_check.missed(wrong, u, y, 45)) > 0.5
     np.testing.assert_allclose(np.sqrt(prediction_check.white_noise(y)), 0.01 * y.std(axis=0), rtol=0.2)
+
+
+def test_missing_samples_cost_no_more_than_the_blocks_they_are_in() -> None:
+    trajectory, event, chords = record()
+    kept = np.ones(len(trajectory.stamp_ns), dtype=np.bool_)
+    kept[8000:8003] = kept[9500] = kept[11000:11200] = False
+    thin = trajectory._replace(**{name: getattr(trajectory, name)[kept]
+                                  for name in ('stamp_ns', 'position', 'velocity', 'effort')})
+    estimates, state = identify(thin, event, 1000)
+    run = Run(estimates, state, chords)
+    late = [one for one in estimates if one.stamp_ns > 12e9]
+    assert all(len(one.modes) == 2 for one in late)
+    for one in late:
+        assert np.all(np.abs([mode.frequency_hz for mode in one.modes] / truth(run, one) - 1.0) < 0.015)
+        assert all(mode.frequency_std_hz < 0.01 * mode.frequency_hz for mode in one.modes)
