@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.identification import rpbsid
+from flexmanip_ros.identification import prediction_check, rpbsid
 from flexmanip_ros.identification.factor import FILLED, REJECTED
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.numerics.background import Background
@@ -112,11 +112,15 @@ class ModelRequest:
     stamp_ns: int
     dt: float
     payload: Payload | None
+    rows: Rows | None = None
+    """The latest samples, on which the model is judged."""
 
     def solve(self) -> Estimate:
         """Return the estimate with model and modes."""
         config, identifier, payload = self.config, self.identifier, self.payload
         found, without = _identified(config, identifier.rpbsid, self.dt)
+        if found is not None and self.rows is not None and config.decimation == 1:
+            found = prediction_check.judged(found, self.rows)
         if config.payload_method == 'block' and found is not None:
             payload = block_extraction.estimate(config, found, identifier.angles, identifier.configuration_range)
         if found is None:

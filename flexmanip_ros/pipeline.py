@@ -17,11 +17,11 @@ from flexmanip_ros import estimator, event_replay
 from flexmanip_ros.errors import MissingSignalError, SignalError
 from flexmanip_ros.estimator import ModelEstimator, PayloadEstimator
 from flexmanip_ros.event_replay import EventReplay
-from flexmanip_ros.identification import rpbsid
+from flexmanip_ros.identification import prediction_check, rpbsid
 from flexmanip_ros.numerics.background import INLINE, Background
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples import sampling
-from flexmanip_ros.samples.sample_log import SampleLog
+from flexmanip_ros.samples.sample_log import Rows, SampleLog
 from flexmanip_ros.samples.sampling import Clock, Counters
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord
 
@@ -227,7 +227,8 @@ def current(state: State) -> Estimate | None:
     if payload.cursor == 0:
         return None
     model = identifier.estimator._replace(rpbsid=rpbsid.finish(config, identifier.estimator.rpbsid))
-    request = estimator.ModelRequest(config, model, payload.estimator, payload.last_ns, state.clock.dt, None)
+    request = estimator.ModelRequest(config, model, payload.estimator, payload.last_ns, state.clock.dt, None,
+                                     _latest(state, payload.cursor))
     estimate = request.solve()
     held = estimator.payload(config, payload.estimator)
     if estimate.model is None:
@@ -296,8 +297,17 @@ def _advance(state: State, until: int, background: Background) -> State:
     assert state.identifier is not None
     if state.keep_log:
         return state
-    needed = min(event_replay.first_needed(state.payload), event_replay.first_needed(state.identifier))
+    needed = min(event_replay.first_needed(state.payload), event_replay.first_needed(state.identifier),
+                 state.identifier.cursor - prediction_check.length(state.clock.dt))
     return state._replace(log=state.log.from_row(needed))
+
+
+def _latest(state: State, until: int) -> Rows:
+    """Return the rows before ``until`` on which a model is judged: of the last second, since the last event."""
+    assert state.payload is not None
+    first = max(state.log.start, until - prediction_check.length(state.clock.dt))
+    first = min(state.log.row_at(state.payload.estimator.since_ns, first), until)
+    return state.log.rows(first, until)
 
 
 def _advance_payload(state: State, until: int, background: Background) -> State:
@@ -357,7 +367,7 @@ def _estimate(state: State, background: Background) -> tuple[State, list[Estimat
     state = _advance_identifier(state, now.cursor, background)
     assert state.identifier is not None
     request = estimator.ModelRequest(config, state.identifier.estimator, now.estimator, stamp_ns, state.clock.dt,
-                                     payload)
+                                     payload, _latest(state, now.cursor))
     background.start(request)
     due = now.cursor - 1 + int(np.ceil(RESULT_DELAY_S / max(state.clock.dt, 1e-9)))
     state = state._replace(pending=PendingModel(request, since_ns, instant, due))

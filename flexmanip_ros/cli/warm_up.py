@@ -19,6 +19,8 @@ SAMPLES = 1200
 """Enough for the prediction-error fit to begin."""
 REFINED = 2600
 """Enough for the fit to go on block by block, and for a test of a drift."""
+MOVING_SAMPLES = 1400
+"""Enough for the model of every configuration to begin."""
 PERIOD_NS = 1_000_000
 
 
@@ -44,6 +46,9 @@ def simulator_and_identifier() -> None:
         messages = simulator.records(simulator.simulate(plant, torques, happens), happens)
         for _ in pipeline.run(replace(IdentifierParameters(), payload_method=method), messages):
             pass
+    empty = simulator.simulate(plant, excitation.sequence(ExcitationParameters(), MOVING_SAMPLES), ())
+    for _ in pipeline.run(replace(IdentifierParameters(), payload_method='block'), simulator.records(empty)):
+        pass
     column = np.ones((2, 1))
     model = StateSpace(np.eye(2) * 0.5, column, column.T.copy(), np.zeros((1, 1)), column, 1e-3)
     u, y = np.ones((20, 1)), np.ones((20, 1))

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from flexmanip_ros.identification import model_output
+from flexmanip_ros.identification import model_output, parameter_varying, varying_start
 from flexmanip_ros.identification.batch_fit import BLOCK, UNEXPLAINED, Recursion, arrive, fit_stretch, unexplained
 from flexmanip_ros.identification.factor import Outcomes
 from flexmanip_ros.identification.moments import triangle
+from flexmanip_ros.identification.parameter_varying import Varying
 from flexmanip_ros.identification.prediction_error import condition, derivatives, measured, moved, run
 from flexmanip_ros.numerics.background import Background
 from flexmanip_ros.parameters import IdentifierParameters
@@ -44,7 +45,8 @@ class FitRequest:
 
     rows: its samples, a slice of the sample log; R: (q, q) factor of the moments and scale: (r + m,), both
     None for the update by a block; old: the fit before, if any; older: that of before the last event, where
-    it is another; later: samples from its last one until the result is taken.
+    it is another; later: samples from its last one until the result is taken; varying: the parameter-varying fit
+    that goes on with a block, or that of before the last event.
     """
 
     config: IdentifierParameters
@@ -54,6 +56,7 @@ class FitRequest:
     old: Recursion | None
     older: Recursion | None = None
     later: int = 0
+    varying: Varying | None = None
 
     def solve(self) -> FitResult:
         """Make the fit."""
@@ -65,6 +68,7 @@ class FitResult(NamedTuple):
 
     recursion: Recursion | None
     failed: bool = False
+    varying: Varying | None = None
 
 
 class Refined(NamedTuple):
@@ -73,7 +77,8 @@ class Refined(NamedTuple):
     begin: row of the sample log with which the stretch began; it may still be to come (a pause after a fit
     that failed); end: the row after the last one taken; seen: the row after the last one that the fit has
     taken in; batch: the fit still sees every sample of the stretch; request: under way, its result is taken at
-    row ``due``; before: the fit of before the last event, to start from; since_ns: stamp of the first sample.
+    row ``due``; before: the fit of before the last event, to start from; since_ns: stamp of the first sample;
+    varying: the parameter-varying fit, which takes the blocks once it is there; varying_before: as before.
     """
 
     begin: int
@@ -85,6 +90,8 @@ class Refined(NamedTuple):
     due: int = 0
     before: Recursion | None = None
     since_ns: int = 0
+    varying: Varying | None = None
+    varying_before: Varying | None = None
 
     @property
     def total(self) -> int:
@@ -97,14 +104,14 @@ class Refined(NamedTuple):
         return self.begin + self.total // CHUNK * CHUNK
 
 
-def start(row: int, before: Recursion | None = None) -> Refined:
+def start(row: int, before: Recursion | None = None, varying_before: Varying | None = None) -> Refined:
     """Begin without a fit at a row of the sample log."""
-    return Refined(row, row, row, before=before)
+    return Refined(row, row, row, before=before, varying_before=varying_before)
 
 
 def restart(refined: Refined) -> Refined:
     """Begin again: the plant has changed, and yet is another of its kind."""
-    return start(refined.end, refined.recursion or refined.before)
+    return start(refined.end, refined.recursion or refined.before, refined.varying or refined.varying_before)
 
 
 def first_needed(refined: Refined) -> int:
@@ -136,7 +143,8 @@ def is_fit_due(refined: Refined) -> bool:
 def is_block_due(refined: Refined) -> bool:
     """Whether a recursive update is due."""
     waiting = refined.closed - refined.seen
-    return refined.recursion is not None and refined.request is None and waiting >= BLOCK
+    is_there = refined.recursion is not None or refined.varying is not None
+    return is_there and refined.request is None and waiting >= BLOCK
 
 
 def result_delay(refined: Refined, now_ns: int) -> int:
@@ -160,14 +168,14 @@ def ask_fit(config: IdentifierParameters, refined: Refined, rows: Rows, R: Array
     old, older, *_ = *(fit for fit in (refined.recursion, refined.before) if fit is not None), None, None
     later = result_delay(refined, int(rows.stamp_ns[-1]))
     request = FitRequest(config, rows.since(refined.begin).between(refined.begin, refined.closed), R.copy(),
-                         scale.copy(), old, older, later)
+                         scale.copy(), old, older, later, refined.varying_before)
     return refined._replace(request=request, due=refined.end + later)
 
 
 def ask_block(config: IdentifierParameters, refined: Refined, rows: Rows) -> Refined:
     """Ask for an update by the oldest block that the fit has not seen; rows: the latest."""
     block = rows.since(refined.seen).between(refined.seen, refined.seen + BLOCK)
-    request = FitRequest(config, block, None, None, refined.recursion)
+    request = FitRequest(config, block, None, None, refined.recursion, varying=refined.varying)
     later = max(CHUNK, _chunks(refined, int(rows.stamp_ns[-1]), BLOCK_S, BLOCK - CHUNK))
     return refined._replace(request=request, due=refined.end + later)
 
@@ -180,13 +188,16 @@ def deliver(refined: Refined, result: FitResult) -> Refined:
     if result.failed:  # the subspace model remains; a new stretch begins
         return start(refined.end)
     if request.R is None:
-        if result.recursion is None and not refined.batch:
+        if request.varying is not None and result.varying is None:  # begin anew
+            return start(refined.end, result.recursion)
+        if result.recursion is None and result.varying is None and not refined.batch:
             return give_up(refined)
-        return refined._replace(recursion=result.recursion, seen=refined.seen + BLOCK)
+        return refined._replace(recursion=result.recursion, varying=result.varying, seen=refined.seen + BLOCK)
     count = len(request.rows)
-    if result.recursion is None and count >= LONGEST:
+    if result.recursion is None and result.varying is None and count >= LONGEST:
         return give_up(refined)
-    return refined._replace(recursion=result.recursion, batch=count < LONGEST, seen=refined.begin + count)
+    return refined._replace(recursion=result.recursion, varying=result.varying, batch=count < LONGEST,
+                            seen=refined.begin + count)
 
 
 def give_up(refined: Refined) -> Refined:
@@ -203,7 +214,9 @@ def skip(refined: Refined) -> Refined:
 def break_window(refined: Refined) -> Refined:
     """Samples are missing: what was learnt is kept, the state is unknown, the open stretch is over."""
     old = refined.recursion
-    fresh = start(refined.end, refined.before)
+    fresh = start(refined.end, refined.before, refined.varying_before)
+    if refined.varying is not None:
+        return fresh._replace(batch=False, recursion=old, varying=parameter_varying.lost(refined.varying))
     if old is None:
         return fresh
     n = old.theta.A.shape[0]
@@ -232,10 +245,14 @@ LARGEST_DRIFT = 1.4
 def solve(request: FitRequest) -> FitResult:
     """Make the fit."""
     try:
-        if request.R is None or request.scale is None:
-            assert request.old is not None
-            return FitResult(_block(request.old, samples_of(request.rows)))
-        return FitResult(_stretch(request, request.R, request.scale))
+        if request.R is not None and request.scale is not None:
+            found = _stretch(request, request.R, request.scale)
+            return FitResult(found, varying=_varying(request, found))
+        if request.varying is not None:
+            return FitResult(request.old, varying=parameter_varying.advance(
+                request.config, request.varying, request.rows))
+        assert request.old is not None
+        return FitResult(_block(request.old, samples_of(request.rows)))
     except np.linalg.LinAlgError:
         return FitResult(None, failed=True)
 
@@ -264,6 +281,15 @@ def _stretch(request: FitRequest, R: Array, scale: Array) -> Recursion | None:
     if found is None or found.trend_share == 0.0:
         return found
     return found._replace(trend_lag=request.later / BLOCK + 1.0)  # the arm goes on until it is read
+
+
+def _varying(request: FitRequest, found: Recursion | None) -> Varying | None:
+    """Fit the whole stretch with a parameter-varying model: from that of before the event, and from the fit."""
+    tried = [varying_start.start(request.config, request.rows, None, request.varying)]
+    if found is not None and len(request.rows) >= varying_start.WINDOW:
+        tried.append(varying_start.start(request.config, request.rows, found, None))
+    good = [one for one in tried if one is not None and float(one.share.max()) ** 2 < UNEXPLAINED]
+    return min(good, key=lambda one: float(one.share.max())) if good else None
 
 
 def _block(old: Recursion, samples: Array) -> Recursion | None:

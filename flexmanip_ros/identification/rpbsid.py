@@ -17,7 +17,9 @@ from flexmanip_ros.errors import SignalError
 from flexmanip_ros.identification import decimation, factor, model_output, paper_recursion, recursive_fit
 from flexmanip_ros.identification.factor import FILLED, POWER, PRIOR, USED, WEIGHT, WEIGHT2, Outcomes
 from flexmanip_ros.identification.moments import solve_regressor
+from flexmanip_ros.identification.parameter_varying import roles
 from flexmanip_ros.identification.uncertainty import Identified
+from flexmanip_ros.identification.varying_model import Configurations
 from flexmanip_ros.numerics.background import INLINE, Background
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Rows, SampleLog, Width
@@ -27,6 +29,8 @@ MODES = {
     'constant': factor.CONSTANT, 'excitation': factor.EXCITATION,
     'innovation': factor.INNOVATION,
 }
+LATEST_VARYING = 3 * recursive_fit.LONGEST // 2
+"""Samples after which a model of one configuration is trusted, where one of every configuration cannot be had."""
 FRESH = 3.0
 """A fit is published while the subspace model rests on at most this many times its samples."""
 
@@ -252,9 +256,18 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> I
     dt *= config.decimation
     d = _regressors(config, len(config.inputs), len(config.outputs))
     refined = state.refined
+    if refined is not None and refined.varying is not None:
+        last = refined.recursion
+        return Configurations(
+            config, refined.varying, dt, model_output.excitation(state.memory[0][:d, :d]), float(state.scalars[POWER]),
+            np.zeros(0) if last is None else last.singular_values, float('nan') if last is None else last.condition,
+        ).now(state.cursor - refined.seen)
     if refined is not None and refined.recursion and FRESH * refined.recursion.weight >= state.counts[USED]:
-        return model_output.from_fit(
+        fitted = model_output.from_fit(
             config, refined.recursion, state.scalars, model_output.excitation(state.memory[0][:d, :d]), dt)
+        # it is followed by a model of the configuration, which starts from displacements alone
+        early = refined.batch and roles(config) is not None and refined.total < LATEST_VARYING
+        return fitted._replace(status=Status.WARMING_UP) if early and fitted.status is Status.TRACKING else fitted
     few = state.counts[USED] <= max(config.past_window, config.order)
     if few or not np.all(np.isfinite(state.memory[0])):
         return None

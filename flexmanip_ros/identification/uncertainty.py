@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.moments import Realized, solved
 from flexmanip_ros.types import Array, Mode, StateSpace, Status
 
 NEARLY_SINGULAR = 1e-12
 """Relative size of a regressor of the state below which it is taken for none."""
+
+
+class AnyConfiguration(Protocol):
+    """A model that is a function of the configuration."""
+
+    def at(self, angles: Array) -> Identified:
+        """Return the model at measured angles (2,) [rad]."""
 
 
 class Identified(NamedTuple):
@@ -34,6 +42,15 @@ class Identified(NamedTuple):
     """The state is y, or [y; dy/dt]; otherwise it is balanced and the spread holds that basis still."""
     samples: float = 0.0
     """Effective number of samples behind the model."""
+    configurations: AnyConfiguration | None = None
+    """The model of every configuration, where this is one of them."""
+
+    def at(self, angles: Array) -> Identified:
+        """Return the model at other measured angles (2,) [rad]. Raises ModelError where it does not depend on them."""
+        if self.configurations is None:
+            raise ModelError('the model holds at one configuration only',
+                             'name the angles, displacements as outputs and twice as many states')
+        return self.configurations.at(np.asarray(angles, dtype=np.float64))
 
 
 class Tangent(NamedTuple):

@@ -52,7 +52,7 @@ def resolve(
         kept = (name for name in wanted if not _is_unfilled(name, record))
         wanted = tuple(kept) or wanted
     groups: list[tuple[tuple[str, int], ...]] = []
-    needs_angles = config.payload_method != 'none'
+    needs_angles = reads_angles(config)
     for group, names in (('inputs', config.inputs), ('outputs', wanted),
                          ('angles', config.angles if needs_angles else ())):
         places = []
@@ -63,6 +63,11 @@ def resolve(
             places.append(place)
         groups.append(tuple(places))
     return Channels(record.names, wanted, groups[0], groups[1], groups[2], sum(groups, start=()))
+
+
+def reads_angles(config: IdentifierParameters) -> bool:
+    """Whether the angles are read: for a payload, or where they are named (the default ones are of one arm)."""
+    return bool(config.angles) and (config.payload_method != 'none' or config.angles != IdentifierParameters.angles)
 
 
 def wrong_size(record: JointRecord | JointBlock) -> Rejection | None:

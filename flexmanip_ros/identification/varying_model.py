@@ -1,0 +1,149 @@
+"""The parameter-varying model at one configuration: matrices, their uncertainty, and what they are worth."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from flexmanip_ros.identification.batch_fit import BLOCK
+from flexmanip_ros.identification.parameter_varying import AT_REST, QUALITIES, Roles, Varying, local, roles, to_local
+from flexmanip_ros.identification.uncertainty import Identified, Tangent, modes
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.types import Array, StateSpace, Status
+
+TERMS = 12
+"""Terms of the exponential series over one sample time, which is at most a sixteenth of a period."""
+AHEAD_S = 1.0
+"""Time over which the configuration is extrapolated at most [s]."""
+MISSED = 0.5
+"""Share of an output's amplitude that the predictions of the last blocks may miss."""
+VAGUE = 0.008
+"""Relative standard deviation of a frequency above which the model is not published as tracking."""
+EARLY = 16
+"""Blocks before which a vague model is still warming up."""
+
+
+class Configurations(NamedTuple):
+    """A model of every configuration: ``at`` reads it at one."""
+
+    config: IdentifierParameters
+    varying: Varying
+    dt: float
+    excitation: float
+    innovation_power: float
+    singular_values: Array
+    condition: float
+
+    def at(self, angles: Array) -> Identified:
+        """Return the model at measured angles (2,) [rad]."""
+        relative = angles[1] - angles[0] if self.config.arm.angle_convention == 'chord' else angles[1]
+        return self.with_relative(float(relative))
+
+    def now(self, waiting: int) -> Identified:
+        """Return the model at the present configuration; waiting: samples that the fit has not taken yet."""
+        v = self.varying
+        delay = sum(QUALITIES) / (2.0 * math.pi * v.corner)  # of the filter
+        return self.with_relative(v.angle + v.rate * (min(waiting * self.dt, AHEAD_S) + delay))
+
+    def with_relative(self, angle: float) -> Identified:
+        """Return the model where link 2 makes this angle with link 1 [rad]."""
+        role = roles(self.config)
+        assert role is not None
+        model, along = _matrices(self, math.cos(angle), role)
+        v = self.varying
+        found = Identified(
+            model=model, spread=along.flat(), singular_values=self.singular_values, excitation=self.excitation,
+            condition=self.condition, innovation_power=self.innovation_power, status=Status.TRACKING,
+            innovation_covariance=_innovations(self, role), refined=True, known_basis=True,
+            samples=float(v.blocks * BLOCK), configurations=self)
+        return found._replace(status=judge(found, v))
+
+
+def judge(found: Identified, v: Varying) -> Status:
+    """Name what the model is worth: by its predictions of samples it had not been fitted to, and by its deviations."""
+    if float(v.share.max()) > MISSED:
+        return Status.INCONSISTENT
+    oscillations = modes(found)
+    if len(oscillations) < len(v.scale_y):
+        return Status.INCONSISTENT
+    if any(mode.frequency_std_hz > VAGUE * mode.frequency_hz for mode in oscillations):
+        return Status.WARMING_UP if v.blocks < EARLY else Status.POORLY_EXCITED
+    return Status.TRACKING
+
+
+def unmodelled(v: Varying) -> float:
+    """Return the relative error of frequencies that explains what predictions over a block miss.
+
+    A frequency off by the share e turns the phase by shift t e in a time t, in the mean over a block of the time T
+    by shift T e / sqrt(3) (root of the mean square).
+    """
+    return math.sqrt(3.0) * float(v.share.mean()) / (v.shift * BLOCK * v.dt)
+
+
+def _innovations(read: Configurations, role: Roles) -> Array:
+    """(m, m) covariance of the residuals of displacements behind the filter; zero for rates."""
+    v = read.varying
+    covariance = np.zeros((len(role.states), len(role.states)))
+    shown = [role.states.index(k) for k in range(len(v.scale_y))]
+    covariance[np.ix_(shown, shown)] = v.noise / np.outer(v.scale_y, v.scale_y)
+    return covariance
+
+
+def _matrices(read: Configurations, c: float, role: Roles) -> tuple[StateSpace, Tangent]:
+    """Model at c in JointState units, and the directions in which it varies."""
+    v = read.varying
+    h, r = len(v.scale_y), len(v.scale_u)
+    m, n = len(role.states), 2 * h
+    G, _, H, _, D, E = local(v.theta, h, r, c, 0.0, AT_REST)
+    a, b, q = h * h, h * r, 2 * r + 1
+    L = to_local(v.theta, h, r, c, 0.0, AT_REST)[:, :len(v.theta)] @ v.root[:len(v.theta)]
+    error = unmodelled(v)
+    more = np.zeros((len(L), 2))
+    more[:a, 0] = 2.0 * error * G.ravel()
+    more[2 * a + 2 * b:3 * a + 2 * b, 1] = 2.0 * error * np.eye(h).ravel()
+    L = np.hstack([L, more])
+    M = np.zeros((n + r, n + r))
+    M[:h, h:n], M[h:n, :h], M[h:n, h:n], M[h:n, n:] = np.eye(h), -G, -D, H
+    turns = np.zeros((2 * a + b, n + r, n + r))  # by the entries of G, D, H
+    for i in range(h):
+        for j in range(h):
+            turns[i * h + j, h + i, j] = turns[a + i * h + j, h + i, h + j] = -1.0
+        for j in range(r):
+            turns[2 * a + i * r + j, h + i, n + j] = 1.0
+    step, by_entry = _exponential(M * (read.dt * v.shift), turns * (read.dt * v.shift))
+    entries = np.vstack([L[:a], L[2 * a + 2 * b:3 * a + 2 * b], L[2 * a:2 * a + b]])
+    along = np.tensordot(entries.T, by_entry, 1)  # (s, n + r, n + r)
+    at_e = 3 * a + 2 * b
+    direct = L[[at_e + p * q + i for p in range(h) for i in range(r)]].T.reshape(-1, h, r)
+    shown = list(role.states) if m == n else list(range(n))
+    unit = np.concatenate([1.0 / v.scale_y, v.shift / v.scale_y])[shown]
+    chosen = np.ix_(shown, shown)
+    A, B = step[chosen], step[np.ix_(shown, range(n, n + r))]
+    dA, dB = along[:, :n, :n][:, chosen[0], chosen[1]], along[:, shown, n:]
+    C = np.eye(m, n)
+    rows = [k for k, state in enumerate(role.states) if state < h]
+    of = [role.states[k] for k in rows]
+    feed, d_feed = np.zeros((m, r)), np.zeros((len(dA), m, r))
+    feed[rows], d_feed[:, rows] = E[of, :r], direct[:, of]
+    in_units = v.scale_u / v.scale_y[of][:, None]
+    feed[rows] *= in_units
+    d_feed[:, rows] *= in_units
+    turned = unit[:, None] / unit
+    K = v.gain if v.gain.shape == (n, m) else np.zeros((n, m))
+    model = StateSpace(A * turned, B * unit[:, None] * v.scale_u, C, feed, K, read.dt)
+    return model, Tangent(dA * turned, dB * unit[:, None] * v.scale_u, np.zeros((len(dA), m, n)), d_feed,
+                          np.zeros((len(dA), n, m)))
+
+
+def _exponential(M: Array, turns: Array) -> tuple[Array, Array]:
+    """exp(M) (q, q) and its derivatives along ``turns`` (e, q, q), by their series."""
+    term, along = np.eye(len(M)), np.zeros_like(turns)
+    total, by = term.copy(), along.copy()
+    for j in range(1, TERMS + 1):
+        along = (turns @ term + M @ along) / j
+        term = M @ term / j
+        total += term
+        by += along
+    return total, by
