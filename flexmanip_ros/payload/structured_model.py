@@ -380,10 +380,10 @@ def first(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Arr
 
 
 def take_as_known(model: Model, m: mem.FilterState) -> None:
-    """Take friction, rotors, gains and offsets as given: an unknown object hides them."""
+    """Take friction, rotors, gains and offsets as given: an unknown object hides them. Modes are never exact."""
     n = model.motion.arm.stiffness.size
     for c, kind in enumerate(model.motion.kind):
-        if kind > Kind.DAMPING:
+        if kind > Kind.DAMPING and kind != Kind.MODE:
             m.x[2 * n + c] = model.given[c]
             m.S[2 * n + c] = 0.0
 
