@@ -109,11 +109,14 @@ class Block(NamedTuple):
 def roles(config: IdentifierParameters) -> Roles | None:
     """Return the roles of the outputs, or None where the model cannot be one of the configuration.
 
-    It needs angles, half as many displacements as states, and no other outputs than these and their rates.
+    It needs angles, half as many displacements as states, and no other outputs than these and their rates. A payload
+    that is read out of the model is weighed at one working point, with the model of that.
     """
     names = config.outputs
     shown = tuple(k for k, name in enumerate(names) if name.endswith('/position'))
-    if not reads_angles(config) or 2 * len(shown) != config.order or config.decimation > 1:
+    if config.payload_method in ('block', 'frequency') or not reads_angles(config):
+        return None
+    if 2 * len(shown) != config.order or config.decimation > 1:
         return None
     joints = [names[k].rpartition('/')[0] for k in shown]
     states = []
