@@ -47,7 +47,9 @@ def simulator_and_identifier() -> None:
         for _ in pipeline.run(replace(IdentifierParameters(), payload_method=method), messages):
             pass
     empty = simulator.simulate(plant, excitation.sequence(ExcitationParameters(), MOVING_SAMPLES), ())
-    for _ in pipeline.run(replace(IdentifierParameters(), payload_method='block'), simulator.records(empty)):
+    named = ('joint2/position', 'joint1/position')  # other angles than the default are read without a payload
+    config = replace(IdentifierParameters(), payload_method='none', angles=named)
+    for _ in pipeline.run(config, simulator.records(empty)):
         pass
     column = np.ones((2, 1))
     model = StateSpace(np.eye(2) * 0.5, column, column.T.copy(), np.zeros((1, 1)), column, 1e-3)

@@ -109,22 +109,29 @@ class Block(NamedTuple):
 def roles(config: IdentifierParameters) -> Roles | None:
     """Return the roles of the outputs, or None where the model cannot be one of the configuration.
 
-    It needs angles, half as many displacements as states, and no other outputs than these and their rates.
+    It needs angles, half as many displacements as states, and no other outputs than these and their rates. A payload
+    that is read out of the model, or has linear dynamics, is weighed at one working point, with the model of that.
     """
+    at_one_point = config.payload_method in ('block', 'frequency') or config.payload.dynamics == 'linear'
+    return None if at_one_point or not reads_angles(config) else shown(config)
+
+
+def shown(config: IdentifierParameters) -> Roles | None:
+    """Return the roles of the outputs by their names alone."""
     names = config.outputs
-    shown = tuple(k for k, name in enumerate(names) if name.endswith('/position'))
-    if not reads_angles(config) or 2 * len(shown) != config.order or config.decimation > 1:
+    places = tuple(k for k, name in enumerate(names) if name.endswith('/position'))
+    if 2 * len(places) != config.order or config.decimation > 1:
         return None
-    joints = [names[k].rpartition('/')[0] for k in shown]
+    joints = [names[k].rpartition('/')[0] for k in places]
     states = []
     for name in names:
         joint, _, field = name.rpartition('/')
         if joint not in joints or field not in ('position', 'velocity'):
             return None
-        states.append(joints.index(joint) + (len(shown) if field == 'velocity' else 0))
-    if len(names) not in (len(shown), config.order):
+        states.append(joints.index(joint) + (len(places) if field == 'velocity' else 0))
+    if len(names) not in (len(places), config.order):
         return None
-    return Roles(shown, tuple(states))
+    return Roles(places, tuple(states))
 
 
 @cache
@@ -325,7 +332,7 @@ def updated(v: Varying, block: Block, noise: Array, iterations: int) -> Varying 
 
 def advance(config: IdentifierParameters, v: Varying, rows: Rows) -> Varying | None:
     """Take a block of ``BLOCK`` samples; None where the fit has come to its end."""
-    role = roles(config)
+    role = shown(config)
     assert role is not None
     signals = signals_of(config, rows, role)
     # a straight line through more missing samples than that is no motion that the filter lets pass

@@ -19,7 +19,7 @@ LAST_S = 1.0
 """Time over which predictions are judged [s]."""
 MOST_ROWS = 4096
 MISSED = 0.5
-"""Share of an output's power that predictions may miss."""
+"""Share of the outputs' power, in the mean over the outputs, that predictions may miss."""
 SILENT = 10.0
 """Power of an output, in units of its white noise, below which it says nothing."""
 FOURTH = 0.6744897501960817 * math.sqrt(70.0)
@@ -79,6 +79,7 @@ def judged(found: Identified, rows: Rows) -> Identified:
         return found
     with np.errstate(over='ignore', invalid='ignore'):
         shares = missed(model, np.ascontiguousarray(rows.u), np.ascontiguousarray(rows.y), horizon)
-    if np.any(shares > MISSED):
+    heard = shares[np.isfinite(shares)]  # rates may ring with modes above the order, which displacements hardly show
+    if heard.size and float(heard.mean()) > MISSED:
         return found._replace(status=Status.INCONSISTENT)
     return found

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.identification.batch_fit import BLOCK
-from flexmanip_ros.identification.parameter_varying import AT_REST, QUALITIES, Roles, Varying, local, roles, to_local
+from flexmanip_ros.identification.parameter_varying import AT_REST, QUALITIES, Roles, Varying, local, shown, to_local
 from flexmanip_ros.identification.uncertainty import Identified, Tangent, modes
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.types import Array, StateSpace, Status
@@ -49,7 +49,7 @@ class Configurations(NamedTuple):
 
     def with_relative(self, angle: float) -> Identified:
         """Return the model where link 2 makes this angle with link 1 [rad]."""
-        role = roles(self.config)
+        role = shown(self.config)
         assert role is not None
         model, along = _matrices(self, math.cos(angle), role)
         v = self.varying
@@ -86,8 +86,8 @@ def _innovations(read: Configurations, role: Roles) -> Array:
     """(m, m) covariance of the residuals of displacements behind the filter; zero for rates."""
     v = read.varying
     covariance = np.zeros((len(role.states), len(role.states)))
-    shown = [role.states.index(k) for k in range(len(v.scale_y))]
-    covariance[np.ix_(shown, shown)] = v.noise / np.outer(v.scale_y, v.scale_y)
+    places = [role.states.index(k) for k in range(len(v.scale_y))]
+    covariance[np.ix_(places, places)] = v.noise / np.outer(v.scale_y, v.scale_y)
     return covariance
 
 
@@ -117,11 +117,11 @@ def _matrices(read: Configurations, c: float, role: Roles) -> tuple[StateSpace, 
     along = np.tensordot(entries.T, by_entry, 1)  # (s, n + r, n + r)
     at_e = 3 * a + 2 * b
     direct = L[[at_e + p * q + i for p in range(h) for i in range(r)]].T.reshape(-1, h, r)
-    shown = list(role.states) if m == n else list(range(n))
-    unit = np.concatenate([1.0 / v.scale_y, v.shift / v.scale_y])[shown]
-    chosen = np.ix_(shown, shown)
-    A, B = step[chosen], step[np.ix_(shown, range(n, n + r))]
-    dA, dB = along[:, :n, :n][:, chosen[0], chosen[1]], along[:, shown, n:]
+    order = list(role.states) if m == n else list(range(n))
+    unit = np.concatenate([1.0 / v.scale_y, v.shift / v.scale_y])[order]
+    chosen = np.ix_(order, order)
+    A, B = step[chosen], step[np.ix_(order, range(n, n + r))]
+    dA, dB = along[:, :n, :n][:, chosen[0], chosen[1]], along[:, order, n:]
     C = np.eye(m, n)
     rows = [k for k, state in enumerate(role.states) if state < h]
     of = [role.states[k] for k in rows]

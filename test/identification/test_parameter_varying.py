@@ -20,7 +20,9 @@ from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointB
 
 CAPTURE_S, DURATION_S, SETTLED_S = 3.0, 16.0, 6.0
 PAYLOAD = 20.0
-CONFIG = replace(IdentifierParameters(), payload_method='block')
+NAMES = ('shoulder', 'elbow', 'link1_bend', 'link2_bend')
+CONFIG = replace(IdentifierParameters(), payload_method='none', inputs=('shoulder/effort', 'elbow/effort'),
+                 angles=('shoulder/position', 'elbow/position'))
 
 
 class Run(NamedTuple):
@@ -42,7 +44,7 @@ def record() -> tuple[simulator.Trajectory, CaptureEvent, Array]:
 
 def blocks(trajectory: simulator.Trajectory, size: int) -> list[JointBlock]:
     effort = np.hstack([trajectory.effort, np.zeros_like(trajectory.effort)])
-    return [JointBlock(trajectory.names, trajectory.stamp_ns[at:at + size], trajectory.position[at:at + size],
+    return [JointBlock(NAMES, trajectory.stamp_ns[at:at + size], trajectory.position[at:at + size],
                        trajectory.velocity[at:at + size], effort[at:at + size])
             for at in range(0, len(trajectory.stamp_ns), size)]
 
@@ -174,7 +176,9 @@ def test_only_displacements_and_their_rates_beside_angles_have_a_model_of_every_
     assert parameter_varying.roles(CONFIG) == ((0, 1), (0, 1, 2, 3))
     assert parameter_varying.roles(replace(CONFIG, order=6)) is None
     assert parameter_varying.roles(replace(CONFIG, angles=())) is None
-    assert parameter_varying.roles(replace(CONFIG, payload_method='none')) is None
+    assert parameter_varying.roles(IdentifierParameters())
+    assert parameter_varying.roles(replace(CONFIG, payload_method='block')) is None
+    assert parameter_varying.roles(replace(IdentifierParameters(), payload_method='none')) is None
     turned = replace(CONFIG, outputs=('link2_bend/velocity', 'link2_bend/position', 'link1_bend/position',
                                       'link1_bend/velocity'))
     assert parameter_varying.roles(turned) == ((1, 2), (2, 0, 1, 3))
