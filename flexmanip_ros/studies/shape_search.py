@@ -49,6 +49,8 @@ BRIDGED_S = 0.02
 """Samples missing for at most so long are interpolated, in the search alone [s]."""
 WORST = 1e9
 """Share that stands for a model that runs away."""
+WARM = 5
+"""Past windows that a predictor runs before what it is judged by: its state has settled then."""
 CHUNK = 4096
 """Regressors that are formed at once."""
 Progress = Callable[[int, int | None], None]
@@ -274,14 +276,18 @@ def powers(search: Search, model: StateSpace, kept: list[Kept], factor: int, pas
     targets, errors = [np.empty((0, search.m))], [np.empty((0, search.m))]
     with np.errstate(all='ignore'):
         for (samples, rows), part in zip(kept, search.stretches, strict=True):
-            if len(samples) < steps + past:
-                continue
-            ahead = validation.predict_ahead(model, samples[:, :search.r], samples[:, search.r:], steps)[past:]
-            at = rows[past + steps - 1:]
-            among = chosen[part.number[at]]
-            target = part.raw[at[among], search.r:]
-            targets.append(target)
-            errors.append(target - ahead[among])
+            inside = np.concatenate([[False], chosen[part.number[rows]], [False]])
+            borders = np.flatnonzero(inside[1:] != inside[:-1]).tolist()
+            for first, end in zip(borders[::2], borders[1::2], strict=True):  # runs of samples that are chosen
+                begin = max(0, first - steps - WARM * past)
+                some = samples[begin:end]
+                at = np.arange(max(first, begin + steps - 1 + past), end)
+                if not len(at):
+                    continue
+                ahead = validation.predict_ahead(model, some[:, :search.r], some[:, search.r:], steps)
+                target = part.raw[rows[at], search.r:]
+                targets.append(target)
+                errors.append(target - ahead[at - begin - steps + 1])
         joint = np.vstack(targets)
         if len(joint) < 2:
             return np.zeros((2, search.m))
