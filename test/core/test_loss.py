@@ -15,13 +15,13 @@ from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Status
 
-COUNT, CAPTURE = 5000, 2000
+COUNT, CAPTURE = 6000, 2000
 PLANT = PlantParameters()
 
 
 @pytest.fixture(scope='module')
 def messages() -> list[JointRecord | CaptureEvent]:
-    """5 s at 1 kHz, 20 kg caught at 2 s."""
+    """6 s at 1 kHz, 20 kg caught at 2 s."""
     events = (CaptureEvent(CAPTURE * 1_000_000, EventKind.CAPTURE),)
     torque = excitation.sequence(ExcitationParameters(), COUNT)
     return list(simulator.records(simulator.simulate(PLANT, torque, events), events))
@@ -70,9 +70,9 @@ def test_payload_and_modes_are_tracked_with_loss(
     assert max(abs(one.mass - 20.0) / one.std for one in payloads) < 4.0
     known = np.median([one.payload.std for one in whole if one.payload is not None])
     assert np.median([one.std for one in payloads]) < wider * known  # a torque that changed in a burst is unknown
-    assert tracked(found) >= 0.9 * tracked(whole)
+    assert tracked(found[-80:]) >= 0.95 * tracked(whole[-80:])
     true = frequencies(vibration_model(PLANT.arm, np.array(PLANT.initial_angles), 20.0)[0])[0]
-    read = [one.modes[0].frequency_hz for one in found]
+    read = [one.modes[0].frequency_hz for one in found[-80:]]
     assert abs(np.median(read) / true - 1.0) < 3e-3
 
 
