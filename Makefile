@@ -5,6 +5,7 @@
 #   make lint    ruff and mypy
 #   make bench   every benchmark; table and JSON in benchmarks/results/
 #   make docs    the pages that are generated from the code, then the site: build/html/index.html
+#   make test-wheel  the wheel in a fresh environment, with every command of the first pages
 #   make test-jazzy  the test suite on the versions of Ubuntu 24.04; needs a Python 3.12
 #   make lock    the dependencies anew, from requirements/*.in
 SHELL := /bin/sh
@@ -33,7 +34,7 @@ SHARED := $(shell find config launch resource -type f -not -path '*/__pycache__/
 # A venv that was moved, or whose interpreter has gone, is made again with its stamps.
 $(foreach folder,$(VENV) $(DOCS) $(JAZZY),$(shell requirements/make_venv.sh --drop-broken $(folder)))
 
-.PHONY: help setup demo test test-jazzy lint bench docs lock clean
+.PHONY: help setup demo test test-wheel test-jazzy lint bench docs lock clean
 help:
 	@sed -n 's/^#   make/  make/p' Makefile
 
@@ -72,8 +73,21 @@ $(VENV)/.benchmark: requirements/benchmark.txt $(VENV)/.development
 demo: setup
 	@$(BIN)/demo $(DEMO_ARGS)
 
+# Two halves side by side: what runs nodes and programs waits much, the rest computes.
+RUNNING := test/ros test/cli test/view
 test: setup $(VENV)/.development
+ifeq ($(strip $(PYTEST_ARGS)),)
+	@mkdir -p log; status=0; \
+	ROS_DOMAIN_ID=71 $(BIN)/python -m pytest $(RUNNING) > log/test_running.txt 2>&1 & running=$$!; \
+	$(BIN)/python -m pytest test $(addprefix --ignore=,$(RUNNING)) || status=$$?; \
+	wait $$running || status=$$?; cat log/test_running.txt; exit $$status
+else
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+endif
+
+# The wheel in a fresh environment, every command of the first pages, and a colcon build with its kernels.
+test-wheel: setup $(VENV)/.development
+	@FLEXMANIP_FRESH=1 $(BIN)/python -m pytest test/packaging
 
 lint: setup $(VENV)/.development
 	@$(BIN)/ruff check .

@@ -107,6 +107,8 @@ def identify(request: Request, progress: Report | None = None) -> Result:
             messages.fault, interrupted = BagError('interrupted', 'the messages until then are reported'), True
         if isinstance(output, TableOutput):
             output.start_ns = messages.first_ns
+    if interrupted and state.counters.accepted == 0:
+        raise KeyboardInterrupt
     if messages.fault is not None and state.counters.accepted == 0:
         raise messages.fault
     progress.phase('fitting the last samples')

@@ -138,10 +138,10 @@ def _watch(
     table, first = structured.input_table(filtered, rows)
     confirm = round(CONFIRM / state.dt)
     light = filtered.model.motion.scale
-    taken = kernel.detect_samples(
+    taken = kernel.advance(
         filtered.model.motion, filtered.sensors, m, glr, light * np.array([SPEED, ACCELERATION, JERK]),
         state.dt, float(np.exp(-state.dt / PEAK_MEMORY)), round(SETTLE / state.dt), confirm, table, first,
-        np.zeros(kernel.CAUSES))
+        np.zeros(kernel.CAUSES), True)
     cursor = rows.first + abs(taken) - first
     if taken < 0:
         fresh = init(config)

@@ -233,20 +233,23 @@ def settled(m: FilterState) -> bool:
 
 
 @kernel
-def detect_samples(
+def advance(
     motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr: GlrState, prior: Array, dt: float,
-    fade: float,
-    hold: int, confirm: int, table: Array, first: int, scratch: Array,
+    fade: float, hold: int, confirm: int, table: Array, first: int, scratch: Array, watching: bool,
 ) -> int:
-    """Run the filter and the test; return the row of the table after the last one taken before an alarm.
+    """Run the filter over the rows of the table from ``first`` on, and the test too if watching; return the next row.
 
-    A negative number -k - 1: numbers left the finite range in row k. hold: samples to be quiet at first;
-    confirm: samples from an alarm to its return, so that it can be dated; fade: factor of the recent peak a
-    sample. Otherwise as ``structured_kernel.advance``.
+    table: (N, 1 + L + m) duration since the sample before, torques held meanwhile, measurements (NaN: missing). While
+    the horizon is open (fewer than ``HORIZON`` samples since the event), it begins with the first sample after it. The
+    test ends at an alarm. hold: samples to be quiet at first; confirm: samples from an alarm to its return, so that it
+    can be dated; fade: factor of the recent peak a sample. A negative number -k - 1: numbers left the finite range in
+    row k. One function for both, since each compiles the whole filter.
     """
     for k in range(first, table.shape[0]):
         if not take(motion, sensors, m, table, k):
             return -k - 1
+        if not watching:
+            continue
         clock = glr.clock
         if clock[SINCE_TRACES] == 0:
             traces(motion, sensors, m, glr, prior, table[k, 1:1 + motion.effort.size], dt)
@@ -264,3 +267,17 @@ def detect_samples(
             remember(glr, fade)
     taken: int = table.shape[0]
     return taken
+
+
+UNWATCHED = GlrState(
+    trace=np.zeros((0, 0, 0)), factors=np.zeros((0, 0, 0)), scores=np.zeros((0, 0)), past=np.zeros((0, 0)),
+    clock=np.zeros(0, dtype=np.int64), level=np.zeros(0), history=np.zeros(0), statistic=np.zeros(0),
+    flow=np.zeros((0, 0)), state=np.zeros((0, 0, 0)))
+"""In the place of a test that is not run."""
+
+
+def filtered(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array, first: int) -> int:
+    """Run the filter alone, see ``advance``; return the row after the last one taken, less than N where it failed."""
+    none = np.zeros(0)
+    taken = advance(motion, sensors, m, UNWATCHED, none, 0.0, 0.0, 0, 0, table, first, none, False)
+    return taken if taken >= 0 else -taken - 1

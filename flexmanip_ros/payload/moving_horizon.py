@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.numerics.compiled import inlined, kernel, merged
+from flexmanip_ros.numerics.compiled import inlined, merged
 from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, factor_information, forward
 from flexmanip_ros.payload.filter_state import (
     AGAIN,
@@ -295,7 +295,7 @@ def diffuse(sensors: MeasurementModel, m: FilterState, duration: float) -> None:
 def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array, k: int) -> bool:
     """Take the sample in row k of the table; False when numbers left the finite range.
 
-    table: (N, 1 + L + m), see ``advance``.
+    table: (N, 1 + L + m), see ``capture_detection_kernel.advance``.
     """
     links = motion.effort.size
     duration, effort, y = table[k, 0], table[k, 1:1 + links], table[k, 1 + links:]
@@ -322,18 +322,3 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     judge_payload(sensors, m)
     diffuse(sensors, m, duration)
     return True
-
-
-@kernel
-def advance(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array, first: int) -> int:
-    """Take the samples in the rows of the table from ``first`` on.
-
-    table: (N, 1 + L + m) duration since the sample before, torques held meanwhile, measurements. While the horizon
-    is open (fewer than ``HORIZON`` samples since the event), the table begins with the first sample after it.
-    Returns the row after the last one taken; less than N when numbers left the finite range.
-    """
-    for k in range(first, table.shape[0]):
-        if not take(motion, sensors, m, table, k):
-            return k
-    taken: int = table.shape[0]
-    return taken

@@ -12,7 +12,8 @@ import numpy as np
 
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
-from flexmanip_ros.payload import moving_horizon, structured_model
+from flexmanip_ros.payload import structured_model
+from flexmanip_ros.payload.capture_detection_kernel import filtered
 from flexmanip_ros.payload.interval import inexact, judge
 from flexmanip_ros.payload.measurement_update import MeasurementModel
 from flexmanip_ros.payload.process_model import predict
@@ -304,7 +305,7 @@ def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> St
     assert state.sensors is not None
     m = mem.copy(state.memory, horizon=False)
     table, first = input_table(state, rows)
-    taken = moving_horizon.advance(state.model.motion, state.sensors, m, table, first)
+    taken = filtered(state.model.motion, state.sensors, m, table, first)
     if taken < len(table):
         return _restart(config, state, m, rows.since(rows.first + taken - first))
     return state._replace(memory=m, cursor=rows.until, last_ns=int(rows.stamp_ns[-1]), effort=rows.u[-1].copy(),

@@ -33,7 +33,7 @@ def test_an_identifier_that_is_restarted_goes_on_as_if_it_had_only_missed_sample
     after = {name: values[1:] if name in (messages.MODEL, messages.PAYLOAD, messages.PAYLOAD_ESTIMATE)
              and len(values) > len(second.said[messages.MODES]) else values
              for name, values in second.said.items()}
-    tail = {name: straight.get(name, [])[-len(values):] for name, values in after.items()}
+    tail = {name: straight.get(name, [])[-len(values):] if values else [] for name, values in after.items()}
     assert compare(after, tail) == ''
 
 

@@ -70,7 +70,7 @@ def test_what_is_no_list_is_not_taken_for_an_empty_one(ros: Ros, given: object) 
     ('order', 0, "'order' is 0; give a value from 1 to 60"),
     ('order', 4.0, "'order' is of type double; give a whole number"),
     ('arm.link_length', [3.0, -1.0], "'arm.link_length' is -1.0 m"),
-    ('arm.link_length', [3.0], "'arm.link_length' has 1 elements; give 2"),
+    ('arm.link_length', [3.0, 3.0, 3.0], "'arm.link_length' has 3 elements; give 2"),
     ('arm.joint_mass', math.nan, "'arm.joint_mass'"),
     ('payload_method', 'magic', 'choose one of none, block, frequency, structured'),
     ('ordr', 4, "unknown parameter 'ordr'; did you mean 'order'?"),
