@@ -68,7 +68,7 @@ def test_a_decimated_model_is_scored_at_its_own_rate():
     for k in range(1, 1600):
         y[k] = pole * y[k - 1] + u[k - 1]
     signals = Signals(np.arange(1600) * 10_000_000, u, y, np.empty((1600, 0)), np.zeros(1600, dtype=np.bool_),
-                      ('a/effort',), ('a/position',))
+                      np.zeros(1600, dtype=int), ('a/effort',), ('a/position',))
     slow = StateSpace(np.array([[pole ** 5]]), np.array([[(1.0 - pole ** 5) / (1.0 - pole)]]), np.eye(1),
                       np.zeros((1, 1)), np.zeros((1, 1)), 5 * DT)
     found = score(slow, signals, 8.0, factor=5)
