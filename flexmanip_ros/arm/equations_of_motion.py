@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.numerics.compiled import inlined, kernel
+from flexmanip_ros.numerics.compiled import inlined, inner, kernel
 
 if TYPE_CHECKING:
     from flexmanip_ros.arm.manipulator import Manipulator, Workspace
@@ -22,7 +22,7 @@ STICTION_RATE = 2e-3
 """Rate [rad/s] at which the Coulomb friction reaches 76 % of its value: F tanh(rate / STICTION_RATE)."""
 
 
-@inlined
+@inner
 def assemble_link(
     arm: Manipulator, i: int, q: Array, qd: Array, M: Array, E: Array, work: Workspace,
 ) -> None:
@@ -113,7 +113,7 @@ def assemble_link(
     b[1] = a[1] + s * (xdd - x * w * w) + c * (2.0 * xd * w)
 
 
-@inlined
+@inner
 def assemble_payload(arm: Manipulator, payload: Array, q: Array, qd: Array, M: Array, E: Array, work: Workspace
                      ) -> None:
     """Add the body that is held at the tip."""
@@ -230,7 +230,7 @@ def elastic(arm: Manipulator, q: Array, work: Workspace) -> None:
                 work.tangent[i, t, j] = work.tangent[i, j, t]
 
 
-@inlined
+@inner
 def factor(M: Array) -> bool:
     """Overwrite the lower triangle of M with its Cholesky factor, diagonal inverted; False if indefinite."""
     n = M.shape[0]
@@ -250,7 +250,7 @@ def factor(M: Array) -> bool:
     return True
 
 
-@inlined
+@inner
 def solve(L: Array, x: Array) -> None:
     """Overwrite x (n,) with M^-1 x, L from ``factor``."""
     n = x.size

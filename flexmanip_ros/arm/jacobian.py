@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexmanip_ros.arm.equations_of_motion import acceleration, assemble
-from flexmanip_ros.numerics.compiled import inlined, kernel
+from flexmanip_ros.numerics.compiled import inlined, inner, kernel, merged
 
 if TYPE_CHECKING:
     from flexmanip_ros.arm.manipulator import Manipulator, Workspace
     from flexmanip_ros.types import Array
 
 
-@inlined
+@inner
 def move_station(arm: Manipulator, i: int, q: Array, qd: Array, qdd: Array, work: Workspace) -> None:
     """Set acceleration A of the tip of link i and its derivatives Aq, Av, from those of its root."""
     k = arm.kappa
@@ -56,7 +56,7 @@ def move_station(arm: Manipulator, i: int, q: Array, qd: Array, qdd: Array, work
     Av[1, i] += s * e + c * f
 
 
-@inlined
+@inner
 def payload_jacobian(
     arm: Manipulator, payload: Array, q: Array, qd: Array, qdd: Array, left: Array, right: Array, dp: Array,
     work: Workspace,
@@ -118,7 +118,7 @@ def payload_jacobian(
                 right[r, t] += g[r] * by_v
 
 
-@inlined
+@inner
 def tip_load_jacobian(arm: Manipulator, i: int, q: Array, left: Array, right: Array, work: Workspace) -> None:
     """Add the force work.F at the tip of link i, with its derivatives Fq and Fv, to the link's own rows."""
     k = arm.kappa
@@ -153,7 +153,7 @@ def tip_load_jacobian(arm: Manipulator, i: int, q: Array, left: Array, right: Ar
             left[o + j, o + t] -= arm.tip_shortening[i, j, t] * Fe
 
 
-@inlined
+@inner
 def link_jacobian(
     arm: Manipulator, i: int, q: Array, qd: Array, qdd: Array, left: Array, right: Array, work: Workspace,
 ) -> None:
@@ -315,7 +315,7 @@ def bias_jacobian(
     force_jacobian(arm, payload, q, qd, qdd, left, right, work.parameters, work)
 
 
-@inlined
+@inner
 def solve_columns(L: Array, X: Array) -> None:
     """Overwrite X (n, m) with -M^-1 X, L from ``equations_of_motion.factor``."""
     n, m = X.shape
@@ -397,7 +397,7 @@ def damping_jacobian(arm: Manipulator, work: Workspace, dqd: Array) -> None:
                         dqd[r, t] += force * work.B[t, i]
 
 
-@inlined
+@merged
 def acceleration_jacobian(
     arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array,
     qdd: Array, dq: Array, dqd: Array, dp: Array, work: Workspace,

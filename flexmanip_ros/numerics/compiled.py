@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from numba import njit
+from numba.extending import register_jitable
 
 Function = TypeVar('Function', bound=Callable[..., Any])
 
@@ -21,7 +22,7 @@ def kernel(function: Function) -> Function:
 
 
 def inlined(function: Function) -> Function:
-    """Compile a kernel into those that call it.
+    """Compile a kernel into those that call it; Python may call it as well.
 
     Passing a Manipulator takes some 300 words on the stack and as many instructions at every call: half the
     time of the small kernels. Every caller compiles it again, so what is called in few places and works long stays
@@ -30,16 +31,29 @@ def inlined(function: Function) -> Function:
     return _compiled(function, forceinline=True)
 
 
-def merged(function: Function) -> Function:
-    """Compile the body of a kernel as a part of the one or two functions that call it.
+def inner(function: Function) -> Function:
+    """Compile a function into the kernels that call it, and nowhere else; Python runs it as it is written.
 
-    The compiler optimizes all that a function calls once more with each function above it: four short functions above
-    the equations of motion took 26 s to compile, as parts of one function 8 s.
+    What unpacks the arguments that Python would pass takes longer to compile than a short function itself.
+    """
+    made: Function = register_jitable(forceinline=True, **_OPTIONS)(function)
+    return made
+
+
+def merged(function: Function) -> Function:
+    """Put the text of a function into the one kernel that calls it, before anything is compiled.
+
+    The compiler optimizes all that a function calls once more with each function above it, so whatever stands above
+    the equations of motion is one function. It copies the whole text for each that is put in: what calls no kernel is
+    ``inner``.
     """
     return _compiled(function, inline='always')
 
 
+_OPTIONS: dict[str, Any] = {'nogil': True, '_nrt': False, 'no_cfunc_wrapper': True}
+"""No wrapper for callbacks from C: it unpacks all arguments once more."""
+
+
 def _compiled(function: Function, **more: Any) -> Function:
-    options: dict[str, Any] = {'cache': True, 'nogil': True, '_nrt': False, **more}
-    compiled: Function = njit(**options)(function)
+    compiled: Function = njit(cache=True, **_OPTIONS, **more)(function)
     return compiled

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from flexmanip_ros.numerics.compiled import inlined, kernel
+from flexmanip_ros.numerics.compiled import inner, kernel
 from flexmanip_ros.types import Array
 
 
-@inlined
+@inner
 def project(x: Array, S: Array, H: Array, offset: int, f: Array) -> float:
     """Return H x[offset:] and fill f = S' H', the spread of that measurement, for the first f.size columns of S."""
     value = 0.0
@@ -22,7 +22,7 @@ def project(x: Array, S: Array, H: Array, offset: int, f: Array) -> float:
     return value
 
 
-@inlined
+@inner
 def dot(a: Array, b: Array) -> float:
     """Return a . b in four sums that do not wait for each other: three times as fast, and the same on every machine."""
     n = a.size - a.size % 4
@@ -37,7 +37,7 @@ def dot(a: Array, b: Array) -> float:
     return (first + second) + (third + fourth)
 
 
-@inlined
+@inner
 def absorb_measurement(x: Array, S: Array, f: Array, e: float, r: float, variance: float) -> None:
     """Potter's update: innovation e of variance = f'f + r, r the noise variance, f = S' H' where that is not zero."""
     gamma = 1.0 / (1.0 + np.sqrt(r / variance))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexmanip_ros.arm.equations_of_motion import solve
-from flexmanip_ros.numerics.compiled import inlined, kernel
+from flexmanip_ros.numerics.compiled import inner, kernel
 from flexmanip_ros.numerics.square_root import factor_information, forward
 from flexmanip_ros.payload.filter_state import AGAIN, BEFORE, EFFECTIVE, HORIZON, REJECTED, STORED
 from flexmanip_ros.payload.moving_horizon import take
@@ -67,18 +67,12 @@ class GlrState(NamedTuple):
     """(2, n2, 2) scratch."""
 
 
-@kernel
-def traces(
-    motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr: GlrState, prior: Array, effort: Array,
-    dt: float,
-) -> None:
-    """Compute the traces of an onset for the present state; prior: (3,) deviations of the causes."""
+@inner
+def traces(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr: GlrState, prior: Array, dt: float
+           ) -> None:
+    """Compute the traces of an onset from the linearization; prior: (3,) deviations of the causes."""
     n = motion.arm.stiffness.size
     w, sensors_count = glr.trace.shape[0], glr.trace.shape[1]
-    set_parameters(motion, m.x)
-    for i in range(motion.effort.size):
-        motion.effort[i] = motion.gain[i] * effort[i]
-    linearize(motion, m.x[:n], m.x[n:2 * n], motion.k[7])
     flow, state = glr.flow, glr.state
     for i in range(2 * n):
         for c in range(2 * n):
@@ -138,7 +132,7 @@ def traces(
     rescore(glr)
 
 
-@kernel
+@inner
 def rescore(glr: GlrState) -> None:
     """Compute every onset's score again: scores and information must come from the same traces."""
     w = glr.trace.shape[0]
@@ -155,7 +149,7 @@ def rescore(glr: GlrState) -> None:
                     score[a] += glr.trace[since, i, a] * e
 
 
-@kernel
+@inner
 def information(m: FilterState, glr: GlrState) -> None:
     """Factor the information of every lag."""
     for lag in range(glr.trace.shape[0]):
@@ -177,7 +171,7 @@ def information(m: FilterState, glr: GlrState) -> None:
                     glr.factors[lag, a, b] = 1e150 if a == b else 0.0
 
 
-@kernel
+@inner
 def update_glr(m: FilterState, glr: GlrState, scratch: Array) -> None:
     """Take the latest innovations into the score of every onset, and find the largest statistic."""
     w = glr.trace.shape[0]
@@ -214,7 +208,7 @@ def update_glr(m: FilterState, glr: GlrState, scratch: Array) -> None:
     glr.level[0], glr.level[1] = best, best_lag
 
 
-@kernel
+@inner
 def remember(glr: GlrState, fade: float) -> None:
     """Let a statistic that is older than the window raise the recent peak."""
     clock, history = glr.clock, glr.history
@@ -224,7 +218,7 @@ def remember(glr: GlrState, fade: float) -> None:
     glr.level[2] = max(glr.level[2] * fade, old)
 
 
-@inlined
+@inner
 def settled(m: FilterState) -> bool:
     """Whether the filter has taken over a moving-horizon estimation that fits most samples since the last event."""
     rows = m.counts[STORED]
@@ -252,7 +246,12 @@ def advance(
             continue
         clock = glr.clock
         if clock[SINCE_TRACES] == 0:
-            traces(motion, sensors, m, glr, prior, table[k, 1:1 + motion.effort.size], dt)
+            n = motion.arm.stiffness.size
+            set_parameters(motion, m.x)
+            for i in range(motion.effort.size):
+                motion.effort[i] = motion.gain[i] * table[k, 1 + i]
+            linearize(motion, m.x[:n], m.x[n:2 * n], motion.k[7])
+            traces(motion, sensors, m, glr, prior, dt)
         clock[SINCE_TRACES] = (clock[SINCE_TRACES] + 1) % REFRESH
         update_glr(m, glr, scratch)
         # while the moving-horizon estimation is on its way, innovations tell nothing

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.numerics.compiled import inlined
+from flexmanip_ros.numerics.compiled import inner
 from flexmanip_ros.numerics.square_root import absorb_measurement, dot, project
 from flexmanip_ros.payload.filter_state import (
     BATCHES,
@@ -72,7 +72,7 @@ class MeasurementModel(NamedTuple):
     """(nx, 2 nx) scratch."""
 
 
-@inlined
+@inner
 def observe(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Array) -> float:
     """Return what sensor i should read and fill f (nx,) with the spread of that, S' times its derivative."""
     predicted = project(x, S, sensors.H[i], n if sensors.rate[i] else 0, f)
@@ -89,7 +89,7 @@ def observe(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Ar
     return predicted
 
 
-@inlined
+@inner
 def measure(sensors: MeasurementModel, m: FilterState, y: Array) -> None:
     """Update the filter with one sample and gather what its innovations say of noise and payload."""
     x, S, f = m.x, m.S, sensors.f[:m.counts[USED]]
@@ -119,7 +119,7 @@ def measure(sensors: MeasurementModel, m: FilterState, y: Array) -> None:
     m.counts[IN_A_ROW] += 1
 
 
-@inlined
+@inner
 def white_noise(m: FilterState, i: int, y: float) -> None:
     """Variance of sensor i's white noise, from fourth differences, in which slow motion has no part."""
     recent = m.recent[i]
@@ -134,7 +134,7 @@ def white_noise(m: FilterState, i: int, y: float) -> None:
     recent[0] = y
 
 
-@inlined
+@inner
 def learn_noise(sensors: MeasurementModel, m: FilterState) -> None:
     """At the end of a block: the variance of each sensor, and its slow part when that is not white.
 
@@ -163,7 +163,7 @@ def learn_noise(sensors: MeasurementModel, m: FilterState) -> None:
         row[EFFECTIVE] = max(row[POWER], row[SLOW] - doubt * row[POWER], row[FLOOR], 0.7 * row[EFFECTIVE])
 
 
-@inlined
+@inner
 def judge_payload(sensors: MeasurementModel, m: FilterState) -> None:
     """At the end of a batch: see whether the payload moved farther than its variance allows."""
     m.counts[IN_BATCH] += 1

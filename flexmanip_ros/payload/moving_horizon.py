@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.numerics.compiled import inlined, merged
+from flexmanip_ros.numerics.compiled import inner, merged
 from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, factor_information, forward
 from flexmanip_ros.payload.filter_state import (
     AGAIN,
@@ -85,7 +85,7 @@ REJECTIONS = 8
 """How often a step is shortened that raises the cost."""
 
 
-@merged
+@inner
 def begin_iteration(m: FilterState) -> None:
     """Start a Gauss-Newton iteration at the event, from the trajectory of the last one."""
     nx = m.x.size
@@ -135,7 +135,7 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
     return m.counts[ITERATED] != m.counts[BEFORE] or not m.score[COST] > m.score[COST_BEFORE] + SLACK
 
 
-@merged
+@inner
 def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
     """Accept the iteration and step on; hand state and spread to the filter if it has caught up with it."""
     nx = m.x.size
@@ -172,7 +172,7 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
     return True
 
 
-@merged
+@inner
 def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
     """Set xi to the accepted one and a step of Levenberg and Marquardt, m.g; the payload stays possible."""
     nx = m.xi.size
@@ -204,7 +204,7 @@ def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
     return True
 
 
-@merged
+@inner
 def reject_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
     """Take a shorter step from the accepted xi, nearer to the gradient, and begin the iteration again."""
     m.counts[REJECTED] += 1
@@ -248,7 +248,7 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
     return True
 
 
-@inlined
+@inner
 def fails(m: FilterState) -> bool:
     """Whether the moving-horizon estimation ended in a minimum that is none: it fits too badly, or too few samples."""
     if m.counts[REFITS] >= MOST_REFITS:
@@ -259,7 +259,7 @@ def fails(m: FilterState) -> bool:
     return failed
 
 
-@inlined
+@inner
 def strays(sensors: MeasurementModel, m: FilterState) -> bool:
     """Whether the filter left the arm after all: every sensor shows far more than its noise, block after block."""
     if m.counts[LEARNED] == 0 or m.counts[HELD] == 0 or m.counts[REFITS] >= MOST_REFITS:
@@ -273,7 +273,7 @@ def strays(sensors: MeasurementModel, m: FilterState) -> bool:
     return least >= STRAY
 
 
-@inlined
+@inner
 def diffuse(sensors: MeasurementModel, m: FilterState, duration: float) -> None:
     """Add the process noise of a while, so that the memory stays finite."""
     m.score[NOW] += duration
@@ -301,24 +301,23 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     duration, effort, y = table[k, 0], table[k, 1:1 + links], table[k, 1 + links:]
     if not predict(motion, m.x, m.S, m.counts[USED], effort, duration):
         return False
-    if y[0] != y[0]:  # it never came
+    came = y[0] == y[0]
+    if came:
+        measure(sensors, m, y)
+        confine(motion, m.x[m.x.size - motion.kind.size:])
+        if not abs(m.x[2 * sensors.H.shape[1]]) < 1e9:
+            return False
+        m.counts[SINCE_EVENT] += 1
+        learn_noise(sensors, m)
+    else:
         m.counts[IN_A_ROW] = 0
         for i in range(y.size):
             m.innovation[i, 0] = 0.0
-        if not iterate(motion, sensors, m, table):
-            return False
-        diffuse(sensors, m, duration)
-        return True
-    measure(sensors, m, y)
-    confine(motion, m.x[m.x.size - motion.kind.size:])
-    if not abs(m.x[2 * sensors.H.shape[1]]) < 1e9:
-        return False
-    m.counts[SINCE_EVENT] += 1
-    learn_noise(sensors, m)
     if not iterate(motion, sensors, m, table):
         return False
-    if strays(sensors, m):
-        return False
-    judge_payload(sensors, m)
+    if came:
+        if strays(sensors, m):
+            return False
+        judge_payload(sensors, m)
     diffuse(sensors, m, duration)
     return True

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, acceleration, factor, net_torques, solve
 from flexmanip_ros.arm.jacobian import acceleration_jacobian, damping_jacobian, solve_columns
-from flexmanip_ros.numerics.compiled import inlined, kernel, merged
+from flexmanip_ros.numerics.compiled import inlined, inner, kernel, merged
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ class ProcessModel(NamedTuple):
     Y: Array
 
 
-@merged
+@inlined
 def set_parameters(motion: ProcessModel, x: Array) -> None:
     """Write what the state holds of payload and arm into motion."""
     arm, payload = motion.arm, motion.payload
@@ -163,7 +163,7 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
             arm.stiffness[links + i] *= np.exp(value)
 
 
-@inlined
+@inner
 def confine(motion: ProcessModel, p: Array) -> None:
     """Move p (np,) to what a payload can be: mass and inertia high enough for a positive mass matrix."""
     p[MASS] = max(p[MASS], 0.5 * motion.least[0])
@@ -175,12 +175,18 @@ def confine(motion: ProcessModel, p: Array) -> None:
             p[c] = max(p[c], motion.least_rotor[motion.link[c]])
 
 
-@inlined
+@merged
 def accelerate(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
     """Fill qdd (n,) under motion.effort; leaves the factor of M in work.M."""
+    if motion.frozen:
+        return accelerate_frozen(motion, q, qd, qdd)
+    return acceleration(motion.arm, motion.payload, q, qd, motion.effort, qdd, motion.work)
+
+
+@inner
+def accelerate_frozen(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
+    """The same for a mass matrix that stays."""
     arm, work = motion.arm, motion.work
-    if not motion.frozen:
-        return acceleration(arm, motion.payload, q, qd, motion.effort, qdd, work)
     n = q.size
     for r in range(n):
         for c in range(r + 1):
@@ -202,10 +208,10 @@ def accelerate(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
     return True
 
 
-@inlined
+@inner
 def linearize_frozen(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
     """The same as ``acceleration_jacobian`` for a mass matrix that stays."""
-    if not accelerate(motion, q, qd, qdd):
+    if not accelerate_frozen(motion, q, qd, qdd):
         return False
     n = q.size
     for r in range(n):
@@ -273,7 +279,7 @@ def linearize(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
     return True
 
 
-@inlined
+@inner
 def slower(motion: ProcessModel, duration: float) -> float:
     """Return 1, or 0.5 where Coulomb friction may change its sign within a time [s]: it bends the motion."""
     arm, qdd = motion.arm, motion.k[0]
@@ -287,7 +293,7 @@ def slower(motion: ProcessModel, duration: float) -> float:
     return 1.0
 
 
-@inlined
+@inner
 def terms(angle: float, error: float) -> int:
     """Return how many terms of an exponential leave out less than an error: angle^k / k! < error."""
     k, left = 1, angle
@@ -366,7 +372,7 @@ def exponential_step(motion: ProcessModel, x: Array, h: float, count: int) -> bo
     return largest < 1e6
 
 
-@merged
+@inner
 def series(motion: ProcessModel, h: float, first: int, scale: float, count: int) -> None:
     """Fill total with scale x phi_first(h F) v, F the linearisation, phi_l(z) = sum of z^j / (j + l)!.
 
@@ -391,7 +397,7 @@ def series(motion: ProcessModel, h: float, first: int, scale: float, count: int)
                 total[part, i] += scale * following[part, i]
 
 
-@merged
+@inner
 def spread(motion: ProcessModel, S: Array, used: int, h: float, count: int) -> None:
     """S <- F S, F the Taylor series of the linearised flow over h, in the first ``used`` columns."""
     n = motion.arm.stiffness.size

@@ -42,7 +42,7 @@ def fine(arm, x: np.ndarray, n: int, duration: float, steps: int) -> np.ndarray:
     """Runge and Kutta with steps so small that they count as exact."""
     def slope(state):
         qdd = np.zeros(n)
-        assert process_model.accelerate(arm, state[:n].copy(), state[n:].copy(), qdd)
+        assert process_model.linearize(arm, state[:n].copy(), state[n:].copy(), qdd)
         return np.concatenate([state[n:], qdd])
 
     state, h = x[:2 * n].copy(), duration / steps
@@ -55,10 +55,9 @@ def fine(arm, x: np.ndarray, n: int, duration: float, steps: int) -> np.ndarray:
 
 
 def error(arm, x: np.ndarray, exact: np.ndarray, n: int, duration: float, h: float) -> float:
-    state = x.copy()
-    for _ in range(round(duration / h)):
-        assert process_model.linearize(arm, state[:n], state[n:2 * n], arm.k[0])
-        assert process_model.exponential_step(arm, state, h, process_model.SERIES)
+    state, spread = x.copy(), np.zeros((x.size, x.size))
+    reported = TORQUE / arm.gain
+    assert process_model.predict(arm._replace(substeps=h), state, spread, 0, reported, duration)
     return float(np.abs(state[:n] - exact[:n]).max())
 
 
@@ -83,8 +82,8 @@ def test_the_linearisation_is_the_derivative_of_the_motion(arm):
         up, down = x[:2 * n].copy(), x[:2 * n].copy()
         up[i] += 1e-6
         down[i] -= 1e-6
-        process_model.accelerate(arm, up[:n].copy(), up[n:].copy(), high)
-        process_model.accelerate(arm, down[:n].copy(), down[n:].copy(), low)
+        process_model.linearize(arm, up[:n].copy(), up[n:].copy(), high)
+        process_model.linearize(arm, down[:n].copy(), down[n:].copy(), low)
         given = dq[:, i] if i < n else dqd[:, i - n]
         np.testing.assert_allclose((high - low) / 2e-6, given, rtol=1e-4, atol=1e-6 * np.abs(given).max())
 
@@ -102,5 +101,5 @@ def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(arm):
         for state, acceleration in ((up, high), (down, low)):
             process_model.set_parameters(arm, state)
             arm.effort[:] = arm.gain * TORQUE / np.exp(0.03)
-            process_model.accelerate(arm, x[:n].copy(), x[n:2 * n].copy(), acceleration)
+            process_model.linearize(arm, x[:n].copy(), x[n:2 * n].copy(), acceleration)
         np.testing.assert_allclose((high - low) / 2e-5, G[:, c], rtol=1e-4, atol=1e-5 * np.abs(G[:, c]).max() + 1e-9)
