@@ -56,6 +56,7 @@ def simulator_and_identifier() -> None:
     u, y = np.ones((20, 1)), np.ones((20, 1))
     validation.simulate(model, u)
     validation.predict(model, u, y, validation.state_at_end(model, u, y))
+    validation.predict_ahead(model, u, y, 2)
 
 
 def payload() -> None:
