@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from flexmanip_ros.cli import tasks, workers
-from flexmanip_ros.io.journal import Journal
+from flexmanip_ros.io.outputs import Journal
 from flexmanip_ros.studies.scenario import scenario
 
 RUNS, WARM = 24, 4

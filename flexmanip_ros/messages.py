@@ -7,14 +7,12 @@ message classes, so both carry the same numbers.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.errors import SignalError
-from flexmanip_ros.types import ArmParameter, Array, Estimate, Mode, Payload, StateSpace, Status
+from flexmanip_ros.types import QUANTILE, ArmParameter, Array, Estimate, Mode, Payload, StateSpace, Status
 
 MODEL = 'model'
 MODES = 'modes'
@@ -25,10 +23,6 @@ PAYLOAD = 'payload'
 PAYLOAD_BODY = 'payload_body'
 ARM_PARAMETERS = 'arm_parameters'
 STATUS = 'status'
-ROWS = re.compile(r'^rows: state=(\d+) output=(\d+) dt=(\S+)$')
-QUANTILE = 1.959963984540054
-"""Half width of a 95 % interval in standard deviations."""
-COLUMNS = re.compile(r'^columns: state=(\d+) input=(\d+) innovation=(\d+)$')
 
 
 class Dimension(NamedTuple):
@@ -88,24 +82,6 @@ def model_matrix(model: StateSpace) -> LabelledArray:
     values = np.block([[model.A, model.B, model.K], [model.C, model.D, np.eye(m)]])
     return _matrix(f'rows: state={n} output={m} dt={model.dt!r}',
                    f'columns: state={n} input={r} innovation={m}', values)
-
-
-def read_model(matrix: LabelledArray) -> StateSpace:
-    """Return the model in a ``~/model`` message; SignalError when labels and sizes do not agree."""
-    labels = [dimension.label for dimension in matrix.dimensions]
-    rows = ROWS.match(labels[0]) if len(labels) == 2 else None
-    columns = COLUMNS.match(labels[1]) if len(labels) == 2 else None
-    if rows is None or columns is None:
-        raise SignalError(f'a model message is labelled {labels}',
-                          'subscribe to the ~/model of rpbsid_identifier')
-    n, m, r = int(rows[1]), int(rows[2]), int(columns[2])
-    data = np.asarray(matrix.data, dtype=np.float64)
-    if (int(columns[1]), int(columns[3])) != (n, m) or data.size != (n + m) * (n + r + m):
-        raise SignalError(f'a model message holds {data.size} values for {labels}',
-                          f'(n + m)(n + r + m) = {(n + m) * (n + r + m)} are expected')
-    block = data.reshape(n + m, n + r + m)
-    A, B, K = block[:n, :n], block[:n, n:n + r], block[:n, n + r:]
-    return StateSpace(A, B, block[n:, :n], block[n:, n:n + r], K, float(rows[3]))
 
 
 def modes_matrix(modes: tuple[Mode, ...], order: int) -> LabelledArray:

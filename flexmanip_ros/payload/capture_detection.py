@@ -76,7 +76,7 @@ def advance(
             state = _start(config, state, one)
             rows = rows.since(one.until)
         elif rows.gap[0]:
-            state = _resume(config, state, one)
+            state = _resume(state, one)
             rows = rows.since(one.until)
         else:
             state, event = _watch(config, state, rows.stretches()[0])
@@ -167,7 +167,7 @@ def _after(state: DetectionState, event: CaptureEvent) -> DetectionState:
     return replace(state, filter=filtered, glr=_quiet(state.glr))
 
 
-def _resume(config: TriggerParameters, state: DetectionState, row: Rows) -> DetectionState:
+def _resume(state: DetectionState, row: Rows) -> DetectionState:
     """After a gap: restart the motion of the filter, and the test."""
     assert state.glr is not None
     filtered = structured.advance(state.identifier, state.filter, row)

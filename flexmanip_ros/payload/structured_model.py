@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from flexmanip_ros.arm.capture import tip_jacobian
-from flexmanip_ros.arm.dynamics import mass_matrix
+from flexmanip_ros.arm.linearization import mass_matrix
 from flexmanip_ros.arm.manipulator import Manipulator, manipulator, modal, workspace
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem

@@ -10,7 +10,7 @@ two-link arm it leaves the moving base out, as the paper does: that is its bias.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -19,11 +19,10 @@ import numpy as np
 from flexmanip_ros.numerics.compiled import kernel
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload.structured_model import chords, pinned_frequencies
+from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Rows
-from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload, Status
+from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, JointRecord, Payload, Status
 
-QUANTILE = 1.959963984540054
-"""Of the normal distribution, for 95 %."""
 FEWEST = 200
 """Samples since the event before anything is claimed."""
 
@@ -333,3 +332,49 @@ class Baseline(NamedTuple):
 
 RIGID_RLS = Baseline(_rigid_init, _rigid_advance, _rigid_event, _rigid_estimate)
 ALGEBRAIC = Baseline(_algebraic_init, _algebraic_advance, _algebraic_event, _algebraic_estimate)
+
+
+BASELINES: Mapping[str, Baseline] = {'rigid_rls': RIGID_RLS, 'algebraic': ALGEBRAIC}
+
+
+class Recorded(NamedTuple):
+    """The rows of a recording, and its events by stamp."""
+
+    rows: Rows
+    events: tuple[CaptureEvent, ...]
+
+
+def recorded(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]) -> Recorded:
+    """Return the samples and events of messages."""
+    clock, log = sampling.Clock(), sampling.EMPTY
+    events: list[CaptureEvent] = []
+    for item in items:
+        if isinstance(item, CaptureEvent):
+            events.append(item)
+        else:
+            clock, log, _ = sampling.push(config, clock, log, item)
+    events.sort(key=lambda event: event.stamp_ns)
+    return Recorded(log.rows(log.start, log.end), tuple(events))
+
+
+def run(name: str, config: IdentifierParameters, recorded: Recorded) -> Iterator[Estimate]:
+    """Yield estimates with a payload and no model: at each publishing instant and at the last sample."""
+    baseline, rows = BASELINES[name], recorded.rows
+    if not len(rows):
+        return
+    stamps = rows.stamp_ns
+    instants = ((stamps - stamps[0]) * config.publish_rate * 1e-9 + 1e-6).astype(np.int64)
+    due = set((np.flatnonzero(np.diff(instants, prepend=-1) > 0) + rows.first + 1).tolist()) | {rows.until}
+    events = [(rows.log.row_at(event.stamp_ns, rows.first), event) for event in recorded.events]
+    state, cursor = baseline.init(config), rows.first
+    for until in sorted(due | {row for row, _ in events if row > cursor}):
+        while events and events[0][0] == cursor:
+            state = baseline.event(config, state, events.pop(0)[1])
+        state, cursor = baseline.advance(config, state, rows.between(cursor, until)), until
+        if until in due:
+            yield _estimate(baseline, config, state, int(stamps[until - 1 - rows.first]))
+
+
+def _estimate(baseline: Baseline, config: IdentifierParameters, state: BaselineState, stamp_ns: int) -> Estimate:
+    payload = baseline.estimate(config, state)
+    return Estimate(stamp_ns, payload.status, None, (), payload)

@@ -1,4 +1,4 @@
-"""Parameters of the consumers of the payload: the example controller and the bridge to a robot driver."""
+"""Parameters of the nodes around the identifier: controller, payload adapter, capture trigger and live page."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.arm import ArmParameters
 from flexmanip_ros.parameters.field import check_all, fit_links, parameter
+from flexmanip_ros.parameters.identifier import PayloadParameters, check_signals, fit_signals
 
 
 @dataclass(frozen=True)
@@ -121,3 +122,80 @@ class AdapterParameters:
         if len(parts) != 3 or parts[1] != 'srv' or not all(part.isidentifier() for part in parts):
             raise ParameterError(f"parameter 'service_type' is '{self.service_type}'",
                                  'write PACKAGE/srv/TYPE')
+
+
+@dataclass(frozen=True)
+class TriggerParameters:
+    """When a capture or release is announced."""
+
+    mode: str = parameter(
+        'service', 'service: on request; time: at set times after the first sample; auto: when the signals show it',
+        choices=('service', 'time', 'auto'))
+    capture_time: float = parameter(
+        3.0, 'time of the capture after the first sample (mode time); negative: no capture', unit='s', low=-1.0)
+    release_time: float = parameter(
+        -1.0, 'time of the release after the first sample (mode time); negative: no release', unit='s', low=-1.0)
+    lead_time: float = parameter(
+        0.5, 'an event at a set time is announced this long before its stamp, so that every node knows it in time',
+        unit='s', low=0.0, high=10.0)
+    service_delay: float = parameter(
+        0.02, 'a requested event takes effect this long after the request (the time that a gripper needs)',
+        unit='s', low=0.0, high=10.0, live=True)
+    stale_after: float = parameter(
+        1.0, 'a request is rejected when no joint_states have come for this long', unit='s', low=0.001, live=True)
+    inputs: tuple[str, ...] = parameter(
+        ('joint1/effort', 'joint2/effort'), 'torques, each NAME/FIELD of JointState (mode auto)')
+    outputs: tuple[str, ...] = parameter(
+        ('link1_bend/position', 'link2_bend/position', 'link1_bend/velocity', 'link2_bend/velocity'),
+        'bends, each NAME/FIELD of JointState (mode auto)')
+    angles: tuple[str, ...] = parameter(
+        ('joint1/position', 'joint2/position'), 'joint angles, each NAME/FIELD of JointState (mode auto)')
+    false_alarms_per_hour: float = parameter(
+        0.05, 'rate of false alarms that the threshold allows where the model fits (mode auto); a lower rate delays '
+        'the detection', unit='1/h', low=1e-12, high=1e4)
+    detection_window: float = parameter(
+        0.1, 'longest time between an event and its detection (mode auto)', unit='s', low=0.005, high=1.0)
+    arm: ArmParameters = field(default_factory=ArmParameters)
+    payload: PayloadParameters = field(default_factory=PayloadParameters)
+
+    def __post_init__(self) -> None:
+        check_all(self)
+        fit_signals(self, len(self.arm.link_length))
+
+
+WINDOWS = (5, 10, 30)
+"""Lengths of time that the page can show [s]."""
+PORT = 8765
+
+
+@dataclass(frozen=True)
+class ViewParameters:
+    """What the live page shows and where. Signals and arm have the names that they have for the identifier."""
+
+    port: int = parameter(PORT, 'port of the page on this machine; 0: any that is free', low=0, high=65535)
+    rate: float = parameter(25.0, 'updates of the page a second', unit='Hz', low=1.0, high=60.0)
+    window: int = parameter(10, 'time that the plots show at first: 5, 10 or 30', unit='s', low=5, high=30)
+    exaggeration: float = parameter(
+        20.0, 'factor by which the links are drawn more bent than they are, at first', low=1.0, high=100.0)
+    stale_after: float = parameter(
+        1.0, 'time without joint states after which the page says so in red', unit='s', low=0.1, high=60.0)
+    identifier: str = parameter('rpbsid_identifier', 'name of the node whose estimates are shown')
+    inputs: tuple[str, ...] = parameter(
+        ('joint1/effort', 'joint2/effort'), 'torques, each NAME/FIELD of JointState')
+    outputs: tuple[str, ...] = parameter(
+        ('link1_bend/position', 'link2_bend/position'), 'bends, each NAME/FIELD of JointState; where one is a '
+        'position, only positions are shown')
+    angles: tuple[str, ...] = parameter(
+        ('joint1/position', 'joint2/position'), "the two joint angles, each NAME/FIELD of JointState; ['']: none, and "
+        'no arm is drawn')
+    arm: ArmParameters = field(default_factory=ArmParameters)
+
+    def __post_init__(self) -> None:
+        check_all(self)
+        if self.window not in WINDOWS:
+            raise ParameterError(f"parameter 'window' is {self.window} s",
+                                 f'give one of {", ".join(map(str, WINDOWS))}')
+        if not self.identifier:
+            raise ParameterError("parameter 'identifier' is empty", 'name the node, such as rpbsid_identifier')
+        for group in ('inputs', 'outputs', 'angles'):
+            check_signals(group, getattr(self, group))
