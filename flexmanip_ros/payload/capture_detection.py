@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
@@ -102,6 +101,8 @@ def threshold(config: TriggerParameters, dt: float) -> float:
     """
     looks = 3600.0 / dt / INDEPENDENT
     chance = min(0.5, config.false_alarms_per_hour / looks)
+    from scipy.special import chdtri  # late: it is a tenth of what the programs import
+
     return float(chdtri(kernel.CAUSES, chance))
 
 

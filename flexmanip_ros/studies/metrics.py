@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import betaincinv
 
 from flexmanip_ros.errors import ModelError, ParameterError
 from flexmanip_ros.identification import decimation, validation
@@ -69,6 +68,8 @@ def coverage(hits: int, runs: int, confidence: float = 0.95) -> tuple[float, flo
     """Return the share of hits and its Clopper-Pearson interval [%]."""
     if runs == 0:
         return math.nan, math.nan, math.nan
+    from scipy.special import betaincinv  # late: it is a tenth of what the programs import
+
     tail = (1.0 - confidence) / 2.0
     low = 0.0 if hits == 0 else float(betaincinv(hits, runs - hits + 1, tail))
     high = 1.0 if hits == runs else float(betaincinv(hits + 1, runs - hits, 1.0 - tail))
