@@ -21,12 +21,12 @@ from flexmanip_ros.cli.replay import Request, identify
 from flexmanip_ros.cli.suggest import suggest
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification import decimation, validation
-from flexmanip_ros.identification.realization import pbsid
+from flexmanip_ros.identification.pbsid import pbsid
 from flexmanip_ros.io import bag
 from flexmanip_ros.parameters import configure
 from flexmanip_ros.parameters.identifier import IdentifierParameters
 from flexmanip_ros.samples import sampling
-from flexmanip_ros.studies.metrics import HORIZON_S
+from flexmanip_ros.studies.holdout import HORIZON_S
 from flexmanip_ros.types import Array, StateSpace
 
 ROOT = Path(__file__).resolve().parents[1]

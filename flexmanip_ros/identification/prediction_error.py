@@ -9,7 +9,8 @@ import numpy as np
 from numba import njit
 
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.identification.realization import pbsid, to_continuous, to_discrete
+from flexmanip_ros.identification.pbsid import pbsid
+from flexmanip_ros.identification.realization import to_continuous, to_discrete
 from flexmanip_ros.types import Array, StateSpace
 
 GATHERED = 64

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from flexmanip_ros.messages import Diagnostics, DiagnosticStatus
 from flexmanip_ros.parameters import IdentifierParameters, ViewParameters
-from flexmanip_ros.parameters.nodes import WINDOWS
+from flexmanip_ros.parameters.view import WINDOWS
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointBlock, Status
 from flexmanip_ros.view.looks import COLOURS, EVENT_COLOUR, MODES_APART, PAYLOAD_COLOUR, STATUS_LOOKS
 

@@ -10,7 +10,8 @@ from linear_arm import configuration, random_system, record, run, sorted_poles, 
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.factor import FILLED, REJECTED, USED
-from flexmanip_ros.identification.realization import markov, pbsid
+from flexmanip_ros.identification.pbsid import pbsid
+from flexmanip_ros.identification.realization import markov
 from flexmanip_ros.samples.sample_log import SampleLog, log_of
 from flexmanip_ros.types import Status
 
