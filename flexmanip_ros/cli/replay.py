@@ -20,7 +20,7 @@ from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.payload.arm_parameters import as_parameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
-from flexmanip_ros.studies import metrics, smoothing
+from flexmanip_ros.studies import holdout, smoothing
 from flexmanip_ros.studies.summary import Summary, summarize
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Mode, Status
 from flexmanip_ros.view.screen import Screen, of_identifier
@@ -45,7 +45,7 @@ class Request:
     """Whether to look for captures and releases in the signals; None: where the recording has no topic of events, no
     time is given, and the signals can show one."""
     validate_from: float | None = None
-    horizon: float = metrics.HORIZON_S
+    horizon: float = holdout.HORIZON_S
     """How far ahead the held-out samples are predicted [s]."""
     smooth: bool = False
     """Fit each stretch between events with all of its samples too."""
@@ -118,7 +118,7 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     signals = messages.signals() if messages.is_kept else None
     if request.validate_from is not None and signals is not None:
         progress.phase('scoring the model')
-        scores = metrics.held_out_scores(None if last is None else last.model, signals, request.validate_from,
+        scores = holdout.score(None if last is None else last.model, signals, request.validate_from,
                                factor=request.config.decimation, horizon_s=request.horizon)
         summary = replace(summary, vaf_simulation_percent=tuple(scores.simulation.tolist()),
                           vaf_prediction_percent=tuple(scores.prediction.tolist()),
@@ -310,7 +310,7 @@ def _remark(state: pipeline.State, foreign: int) -> str:
 
 
 def _report(request: Request, summary: Summary, messages: _Messages, kept: list[Estimate], signals: Signals,
-            last: Estimate | None, scores: metrics.Scores | None, state: pipeline.State,
+            last: Estimate | None, scores: holdout.Scores | None, state: pipeline.State,
             fault: FlexmanipError | None) -> None:
     from flexmanip_ros.io import plots, report
     from flexmanip_ros.studies.metrics import payload_bound

@@ -21,7 +21,7 @@ from matplotlib.patches import Patch
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
-from flexmanip_ros.studies.metrics import Scores
+from flexmanip_ros.studies.holdout import Scores
 from flexmanip_ros.studies.smoothing import Smoothed
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointRecord, Status
 from flexmanip_ros.view.looks import COLOURS, EVENT_COLOUR, MODES_APART, PAYLOAD_COLOUR, STATUS_LOOKS

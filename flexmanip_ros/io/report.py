@@ -18,7 +18,8 @@ from flexmanip_ros.io.outputs import write_text
 from flexmanip_ros.parameters import IdentifierParameters, flatten
 from flexmanip_ros.parameters.document import written
 from flexmanip_ros.parameters.field import leaves
-from flexmanip_ros.studies.metrics import Score, Scores, score
+from flexmanip_ros.studies.holdout import Scores
+from flexmanip_ros.studies.metrics import Score, score
 from flexmanip_ros.studies.smoothing import Smoothed
 from flexmanip_ros.studies.summary import Summary, status_text
 from flexmanip_ros.studies.trial import Row

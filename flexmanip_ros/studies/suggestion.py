@@ -15,7 +15,7 @@ import numpy as np
 from flexmanip_ros.identification import recursive_fit, rpbsid
 from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.samples.sample_log import Signals, log_of
-from flexmanip_ros.studies import metrics, shape_search
+from flexmanip_ros.studies import holdout, shape_search
 from flexmanip_ros.studies.shape_search import PRIOR, Progress, Search, Shape
 
 PLAIN = 1.03
@@ -41,7 +41,7 @@ class Suggestion:
     reasons: tuple[tuple[str, str], ...]
 
 
-def suggest(given: Mapping[str, Any], signals: Signals, dt: float, *, horizon_s: float = metrics.HORIZON_S,
+def suggest(given: Mapping[str, Any], signals: Signals, dt: float, *, horizon_s: float = holdout.HORIZON_S,
             progress: Progress | None = None) -> Suggestion:
     """Choose the parameters for a recording of one machine that does not change meanwhile.
 

@@ -7,7 +7,7 @@ import pytest
 
 from flexmanip_ros.errors import ModelError, ParameterError
 from flexmanip_ros.samples.sample_log import Signals
-from flexmanip_ros.studies.metrics import held_out_scores
+from flexmanip_ros.studies.holdout import score
 from flexmanip_ros.types import StateSpace
 
 DT = 0.01
@@ -34,7 +34,7 @@ def _signals(noise: float = 0.0, gap_at: int | None = None, count: int = 800) ->
 
 
 def test_the_true_model_scores_a_hundred_percent():
-    found = held_out_scores(_system(), _signals(), 4.0)
+    found = score(_system(), _signals(), 4.0)
     assert found.simulation == pytest.approx([100.0])
     assert found.prediction == pytest.approx([100.0])
     assert found.time[0] == pytest.approx(4.0)
@@ -44,7 +44,7 @@ def test_the_true_model_scores_a_hundred_percent():
 def test_a_prediction_ahead_uses_no_output_in_between():
     signals, steps = _signals(noise=0.3), 25
     known = _signals().y[:, 0]
-    found = held_out_scores(_system(), signals, 4.0, horizon_s=steps * DT)
+    found = score(_system(), signals, 4.0, horizon_s=steps * DT)
     expected = 100.0 * (1.0 - np.var(signals.y[424:, 0] - known[424:]) / np.var(signals.y[424:]))
     assert found.horizon == pytest.approx([expected], abs=0.5)
 
@@ -52,12 +52,12 @@ def test_a_prediction_ahead_uses_no_output_in_between():
 def test_one_step_ahead_is_the_prediction():
     signals, model = _signals(noise=0.3), _system()
     model = StateSpace(model.A, model.B, model.C, model.D, np.array([[0.2], [0.1]]), DT)
-    found = held_out_scores(model, signals, 4.0, horizon_s=DT)
+    found = score(model, signals, 4.0, horizon_s=DT)
     assert found.horizon == pytest.approx(found.prediction)
 
 
 def test_a_horizon_beyond_the_recording_has_no_score():
-    assert np.isnan(held_out_scores(_system(), _signals(), 4.0, horizon_s=100.0).horizon).all()
+    assert np.isnan(score(_system(), _signals(), 4.0, horizon_s=100.0).horizon).all()
 
 
 def test_a_decimated_model_is_scored_at_its_own_rate():
@@ -71,7 +71,7 @@ def test_a_decimated_model_is_scored_at_its_own_rate():
                       np.zeros(1600, dtype=int), ('a/effort',), ('a/position',))
     slow = StateSpace(np.array([[pole ** 5]]), np.array([[(1.0 - pole ** 5) / (1.0 - pole)]]), np.eye(1),
                       np.zeros((1, 1)), np.zeros((1, 1)), 5 * DT)
-    found = held_out_scores(slow, signals, 8.0, factor=5)
+    found = score(slow, signals, 8.0, factor=5)
     assert min(found.simulation[0], found.prediction[0], found.horizon[0]) > 98.0
     assert np.diff(found.time) == pytest.approx(5 * DT)
     assert found.time[0] == pytest.approx(8.0 - 4 * 5 * DT, abs=5 * DT)
@@ -80,11 +80,11 @@ def test_a_decimated_model_is_scored_at_its_own_rate():
 def test_noise_costs_what_its_variance_is():
     signals = _signals(noise=0.3)
     expected = 100.0 * (1.0 - 0.09 / np.var(signals.y[400:]))
-    assert held_out_scores(_system(), signals, 4.0).simulation == pytest.approx([expected], abs=2.0)
+    assert score(_system(), signals, 4.0).simulation == pytest.approx([expected], abs=2.0)
 
 
 def test_the_score_ends_at_a_gap_and_says_so():
-    found = held_out_scores(_system(), _signals(gap_at=600), 4.0)
+    found = score(_system(), _signals(gap_at=600), 4.0)
     assert found.time.size == 200
     assert found.until_gap
 
@@ -92,15 +92,15 @@ def test_the_score_ends_at_a_gap_and_says_so():
 def test_an_unstable_model_scores_zero():
     model = _system()
     wild = StateSpace(2.0 * model.A, model.B, model.C, model.D, model.K, DT)
-    assert held_out_scores(wild, _signals(), 4.0).simulation == pytest.approx([0.0])
+    assert score(wild, _signals(), 4.0).simulation == pytest.approx([0.0])
 
 
 @pytest.mark.parametrize('start', [0.0, 8.0, -1.0, 1e9, float('nan')])
 def test_nothing_to_score_is_said(start):
     with pytest.raises(ParameterError, match='leaves no samples'):
-        held_out_scores(_system(), _signals(), start)
+        score(_system(), _signals(), start)
 
 
 def test_a_missing_model_is_said():
     with pytest.raises(ModelError, match='no model'):
-        held_out_scores(None, _signals(), 4.0)
+        score(None, _signals(), 4.0)
