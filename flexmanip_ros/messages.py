@@ -142,11 +142,6 @@ def arm_parameters(found: Sequence[ArmParameter]) -> LabelledArray:
                    np.array([(one.value, one.std) for one in found]).reshape(len(found), 2))
 
 
-def inertia(payload: Payload, stamp_ns: int, frame_id: str) -> Inertia:
-    """Return the payload as a robot driver takes it."""
-    return Inertia(stamp_ns, frame_id, payload.mass, payload.com, payload.inertia)
-
-
 def payload_status(payload: Payload, stamp_ns: int, frame_id: str) -> Diagnostics:
     """Return payload, interval and status under one stamp; level OK only where the payload is to be trusted.
 
@@ -198,7 +193,7 @@ def outgoing_payload(payload: Payload | None, stamp_ns: int, frame_id: str) -> I
     if any(map(math.isnan, numbers)):
         return
     if all(map(math.isfinite, (payload.std, *payload.com, *payload.inertia))):
-        yield PAYLOAD, inertia(payload, stamp_ns, frame_id)
+        yield PAYLOAD, Inertia(stamp_ns, frame_id, payload.mass, payload.com, payload.inertia)
     yield PAYLOAD_ESTIMATE, payload_row(payload)
     if payload.covariance and all(map(math.isfinite, (*payload.covariance, *payload.com, *payload.inertia))):
         yield PAYLOAD_BODY, payload_body(payload)
@@ -222,13 +217,8 @@ def outgoing_model(estimate: Estimate) -> Iterator[tuple[str, Value]]:
     model = estimate.model
     if model is None or not estimate.model_is_new:
         return
-    if all(np.isfinite(part).all() for part in model_parts(model)):
+    if all(np.isfinite(part).all() for part in (model.A, model.B, model.C, model.D, model.K)):
         yield MODEL, model_matrix(model)
         yield MODES, modes_matrix(estimate.modes, model.order)
         yield MODES_INTERVAL, modes_interval(estimate.modes, model.order)
         yield STATUS, model_status(estimate)
-
-
-def model_parts(model: StateSpace) -> tuple[Array, ...]:
-    """Return A, B, C, D, K."""
-    return model.A, model.B, model.C, model.D, model.K

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flexmanip_ros.arm import manipulator
+from flexmanip_ros.arm.urdf import urdf
 from flexmanip_ros.cli import write_urdf
-from flexmanip_ros.cli.write_urdf import urdf
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
