@@ -94,11 +94,11 @@ def number(value: Any, digits: int = 5) -> str:
     return str(value) if isinstance(value, (int, str)) else f'{float(value):.{digits}g}'
 
 
-def plain(value: float | None, digits: int = 2) -> str:
-    """Return a number as text with few digits and without an exponent; None and nan give a dash."""
+def plain(value: float | None) -> str:
+    """Return a number as text with two digits and without an exponent; None and nan give a dash."""
     if value is None or np.isnan(value):
         return '\N{EN DASH}'
-    return np.format_float_positional(value, precision=digits, fractional=False, trim='-')
+    return np.format_float_positional(value, precision=2, fractional=False, trim='-')
 
 
 def _cell(value: Any, digits: int) -> str:

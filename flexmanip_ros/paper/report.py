@@ -268,10 +268,10 @@ def _held(rows: Sequence[trial.Row]) -> str:
     return f'{sum(bool(row.get("covered")) for row in rows)} of {len(rows)}'
 
 
-def simulation(case: experiments.Case, seed: int = 0) -> simulator.Trajectory:
+def simulation(case: experiments.Case) -> simulator.Trajectory:
     """Return one noisy run of a case."""
     made = experiments.scenario(case, experiments.METHODS[0])
-    run = made.configuration(seed, experiments.METHODS[0].name)
+    run = made.configuration(0, experiments.METHODS[0].name)
     torque = excitation.sequence(run.excitation, round(made.duration * run.plant.rate))
     events = (CaptureEvent(round(made.capture_time * 1e9), EventKind.CAPTURE),)
     return simulator.simulate(run.plant, torque, events)
