@@ -139,7 +139,7 @@ class Model(NamedTuple):
     @property
     def body(self) -> int:
         """How many states describe the payload: 1 a point, 4 a body."""
-        return int(np.sum(self.motion.kind <= Kind.INERTIA))
+        return int(np.count_nonzero(self.motion.kind <= int(Kind.INERTIA)))
 
 
 def build(config: IdentifierParameters) -> Model | None:
