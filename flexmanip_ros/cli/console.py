@@ -1,4 +1,4 @@
-"""What every program shares: progress on a terminal, a word while kernels are compiled, errors, exit codes.
+"""What every program shares: progress on a terminal, one line for an error, exit codes.
 
 The programs import numpy, scipy, numba, rosbags and matplotlib only after their arguments are parsed, so that
 ``--help`` and a mistake in the arguments are answered at once.
@@ -12,27 +12,19 @@ import math
 import os
 import signal
 import sys
-import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import NoReturn
 
 from flexmanip_ros.errors import FlexmanipError, ModelError
-
-if TYPE_CHECKING:
-    from multiprocessing.sharedctypes import Synchronized
 
 SUCCESS, DEFECT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 LONGEST = 1e9
 """Largest time that is accepted [s]; larger ones overflow a stamp in nanoseconds."""
 TRACEBACK = 'FLEXMANIP_TRACEBACK'
 """Environment variable; where it is set, a defect prints its traceback."""
-COMPILE_PATIENCE = 2.0
-"""Time [s] for which a kernel is compiled before the user is told; one that takes less is not worth a line."""
-COMPILE_WORDS = ('flexmanip_ros: compiling the kernels for this machine. This happens once after an installation and '
-                 'takes a minute or two.')
 
 
 class Report:
@@ -120,65 +112,6 @@ def progress(words: str, unit: str) -> Iterator[Report]:
                 bar.reset(task, description=words, total=None)
 
         yield Shown()
-
-
-@contextmanager
-def compile_notice() -> Iterator[None]:
-    """Tell the user on stderr, at most once, that kernels are being compiled.
-
-    `make setup` and `colcon build` compile all kernels beforehand (`warm_up`); a wheel is only files. numba then
-    compiles each kernel when it is called first, and keeps it on disk beside the package or in the user's cache folder.
-    """
-    from numba.core import event
-
-    with event.install_listener('numba:compile', _compile_listener(_tell_of_compilation)):
-        yield
-
-
-def compile_notice_in_worker(told: Synchronized[bool]) -> None:
-    """Tell the same in a process of a pool, whose workers share ``told``: one of them speaks."""
-    from numba.core import event
-
-    def once() -> None:
-        with told.get_lock():
-            if told.value:
-                return
-            told.value = True
-        _tell_of_compilation()
-
-    event.register('numba:compile', _compile_listener(once))  # type: ignore[no-untyped-call]
-
-
-def _tell_of_compilation() -> None:
-    print(COMPILE_WORDS, file=sys.stderr, flush=True)
-
-
-def _compile_listener(say: Callable[[], None]) -> Any:
-    """Return what hears that numba compiles a kernel which is not on disk, and calls ``say`` once if one takes long."""
-    from numba.core import event
-
-    class Listener(event.Listener):
-        depth, told = 0, False
-        """Kernels being compiled, as one may compile another within; whether ``say`` was called."""
-        timer: threading.Timer | None = None
-
-        def on_start(self, event: Any) -> None:
-            self.depth += 1
-            if self.depth == 1 and not self.told:
-                self.timer = threading.Timer(COMPILE_PATIENCE, self.tell)
-                self.timer.daemon = True
-                self.timer.start()
-
-        def on_end(self, event: Any) -> None:
-            self.depth -= 1
-            if self.depth == 0 and self.timer is not None:
-                self.timer.cancel()
-
-        def tell(self) -> None:
-            self.told = True
-            say()
-
-    return Listener()
 
 
 def print_error(prog: str, error: BaseException | str) -> None:

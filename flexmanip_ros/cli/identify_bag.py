@@ -79,6 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(given: argparse.Namespace) -> int:
+    from flexmanip_ros.cli import first_use
     from flexmanip_ros.cli.replay import Request, identify
 
     if given.suggest is not None:
@@ -95,7 +96,7 @@ def _main(given: argparse.Namespace) -> int:
         capture_time=given.capture_time, release_time=given.release_time, detect=given.detect,
         validate_from=given.validate_from, horizon=given.horizon, smooth=given.smooth,
         output=given.output, report=given.report, save_arm=given.save_arm)
-    with console.progress('identifying', 'messages') as progress, console.compile_notice():
+    with console.progress('identifying', 'messages') as progress, first_use.announced():
         result = identify(request, progress)
     if not given.json:
         print('\n'.join(describe(result)))

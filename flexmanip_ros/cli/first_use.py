@@ -1,0 +1,73 @@
+"""A word to the user while kernels are compiled, which a wheel does at the first use.
+
+`make setup` and `colcon build` compile all kernels beforehand (`warm_up`); a wheel is only files. numba then compiles
+each kernel when it is called first, and keeps it on disk beside the package or in the user's cache folder.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing.sharedctypes import Synchronized
+from typing import Any
+
+from numba.core import event
+
+PATIENCE = 2.0
+"""Time [s] for which a kernel is compiled before the user is told; one that takes less is not worth a line."""
+WORDS = ('flexmanip_ros: compiling the kernels for this machine. This happens once after an installation and takes '
+         'a minute or two.')
+
+
+def tell() -> None:
+    """Write the words on stderr."""
+    print(WORDS, file=sys.stderr, flush=True)
+
+
+class Listener(event.Listener):
+    """Hears when numba compiles a kernel that is not on disk, and calls ``say`` once if one takes long."""
+
+    def __init__(self, say: Callable[[], None] = tell) -> None:
+        self._say = say
+        self._depth = 0
+        self._told = False
+        self._timer: threading.Timer | None = None
+
+    def on_start(self, event: Any) -> None:
+        """Note the begin of a compilation; one kernel may compile another within."""
+        self._depth += 1
+        if self._depth == 1 and not self._told:
+            self._timer = threading.Timer(PATIENCE, self._tell)
+            self._timer.daemon = True
+            self._timer.start()
+
+    def on_end(self, event: Any) -> None:
+        """Note the end of a compilation."""
+        self._depth -= 1
+        if self._depth == 0 and self._timer is not None:
+            self._timer.cancel()
+
+    def _tell(self) -> None:
+        self._told = True
+        self._say()
+
+
+@contextmanager
+def announced() -> Iterator[None]:
+    """Tell the user on stderr, at most once, that kernels are being compiled."""
+    with event.install_listener('numba:compile', Listener()):
+        yield
+
+
+def announce_in_worker(told: Synchronized[bool]) -> None:
+    """Tell the same in a process of a pool, whose workers share ``told``: one of them speaks."""
+    def once() -> None:
+        with told.get_lock():
+            if told.value:
+                return
+            told.value = True
+        tell()
+
+    event.register('numba:compile', Listener(once))  # type: ignore[no-untyped-call]
