@@ -107,7 +107,7 @@ setup(
     entry_points={
         'console_scripts': [
             *(f'{name} = {NAME}.ros.nodes.{name}:main' for name in NODES),
-            f'demo = {NAME}.ros.demo.program:main',
+            f'demo = {NAME}.ros.demo:main',
             *(f'{name} = {NAME}.cli.{name}:main' for name in PROGRAMS),
         ],
     },

@@ -38,7 +38,7 @@ NODES = ('plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier'
 
 def command(name: str) -> list[str]:
     """Return what the installed script of a program does."""
-    where = 'ros.nodes.' + name if name in NODES else 'ros.demo.program' if name == 'demo' else 'cli.' + name
+    where = 'ros.nodes.' + name if name in NODES else 'ros.demo' if name == 'demo' else 'cli.' + name
     return [sys.executable, '-c', f'import sys; from flexmanip_ros.{where} import main; sys.exit(main())']
 
 

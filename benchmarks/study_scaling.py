@@ -18,8 +18,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from flexmanip_ros.cli import tasks, workers
-from flexmanip_ros.io.journal import Journal
+from flexmanip_ros.cli import workers
+from flexmanip_ros.io.outputs import Journal
 from flexmanip_ros.studies.scenario import scenario
 
 RUNS, WARM = 24, 4
@@ -28,13 +28,13 @@ KEPT = 500
 """Runs given to the journal."""
 SCENARIO = {'name': 'scaling', 'vary': {'plant.payload_mass': {'uniform': [12.0, 100.0]}},
             'plant': {'arm.damping_ratio': 0.003}, 'identifier': {'arm.damping_ratio': 0.003}}
-Compute = Callable[[list[tasks.Task], int], Iterator[workers.Outcome]]
+Compute = Callable[[list[workers.Task], int], Iterator[workers.Outcome]]
 
 
 def rate(compute: Compute, count: int) -> float:
     """Return runs a second of ``count`` workers."""
     made = scenario(SCENARIO)
-    todo: list[tasks.Task] = [tasks.Simulated(made, seed) for seed in range(WARM * count + RUNS)]
+    todo: list[workers.Task] = [workers.Simulated(made, seed) for seed in range(WARM * count + RUNS)]
     started = 0.0
     for done, outcome in enumerate(compute(todo, count), start=1):
         if outcome.error is not None:
@@ -44,22 +44,22 @@ def rate(compute: Compute, count: int) -> float:
     return RUNS / (time.perf_counter() - started)
 
 
-def by_processes(todo: list[tasks.Task], count: int) -> Iterator[workers.Outcome]:
+def by_processes(todo: list[workers.Task], count: int) -> Iterator[workers.Outcome]:
     """Compute in processes of this machine."""
-    return workers.processes(tasks.work, todo, count)
+    return workers.processes(workers.work, todo, count)
 
 
-def by_dask(todo: list[tasks.Task], count: int) -> Iterator[workers.Outcome]:
+def by_dask(todo: list[workers.Task], count: int) -> Iterator[workers.Outcome]:
     """Compute on a Dask cluster of this machine, through its scheduler's address as on any other."""
     from distributed import LocalCluster
 
     with LocalCluster(n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None) as there:
-        yield from workers.cluster(tasks.work, todo, there.scheduler_address)
+        yield from workers.cluster(workers.work, todo, there.scheduler_address)
 
 
 def keeping() -> float:
     """Return the time to keep the row of one run [s]."""
-    row = tasks.work(tasks.Simulated(scenario(SCENARIO), 0))
+    row = workers.work(workers.Simulated(scenario(SCENARIO), 0))
     with tempfile.TemporaryDirectory() as folder, Journal(Path(folder) / 'kept.csv', {}) as journal:
         started = time.perf_counter()
         for _ in range(KEPT):

@@ -7,14 +7,12 @@ message classes, so both carry the same numbers.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.errors import SignalError
-from flexmanip_ros.types import ArmParameter, Array, Estimate, Mode, Payload, StateSpace, Status
+from flexmanip_ros.types import QUANTILE, ArmParameter, Array, Estimate, Mode, Payload, StateSpace, Status
 
 MODEL = 'model'
 MODES = 'modes'
@@ -25,10 +23,6 @@ PAYLOAD = 'payload'
 PAYLOAD_BODY = 'payload_body'
 ARM_PARAMETERS = 'arm_parameters'
 STATUS = 'status'
-ROWS = re.compile(r'^rows: state=(\d+) output=(\d+) dt=(\S+)$')
-QUANTILE = 1.959963984540054
-"""Half width of a 95 % interval in standard deviations."""
-COLUMNS = re.compile(r'^columns: state=(\d+) input=(\d+) innovation=(\d+)$')
 
 
 class Dimension(NamedTuple):
@@ -90,24 +84,6 @@ def model_matrix(model: StateSpace) -> LabelledArray:
                    f'columns: state={n} input={r} innovation={m}', values)
 
 
-def read_model(matrix: LabelledArray) -> StateSpace:
-    """Return the model in a ``~/model`` message; SignalError when labels and sizes do not agree."""
-    labels = [dimension.label for dimension in matrix.dimensions]
-    rows = ROWS.match(labels[0]) if len(labels) == 2 else None
-    columns = COLUMNS.match(labels[1]) if len(labels) == 2 else None
-    if rows is None or columns is None:
-        raise SignalError(f'a model message is labelled {labels}',
-                          'subscribe to the ~/model of rpbsid_identifier')
-    n, m, r = int(rows[1]), int(rows[2]), int(columns[2])
-    data = np.asarray(matrix.data, dtype=np.float64)
-    if (int(columns[1]), int(columns[3])) != (n, m) or data.size != (n + m) * (n + r + m):
-        raise SignalError(f'a model message holds {data.size} values for {labels}',
-                          f'(n + m)(n + r + m) = {(n + m) * (n + r + m)} are expected')
-    block = data.reshape(n + m, n + r + m)
-    A, B, K = block[:n, :n], block[:n, n:n + r], block[:n, n + r:]
-    return StateSpace(A, B, block[n:, :n], block[n:, n:n + r], K, float(rows[3]))
-
-
 def modes_matrix(modes: tuple[Mode, ...], order: int) -> LabelledArray:
     """Return (order // 2, 2), one mode a row in rising frequency: damped frequency [Hz], damping ratio.
 
@@ -166,11 +142,6 @@ def arm_parameters(found: Sequence[ArmParameter]) -> LabelledArray:
                    np.array([(one.value, one.std) for one in found]).reshape(len(found), 2))
 
 
-def inertia(payload: Payload, stamp_ns: int, frame_id: str) -> Inertia:
-    """Return the payload as a robot driver takes it."""
-    return Inertia(stamp_ns, frame_id, payload.mass, payload.com, payload.inertia)
-
-
 def payload_status(payload: Payload, stamp_ns: int, frame_id: str) -> Diagnostics:
     """Return payload, interval and status under one stamp; level OK only where the payload is to be trusted.
 
@@ -222,7 +193,7 @@ def outgoing_payload(payload: Payload | None, stamp_ns: int, frame_id: str) -> I
     if any(map(math.isnan, numbers)):
         return
     if all(map(math.isfinite, (payload.std, *payload.com, *payload.inertia))):
-        yield PAYLOAD, inertia(payload, stamp_ns, frame_id)
+        yield PAYLOAD, Inertia(stamp_ns, frame_id, payload.mass, payload.com, payload.inertia)
     yield PAYLOAD_ESTIMATE, payload_row(payload)
     if payload.covariance and all(map(math.isfinite, (*payload.covariance, *payload.com, *payload.inertia))):
         yield PAYLOAD_BODY, payload_body(payload)
@@ -246,13 +217,8 @@ def outgoing_model(estimate: Estimate) -> Iterator[tuple[str, Value]]:
     model = estimate.model
     if model is None or not estimate.model_is_new:
         return
-    if all(np.isfinite(part).all() for part in model_parts(model)):
+    if all(np.isfinite(part).all() for part in (model.A, model.B, model.C, model.D, model.K)):
         yield MODEL, model_matrix(model)
         yield MODES, modes_matrix(estimate.modes, model.order)
         yield MODES_INTERVAL, modes_interval(estimate.modes, model.order)
         yield STATUS, model_status(estimate)
-
-
-def model_parts(model: StateSpace) -> tuple[Array, ...]:
-    """Return A, B, C, D, K."""
-    return model.A, model.B, model.C, model.D, model.K

@@ -131,13 +131,12 @@ def catch_up(state: State, background: Background = INLINE, group: int = 1) -> t
     estimates: list[Estimate] = []
     if state.payload is None or state.identifier is None:
         return state, estimates
-    for row in _due_rows(state, state.payload):
+    for row in _due_rows(state):
         state, model = _take_model(state, background)
         state = _advance_payload(state, row + 1, background)
         state, estimate = _estimate(state, background)
         estimates += [*model, *estimate]
-    assert state.identifier is not None
-    if state.log.end - state.identifier.cursor >= group:
+    if state.log.end - _running(state)[2].cursor >= group:
         state = _advance(state, state.log.end, background)
     if state.pending is not None and state.log.end > state.pending.due:
         state, model = _take_model(state, background)
@@ -152,13 +151,12 @@ def run(config: IdentifierParameters, items: Iterable[Item]) -> Iterator[Estimat
             yield estimate
 
 
-def replay(config: IdentifierParameters, items: Iterable[Item], state: State | None = None
-           ) -> Iterator[tuple[State, Estimate | None]]:
+def replay(config: IdentifierParameters, items: Iterable[Item]) -> Iterator[tuple[State, Estimate | None]]:
     """Yield the state with each estimate of a recording, and at the end the last state with None.
 
     Payload and model of one stamp come in one estimate. Raises SignalError when no message can be used.
     """
-    last = init() if state is None else state
+    last = init()
 
     def all_estimates() -> Iterator[tuple[State, Estimate]]:
         nonlocal last
@@ -220,10 +218,7 @@ def current(state: State) -> Estimate | None:
     if state.payload is None or state.config is None:
         return None
     state, _ = _take_model(_advance(state, state.log.end, INLINE), INLINE)
-    config, payload, identifier = state.config, state.payload, state.identifier
-    assert config is not None
-    assert payload is not None
-    assert identifier is not None
+    config, payload, identifier = _running(state)
     if payload.cursor == 0:
         return None
     model = identifier.estimator._replace(rpbsid=rpbsid.finish(config, identifier.estimator.rpbsid))
@@ -282,45 +277,46 @@ def _insert(state: State, event: CaptureEvent, background: Background) -> State:
     if state.payload is None or state.config is None:
         return state._replace(early=(*state.early, event)[-event_replay.MOST_EVENTS:])
     state = _advance(state, state.log.end, background)
+    config, payload, identifier = _running(state)
+    given = state.log, event, state.first_ns, background
+    return state._replace(payload=event_replay.insert(config, payload, *given),
+                          identifier=event_replay.insert(config, identifier, *given))
+
+
+def _running(state: State) -> tuple[IdentifierParameters, EventReplay[PayloadEstimator], EventReplay[ModelEstimator]]:
+    """Return configuration and estimators of a state that has seen a usable message."""
+    assert state.config is not None
     assert state.payload is not None
     assert state.identifier is not None
-    assert state.config is not None
-    given = state.log, event, state.first_ns, background
-    return state._replace(payload=event_replay.insert(state.config, state.payload, *given),
-                          identifier=event_replay.insert(state.config, state.identifier, *given))
+    return state.config, state.payload, state.identifier
 
 
 def _advance(state: State, until: int, background: Background) -> State:
     """Let both estimators take the rows up to ``until``; drop rows that neither reads again."""
     state = _advance_identifier(_advance_payload(state, until, background), until, background)
-    assert state.payload is not None
-    assert state.identifier is not None
     if state.keep_log:
         return state
-    needed = min(event_replay.first_needed(state.payload), event_replay.first_needed(state.identifier),
-                 state.identifier.cursor - prediction_check.length(state.clock.dt))
+    _, payload, identifier = _running(state)
+    needed = min(event_replay.first_needed(payload), event_replay.first_needed(identifier),
+                 identifier.cursor - prediction_check.length(state.clock.dt))
     return state._replace(log=state.log.from_row(needed))
 
 
 def _latest(state: State, until: int) -> Rows:
     """Return the rows before ``until`` on which a model is judged: of the last second, since the last event."""
-    assert state.payload is not None
     first = max(state.log.start, until - prediction_check.length(state.clock.dt))
-    first = min(state.log.row_at(state.payload.estimator.since_ns, first), until)
+    first = min(state.log.row_at(_running(state)[1].estimator.since_ns, first), until)
     return state.log.rows(first, until)
 
 
 def _advance_payload(state: State, until: int, background: Background) -> State:
-    assert state.payload is not None
-    assert state.config is not None
-    return state._replace(payload=event_replay.advance(state.config, state.payload, state.log, until, background))
+    config, payload, _ = _running(state)
+    return state._replace(payload=event_replay.advance(config, payload, state.log, until, background))
 
 
 def _advance_identifier(state: State, until: int, background: Background) -> State:
-    assert state.identifier is not None
-    assert state.config is not None
-    return state._replace(
-        identifier=event_replay.advance(state.config, state.identifier, state.log, until, background))
+    config, _, identifier = _running(state)
+    return state._replace(identifier=event_replay.advance(config, identifier, state.log, until, background))
 
 
 def _instant(state: State, stamp_ns: int, rate: float) -> int:
@@ -328,14 +324,14 @@ def _instant(state: State, stamp_ns: int, rate: float) -> int:
     return int((stamp_ns - state.first_ns) * rate * 1e-9 + ROUNDING)
 
 
-def _due_rows(state: State, payload: EventReplay[PayloadEstimator]) -> list[int]:
+def _due_rows(state: State) -> list[int]:
     """Return the rows not taken yet that are the first at or after an instant of ``publish_rate``."""
-    assert state.config is not None
+    config, payload, _ = _running(state)
     cursor = payload.cursor
     rows = state.log.rows(cursor, state.log.end)
     measured = np.flatnonzero(rows.missing == 0)
     stamps = rows.stamp_ns[measured]
-    instants = ((stamps - state.first_ns) * state.config.publish_rate * 1e-9 + ROUNDING).astype(np.int64)
+    instants = ((stamps - state.first_ns) * config.publish_rate * 1e-9 + ROUNDING).astype(np.int64)
     if not len(instants) or instants[-1] <= state.published:
         return []
     new = np.empty(len(instants), dtype=np.bool_)
@@ -350,9 +346,7 @@ def _estimate(state: State, background: Background) -> tuple[State, list[Estimat
     A model is due by ``model_rate``, and with every estimate for as long after an event as another may arrive
     late: so any order of arrival reads models at the same stamps.
     """
-    config, now, last = state.config, state.payload, state.model
-    assert config is not None
-    assert now is not None
+    (config, now, _), last = _running(state), state.model
     stamp_ns, since_ns = now.last_ns, now.estimator.since_ns
     payload = estimator.payload(config, now.estimator)
     second = _instant(state, stamp_ns, ARM_RATE)
@@ -365,17 +359,16 @@ def _estimate(state: State, background: Background) -> tuple[State, list[Estimat
     if last is not None and last.since_ns == since_ns and not young and instant <= last.instant:
         return state, [estimator.with_model_of(config, stamp_ns, last.estimate, payload)._replace(arm_parameters=arm)]
     state = _advance_identifier(state, now.cursor, background)
-    assert state.identifier is not None
-    request = estimator.ModelRequest(config, state.identifier.estimator, now.estimator, stamp_ns, state.clock.dt,
+    request = estimator.ModelRequest(config, _running(state)[2].estimator, now.estimator, stamp_ns, state.clock.dt,
                                      payload, _latest(state, now.cursor))
     background.start(request)
     due = now.cursor - 1 + int(np.ceil(RESULT_DELAY_S / max(state.clock.dt, 1e-9)))
     state = state._replace(pending=PendingModel(request, since_ns, instant, due))
     if payload is None:  # it rests on the model
         return state, []
-    if last is None:
-        return state, [estimator.without_model(config, stamp_ns, payload)._replace(arm_parameters=arm)]
-    return state, [estimator.with_model_of(config, stamp_ns, last.estimate, payload)._replace(arm_parameters=arm)]
+    estimate = estimator.without_model(config, stamp_ns, payload) if last is None else (
+        estimator.with_model_of(config, stamp_ns, last.estimate, payload))
+    return state, [estimate._replace(arm_parameters=arm)]
 
 
 def _take_model(state: State, background: Background) -> tuple[State, list[Estimate]]:

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+QUANTILE = 1.959963984540054
+"""Half width of a 95 % interval, in standard deviations."""
 
 
 class EventKind(Enum):

@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 
-from flexmanip_ros.errors import SignalError
-from flexmanip_ros.messages import LabelledArray, model_matrix, modes_interval, modes_matrix, outgoing, read_model
+from flexmanip_ros.messages import model_matrix, modes_interval, modes_matrix, outgoing
 from flexmanip_ros.types import Estimate, Mode, Payload, StateSpace, Status
 
 
@@ -28,25 +26,8 @@ def test_the_model_message_is_laid_out_as_the_contract_says():
     assert rows.label == 'rows: state=4 output=3 dt=0.001'
     assert columns.label == 'columns: state=4 input=2 innovation=3'
     assert (rows.size, rows.stride, columns.size, columns.stride) == (7, 63, 9, 9)
-    block = matrix.data.reshape(7, 9)
-    np.testing.assert_array_equal(block[:4, 6:], _model().K)
-    np.testing.assert_array_equal(block[4:, 6:], np.eye(3))
-
-
-def test_a_model_survives_the_message_bit_for_bit():
-    model = _model(3, 1, 1)
-    back = read_model(model_matrix(model))
-    for name in 'ABCDK':
-        np.testing.assert_array_equal(getattr(back, name), getattr(model, name))
-    assert back.dt == model.dt
-
-
-def test_a_model_message_of_the_wrong_size_is_refused():
-    matrix = model_matrix(_model())
-    with pytest.raises(SignalError, match='values'):
-        read_model(LabelledArray(matrix.dimensions, matrix.data[:-1]))
-    with pytest.raises(SignalError, match='labelled'):
-        read_model(LabelledArray((), matrix.data))
+    block, model = matrix.data.reshape(7, 9), _model()
+    np.testing.assert_array_equal(block, np.block([[model.A, model.B, model.K], [model.C, model.D, np.eye(3)]]))
 
 
 def test_modes_are_sorted_and_always_as_many_rows_as_the_order_allows():

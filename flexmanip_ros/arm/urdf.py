@@ -18,14 +18,14 @@ from flexmanip_ros.types import Array
 COLOURS = ('0.20 0.45 0.70 1', '0.85 0.50 0.15 1')
 
 
-def urdf(arm: ArmParameters, segments: int = 12, name: str = 'flexible_arm') -> str:
+def urdf(arm: ArmParameters, segments: int = 12) -> str:
     """Return the description as XML text; ``segments`` of each link, encoder angles assumed.
 
     Raises ModelError for fewer than two segments.
     """
     if segments < 2:
         raise ModelError(f'{segments} segments cannot bend', 'draw at least two segments a link')
-    robot = ET.Element('robot', name=name)
+    robot = ET.Element('robot', name='flexible_arm')
     _link(robot, 'base_link')
     parent, offset = 'base_link', 0.0
     for link in range(len(arm.link_length)):

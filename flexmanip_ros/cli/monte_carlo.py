@@ -57,8 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.cli import workers
-    from flexmanip_ros.io.journal import Journal
-    from flexmanip_ros.io.outputs import check_place
+    from flexmanip_ros.io.outputs import Journal, check_place
 
     todo, identity = _plan(given)
     if given.report is not None:

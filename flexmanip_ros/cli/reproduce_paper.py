@@ -75,7 +75,7 @@ def _main(given: argparse.Namespace) -> int:
         raise ParameterError(f'--runs is {given.runs}', 'give at least 1')
     console.require_matplotlib()
     console.require_scikit_fem()
-    from flexmanip_ros.paper import report, summary
+    from flexmanip_ros.paper import report
 
     folder = Path(given.output)
     try:
@@ -95,7 +95,7 @@ def _main(given: argparse.Namespace) -> int:
             drawn[outcome.task[0]] = outcome.result or b''
             progress(len(drawn), len(planned))
     wall = time.perf_counter() - started
-    lines = summary.summary(rows, bounds)
+    lines = report.summary(rows, bounds)
     write_rows(folder / ROWS, rows)
     write_rows(folder / SUMMARY, lines)
     report.report(folder / PAGE, report.Study(rows, bounds, [(one, drawn[k]) for k, one in planned], given.runs, wall))

@@ -1,21 +1,189 @@
-"""The regulator over time: it follows configuration and trusted payload, without a bump in the torque.
+"""The regulator: its design at a configuration with a payload, its path to a setpoint, and its work over time.
 
-``step`` takes a sample and gives the torques, ``estimate`` takes a payload estimate, ``goto`` a new setpoint.
+``step`` takes a sample and gives the torques, ``estimate`` takes a payload estimate, ``goto`` a new setpoint. The gains
+follow configuration and trusted payload, without a bump in the torque.
+
+x = [theta, eta, theta', eta'] (2n,), n = L (1 + kappa): chord angles theta [rad] and modal coordinates eta [m] of the
+arm's shape functions (with one mode alone the second and third of a real link are driven unstable). A link at rest
+under no torque is straight, so the regulator needs no integrator: the plane has no gravity.
+
+The path is a polynomial of fifth degree (minimum jerk: Flash and Hogan, J. Neuroscience 5, 1985) whose duration follows
+from what the arm must bear on it, hence from the payload: a heavier arm is moved more slowly.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve, solve_discrete_are
 
-from flexmanip_ros.control import path
-from flexmanip_ros.control.feedback import Design, design, observation, reference
+from flexmanip_ros.arm.linearization import blocks, discretize, first_order
+from flexmanip_ros.arm.manipulator import manipulator
 from flexmanip_ros.control.handover import PayloadEstimate, Verdict, judge
-from flexmanip_ros.control.path import Path
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ControllerParameters
 from flexmanip_ros.types import Array
+
+RATE_SCALE = 8.0
+"""A rate [1/s] costs as much as the deviation that is RATE_SCALE times smaller."""
+FLOOR = 1e-6
+"""Process noise on every state, so that the filter never stops to listen."""
+
+
+def observation(config: ControllerParameters) -> Array:
+    """Return T (2 L, n): [encoder angles, bends] = T [theta, eta], and the same for their rates."""
+    arm = config.arm
+    output = manipulator(replace(arm, base_mass=0.0) if arm.base_mass else arm).output
+    return np.asarray(np.append(np.ones(len(arm.bend_gain)), arm.bend_gain)[:, None] * output)
+
+
+def reference(config: ControllerParameters, angles: Array) -> Array:
+    """Return the chord angles (L,) of a straight arm whose encoders read ``angles`` (L,)."""
+    return np.cumsum(angles) if config.arm.angle_convention == 'encoder' else np.array(angles, dtype=np.float64)
+
+
+def model(config: ControllerParameters, between: float, payload: float) -> tuple[Array, Array]:
+    """Return (A (2n, 2n), B (2n, L)) of one sample at theta2 - theta1 = ``between`` [rad], payload [kg]."""
+    b = blocks(config.arm, turned(config, between), payload)
+    links = len(b.Ma)
+    n = links + len(b.Mc)
+    M = np.block([[b.Ma, b.Mb], [b.Mb.T, b.Mc]])
+    B = np.vstack([b.B_theta, b.B_eta])
+    K, D = np.zeros((n, n)), (B * np.array(config.arm.joint_viscous_friction)) @ B.T
+    K[links:, links:] = b.Kc
+    D[links:, links:] += b.Dc
+    return discretize(*first_order(M, K, D, B * np.array(config.arm.torque_gain)), 1.0 / config.rate)
+
+
+def turned(config: ControllerParameters, between: float) -> Array:
+    """Return chord angles (L,) [rad] with that angle between the links: the blocks depend on it alone."""
+    return np.array([0.0, between])[:len(config.arm.link_length)]
+
+
+def feedforward(config: ControllerParameters, between: float, payload: float) -> tuple[Array, Array]:
+    """Return (F (L, L), E (L kappa, L)): torques and modal coordinates per acceleration of the chords.
+
+    The quasi-static solution of M q'' + K q = B u with eta'' = 0.
+    """
+    b = blocks(config.arm, turned(config, between), payload)
+    F = solve(b.B_theta, b.Ma)
+    E = solve(b.Kc, b.B_eta @ F - b.Mb.T, assume_a='pos')
+    return F / np.array(config.arm.torque_gain)[:, None], E
+
+
+class Design(NamedTuple):
+    """Everything made for one configuration and payload.
+
+    A (2n, 2n), B (2n, L): one sample; G (L, 2n): torque = -G (x - x_ref); L (2n, 4 L): weight of the innovation
+    of [positions, rates]; the stationary linear quadratic regulator and Kalman filter. F (L, L): torque that
+    accelerates the chords (L,) without vibration, E (L kappa, L): modal coordinates that go with it.
+    """
+
+    A: Array
+    B: Array
+    G: Array
+    L: Array
+    F: Array
+    E: Array
+
+
+def design(config: ControllerParameters, between: float, payload: float) -> Design:
+    """Return the regulator and the filter. Raises ModelError when there is no stabilizing one."""
+    A, B = model(config, between, payload)
+    T = observation(config)
+    C = np.kron(np.eye(2), T)
+    links = len(T) // 2
+    scale = np.array([config.angle_scale] * links + [config.bend_scale] * (T.shape[1] - links))
+    Q = np.diag(np.concatenate([1.0 / scale, 1.0 / (RATE_SCALE * scale)]) ** 2)
+    R = np.diag(1.0 / np.asarray(config.effort_scale) ** 2)
+    W = B @ np.diag(np.asarray(config.disturbance_std) ** 2) @ B.T
+    V = np.diag(np.asarray(config.noise_std) ** 2)
+    try:
+        P = solve_discrete_are(A, B, Q, R)
+        G: Array = solve(R + B.T @ P @ B, B.T @ P @ A, assume_a='pos')
+        S = solve_discrete_are(A.T, C.T, W + FLOOR * np.trace(W) * np.eye(len(A)), V)
+        L: Array = solve(C @ S @ C.T + V, C @ S, assume_a='pos').T
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ModelError(
+            f'there is no regulator at {between:.3f} rad with {payload:.3f} kg',
+            'change angle_scale, bend_scale or effort_scale') from error
+    return Design(A, B, G, L, *feedforward(config, between, payload))
+
+
+PEAK_RATE, PEAK_ACCELERATION = 15.0 / 8.0, 10.0 / math.sqrt(3.0)
+"""Of a move by 1 in 1 s from rest to rest."""
+BRAKING = 4.0
+"""Peak acceleration of coming to rest within 1 s from a rate of 1, where one is."""
+SHORTEST = 1e-3
+"""Duration of the shortest move [s]."""
+
+
+class Path(NamedTuple):
+    """Coefficients (6, L) of the time since the start over the duration [s], and how old it is [s]."""
+
+    coefficients: Array
+    duration: float
+    age: float = 0.0
+
+    @property
+    def goal(self) -> Array:
+        """Where it ends, (L,)."""
+        end: Array = self.coefficients.sum(axis=0)
+        return end
+
+    def after(self, seconds: float) -> Path:
+        """Return the path some time later."""
+        return self._replace(age=min(self.age + seconds, self.duration))
+
+    @property
+    def ended(self) -> bool:
+        """Whether the goal is reached."""
+        return self.age >= self.duration
+
+    def now(self) -> Array:
+        """Return position, rate, acceleration and jerk (4, L) now."""
+        s = self.age / self.duration
+        powers = np.array([s**k for k in range(6)])
+        rows, c, scale = np.zeros((4, self.coefficients.shape[1])), self.coefficients, 1.0
+        for row in range(4):
+            rows[row] = (powers[:len(c)] @ c) * scale
+            c = c[1:] * np.arange(1, len(c))[:, None]
+            scale /= self.duration
+        if self.ended:
+            rows[1:] = 0.0
+        return rows
+
+
+def rest(position: Array) -> Path:
+    """Stay."""
+    coefficients = np.zeros((6, len(position)))
+    coefficients[0] = position
+    return Path(coefficients, SHORTEST, SHORTEST)
+
+
+def plan(before: Path, goal: Array, duration: float) -> Path:
+    """Leave a path where it is now, with the rate and acceleration it has, to be at rest at the goal (L,)."""
+    position, rate, acceleration, _ = before.now()
+    a0, a1, a2 = position, rate * duration, acceleration * duration**2 / 2.0
+    d = np.asarray(goal) - a0 - a1 - a2
+    v, a = -a1 - 2.0 * a2, -2.0 * a2
+    return Path(np.stack([a0, a1, a2, 10.0 * d - 4.0 * v + a / 2.0, -15.0 * d + 7.0 * v - a,
+                          6.0 * d - 3.0 * v + a / 2.0]), duration)
+
+
+def duration(distance: Array, rate: Array, fastest: float, loads: Array, limits: Array) -> float:
+    """Return the duration [s] of a move by ``distance`` (L,) that begins with ``rate`` (L,).
+
+    fastest: the largest rate; loads (r, L): what each acceleration costs (torques, bends); limits (r,): what
+    they may. From rest it is the shortest that keeps to all of them.
+    """
+    by_rate = PEAK_RATE * float(np.abs(distance).max()) / fastest
+    by_load = PEAK_ACCELERATION * float((np.abs(loads @ distance) / limits).max())
+    braking = BRAKING * float((np.abs(loads @ rate) / limits).max())
+    return max(by_rate, math.sqrt(by_load), braking, SHORTEST)
 
 
 class Measured(NamedTuple):
@@ -120,7 +288,7 @@ def _filtered(config: ControllerParameters, state: ControllerState, measured: Me
 
 def _onward(config: ControllerParameters, state: ControllerState, present: Array) -> Path:
     """Stay at the first angles, go towards the setpoint when there is another one."""
-    way = path.rest(present) if state.way is None else state.way.after(1.0 / config.rate)
+    way = rest(present) if state.way is None else state.way.after(1.0 / config.rate)
     if state.setpoint is None or state.setpoint is state.goal:
         return way
     position, rate, *_ = way.now()
@@ -128,10 +296,10 @@ def _onward(config: ControllerParameters, state: ControllerState, present: Array
     links = len(position)
     bends = state.C[links:2 * links, links:len(design.A) // 2] @ design.E
     limits = np.concatenate([config.move_effort * np.asarray(config.effort_limit), [config.move_bend] * links])
-    seconds = path.duration(
+    seconds = duration(
         reference(config, state.setpoint - position), reference(config, rate), config.setpoint_rate,
         np.vstack([design.F, bends]), limits)
-    return path.plan(way, state.setpoint, seconds)
+    return plan(way, state.setpoint, seconds)
 
 
 def _wanted(config: ControllerParameters, state: ControllerState, way: Path) -> tuple[Array, Array]:

@@ -100,13 +100,12 @@ def from_fit(
     along = Tangent(dA, dB, dC, dD, dK)
     along = Tangent(*_in_units(*along, su, sy))
     model = StateSpace(*_in_units(theta.A, theta.B, theta.C, theta.D, recursion.gain, su, sy), dt=dt)
-    model, moved_along, known = based(model, along, config.stable_model)
+    model, moved_along = based(model, along, config.stable_model)
     assert moved_along is not None
     return Identified(
         model=model, spread=moved_along.flat(), singular_values=recursion.singular_values,
         excitation=excited, condition=recursion.condition, innovation_power=float(scalars[POWER]),
-        status=Status.TRACKING, innovation_covariance=recursion.covariance / np.outer(sy, sy),
-        refined=True, known_basis=known, samples=recursion.weight)
+        status=Status.TRACKING, refined=True, samples=recursion.weight)
 
 
 def publish(
@@ -133,7 +132,7 @@ def publish(
     if parameters * entries <= LARGEST_SPREAD:
         along = uncertainty.tangent(R, realized, r, innovation * np.sqrt(scalars[WEIGHT2] / scalars[WEIGHT]))
         along = Tangent(*_in_units(*along, su, sy))
-    model, along, known = based(model, along, config.stable_model)
+    model, along = based(model, along, config.stable_model)
     spread = along.flat() if along is not None else np.zeros((entries, 0))
     ratio = float(effective * np.log1p(realized.neglected).sum())
     too_low = ratio > SIGNIFICANT and float(realized.neglected.max()) > NEGLECTED
@@ -147,9 +146,7 @@ def publish(
     return Identified(
         model=model, spread=spread, singular_values=realized.singular_values,
         excitation=excitation(realized.regression), condition=condition, innovation_power=power,
-        status=judge(used, d, condition, unexplained, too_low),
-        innovation_covariance=covariance / np.outer(sy, sy),
-        known_basis=known, samples=float(effective))
+        status=judge(used, d, condition, unexplained, too_low), samples=float(effective))
 
 
 def _in_units(
@@ -159,9 +156,7 @@ def _in_units(
     return A, B * su, C / sy[:, None], D * su / sy[:, None], K * sy
 
 
-def based(
-    model: StateSpace, along: Tangent | None, stable: bool = False,
-) -> tuple[StateSpace, Tangent | None, bool]:
+def based(model: StateSpace, along: Tangent | None, stable: bool = False) -> tuple[StateSpace, Tangent | None]:
     """Bring model and tangent to the published basis: y = C x with the known C, else balanced.
 
     stable: poles outside the unit circle are drawn back onto it.
@@ -176,7 +171,7 @@ def based(
     if along is not None:
         dW = uncertainty.known_basis_tangent(model, along) if known else None
         along = uncertainty.move(model, along, W, dW)
-    return moved, along, known
+    return moved, along
 
 
 def judge(used: int, parameters: int, condition: float, unexplained: float, too_low: bool) -> Status:

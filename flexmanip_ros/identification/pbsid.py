@@ -14,7 +14,7 @@ from flexmanip_ros.types import Array, StateSpace
 
 
 def pbsid(
-    U: Array, Y: Array, *, n: int, p: int, f: int, dt: float, feedthrough: bool = False,
+    U: Array, Y: Array, *, n: int, p: int, f: int, dt: float,
     weighted: bool = True, fixed: bool = False, forgetting: float = 1.0, regularization: float = 0.0,
 ) -> tuple[StateSpace, Array]:
     """Identify from inputs U (N, r) and outputs Y (N, m) of one record without gaps.
@@ -32,11 +32,10 @@ def pbsid(
         raise ModelError(f'{U.shape[0]} samples are too few for a past window of {p}', 'give a longer record')
     root = np.sqrt(forgetting) ** np.arange(count - 1, -1, -1.0)[:, None]
     u, y = U[p:], Y[p:]
-    regressor = np.hstack([z, u]) if feedthrough else z
-    d = regressor.shape[1]
-    stacked = np.vstack([root * regressor, np.sqrt(regularization) * np.eye(d)])
+    d = z.shape[1]
+    stacked = np.vstack([root * z, np.sqrt(regularization) * np.eye(d)])
     target = np.vstack([root * y, np.zeros((d, m))])
-    Xi = np.linalg.lstsq(stacked, target, rcond=1e-12)[0].T[:, :z.shape[1]]
+    Xi = np.linalg.lstsq(stacked, target, rcond=1e-12)[0].T
     G = observability_controllability(Xi, f, r, weighted)
     left, values, _ = np.linalg.svd(G @ (root * z).T, full_matrices=False)
     if values.size < n or values[n - 1] <= 1e-14 * values[0]:
@@ -45,10 +44,8 @@ def pbsid(
     S = np.eye(n, f * m) if fixed else (left[:, :n] / np.sqrt(values[:n])).T
     following = windows @ (S @ G).T
     x = following[:-1]
-    output = np.hstack([x, u]) if feedthrough else x
-    CD = np.linalg.lstsq(root * output, root * y, rcond=None)[0].T
-    e = y - output @ CD.T
+    C = np.linalg.lstsq(root * x, root * y, rcond=None)[0].T
+    e = y - x @ C.T
     known = np.hstack([x, u, e])
     ABK = np.linalg.lstsq(root * known, root * following[1:], rcond=None)[0].T
-    D = CD[:, n:] if feedthrough else np.zeros((m, r))
-    return StateSpace(ABK[:, :n], ABK[:, n:n + r], CD[:, :n], D, ABK[:, n + r:], dt), values
+    return StateSpace(ABK[:, :n], ABK[:, n:n + r], C, np.zeros((m, r)), ABK[:, n + r:], dt), values

@@ -118,17 +118,16 @@ def known_output_basis(model: StateSpace) -> Array | None:
     return W
 
 
-def balancing(model: StateSpace, horizon: int = 0) -> Array:
-    """W (n, n) with equal, diagonal observability and controllability over ``horizon`` steps.
+def balancing(model: StateSpace) -> Array:
+    """W (n, n) with equal, diagonal observability and controllability over 10 n steps.
 
-    A finite horizon (10 n by default) also serves marginal and unstable models. Signs are fixed by the
+    A finite horizon also serves marginal and unstable models. Signs are fixed by the
     first non-zero output of each state, so the basis moves smoothly with the model.
     """
     n = model.order
-    horizon = horizon or 10 * n
     inputs = np.hstack([model.B, model.K]) if np.linalg.norm(model.B) > 0 else model.K
     reach, seen = [inputs], [model.C]
-    for _ in range(horizon - 1):
+    for _ in range(10 * n - 1):
         reach.append(model.A @ reach[-1])
         seen.append(seen[-1] @ model.A)
     Lc = triangle(np.hstack(reach).T).T

@@ -25,7 +25,7 @@ class Identified(NamedTuple):
     """A model and what it is worth."""
 
     model: StateSpace
-    """In JointState units, in the published basis."""
+    """In JointState units. Its state is y, or [y; dy/dt]; else balanced, and the spread holds that basis still."""
     spread: Array
     """(k, s): the covariance of [A, B, C, D, K], each row-major, one after another, is spread @ spread.T;
     (k, 0) where none is known."""
@@ -34,12 +34,8 @@ class Identified(NamedTuple):
     condition: float
     innovation_power: float
     status: Status
-    innovation_covariance: Array
-    """(m, m) covariance of the innovations, in JointState units."""
     refined: bool = False
     """A prediction-error fit, not the subspace model it began with."""
-    known_basis: bool = False
-    """The state is y, or [y; dy/dt]; otherwise it is balanced and the spread holds that basis still."""
     samples: float = 0.0
     """Effective number of samples behind the model."""
     configurations: AnyConfiguration | None = None

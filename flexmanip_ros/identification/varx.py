@@ -55,18 +55,6 @@ def open_loop(Xi: Array, f: int, r: int, L: Array) -> None:
                         L[i * m + o, q] += a * L[j * m + k, q]
 
 
-def shifted(Xi: Array, block: int, width: int) -> Array:
-    """Xi acting on the window that starts ``block`` samples later, zero where the past is not known yet.
-
-    Xi: (m, p width) -> (m, p width); eqs. (33)-(34), one block row.
-    """
-    if block == 0:
-        return Xi
-    moved = np.zeros_like(Xi)
-    moved[:, block * width:] = Xi[:, :-block * width]
-    return moved
-
-
 def observability_controllability(Xi: Array, f: int, r: int, weighted: bool) -> Array:
     """(f m, p (r + m)): predictions of the next f outputs for inputs (and innovations) at rest.
 

@@ -56,8 +56,7 @@ class Configurations(NamedTuple):
         found = Identified(
             model=model, spread=along.flat(), singular_values=self.singular_values, excitation=self.excitation,
             condition=self.condition, innovation_power=self.innovation_power, status=Status.TRACKING,
-            innovation_covariance=_innovations(self, role), refined=True, known_basis=True,
-            samples=float(v.blocks * BLOCK), configurations=self)
+            refined=True, samples=float(v.blocks * BLOCK), configurations=self)
         return found._replace(status=judge(found, v))
 
 
@@ -80,15 +79,6 @@ def unmodelled(v: Varying) -> float:
     by shift T e / sqrt(3) (root of the mean square).
     """
     return math.sqrt(3.0) * float(v.share.mean()) / (v.shift * BLOCK * v.dt)
-
-
-def _innovations(read: Configurations, role: Roles) -> Array:
-    """(m, m) covariance of the residuals of displacements behind the filter; zero for rates."""
-    v = read.varying
-    covariance = np.zeros((len(role.states), len(role.states)))
-    places = [role.states.index(k) for k in range(len(v.scale_y))]
-    covariance[np.ix_(places, places)] = v.noise / np.outer(v.scale_y, v.scale_y)
-    return covariance
 
 
 def _matrices(read: Configurations, c: float, role: Roles) -> tuple[StateSpace, Tangent]:

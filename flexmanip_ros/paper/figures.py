@@ -15,7 +15,7 @@ from scipy.integrate import cumulative_trapezoid
 from flexmanip_ros.arm import linearization
 from flexmanip_ros.identification import validation
 from flexmanip_ros.io import plots
-from flexmanip_ros.io.html import plain
+from flexmanip_ros.io.report import plain
 from flexmanip_ros.paper import experiments
 from flexmanip_ros.paper.case_run import Track
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, configure

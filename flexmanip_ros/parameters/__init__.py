@@ -1,9 +1,9 @@
 """Every parameter of the package: the only place of defaults, units, ranges and words."""
 
 from flexmanip_ros.parameters.arm import ArmParameters
-from flexmanip_ros.parameters.control import AdapterParameters, ControllerParameters
 from flexmanip_ros.parameters.field import Leaf, check, configure, flatten, leaves
 from flexmanip_ros.parameters.identifier import IdentifierParameters, PayloadParameters
+from flexmanip_ros.parameters.nodes import AdapterParameters, ControllerParameters, TriggerParameters
 from flexmanip_ros.parameters.simulation import (
     ActuatorParameters,
     DemoParameters,
@@ -11,7 +11,6 @@ from flexmanip_ros.parameters.simulation import (
     PlantParameters,
     SensorParameters,
 )
-from flexmanip_ros.parameters.trigger import TriggerParameters
 from flexmanip_ros.parameters.view import ViewParameters
 
 __all__ = [

@@ -9,11 +9,10 @@ from typing import Any
 
 import yaml
 
-from flexmanip_ros.parameters.control import AdapterParameters, ControllerParameters
 from flexmanip_ros.parameters.field import LINKS, Leaf, leaves
 from flexmanip_ros.parameters.identifier import IdentifierParameters
+from flexmanip_ros.parameters.nodes import AdapterParameters, ControllerParameters, TriggerParameters
 from flexmanip_ros.parameters.simulation import ExcitationParameters, PlantParameters
-from flexmanip_ros.parameters.trigger import TriggerParameters
 from flexmanip_ros.parameters.view import ViewParameters
 
 NODES: Mapping[str, type] = {

@@ -7,6 +7,7 @@ import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from flexmanip_ros.errors import ParameterError
@@ -61,15 +62,20 @@ def parameter(default: Any, words: str, *, unit: str = '', low: float | None = N
         'per_link': per_link})
 
 
-def leaves(cls: type, prefix: str = '') -> tuple[Leaf, ...]:
+def leaves(cls: type) -> tuple[Leaf, ...]:
     """List every parameter of a configuration class, nested groups flattened with dots."""
+    return _leaves(cls, '')
+
+
+@cache  # finding out the types takes 3 ms, as often as a configuration is made or changed
+def _leaves(cls: type, prefix: str) -> tuple[Leaf, ...]:
     hints = get_type_hints(cls)
     found: list[Leaf] = []
     for item in dataclasses.fields(cls):
         hint = hints[item.name]
         if dataclasses.is_dataclass(hint):
             assert isinstance(hint, type)
-            found.extend(leaves(hint, f'{prefix}{item.name}.'))
+            found.extend(_leaves(hint, f'{prefix}{item.name}.'))
             continue
         is_array = get_origin(hint) is tuple
         kind = get_args(hint)[0] if is_array else hint

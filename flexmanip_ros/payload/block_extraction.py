@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexmanip_ros.arm.linearization import Blocks, blocks, vibration_model
-from flexmanip_ros.arm.manipulator import manipulator
-from flexmanip_ros.arm.shape_functions import count
+from flexmanip_ros.arm.manipulator import count, manipulator
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.factor import POWER_RATE
 from flexmanip_ros.identification.realization import to_continuous
@@ -20,7 +19,7 @@ from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload.structured_model import Quantity, chords, signals
 from flexmanip_ros.samples.sample_log import Rows
-from flexmanip_ros.types import Array, Payload, Status
+from flexmanip_ros.types import QUANTILE, Array, Payload, Status
 
 STEPS = 3
 """Of the search for the payload that would be read as the one that was."""
@@ -103,8 +102,6 @@ DRAWS = 256
 """Models drawn for the interval."""
 STEP = 1e-4
 """Step of the derivatives, in standard deviations."""
-QUANTILE = 1.959963984540054
-"""Of the normal distribution, for 95 %."""
 CHANCE = 2.0
 """Standard deviations of the power of the innovations, a mean over few samples, that are left to chance."""
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
@@ -76,7 +75,7 @@ def advance(
             state = _start(config, state, one)
             rows = rows.since(one.until)
         elif rows.gap[0]:
-            state = _resume(config, state, one)
+            state = _resume(state, one)
             rows = rows.since(one.until)
         else:
             state, event = _watch(config, state, rows.stretches()[0])
@@ -102,6 +101,8 @@ def threshold(config: TriggerParameters, dt: float) -> float:
     """
     looks = 3600.0 / dt / INDEPENDENT
     chance = min(0.5, config.false_alarms_per_hour / looks)
+    from scipy.special import chdtri  # late: it is a tenth of what the programs import
+
     return float(chdtri(kernel.CAUSES, chance))
 
 
@@ -167,7 +168,7 @@ def _after(state: DetectionState, event: CaptureEvent) -> DetectionState:
     return replace(state, filter=filtered, glr=_quiet(state.glr))
 
 
-def _resume(config: TriggerParameters, state: DetectionState, row: Rows) -> DetectionState:
+def _resume(state: DetectionState, row: Rows) -> DetectionState:
     """After a gap: restart the motion of the filter, and the test."""
     assert state.glr is not None
     filtered = structured.advance(state.identifier, state.filter, row)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from flexmanip_ros.arm.capture import tip_jacobian
-from flexmanip_ros.arm.dynamics import mass_matrix
+from flexmanip_ros.arm.linearization import mass_matrix
 from flexmanip_ros.arm.manipulator import Manipulator, manipulator, modal, workspace
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
@@ -139,7 +139,7 @@ class Model(NamedTuple):
     @property
     def body(self) -> int:
         """How many states describe the payload: 1 a point, 4 a body."""
-        return int(np.sum(self.motion.kind <= Kind.INERTIA))
+        return int(np.count_nonzero(self.motion.kind <= int(Kind.INERTIA)))
 
 
 def build(config: IdentifierParameters) -> Model | None:

@@ -137,7 +137,8 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         Return False, with the reason logged, when the node could not.
         """
         if not self.autostarts:
-            self.get_logger().info(f'waits for: ros2 lifecycle set {self.get_fully_qualified_name()} configure')
+            self.get_logger().info('not started, as autostart is false; to start it: '
+                                   f'ros2 lifecycle set {self.get_fully_qualified_name()} configure')
             return True
         return all(transition() == TransitionCallbackReturn.SUCCESS
                    for transition in (self.trigger_configure, self.trigger_activate))

@@ -52,7 +52,7 @@ def interrupt_on_signals() -> None:
         signal.signal(number, signal.default_int_handler)
 
 
-def spin(executor: Executor, context: Context | None = None, until: Callable[[], bool] = lambda: False) -> None:
+def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
     """Run callbacks until the context ends or a condition holds. SIGINT and SIGTERM raise KeyboardInterrupt.
 
     The events executor of rclpy 7.1 runs no callback in ``spin()`` without a time-out. It reports a KeyboardInterrupt
@@ -62,7 +62,7 @@ def spin(executor: Executor, context: Context | None = None, until: Callable[[],
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, frame: caught.append(number))
     try:
-        while not caught and rclpy.ok(context=context) and not until():
+        while not caught and rclpy.ok() and not until():
             executor.spin_once(timeout_sec=POLL_S)
     except ExternalShutdownException:
         return
@@ -73,7 +73,7 @@ def spin(executor: Executor, context: Context | None = None, until: Callable[[],
 
 
 @contextmanager
-def shutdown(context: Context | None = None) -> Iterator[None]:
+def shutdown() -> Iterator[None]:
     """End what rclpy and Fast DDS hold; the body stops and forgets executor and nodes.
 
     Signals are ignored: ``ros2 launch`` and the terminal both send SIGINT, and the second would interrupt the end.
@@ -88,7 +88,7 @@ def shutdown(context: Context | None = None) -> Iterator[None]:
     try:
         yield
     finally:
-        rclpy.try_shutdown(context=context)
+        rclpy.try_shutdown()
         gc.collect()
         faulthandler.cancel_dump_traceback_later()
         _ignore_signals()  # the executor that went gave the signals their default actions back

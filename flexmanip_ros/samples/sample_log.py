@@ -252,11 +252,11 @@ class Signals:
 
 
 def log_of(u: Array, y: Array, angles: Array | None = None, stamp_ns: NDArray[np.int64] | None = None,
-           gap: NDArray[np.bool_] | None = None, missing: NDArray[np.int64] | None = None) -> SampleLog:
-    """Return a log of whole arrays: u (N, r), y (N, m), angles (N, a), stamp_ns (N,), gap (N,), missing (N,)."""
+           gap: NDArray[np.bool_] | None = None) -> SampleLog:
+    """Return a log of whole arrays: u (N, r), y (N, m), angles (N, a), stamp_ns (N,), gap (N,)."""
     u, y = np.atleast_2d(u), np.atleast_2d(y)
     count = len(y)
     angles = np.zeros((count, 0)) if angles is None else angles
     log = SampleLog(Width(u.shape[1], y.shape[1], angles.shape[1]))
     return log.append(np.zeros(count, dtype=np.int64) if stamp_ns is None else stamp_ns, u, y, angles,
-                      np.zeros(count, dtype=np.bool_) if gap is None else gap, missing=missing)
+                      np.zeros(count, dtype=np.bool_) if gap is None else gap)

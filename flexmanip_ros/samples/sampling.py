@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import SampleLog, Signals, Width
@@ -301,10 +300,8 @@ def _learned(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Samp
 def _next(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sample
           ) -> tuple[Clock, SampleLog, bool]:
     """Advance the clock by one sample; return clock, log and whether a gap precedes ``raw``."""
-    gap = False
-    if clock.last_ns is None:
-        clock = clock._replace(last_ns=raw.stamp_ns)
-    else:
+    gap = unknown = False
+    if clock.last_ns is not None:
         interval = raw.stamp_ns - clock.last_ns
         total, count = clock.interval_sum_ns, clock.interval_count
         # compared in whole nanoseconds times count: the same stamps give the same verdict on any machine
@@ -313,16 +310,14 @@ def _next(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sampl
         if gap:
             absent = _absent(config, clock, raw)
             log = _filled(log, clock, raw, absent, config.arm.effort_delay) if absent else log.without_waiting()
-            clock = clock._replace(irregular=clock.irregular + 1, last_ns=raw.stamp_ns,
-                                   counters=clock.counters.plus('gaps'))
             unknown = not absent or _is_torque_unknown(clock, raw, absent)
-            clock = clock._replace(latest=raw, peak=_peak(clock, np.abs(raw.u)))
-            return clock, _append(log, raw, unknown, config.arm.effort_delay), gap
+            clock = clock._replace(irregular=clock.irregular + 1, counters=clock.counters.plus('gaps'))
         else:
-            clock = clock._replace(irregular=0, interval_sum_ns=total + interval, interval_count=count + 1,
-                                   last_ns=raw.stamp_ns)
-    clock = clock._replace(latest=raw, peak=_peak(clock, np.abs(raw.u)))
-    return clock, _append(log, raw, gap, config.arm.effort_delay), gap
+            clock = clock._replace(irregular=0, interval_sum_ns=total + interval, interval_count=count + 1)
+    clock = clock._replace(last_ns=raw.stamp_ns, latest=raw, peak=_peak(clock, np.abs(raw.u)))
+    log = log.append(np.array([raw.stamp_ns]), raw.u[None], raw.y[None], raw.angles[None], np.array([unknown]),
+                     config.arm.effort_delay)
+    return clock, log, gap
 
 
 def _peak(clock: Clock, size: Array) -> Array:
@@ -357,9 +352,3 @@ def _filled(log: SampleLog, clock: Clock, raw: Sample, absent: int, delay: int) 
     u, y, angles = (np.asarray(a + share * (b - a)) for a, b in (
         (before.u, raw.u), (before.y, raw.y), (before.angles, raw.angles)))
     return log.append(stamps, u, y, angles, np.zeros(absent, dtype=np.bool_), delay, number)
-
-
-def _append(log: SampleLog, raw: Sample, gap: bool, delay: int) -> SampleLog:
-    stamp: NDArray[np.int64] = np.array([raw.stamp_ns])
-    u: Array = raw.u[None]
-    return log.append(stamp, u, raw.y[None], raw.angles[None], np.array([gap]), delay)

@@ -1,15 +1,23 @@
-"""Linear plants at a working point, stepped exactly: assumed modes, and whatever gives M, D, K, B, C."""
+"""Linear plants at a working point, stepped exactly: assumed modes, and two chains of Euler-Bernoulli elements.
+
+The elements (paper section 4.3) are independent of the assumed modes: cubic Hermite elements, each link's transverse
+displacement y_i(x) from the posture of rest includes its rigid motion. Joint 2 carries link 2 along, axially as well.
+The chains are kept at the working point's geometry.
+"""
 
 from __future__ import annotations
 
-import numpy as np
-from scipy.linalg import cho_factor, cho_solve, null_space
+from typing import NamedTuple
 
-from flexmanip_ros.arm import dynamics
+import numpy as np
+from scipy.linalg import eigh, null_space
+
+from flexmanip_ros.arm import linearization
 from flexmanip_ros.arm.capture import body_jacobian, tip_angle, tip_jacobian
 from flexmanip_ros.arm.linearization import discretize
 from flexmanip_ros.arm.manipulator import manipulator
-from flexmanip_ros.parameters import PlantParameters
+from flexmanip_ros.errors import ModelError
+from flexmanip_ros.parameters import ArmParameters, PlantParameters
 from flexmanip_ros.simulation.integration import run_linear, scratch
 from flexmanip_ros.types import Array
 
@@ -57,11 +65,7 @@ class LinearModel:
 
     def continuous(self, payload: Array) -> tuple[Array, Array]:
         """Continuous (Ac (2n, 2n), Bc (2n, L)) of x = [dq; dq']."""
-        n = self.M0.shape[0]
-        rows = cho_solve(cho_factor(self.mass_matrix(self.rest(), payload)),
-                         np.hstack([-self.K, -self.D, self.B]))
-        Ac = np.block([[np.zeros((n, n)), np.eye(n)], [rows[:, :2 * n]]])
-        return Ac, np.vstack([np.zeros_like(self.B), rows[:, 2 * n:]])
+        return linearization.first_order(self.mass_matrix(self.rest(), payload), self.K, self.D, self.B)
 
     def mass_matrix(self, x: Array, payload: Array) -> Array:
         """See Model; constant."""
@@ -87,7 +91,138 @@ def linear_model(config: PlantParameters) -> LinearModel:
     q = np.zeros(arm.stiffness.size)
     q[:len(config.initial_angles)] = config.initial_angles
     return LinearModel(
-        M0=dynamics.mass_matrix(arm, np.zeros(4), q),
+        M0=linearization.mass_matrix(arm, np.zeros(4), q),
         D=np.diag(arm.damping) + (arm.torque * arm.viscous) @ arm.torque.T,
         K=np.diag(arm.stiffness), B=arm.torque, C=arm.output, rest_output=arm.output @ q, dt=1.0 / config.rate,
         tip=tip_jacobian(arm, np.zeros(4), q), turn=tip_angle(arm, q), locked=config.locked)
+
+
+class Beam(NamedTuple):
+    """Free-free matrices of one link; coordinates [y, y'] node by node, (2 elements + 2) of them."""
+
+    length: float
+    M: Array
+    K: Array
+
+    def at(self, x: float) -> Array:
+        """Row that gives the deflection y(x)."""
+        elements = self.M.shape[0] // 2 - 1
+        h = self.length / elements
+        e = min(int(x / h), elements - 1)
+        t = x / h - e
+        row = np.zeros(self.M.shape[0])
+        row[2 * e:2 * e + 4] = [1 - 3 * t**2 + 2 * t**3, h * (t - 2 * t**2 + t**3),
+                                3 * t**2 - 2 * t**3, h * (t**3 - t**2)]
+        return row
+
+
+def beam(length: float, density: float, stiffness: float, elements: int) -> Beam:
+    """Assemble a link of ``length`` [m], ``density`` [kg/m] and ``stiffness`` EI [N m^2] with scikit-fem."""
+    try:
+        from skfem import Basis, BilinearForm, ElementLineHermite, MeshLine
+        from skfem.helpers import dd
+    except ImportError as error:
+        raise ModelError(
+            'the finite element plant needs scikit-fem, which is not installed',
+            'run: pip install scikit-fem, or use another model') from error
+    basis = Basis(MeshLine(np.linspace(0.0, length, elements + 1)), ElementLineHermite(), intorder=6)
+    M = BilinearForm(lambda u, v, _: density * u * v).assemble(basis).toarray()
+    K = BilinearForm(lambda u, v, _: stiffness * dd(u)[0, 0] * dd(v)[0, 0]).assemble(basis).toarray()
+    order = basis.nodal_dofs[:, np.argsort(basis.mesh.p[0])].T.ravel()
+    return Beam(length, M[np.ix_(order, order)], K[np.ix_(order, order)])
+
+
+def bending_damping(arm: ArmParameters, element_beam: Beam) -> Array:
+    """Damping matrix of a link in the coordinates of its beam, none of its rigid motion."""
+    size = element_beam.M.shape[0]
+    chord = np.tile([0.0, 1.0], size // 2)  # slope of the chord at every node, then its height
+    chord_rows = np.zeros((size, size))
+    ends = np.zeros(size)
+    ends[0], ends[-2] = -1 / element_beam.length, 1 / element_beam.length
+    x = np.linspace(0, element_beam.length, size // 2)
+    chord_rows += np.outer(chord, ends)
+    chord_rows[::2] += np.outer(x, ends)
+    chord_rows[::2, 0] += 1.0
+    bending = np.eye(size) - chord_rows
+    inner = np.r_[1:size - 2, size - 1]  # pinned: both ends without deflection
+    M, K = (matrix[np.ix_(inner, inner)] for matrix in (element_beam.M, element_beam.K))
+    squares, shapes = eigh(K, M)
+    omega = np.sqrt(squares)
+    rate = omega**2 / omega[0] if arm.damping_model == 'stiffness' else omega
+    loaded = M @ shapes
+    pinned = loaded @ np.diag(2 * arm.damping_ratio * rate) @ loaded.T
+    damping: Array = bending[inner].T @ pinned @ bending[inner]
+    return damping
+
+
+class Chain(NamedTuple):
+    """The two-link arm in free coordinates z: M z'' + D z' + K z = B tau; rows give motions from z."""
+
+    M: Array
+    D: Array
+    K: Array
+    B: Array
+    C: Array
+    """(4, n) joint angles by the arm's convention and bends."""
+    tip: Array
+    """(3, n) displacement of the tip along e2 and n2 [m], its angle [rad]."""
+
+
+def chain(arm: ArmParameters, theta: tuple[float, ...], elements: int) -> Chain:
+    """Assemble the arm at chord angles theta [rad], without payload."""
+    beams = [beam(*values, elements) for values in zip(
+        arm.link_length, arm.linear_density, arm.bending_stiffness, strict=True)]
+    size = 2 * elements + 2
+    n = 2 * size - 2
+    c, s = np.cos(theta[1] - theta[0]), np.sin(theta[1] - theta[0])
+    # beam coordinates from the free ones: y1(0) = 0, y2(0) = c y1(L1)
+    T1, T2 = np.zeros((size, n)), np.zeros((size, n))
+    T1[1:, :size - 1] = np.eye(size - 1)
+    T2[1:, size - 1:] = np.eye(size - 1)
+    elbow = T1[-2]
+    T2[0] = c * elbow
+    along = s * elbow  # link 2 moves as one along e2
+    slopes = {'root1': T1[1], 'tip1': T1[-1], 'root2': T2[1], 'tip2': T2[-1]}
+    M, K, D = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+    for T, link in zip((T1, T2), beams, strict=True):
+        M += T.T @ link.M @ T
+        K += T.T @ link.K @ T
+        D += T.T @ bending_damping(arm, link) @ T
+    for mass, row in (
+        (arm.joint_mass, elbow), (arm.tip_mass, T2[-2]),
+        (arm.linear_density[1] * arm.link_length[1] + arm.tip_mass, along),
+        (arm.hub_inertia[0], slopes['root1']), (arm.hub_inertia[1], slopes['root2']),
+        (arm.joint_inertia, slopes['tip1']), (arm.tip_inertia, slopes['tip2']),
+    ):
+        M += mass * np.outer(row, row)
+    chords = np.stack([T[-2] - T[0] for T in (T1, T2)]) / np.array(arm.link_length)[:, None]
+    encoders = np.stack([slopes['root1'], slopes['root2'] - slopes['tip1']])
+    bends = []
+    for i, (T, link) in enumerate(zip((T1, T2), beams, strict=True)):
+        x = arm.sensor_position[i] * link.length
+        bends.append(link.at(x) @ T - T[0] - x * chords[i])
+    B = (encoders if arm.torque_convention == 'joint' else chords).T
+    for rotor, viscous, row, torque in zip(
+            arm.rotor_inertia, arm.joint_viscous_friction, encoders, B.T, strict=True):
+        M += rotor * np.outer(row, row)
+        D += viscous * np.outer(torque, torque)
+    return Chain(
+        M=M, D=D, K=K, B=B,
+        C=np.vstack([encoders if arm.angle_convention == 'encoder' else chords, *bends]),
+        tip=np.stack([along, T2[-2], slopes['tip2']]))
+
+
+def finite_element_model(config: PlantParameters) -> LinearModel:
+    """Plant for the simulator: the chain at the initial angles."""
+    arm, theta = config.arm, config.initial_angles
+    parts = chain(arm, theta, config.elements)
+    rest = np.zeros(4)
+    rest[:2] = theta
+    if arm.angle_convention == 'encoder':
+        rest[1] -= theta[0]
+    e2 = np.array([np.cos(theta[1]), np.sin(theta[1])])
+    turn = np.array([e2, [-e2[1], e2[0]]]).T  # e2, n2 as columns
+
+    return LinearModel(
+        M0=parts.M, D=parts.D, K=parts.K, B=parts.B, C=parts.C, rest_output=rest, dt=1.0 / config.rate,
+        tip=np.vstack([turn @ parts.tip[:2], parts.tip[2]]), turn=theta[1], locked=config.locked)

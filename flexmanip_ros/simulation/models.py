@@ -10,17 +10,16 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, eigvals
+from scipy.linalg import eigvals
 
-from flexmanip_ros.arm import dynamics
+from flexmanip_ros.arm import linearization
 from flexmanip_ros.arm.capture import body_jacobian, free_object, tip_angle, tip_jacobian
 from flexmanip_ros.arm.equations_of_motion import STICTION_RATE
 from flexmanip_ros.arm.manipulator import Manipulator, manipulator, workspace
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import PlantParameters
-from flexmanip_ros.simulation.finite_elements import finite_element_model
 from flexmanip_ros.simulation.integration import run_nonlinear, scratch
-from flexmanip_ros.simulation.linear_model import linear_model
+from flexmanip_ros.simulation.linear_model import finite_element_model, linear_model
 from flexmanip_ros.types import Array
 
 STEP_ANGLE = 0.15
@@ -79,7 +78,7 @@ class NonlinearModel:
 
     def mass_matrix(self, x: Array, payload: Array) -> Array:
         """See Model."""
-        return dynamics.mass_matrix(self.arm, payload, x[:x.size // 2])
+        return linearization.mass_matrix(self.arm, payload, x[:x.size // 2])
 
     def body_jacobian(self, x: Array, payload: Array, com: tuple[float, float]) -> Array:
         """See Model."""
@@ -88,7 +87,7 @@ class NonlinearModel:
 
     def floating_mass(self, payload: Array) -> float:
         """See Model."""
-        return dynamics.momentum(self.arm, payload, self.rest()[:self.arm.stiffness.size])[1] \
+        return linearization.momentum(self.arm, payload, self.rest()[:self.arm.stiffness.size])[1] \
             if self.arm.floating else np.inf
 
 
@@ -139,9 +138,8 @@ def _fastest(arm: Manipulator, spread: float, sticking: float) -> float:
     n, links = arm.torque.shape
     q = np.zeros(n)
     q[links - 1] = spread
-    M = cho_factor(dynamics.mass_matrix(arm, np.zeros(4), q))
     friction = arm.viscous + sticking * arm.coulomb / STICTION_RATE
     D = np.diag(arm.damping) + (arm.torque * friction) @ arm.torque.T
-    rows = cho_solve(M, np.hstack([-np.diag(arm.stiffness), -D]))
-    poles = eigvals(np.block([[np.zeros((n, n)), np.eye(n)], [rows]]))
-    return float(np.max(np.abs(poles)))
+    M = linearization.mass_matrix(arm, np.zeros(4), q)
+    A, _ = linearization.first_order(M, np.diag(arm.stiffness), D, np.zeros((n, 0)))
+    return float(np.max(np.abs(eigvals(A))))

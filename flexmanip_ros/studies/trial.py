@@ -1,10 +1,13 @@
-"""One run of a scenario: one row per estimator. The number of the run is its seed."""
+"""One run of a scenario: one row per estimator. The number of the run is its seed.
+
+Faults of networks and publishers can be put into the messages of the simulation.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,11 +18,46 @@ from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import IdentifierParameters, PlantParameters
 from flexmanip_ros.samples.sampling import collect
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.studies.fault_injection import inject
 from flexmanip_ros.studies.metrics import payload_bound, relative_error_percent
-from flexmanip_ros.studies.scenario import Run, Scenario
+from flexmanip_ros.studies.scenario import Faults, Run, Scenario
 from flexmanip_ros.studies.summary import summarize
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord
+
+Message = JointRecord | CaptureEvent
+
+
+def inject(items: Iterable[Message], faults: Faults, rng: np.random.Generator) -> list[Message]:
+    """Return the messages with the faults of a scenario; events are delayed, never lost."""
+    given = list(items)
+    records = [item for item in given if isinstance(item, JointRecord)]
+    events = [item for item in given if isinstance(item, CaptureEvent)]
+    if not records:
+        return given
+    start = records[0].stamp_ns
+    begin, end = (start + round(edge * 1e9) for edge in faults.gap)
+    arriving: list[tuple[int, Message]] = []
+    for record in records:
+        chances = rng.random(4)  # always drawn, so that the probability of one fault does not move another
+        if chances[0] < faults.drop or begin <= record.stamp_ns < end:
+            continue
+        sent = _with_nan(record, rng) if chances[3] < faults.nan else record
+        arriving.append((record.stamp_ns, sent))
+        if chances[1] < faults.duplicate:
+            arriving.append((record.stamp_ns, sent))
+        if chances[2] < faults.swap and len(arriving) > 1:
+            (earlier, first), (later, second) = arriving[-2:]
+            arriving[-2:] = [(earlier, second), (later, first)]
+    delay = round(faults.event_delay * 1e9)
+    # An event without delay arrives before the sample of its own stamp, as in a recording.
+    arriving += [(event.stamp_ns + delay - (delay == 0), event) for event in events]
+    return [item for _, item in sorted(arriving, key=lambda pair: pair[0])]
+
+
+def _with_nan(record: JointRecord, rng: np.random.Generator) -> JointRecord:
+    position = record.position.copy()
+    position[int(rng.integers(position.size))] = np.nan
+    return record._replace(position=position)
+
 
 Row = dict[str, Any]
 """Column name -> bool, int, float, str or None."""

@@ -10,7 +10,7 @@ import time
 import pytest
 from quick_study import SCENARIO, rows_of, run, without_cost
 
-from flexmanip_ros.io.journal import Journal
+from flexmanip_ros.io.outputs import Journal
 
 
 def test_a_study_continues_where_a_kill_left_it(scenario_file, tmp_path, capsys):

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexmanip_ros.arm.linearization import frequencies, vibration_model
-from flexmanip_ros.control.feedback import design, model, observation, reference
+from flexmanip_ros.control.controller import design, model, observation, reference
 from flexmanip_ros.parameters import ArmParameters, ControllerParameters
 
 BETWEEN = st.floats(-3.0, 3.0)

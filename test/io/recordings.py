@@ -42,9 +42,9 @@ def storage_file(path: Path) -> Path:
     return next(file for file in path.iterdir() if file.suffix in ('.mcap', '.db3'))
 
 
-def good_part(path: Path) -> tuple[list[bag.Item], str]:
+def good_part(path: Path) -> tuple[list[JointRecord | CaptureEvent], str]:
     """Read until the error; return what came before and its line."""
-    items: list[bag.Item] = []
+    items: list[JointRecord | CaptureEvent] = []
     with pytest.raises(BagError) as caught:
         items.extend(bag.read(path))  # keeps what came before the error
     assert '\n' not in str(caught.value)

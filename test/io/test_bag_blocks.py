@@ -17,8 +17,8 @@ from flexmanip_ros.io import bag
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.studies.fault_injection import inject
 from flexmanip_ros.studies.scenario import Faults
+from flexmanip_ros.studies.trial import inject
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord
 
 Item = JointRecord | CaptureEvent

@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -159,3 +160,28 @@ def test_imports_without(libraries: set[str], parts: str) -> None:
         cwd=ROOT, capture_output=True, text=True, check=False,
     )
     assert result.returncode == 0, result.stderr[-2000:]
+
+
+@cache
+def defined_in(path: Path) -> set[str]:
+    """Return every name that a module binds anywhere."""
+    return {name for node in ast.walk(tree_of(path)) for name in (
+        [node.name] if isinstance(node, (ast.FunctionDef, ast.ClassDef)) else
+        [node.id] if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) else
+        [alias.asname or alias.name for alias in node.names] if isinstance(node, (ast.Import, ast.ImportFrom)) else [])}
+
+
+@pytest.mark.parametrize('folder', ['benchmarks', 'docs', 'launch', 'test'])
+def test_what_is_imported_from_the_package_is_there(folder: str) -> None:
+    """Benchmarks and launch files run seldom, and mypy reads the package alone."""
+    missing = []
+    for path in sorted((ROOT / folder).rglob('*.py')):
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.ImportFrom) and (node.module or '').split('.')[0] == PACKAGE.name:
+                place = ROOT / Path(*str(node.module).split('.'))
+                file = place / '__init__.py' if place.is_dir() else place.with_suffix('.py')
+                known = defined_in(file) if file.is_file() else set()
+                missing += [f'{without(path)}:{node.lineno}: {node.module}.{alias.name}' for alias in node.names
+                            if alias.name not in known and not (place / alias.name).with_suffix('.py').is_file()
+                            and not (place / alias.name).is_dir()]
+    assert not missing, missing

@@ -202,16 +202,13 @@ def test_every_program_imports_and_is_callable(distribution: Distribution) -> No
     for name, target in programs(distribution).items():
         module, function = target.split(':')
         assert function == 'main'
-        assert module.rpartition('.')[2] == ('program' if name == 'demo' else name)
+        assert module.rpartition('.')[2] == name
         assert callable(getattr(importlib.import_module(module), function))
 
 
 def test_every_module_with_a_main_is_a_program(distribution: Distribution) -> None:
     modules = [path for door in ('ros', 'cli') for path in (ROOT / 'flexmanip_ros' / door).rglob('*.py')]
-    mains = {
-        'demo' if path.parent.name == 'demo' else path.stem
-        for path in modules if '\ndef main(' in path.read_text(encoding='utf-8')
-    }
+    mains = {path.stem for path in modules if '\ndef main(' in path.read_text(encoding='utf-8')}
     assert mains - {'warm_up', 'write_parameters'} == set(programs(distribution))
 
 

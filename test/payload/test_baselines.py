@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from recording import ARM, config, event, record, rows_of
 
+from flexmanip_ros.paper.baselines import ALGEBRAIC, RIGID_RLS
 from flexmanip_ros.parameters import PayloadParameters
-from flexmanip_ros.payload.baselines import ALGEBRAIC, RIGID_RLS
 from flexmanip_ros.types import EventKind, Status
 
 STIFF = replace(ARM, bending_stiffness=(1e6, 1e6), damping_ratio=0.7, modes=1, angle_convention='chord')

@@ -85,7 +85,7 @@ def test_a_mass_below_zero_is_never_a_narrow_interval_at_zero(tip_mass, noise):
     spread = np.zeros((16 + 8 + 16 + 8 + 16, 16))
     spread[:16] = noise * np.eye(16)
     found = estimate(config, Identified(
-        model, spread, np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, np.eye(4), known_basis=True), theta)
+        model, spread, np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING), theta)
     missing = config.arm.tip_mass - tip_mass
     assert found.mass == found.lower == 0.0
     assert found.upper >= 1.95 * found.std
@@ -100,8 +100,7 @@ def _sharp(model, order=4):
     exact = StateSpace(A, B, np.eye(order), np.zeros((order, 2)), np.zeros((order, order)), 1e-3)
     spread = np.zeros((order * (2 * order + 2) + 2 * order + order * order, 16))
     spread[:16] = 1e-9 * np.eye(16)
-    return Identified(exact, spread, np.ones(order), 1.0, 1.0, 1.0, Status.TRACKING, np.eye(order),
-                      known_basis=True)
+    return Identified(exact, spread, np.ones(order), 1.0, 1.0, 1.0, Status.TRACKING)
 
 
 def _config(**changes):

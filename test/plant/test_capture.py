@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import mechanics
 import numpy as np
 import pytest
 
-from flexmanip_ros.arm import dynamics
 from flexmanip_ros.arm.manipulator import payload_array
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
@@ -88,9 +88,9 @@ def test_energy_is_lost_unless_the_object_moves_with_the_tip() -> None:
     before = moving(CONFIG)
     half = before.x.size // 2
     arm = before.model.arm
-    energy = dynamics.energy(arm, before.payload, before.x[:half], before.x[half:])
+    energy = mechanics.energy(arm, before.payload, before.x[:half], before.x[half:])
     after = simulator.attach(CONFIG, before)
-    lost = energy - dynamics.energy(arm, after.payload, after.x[:half], after.x[half:])
+    lost = energy - mechanics.energy(arm, after.payload, after.x[:half], after.x[half:])
     assert lost > 0
     vx, vy, spin = before.model.body_jacobian(before.x, before.payload, (0.0, 0.0)) @ before.x[half:]
     matched = replace(CONFIG, object_velocity=(vx, vy), object_spin=spin)
@@ -176,7 +176,7 @@ def test_energy_stays_with_rotors_and_a_floating_base_and_friction_takes_it(arm:
         half, found = state.x.size // 2, []
         for _ in range(300):
             state, _ = simulator.step(config, state, np.zeros(2))
-            found.append(dynamics.energy(state.model.arm, state.payload, state.x[:half], state.x[half:]))
+            found.append(mechanics.energy(state.model.arm, state.payload, state.x[:half], state.x[half:]))
         return np.array(found)
 
     free = energies(arm)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import lagrangian
+import mechanics
 import numpy as np
 import pytest
 
-from flexmanip_ros.arm import dynamics, manipulator
+from flexmanip_ros.arm import linearization, manipulator
 from flexmanip_ros.parameters import ArmParameters
 
 BODIES = {'point': (20.0, 0.0, 0.0, 0.0), 'body': (20.0, 1.5, 0.2, -0.1)}
@@ -28,8 +29,8 @@ def test_equations_of_motion_follow_from_the_lagrangian(
     for _ in range(3):
         q, qd, qdd = rng.normal(size=(3, 2 + 2 * kappa))
         q[2:] *= 0.2  # bends of 20 cm, so that each term counts
-        ours = (dynamics.mass_matrix(arm, payload, q) @ qdd + dynamics.bias(arm, payload, q, qd)
-                + dynamics.elastic_forces(arm, q))
+        ours = (linearization.mass_matrix(arm, payload, q) @ qdd + mechanics.bias(arm, payload, q, qd)
+                + mechanics.elastic_forces(arm, q))
         assert ours == pytest.approx(lagrangian.evaluate(derived, q, qd, qdd), rel=1e-9, abs=1e-8)
 
 
@@ -47,7 +48,7 @@ def test_torques_work_on_the_tangents(shortening: bool) -> None:
 
     h = 1e-5
     expected = [(angles(q + h * e) - angles(q - h * e)) / (2 * h) for e in np.eye(8)]
-    assert dynamics.torque_at(arm, q) == pytest.approx(np.array(expected), rel=1e-8, abs=1e-9)
+    assert mechanics.torque_at(arm, q) == pytest.approx(np.array(expected), rel=1e-8, abs=1e-9)
 
 
 def test_torques_do_the_work_of_their_joint_angles() -> None:

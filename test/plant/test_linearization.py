@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexmanip_ros.arm import dynamics, linearization, manipulator
+from flexmanip_ros.arm import linearization, manipulator
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
 
@@ -29,7 +29,7 @@ def test_blocks_are_the_nonlinear_matrices_without_bending(arm: ArmParameters, k
     b = linearization.blocks(arm, POINT, 20.0, kappa)
     full = manipulator.manipulator(arm, kappa)
     q = np.concatenate([POINT, np.zeros(2 * kappa)])
-    M = dynamics.mass_matrix(full, manipulator.payload_array(20.0), q)
+    M = linearization.mass_matrix(full, manipulator.payload_array(20.0), q)
     assert np.allclose(M, np.block([[b.Ma, b.Mb], [b.Mb.T, b.Mc]]), rtol=1e-13, atol=1e-12)
     assert np.array_equal(np.diag(full.stiffness[2:]), b.Kc)
     assert np.array_equal(full.torque, np.vstack([b.B_theta, b.B_eta]))
@@ -88,7 +88,7 @@ def test_the_default_shape_functions_are_converged(inertia: float) -> None:
     q, found = np.radians([60.0, 45.0]), []
     for modes in (ArmParameters().modes, 9):
         arm = manipulator.manipulator(ArmParameters(modes=modes))
-        M = dynamics.mass_matrix(arm, payload, np.append(q, np.zeros(2 * arm.kappa)))
+        M = linearization.mass_matrix(arm, payload, np.append(q, np.zeros(2 * arm.kappa)))
         K = np.diag(arm.stiffness)
         response = [arm.output[:2] @ np.linalg.solve(K - (2 * np.pi * f) ** 2 * M, arm.torque)
                     for f in (1.0, 3.0, 10.0)]

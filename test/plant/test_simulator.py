@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import mechanics
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexmanip_ros.arm import dynamics
 from flexmanip_ros.errors import ModelError, ParameterError, SignalError
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
@@ -84,7 +84,7 @@ def test_energy_is_conserved_without_torque(shapes: str, substeps: int, shorteni
     half = state.x.size // 2
 
     def energy(now: simulator.PlantState) -> float:
-        return dynamics.energy(model.arm, now.payload, now.x[:half], now.x[half:])
+        return mechanics.energy(model.arm, now.payload, now.x[:half], now.x[half:])
 
     before = energy(state)
     assert before > 1.0
@@ -102,7 +102,7 @@ def test_damping_only_takes_energy() -> None:
     energies = []
     for _ in range(300):
         state, _ = simulator.step(config, state, np.zeros(2))
-        energies.append(dynamics.energy(state.model.arm, state.payload, state.x[:half], state.x[half:]))
+        energies.append(mechanics.energy(state.model.arm, state.payload, state.x[:half], state.x[half:]))
     assert np.all(np.diff(energies) < 0)
 
 

@@ -15,7 +15,7 @@ from std_msgs.msg import Header
 from flexmanip_ros import pipeline
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters
 from flexmanip_ros.ros import conversions, qos
-from flexmanip_ros.ros.demo.program import outgoing
+from flexmanip_ros.ros.demo import outgoing
 from flexmanip_ros.ros.nodes.rpbsid_identifier import TOPICS, RpbsidIdentifier
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord

@@ -15,10 +15,9 @@ from identifier_harness import CAPTURE, Live, recording
 from ros_harness import Ros
 from visualization_msgs.msg import Marker, MarkerArray
 
-from flexmanip_ros.arm.drawing import draw
 from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.ros import conversions
-from flexmanip_ros.ros.arm_markers import ArmMarkers, words
+from flexmanip_ros.ros.arm_markers import ArmMarkers, draw, words
 from flexmanip_ros.ros.nodes.rpbsid_identifier import TOPICS
 from flexmanip_ros.types import JointRecord, Payload, Status
 

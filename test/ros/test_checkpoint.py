@@ -8,7 +8,7 @@ from ros_harness import Ros
 
 from flexmanip_ros import messages
 from flexmanip_ros.ros import conversions
-from flexmanip_ros.ros.demo.program import compare
+from flexmanip_ros.ros.demo import compare
 
 
 def test_an_identifier_that_is_restarted_goes_on_as_if_it_had_only_missed_samples(

@@ -12,7 +12,7 @@ from sensor_msgs.msg import JointState
 
 from flexmanip_ros import messages
 from flexmanip_ros.ros import conversions, qos
-from flexmanip_ros.ros.demo.program import compare
+from flexmanip_ros.ros.demo import compare
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, Payload, Status
 
 TRUTH = 20.0

@@ -27,7 +27,7 @@ NODES = ('plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier'
 
 
 def module(name: str) -> str:
-    return 'flexmanip_ros.ros.demo.program' if name == 'demo' else f'flexmanip_ros.ros.nodes.{name}'
+    return 'flexmanip_ros.ros.demo' if name == 'demo' else f'flexmanip_ros.ros.nodes.{name}'
 
 
 def start(name: str, *arguments: str) -> subprocess.Popen[str]:
@@ -168,7 +168,7 @@ def test_an_interrupted_demonstration_leaves_a_readable_bag(tmp_path: Path) -> N
 
 
 def test_runs_never_share_a_folder(tmp_path: Path) -> None:
-    from flexmanip_ros.ros.demo.program import new_folder
+    from flexmanip_ros.ros.demo import new_folder
 
     (tmp_path / 'run_007').mkdir()
     assert [new_folder(tmp_path).name, new_folder(tmp_path).name] == ['run_008', 'run_009']
@@ -182,7 +182,7 @@ def test_a_full_disk_ends_the_recording_with_the_reason_and_keeps_what_was_writt
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     process = subprocess.run(
-        [sys.executable, '-m', 'flexmanip_ros.ros.demo.program', str(tmp_path), '--duration', '2',
+        [sys.executable, '-m', 'flexmanip_ros.ros.demo', str(tmp_path), '--duration', '2',
          '--capture-time', '1'],
         env=environment, text=True, capture_output=True, timeout=120, preexec_fn=small_files, check=False)
     assert process.returncode == 1, process.stdout + process.stderr

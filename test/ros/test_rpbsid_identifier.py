@@ -11,7 +11,7 @@ from std_srvs.srv import Trigger
 
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.ros import conversions, qos
-from flexmanip_ros.ros.demo.program import compare
+from flexmanip_ros.ros.demo import compare
 from flexmanip_ros.types import JointRecord
 
 

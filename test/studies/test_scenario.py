@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.studies import trial
-from flexmanip_ros.studies.fault_injection import inject
 from flexmanip_ros.studies.scenario import Faults, scenario
+from flexmanip_ros.studies.trial import inject
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
 VARIED = {

@@ -97,7 +97,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
 
     def _send(self, inertia: Inertia, now: float) -> None:
         if not self._client.service_is_ready():
-            self.problem = f"service '{self._client.srv_name}' is not there"
+            self.problem = f"service '{self._client.srv_name}' is not available"
             self.log_throttled('service', f'{self.problem}; start the driver, or correct the parameters')
             self.state = handover.rejected(self.state, now)
             return
@@ -130,7 +130,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         self.problem = ''
         self.sent += 1
         self.state = handover.accepted(self.state, mass, time.monotonic())
-        self.get_logger().info(f'the driver took {mass:.3f} kg')
+        self.get_logger().info(f'the driver accepted a payload of {mass:.3f} kg')
 
     def report(self, report: Report) -> None:
         """What was sent, and what went wrong."""

@@ -150,7 +150,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
 
     def _on_estimate(self, message: Float64MultiArray) -> None:
         if len(message.data) != 5:
-            self._drop('payload_estimate', 'a payload estimate has not 5 values; it was dropped')
+            self._drop('payload_estimate', f'a payload estimate was dropped: it has {len(message.data)} values, not 5')
             return
         self._estimate = PayloadEstimate(*message.data)  # kept: a latched one may come before activation
         self._judge(self._estimate)
@@ -165,7 +165,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
 
     def _on_added(self, message: Float64MultiArray) -> None:
         if len(message.data) != len(self.config.joints) or not np.isfinite(message.data).all():
-            self._drop('added_efforts', 'an added effort is not two finite torques; it was dropped')
+            self._drop('added_efforts', 'added torques were dropped: one finite value for each joint is needed')
             return
         self._added, self._added_at = np.array(message.data), time.monotonic()
 
@@ -177,7 +177,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         if self.state is not None:
             self.state = self.state._replace(x=None)
         self._send(np.zeros(len(self.config.joints)))
-        self.log_throttled('silence', f'no joint_states for {self.config.stale_after:g} s: zero torque')
+        self.log_throttled('silence', f'no joint_states for {self.config.stale_after:g} s: zero torque was sent')
 
     def _send(self, torque: Array) -> None:
         self._message.data = doubles(torque)
@@ -198,7 +198,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         if self.state is None:
             return
         if self.state.failed_designs:
-            report.worse(WARN, f'{self.state.failed_designs} times no regulator was found; the gains stayed')
+            report.worse(WARN, f'{self.state.failed_designs} times no regulator was found; the gains before stay')
         verdict = self.state.verdict
         report.values.update(
             scheduled_payload_kg=self.state.payload, trusted_payload_kg=self.state.trusted,

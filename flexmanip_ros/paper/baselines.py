@@ -10,7 +10,7 @@ two-link arm it leaves the moving base out, as the paper does: that is its bias.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -19,11 +19,10 @@ import numpy as np
 from flexmanip_ros.numerics.compiled import kernel
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload.structured_model import chords, pinned_frequencies
+from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Rows
-from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload, Status
+from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, JointRecord, Payload, Status
 
-QUANTILE = 1.959963984540054
-"""Of the normal distribution, for 95 %."""
 FEWEST = 200
 """Samples since the event before anything is claimed."""
 
@@ -65,11 +64,6 @@ def _unknown(status: Status) -> Payload:
     return Payload(0.0, math.inf, 0.0, math.inf, 1.0, status)
 
 
-def _nothing_held() -> Payload:
-    """Return the payload of an arm that is empty because nothing was caught; these methods do not test it."""
-    return Payload(0.0, 0.0, 0.0, 0.0, 1.0, Status.TRACKING)
-
-
 def _interval(mass: float, std: float, misfit: float) -> Payload:
     """Return mass and interval; misfit: share of the regression's power that is left, 0 where it fits.
 
@@ -94,35 +88,15 @@ MEMORY_S = 10.0
 """Seconds after which a sample counts 1/e."""
 
 
-def _rigid_init(config: IdentifierParameters) -> BaselineState:
-    """Start with an empty arm."""
-    return BaselineState(np.zeros((4, 4)), np.zeros(5))
-
-
-def _rigid_advance(config: IdentifierParameters, state: BaselineState, rows: Rows) -> BaselineState:
-    """Take the next rows of the sample log."""
-    if not len(rows) or not _usable(config):
-        return state
-    efforts, angles, dt = _series(config, state, rows)
-    x, sums = state.x.copy(), state.sums.copy()
-    if state.last_ns is None or rows.gap[0]:
+def _rigid_take(config: IdentifierParameters, x: Array, sums: Array, dt: float, efforts: Array, angles: Array,
+                restarted: bool) -> None:
+    if restarted:
         x[:2], sums[4] = angles[0][:, None] * (1.0, 0.0, 1.0, 0.0), 0.0
     _rigid_kernel(_arm(config, dt), x, sums, dt, efforts, angles)
-    return replace(state, x=x, sums=sums, dt=dt, last_ns=int(rows.stamp_ns[-1]), effort=rows.u[-1].copy())
-
-
-def _rigid_event(config: IdentifierParameters, state: BaselineState, event: CaptureEvent) -> BaselineState:
-    """Restart the least squares."""
-    held = event.kind is EventKind.CAPTURE
-    return replace(state, sums=np.zeros(5), held=held)
 
 
 def _rigid_estimate(config: IdentifierParameters, state: BaselineState) -> Payload:
     """Return the payload; the interval takes the residuals as correlated over the filter's memory."""
-    if not _usable(config):
-        return _unknown(Status.UNOBSERVABLE)
-    if not state.held:
-        return _nothing_held()
     information, score, residual, count, _ = state.sums
     if count < 2 * FEWEST or information <= 0.0:
         return _unknown(Status.WARMING_UP)
@@ -158,37 +132,18 @@ STILL = 1e-6
 """Motion [rad] below which a link tells nothing."""
 
 
-def _algebraic_init(config: IdentifierParameters) -> BaselineState:
-    """Start with an empty arm."""
-    return BaselineState(np.zeros(11), np.zeros(7))
-
-
-def _algebraic_advance(config: IdentifierParameters, state: BaselineState, rows: Rows) -> BaselineState:
-    """Take the next rows of the sample log."""
-    if not len(rows) or not _usable(config):
-        return state
-    efforts, angles, dt = _series(config, state, rows)
-    x, normal = state.x.copy(), state.sums.copy()
-    if rows.gap[0]:
-        x, normal = np.zeros(11), np.zeros(7)
+def _algebraic_take(config: IdentifierParameters, x: Array, sums: Array, dt: float, efforts: Array, angles: Array,
+                    restarted: bool) -> None:
+    if restarted:
+        x[:], sums[:] = 0.0, 0.0
     arm = config.arm
     L, rho = arm.link_length[1], arm.linear_density[1]
     _algebraic_kernel(rho * L ** 3 / 3 + arm.tip_mass * L ** 2, rho * L / 2 + arm.tip_mass, L, config.payload.gravity,
-                      x, normal, dt, np.ascontiguousarray(angles[:, 1]), np.ascontiguousarray(efforts[:, 1]))
-    return replace(state, x=x, sums=normal, dt=dt, last_ns=int(rows.stamp_ns[-1]), effort=rows.u[-1].copy())
-
-
-def _algebraic_event(config: IdentifierParameters, state: BaselineState, event: CaptureEvent) -> BaselineState:
-    """Restart the integrals: their time counts from the event."""
-    return replace(state, x=np.zeros(11), sums=np.zeros(7), held=event.kind is EventKind.CAPTURE)
+                      x, sums, dt, np.ascontiguousarray(angles[:, 1]), np.ascontiguousarray(efforts[:, 1]))
 
 
 def _algebraic_estimate(config: IdentifierParameters, state: BaselineState) -> Payload:
     """Return the payload; the twice integrated residuals count as one a tenth of the record."""
-    if not _usable(config):
-        return _unknown(Status.UNOBSERVABLE)
-    if not state.held:
-        return _nothing_held()
     if state.sums[6] < FEWEST:
         return _unknown(Status.WARMING_UP)
     A = np.array([[state.sums[0], state.sums[1]], [state.sums[1], state.sums[2]]])
@@ -323,13 +278,80 @@ def _algebraic_kernel(
 
 
 class Baseline(NamedTuple):
-    """The calls of one estimator; those of ``payload.structured``."""
+    """One estimator; its calls are those of ``payload.structured``."""
 
-    init: Callable[[IdentifierParameters], BaselineState]
-    advance: Callable[[IdentifierParameters, BaselineState, Rows], BaselineState]
-    event: Callable[[IdentifierParameters, BaselineState, CaptureEvent], BaselineState]
-    estimate: Callable[[IdentifierParameters, BaselineState], Payload]
+    start: BaselineState
+    """With an empty arm."""
+    keeps_filters: bool
+    """Whether an event restarts the sums alone, not the states of filters or integrals."""
+    take: Callable[[IdentifierParameters, Array, Array, float, Array, Array, bool], None]
+    """Take samples into states and sums: efforts (N, 2), chord angles (N, 2), whether a gap comes before them."""
+    fitted: Callable[[IdentifierParameters, BaselineState], Payload]
+
+    def init(self, config: IdentifierParameters) -> BaselineState:
+        """Start with an empty arm."""
+        return self.start
+
+    def advance(self, config: IdentifierParameters, state: BaselineState, rows: Rows) -> BaselineState:
+        """Take the next rows of the sample log."""
+        if not len(rows) or not _usable(config):
+            return state
+        efforts, angles, dt = _series(config, state, rows)
+        x, sums = state.x.copy(), state.sums.copy()
+        self.take(config, x, sums, dt, efforts, angles, state.last_ns is None or bool(rows.gap[0]))
+        return replace(state, x=x, sums=sums, dt=dt, last_ns=int(rows.stamp_ns[-1]), effort=rows.u[-1].copy())
+
+    def event(self, config: IdentifierParameters, state: BaselineState, event: CaptureEvent) -> BaselineState:
+        """Restart the least squares, and integrals, whose time counts from the event."""
+        return replace(state, x=state.x if self.keeps_filters else self.start.x, sums=self.start.sums,
+                       held=event.kind is EventKind.CAPTURE)
+
+    def estimate(self, config: IdentifierParameters, state: BaselineState) -> Payload:
+        """Return the payload; an arm is empty as long as nothing was caught, these methods do not test it."""
+        if not _usable(config):
+            return _unknown(Status.UNOBSERVABLE)
+        return self.fitted(config, state) if state.held else Payload(0.0, 0.0, 0.0, 0.0, 1.0, Status.TRACKING)
 
 
-RIGID_RLS = Baseline(_rigid_init, _rigid_advance, _rigid_event, _rigid_estimate)
-ALGEBRAIC = Baseline(_algebraic_init, _algebraic_advance, _algebraic_event, _algebraic_estimate)
+RIGID_RLS = Baseline(BaselineState(np.zeros((4, 4)), np.zeros(5)), True, _rigid_take, _rigid_estimate)
+ALGEBRAIC = Baseline(BaselineState(np.zeros(11), np.zeros(7)), False, _algebraic_take, _algebraic_estimate)
+BASELINES: Mapping[str, Baseline] = {'rigid_rls': RIGID_RLS, 'algebraic': ALGEBRAIC}
+
+
+class Recorded(NamedTuple):
+    """The rows of a recording, and its events by stamp."""
+
+    rows: Rows
+    events: tuple[CaptureEvent, ...]
+
+
+def recorded(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]) -> Recorded:
+    """Return the samples and events of messages."""
+    clock, log = sampling.Clock(), sampling.EMPTY
+    events: list[CaptureEvent] = []
+    for item in items:
+        if isinstance(item, CaptureEvent):
+            events.append(item)
+        else:
+            clock, log, _ = sampling.push(config, clock, log, item)
+    events.sort(key=lambda event: event.stamp_ns)
+    return Recorded(log.rows(log.start, log.end), tuple(events))
+
+
+def run(name: str, config: IdentifierParameters, recorded: Recorded) -> Iterator[Estimate]:
+    """Yield estimates with a payload and no model: at each publishing instant and at the last sample."""
+    baseline, rows = BASELINES[name], recorded.rows
+    if not len(rows):
+        return
+    stamps = rows.stamp_ns
+    instants = ((stamps - stamps[0]) * config.publish_rate * 1e-9 + 1e-6).astype(np.int64)
+    due = set((np.flatnonzero(np.diff(instants, prepend=-1) > 0) + rows.first + 1).tolist()) | {rows.until}
+    events = [(rows.log.row_at(event.stamp_ns, rows.first), event) for event in recorded.events]
+    state, cursor = baseline.init(config), rows.first
+    for until in sorted(due | {row for row, _ in events if row > cursor}):
+        while events and events[0][0] == cursor:
+            state = baseline.event(config, state, events.pop(0)[1])
+        state, cursor = baseline.advance(config, state, rows.between(cursor, until)), until
+        if until in due:
+            payload = baseline.estimate(config, state)
+            yield Estimate(int(stamps[until - 1 - rows.first]), payload.status, None, (), payload)

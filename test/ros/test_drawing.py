@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexmanip_ros.arm.drawing import draw
 from flexmanip_ros.parameters import ArmParameters
+from flexmanip_ros.ros.arm_markers import draw
 
 ARM = ArmParameters(link_length=(3.0, 2.0), sensor_position=(0.5, 0.4))
 
