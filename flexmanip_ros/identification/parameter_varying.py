@@ -23,7 +23,7 @@ from flexmanip_ros.identification.prediction_error import condition
 from flexmanip_ros.identification.varying_kernel import basis, low_pass, simulate_block
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Rows
-from flexmanip_ros.samples.signals import reads_angles
+from flexmanip_ros.samples.signals import reads_angles, relative_angle
 from flexmanip_ros.types import Array
 
 FUNCTIONS = 3
@@ -220,9 +220,9 @@ def _filter(v: Varying) -> tuple[Array, Array, Array]:
 
 def signals_of(config: IdentifierParameters, rows: Rows, role: Roles) -> Array:
     """(N, r + h + 2) inputs, displacements, relative angle of the links and absolute angle of the first."""
-    angles = rows.angles
-    relative = angles[:, 1] - angles[:, 0] if config.arm.angle_convention == 'chord' else angles[:, 1]
-    return np.ascontiguousarray(np.column_stack([rows.u, rows.y[:, list(role.displacements)], relative, angles[:, 0]]))
+    relative = relative_angle(config, rows.angles)
+    columns = rows.u, rows.y[:, list(role.displacements)], relative, rows.angles[:, 0]
+    return np.ascontiguousarray(np.column_stack(columns))
 
 
 def passed(v: Varying, signals: Array, anew: bool) -> tuple[Array, Array, Array]:

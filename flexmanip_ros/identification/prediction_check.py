@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.identification.validation import simulate
@@ -37,34 +38,37 @@ def white_noise(Y: Array) -> Array:
     return found
 
 
-def missed(model: StateSpace, U: Array, Y: Array, horizon: int) -> Array:
+def missed(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np.bool_] | None = None) -> Array:
     """(m,) share of the power of Y (N, m) that predictions up to ``horizon`` samples ahead miss, beyond white noise.
 
-    Each begins at the state that fits twice as many samples before it; no output after that is used. nan where an
-    output is silent.
+    Each begins at the state that fits twice as many samples before it, outputs at unit power; no output after that is
+    used. seen: (N,) rows that were measured, all of them by default. nan where an output is silent.
     """
     n, m = model.order, model.C.shape[0]
     before = 2 * max(horizon, n)
-    free, row = np.empty((before, m, n)), model.C
-    for k in range(before):
+    free, row = np.empty((before + horizon, m, n)), model.C
+    for k in range(len(free)):
         free[k], row = row, row @ model.A
-    end = np.linalg.matrix_power(model.A, before)
-    back = np.linalg.pinv(free.reshape(-1, n), rcond=1e-9)
+    power, white = np.var(Y, axis=0), white_noise(Y)
+    unit = 1.0 / np.sqrt(np.where(power > 0.0, power, 1.0))
+    free *= unit[:, None]
+    left = (Y - simulate(model, U)) * unit  # a free motion of the model, as far as it is right
+    if not np.all(np.isfinite(free)) or not np.all(np.isfinite(left)):  # a model that runs away
+        return np.full(m, np.inf)
+    known = np.ones(len(Y), dtype=np.bool_) if seen is None else seen
+    back = np.linalg.pinv(free[:before].reshape(-1, n), rcond=1e-9)
     errors = np.zeros(m)
     count = 0
     for first in range(before, len(Y) - horizon + 1, horizon):
-        u, y = U[first - before:first], Y[first - before:first]
-        x = back @ (y - simulate(model, u)).ravel()
-        forced = np.zeros(n)
-        for sample in u:
-            forced = model.A @ forced + model.B @ sample
-        ahead = slice(first, first + horizon)
-        errors += np.sum((Y[ahead] - simulate(model, U[ahead], end @ x + forced)) ** 2, axis=0)
-        count += horizon
-    power, white = np.var(Y, axis=0), white_noise(Y)
+        used, ahead = known[first - before:first], known[first:first + horizon]
+        y = left[first - before:first]
+        x = back @ y.ravel() if used.all() else np.linalg.lstsq(
+            free[:before][used].reshape(-1, n), y[used].ravel(), rcond=1e-9)[0]
+        errors += np.sum((left[first:first + horizon][ahead] - free[before:][ahead] @ x) ** 2, axis=0)
+        count += int(np.count_nonzero(ahead))
     if not count:
         return np.full(m, np.nan)
-    share = np.maximum(errors / count - 2.0 * white, 0.0) / np.where(power > 0.0, power, np.inf)
+    share = np.maximum(errors / count - 2.0 * white * unit ** 2, 0.0)
     return np.where(power > SILENT * white, share, np.nan)
 
 
@@ -78,8 +82,8 @@ def judged(found: Identified, rows: Rows) -> Identified:
     if 2 * len(rows) < length(model.dt) or len(rows) < 6 * max(horizon, model.order) or rows.gap[1:].any():
         return found
     with np.errstate(over='ignore', invalid='ignore'):
-        shares = missed(model, np.ascontiguousarray(rows.u), np.ascontiguousarray(rows.y), horizon)
-    heard = shares[np.isfinite(shares)]  # rates may ring with modes above the order, which displacements hardly show
+        shares = missed(model, rows.u, rows.y, horizon, rows.missing == 0)
+    heard = shares[~np.isnan(shares)]  # rates may ring with modes above the order, which displacements hardly show
     if heard.size and float(heard.mean()) > MISSED:
         return found._replace(status=Status.INCONSISTENT)
     return found

@@ -11,6 +11,7 @@ from flexmanip_ros.identification.batch_fit import BLOCK
 from flexmanip_ros.identification.parameter_varying import AT_REST, QUALITIES, Roles, Varying, local, shown, to_local
 from flexmanip_ros.identification.uncertainty import Identified, Tangent, modes
 from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.samples.signals import relative_angle
 from flexmanip_ros.types import Array, StateSpace, Status
 
 TERMS = 12
@@ -38,8 +39,7 @@ class Configurations(NamedTuple):
 
     def at(self, angles: Array) -> Identified:
         """Return the model at measured angles (2,) [rad]."""
-        relative = angles[1] - angles[0] if self.config.arm.angle_convention == 'chord' else angles[1]
-        return self.with_relative(float(relative))
+        return self.with_relative(float(relative_angle(self.config, angles)))
 
     def now(self, waiting: int) -> Identified:
         """Return the model at the present configuration; waiting: samples that the fit has not taken yet."""
