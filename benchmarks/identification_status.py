@@ -4,23 +4,23 @@ A reading is wrong where the band of a frequency misses the truth by three times
 ahead explains less than half of an output over the last second. That is computed here from the published matrices: the
 state at an instant is the one that fits the 0.25 s before it, outputs at unit power. Truth: the linearized arm at the
 mean angles of the last half second, where the recording tells the payload. An output within ten times its white noise
-says nothing. Records: folder FLEXMANIP_DATA or ../shared/data.
+says nothing. Measured arms are told their names alone. Records: folder FLEXMANIP_DATA or ../shared/data.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from identification_moving_arm import CONFIGURATIONS, MASSES, frequencies
+from identification_moving_arm import CONFIGURATIONS, frequencies
 from identification_suggested import CASES
 
 from flexmanip_ros import pipeline
-from flexmanip_ros.cli.suggest import suggest
 from flexmanip_ros.identification import decimation
 from flexmanip_ros.identification.validation import simulate
 from flexmanip_ros.io import bag
@@ -29,7 +29,7 @@ from flexmanip_ros.payload.structured_model import chords
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, StateSpace, Status
+from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, StateSpace, Status
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get('FLEXMANIP_DATA', ROOT.parent / 'shared' / 'data'))
@@ -37,6 +37,7 @@ AHEAD_S, LAST_S, LATELY_S = 0.25, 1.0, 0.5
 EVERY = 20
 """Samples between two instants from which predictions are made."""
 CAPTURE_S = 3.0
+MASSES = (20.0, 100.0)
 PLAIN = ('physics_20kg_60_45', 'physics_100kg_0_0', 'arm_gains', 'arm_wander_60s')
 """Recordings of the default arm with a point mass, so that its frequencies are known."""
 OTHERS = ('arm_body', 'arm_friction_rotor', 'arm_orbit')
@@ -54,35 +55,34 @@ class Case(NamedTuple):
 
 def cases() -> Iterator[Case]:
     """Yield every recording and the simulated arms."""
-    default = IdentifierParameters()
     still = configure(IdentifierParameters, {'payload_method': 'none'})
+    moving = configure(IdentifierParameters, {  # angles that are named are read without a payload, too
+        'payload_method': 'none', 'inputs': ('shoulder/effort', 'elbow/effort'),
+        'angles': ('shoulder/position', 'elbow/position')})
     for name in (*PLAIN, *OTHERS):
         if (DATA / name).exists():
             truth = json.loads((DATA / f'{name}.truth.json').read_text(encoding='utf-8'))
             mass = truth.get('payload', truth.get('payload_mass_kg')) if name in PLAIN else None
-            items = list(bag.read_blocks(DATA / name))
-            yield Case(name, default, items, mass)
-            yield Case(f'{name}, one configuration', still, items, mass)
+            yield Case(name, moving, renamed(bag.read_blocks(DATA / name)), mass)
     for name, (inputs, outputs) in CASES.items():
         if (DATA / name).exists():
             given = {'inputs': inputs, 'outputs': outputs, 'angles': (), 'payload_method': 'none'}
-            items = list(bag.read_blocks(DATA / name))
-            yield Case(name, configure(IdentifierParameters, given), items)
-            place = ROOT / 'benchmarks' / 'results' / 'suggested.yaml'
-            chosen, _ = suggest(str(DATA / name), str(place), given, bag.Topics())
-            place.unlink()
-            yield Case(f'{name}, suggested', chosen, items)
-    for degrees in CONFIGURATIONS:
-        for mass in MASSES:
-            items = simulated(7.0, mass, degrees)
-            where = f'{mass:.0f} kg at {degrees[0]:.0f}/{degrees[1]:.0f}'
-            yield Case(f'{where}, 7 s', default, items, mass)
-            yield Case(f'{where}, 7 s, one configuration', still, items, mass)
-    for mass, degrees in ((20.0, (60.0, 45.0)), (50.0, (0.0, 45.0))):
-        items = simulated(60.0, mass, degrees)
-        yield Case(f'{mass:.0f} kg at {degrees[0]:.0f}/{degrees[1]:.0f}, 60 s', default, items, mass)
+            yield Case(name, configure(IdentifierParameters, given), list(bag.read_blocks(DATA / name)))
+    for degrees, mass in itertools.product(CONFIGURATIONS, MASSES):
+        where = f'{mass:.0f} kg at {degrees[0]:.0f}/{degrees[1]:.0f}, 7 s'
+        items = simulated(7.0, mass, degrees)
+        yield Case(where, moving, renamed(items), mass)
+        yield Case(f'{where}, one configuration', still, items, mass)
+    yield Case('20 kg at 0/45, 60 s', moving, renamed(simulated(60.0, 20.0, (0.0, 45.0))), 20.0)
     for words, loss in LOST.items():
-        yield Case(words, default, simulated(15.0, 20.0, (60.0, 45.0), loss), 20.0)
+        yield Case(words, moving, renamed(simulated(9.0, 20.0, (60.0, 45.0), loss)), 20.0)
+
+
+def renamed(items: Iterable[JointBlock | JointRecord | CaptureEvent]) -> list[JointBlock | CaptureEvent]:
+    """Return the messages with other names for the joints."""
+    names = {'joint1': 'shoulder', 'joint2': 'elbow'}
+    return [item._replace(names=tuple(names.get(name, name) for name in item.names))
+            if isinstance(item, JointBlock) else item for item in items if not isinstance(item, JointRecord)]
 
 
 def simulated(seconds: float, mass: float, degrees: tuple[float, float], loss: float | int = 0
@@ -160,7 +160,8 @@ def band_misses(case: Case, held: float, estimate: Estimate) -> bool:
     for item in case.items:
         if isinstance(item, JointBlock):
             rows = (item.stamp_ns <= estimate.stamp_ns) & (item.stamp_ns > estimate.stamp_ns - round(LATELY_S * 1e9))
-            lately.append(item.position[np.ix_(rows, [item.names.index('joint1'), item.names.index('joint2')])])
+            joints = [k for k, name in enumerate(item.names) if 'bend' not in name]
+            lately.append(item.position[np.ix_(rows, joints)])
     arm = PlantParameters().arm
     truth = frequencies(PlantParameters(), chords(arm, np.concatenate(lately).mean(axis=0)), held)
     return any(abs(mode.frequency_hz - known) > 3.0 * 1.96 * mode.frequency_std_hz

@@ -63,11 +63,11 @@ class Varying(NamedTuple):
     """The fit and what it remembers, constant in size; h displacements, r inputs, k parameters.
 
     shift: unit of time [1/s]; scale_u (r,), scale_y (h,): factors on signals; theta: (k,) see ``parts``; x: (2h,);
-    root: (k + 2h, k + 2h) S with S S' their covariance; noise: (h, h); share: (h,) of the outputs' amplitude that the
-    prediction of a block misses, and swing: ``Block.swing``, averaged over the last blocks; corner [Hz], every: the filter and the samples that it
-    keeps one of; filtered: (4, r + h + 2) its state; dt: sample time [s]; angle, rate: relative angle of the links at
-    the end [rad, rad/s]; blocks: number taken; strikes: bad ones in a row; lost: samples were missing, so filter and
-    state begin anew; gain: (n, m) published K.
+    root: (k + 2h, k + 2h) S with S S' their covariance; noise: (h, h); averaged over the last blocks, share: (h,) of
+    the outputs' amplitude that the prediction of a block misses, and swing: ``Block.swing``; corner [Hz], every: the
+    filter and the samples that it keeps one of; filtered: (4, r + h + 2) its state; dt: sample time [s]; angle, rate:
+    relative angle of the links at the end [rad, rad/s]; blocks: number taken; strikes: bad ones in a row; lost: samples
+    were missing, so filter and state begin anew; gain: (n, m) published K.
     """
 
     shift: float

@@ -16,6 +16,7 @@ from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.identification.varying_kernel import basis
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.studies import configurations
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, Status
 
 CAPTURE_S, DURATION_S, SETTLED_S = 3.0, 16.0, 6.0
@@ -112,6 +113,19 @@ def test_the_model_can_be_asked_for_a_configuration_between_those_it_has_seen(ru
     for relative in np.linspace(swept.min(), swept.max(), 5):
         found = modes(model.at(np.array([0.3, relative])))
         np.testing.assert_allclose([mode.frequency_hz for mode in found], true_frequencies(float(relative)), rtol=0.012)
+
+
+def test_frequencies_over_configurations_are_right_within_their_bands_and_drawn(run: Run) -> None:
+    plots = pytest.importorskip('flexmanip_ros.io.plots')
+    found = configurations.sweep(run.state, np.diff(run.chords[3000:], axis=1) * [0.0, 1.0])
+    assert found is not None
+    truth = np.array([true_frequencies(float(angle)) for angle in found.relative])
+    assert np.mean(np.abs(found.frequency - truth) < 1.96 * found.std) > 0.8
+    seen = (found.seen[0] <= found.relative) & (found.relative <= found.seen[1])
+    assert np.count_nonzero(seen) > 3
+    assert np.all(np.abs(found.frequency[seen] / truth[seen] - 1.0) < 0.012)
+    _, labels = plots.configurations_figure(found).axes[0].get_legend_handles_labels()
+    assert labels == ['configurations\nof the recording', 'mode 1, 95 % band', 'mode 2, 95 % band']
 
 
 def test_deviations_of_frequencies_are_the_derivatives_of_the_matrices(run: Run) -> None:
