@@ -135,8 +135,8 @@ def identification_status(rows: list[dict[str, Any]]) -> Claims:
     total = sum(row['readings'] for row in rows)
     yield Claim('readings', total, 1500)
     yield Claim('TRACKING and wrong', 100.0 * sum(row['wrong'] for row in rows) / total, high=1.0, unit='%')
-    follow = [row for row in rows if row['case'].endswith('60 s')]
-    yield Claim('TRACKING on the default arm, 60 s', 100.0 * sum(row['tracking'] for row in follow)
+    follow = [row for row in rows if row['case'].endswith('40 s')]
+    yield Claim('TRACKING on the default arm, 40 s', 100.0 * sum(row['tracking'] for row in follow)
                 / sum(row['readings'] for row in follow), 80.0, unit='%')
 
 
