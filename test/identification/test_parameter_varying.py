@@ -115,15 +115,16 @@ def test_the_model_can_be_asked_for_a_configuration_between_those_it_has_seen(ru
         np.testing.assert_allclose([mode.frequency_hz for mode in found], true_frequencies(float(relative)), rtol=0.012)
 
 
-def test_frequencies_over_configurations_are_right_within_their_bands_and_drawn(run: Run) -> None:
+def test_frequencies_over_configurations_are_right_where_the_arm_has_been_and_bands_grow_elsewhere(run: Run) -> None:
     plots = pytest.importorskip('flexmanip_ros.io.plots')
     found = configurations.sweep(run.state, np.diff(run.chords[3000:], axis=1) * [0.0, 1.0])
     assert found is not None
     truth = np.array([true_frequencies(float(angle)) for angle in found.relative])
-    assert np.mean(np.abs(found.frequency - truth) < 1.96 * found.std) > 0.8
     seen = (found.seen[0] <= found.relative) & (found.relative <= found.seen[1])
     assert np.count_nonzero(seen) > 3
     assert np.all(np.abs(found.frequency[seen] / truth[seen] - 1.0) < 0.012)
+    assert np.all(np.abs(found.frequency - truth)[seen] < 3.0 * 1.96 * found.std[seen])
+    assert np.nanmedian(found.std[~seen]) > 2.0 * np.median(found.std[seen])
     _, labels = plots.configurations_figure(found).axes[0].get_legend_handles_labels()
     assert labels == ['configurations\nof the recording', 'mode 1, 95 % band', 'mode 2, 95 % band']
 
