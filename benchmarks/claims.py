@@ -108,6 +108,9 @@ def identification_suggested(table: dict[str, Any]) -> Claims:
     """Told names alone, a suggestion predicts measured arms 0.25 s ahead as well as a grid's best batch PBSID."""
     for name, row in table.items():
         yield Claim(f'{name}: mean VAF ahead, over the best of the grid', row['gain'], 0.0, unit='%')
+        # docs/lab/identification.md, "Suggested parameters on measured arms": the most that the wide grid gains
+        yield Claim(f'{name}: mean VAF ahead, over the best of the wide grid', row['gain_wide'], -rounded(0.08, 2),
+                    unit='%')
     yield Claim('daisy_robot_arm: simulation', table['daisy_robot_arm']['simulation'][0], 99.8, unit='%')
 
 
@@ -125,6 +128,16 @@ def identification_moving_arm(rows: list[dict[str, Any]]) -> Claims:
                 unit='%')
     for case, found in (('0/0 deg', 100.0), ('60/45 deg', 95.0)):
         yield Claim(f'{case}: readings with both modes', by[case, 1, 'lately']['found_percent'], found - 0.5, unit='%')
+
+
+def identification_status(rows: list[dict[str, Any]]) -> Claims:
+    """Fewer than 1 % of all readings say TRACKING of a model that is wrong, over every recording and simulated arm."""
+    total = sum(row['readings'] for row in rows)
+    yield Claim('readings', total, 1500)
+    yield Claim('TRACKING and wrong', 100.0 * sum(row['wrong'] for row in rows) / total, high=1.0, unit='%')
+    follow = [row for row in rows if row['case'].endswith('40 s')]
+    yield Claim('TRACKING on the default arm, 40 s', 100.0 * sum(row['tracking'] for row in follow)
+                / sum(row['readings'] for row in follow), 80.0, unit='%')
 
 
 def identification_paper_settings(rows: list[dict[str, Any]]) -> Claims:
@@ -347,7 +360,7 @@ CLAIMS: dict[str, Callable[[Any], Claims]] = {
     function.__name__: function for function in (
         control_payload, detection_delay, identification_coverage, identification_measured_arms,
         identification_moving_arm, identification_paper_settings, identification_soak, identification_speed,
-        identification_suggested,
+        identification_status, identification_suggested,
         io_bag_reading, payload_block, payload_coverage, payload_elements, payload_linear, payload_mismatched,
         payload_speed, plant_convergence, plant_hour, plant_live, plant_segment_chain, plant_speed,
         replay_speed, ros_fuzz, ros_latency, ros_signals, setup_time, study_scaling)}

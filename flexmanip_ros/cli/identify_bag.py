@@ -56,6 +56,9 @@ def _parser() -> console.Parser:
     add('--report', metavar='REPORT.html', help='write a report: one HTML page with figures and tables')
     add('--save-arm', metavar='FILE.yaml',
         help='write what the arm taught (stiffness, damping, friction, rotors, gains, offsets) as a parameter file')
+    add('--configurations', metavar='FILE.csv',
+        help='write frequencies and damping over the angle between the links, with deviations (a moving arm: '
+        'docs/moving_arm.md); --report draws them')
     add('--json', action='store_true', help='print the result as JSON in the last line of stdout')
     add('--joint-states', metavar='TOPIC', default='joint_states',
         help='topic of the joint states; default: joint_states, in any namespace')
@@ -95,7 +98,7 @@ def _main(given: argparse.Namespace) -> int:
         events_required=given.capture_event is not None,
         capture_time=given.capture_time, release_time=given.release_time, detect=given.detect,
         validate_from=given.validate_from, horizon=given.horizon, smooth=given.smooth,
-        output=given.output, report=given.report, save_arm=given.save_arm)
+        output=given.output, report=given.report, save_arm=given.save_arm, configurations=given.configurations)
     with console.progress('identifying', 'messages') as progress, first_use.announced():
         result = identify(request, progress)
     if not given.json:

@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flexmanip_ros import estimator, pipeline
 from flexmanip_ros.cli.console import Report, require_matplotlib
-from flexmanip_ros.errors import BagError, FlexmanipError, MissingSignalError, ParameterError, SignalError
+from flexmanip_ros.errors import BagError, FlexmanipError, MissingSignalError, ModelError, ParameterError, SignalError
 from flexmanip_ros.io import bag
-from flexmanip_ros.io.outputs import TableOutput, check_place, open_output, write_text
+from flexmanip_ros.io.outputs import TableOutput, check_place, open_output, write_rows, write_text
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import yaml_text
 from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.payload.arm_parameters import as_parameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
-from flexmanip_ros.studies import holdout, smoothing
+from flexmanip_ros.studies import configurations, holdout, smoothing
 from flexmanip_ros.studies.summary import Summary, summarize
-from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Mode, Status
+from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Mode, Status
 from flexmanip_ros.view.screen import Screen, of_identifier
 
 NEVER = (1 << 63) - 1
@@ -53,6 +55,8 @@ class Request:
     report: str | None = None
     save_arm: str | None = None
     """Parameter file for what the arm taught."""
+    configurations: str | None = None
+    """Table for the frequencies of every configuration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +87,9 @@ def identify(request: Request, progress: Report | None = None) -> Result:
         require_matplotlib()
         if request.output is not None and Path(request.output).resolve() == Path(request.report).resolve():
             raise ParameterError(f"--output and --report are both '{request.report}'", 'give two names')
-    if request.save_arm is not None:
-        check_place(request.save_arm)
+    for place in (request.save_arm, request.configurations):
+        if place is not None:
+            check_place(place)
     progress = progress or Report()
     messages = _Messages(request, progress)
     kept: list[Estimate] = []
@@ -130,12 +135,20 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     fault = messages.fault or _dropped(state)
     if request.save_arm is not None:
         _save_arm(request, state, last)
+    found = None if signals is None else configurations.sweep(state, _angles_held(signals, messages.events))
+    if request.configurations is not None:
+        if found is None:
+            raise ModelError('the model is not one of every configuration, so --configurations has nothing to write',
+                             'name two angles and, as outputs, half as many positions as the order; see '
+                             'docs/moving_arm.md')
+        write_rows(request.configurations, found.rows())
     if request.report is not None and signals is not None:
         progress.phase('drawing the report')
-        _report(request, summary, messages, kept, signals, last, scores, state, fault)
+        _report(request, summary, messages, kept, signals, last, scores, state, fault, found)
     return Result(
         summary, () if last is None else last.modes, state.config or request.config,
-        tuple(str(place) for place in (request.output, request.report, request.save_arm) if place is not None), fault,
+        tuple(str(place) for place in (request.output, request.report, request.save_arm, request.configurations)
+              if place is not None), fault,
         interrupted, messages.search(summary.status), _remark(state, messages.foreign))
 
 
@@ -148,7 +161,8 @@ class _Messages:
         """Messages that hold none of the configured joints."""
         self.first_ns: int | None = None
         self.events: list[CaptureEvent] = []
-        self.is_kept = request.report is not None or request.validate_from is not None or request.smooth
+        self.is_kept = (request.smooth or request.validate_from is not None or request.report is not None
+                        or request.configurations is not None)
         self._clock, self._log = sampling.Clock(), sampling.EMPTY
         self._findings = capture_detection.Findings()
         self._looked = False
@@ -260,6 +274,12 @@ class _Messages:
         return self.first_ns + round(limit * 1e9)
 
 
+def _angles_held(signals: Signals, events: Sequence[CaptureEvent]) -> Array:
+    """Return the angles since the last event (N, 2) [rad]; (0, 2) where none were read."""
+    since = max((event.stamp_ns for event in events), default=0)
+    return signals.angles[signals.stamp_ns >= since] if signals.angles.shape[1] == 2 else np.zeros((0, 2))
+
+
 def _save_arm(request: Request, state: pipeline.State, last: Estimate | None) -> None:
     """Write what the arm taught as parameters for every node. Raises SignalError where it taught nothing."""
     config = state.config or request.config
@@ -311,7 +331,7 @@ def _remark(state: pipeline.State, foreign: int) -> str:
 
 def _report(request: Request, summary: Summary, messages: _Messages, kept: list[Estimate], signals: Signals,
             last: Estimate | None, scores: holdout.Scores | None, state: pipeline.State,
-            fault: FlexmanipError | None) -> None:
+            fault: FlexmanipError | None, found: configurations.Sweep | None) -> None:
     from flexmanip_ros.io import plots, report
     from flexmanip_ros.studies.metrics import payload_bound
     from flexmanip_ros.view import recording
@@ -327,4 +347,4 @@ def _report(request: Request, summary: Summary, messages: _Messages, kept: list[
         request.report, Path(request.bag).name, config, summary, made,
         None if last is None else last.model, scores, counts, bound, '' if fault is None else str(fault),
         modes=() if last is None else last.modes, events=messages.search(summary.status),
-        player=recording.embedded(messages.screen, messages.events, kept))
+        player=recording.embedded(messages.screen, messages.events, kept), configurations=found)

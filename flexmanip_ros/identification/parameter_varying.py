@@ -23,7 +23,7 @@ from flexmanip_ros.identification.prediction_error import condition
 from flexmanip_ros.identification.varying_kernel import basis, low_pass, simulate_block
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Rows
-from flexmanip_ros.samples.signals import reads_angles
+from flexmanip_ros.samples.signals import reads_angles, relative_angle
 from flexmanip_ros.types import Array
 
 FUNCTIONS = 3
@@ -63,11 +63,11 @@ class Varying(NamedTuple):
     """The fit and what it remembers, constant in size; h displacements, r inputs, k parameters.
 
     shift: unit of time [1/s]; scale_u (r,), scale_y (h,): factors on signals; theta: (k,) see ``parts``; x: (2h,);
-    root: (k + 2h, k + 2h) S with S S' their covariance; noise: (h, h); share: (h,) of the outputs' amplitude that the
-    prediction of a block misses, averaged over the last blocks; corner [Hz], every: the filter and the samples that it
-    keeps one of; filtered: (4, r + h + 2) its state; dt: sample time [s]; angle, rate: relative angle of the links at
-    the end [rad, rad/s]; blocks: number taken; strikes: bad ones in a row; lost: samples were missing, so filter and
-    state begin anew; gain: (n, m) published K.
+    root: (k + 2h, k + 2h) S with S S' their covariance; noise: (h, h); averaged over the last blocks, share: (h,) of
+    the outputs' amplitude that the prediction of a block misses, and swing: ``Block.swing``; corner [Hz], every: the
+    filter and the samples that it keeps one of; filtered: (4, r + h + 2) its state; dt: sample time [s]; angle, rate:
+    relative angle of the links at the end [rad, rad/s]; blocks: number taken; strikes: bad ones in a row; lost: samples
+    were missing, so filter and state begin anew; gain: (n, m) published K.
     """
 
     shift: float
@@ -78,6 +78,7 @@ class Varying(NamedTuple):
     root: Array
     noise: Array
     share: Array
+    swing: float
     corner: float
     every: int
     filtered: Array
@@ -91,7 +92,11 @@ class Varying(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Filtered and scaled samples, and the configuration in the middle of them; see ``simulate_block``."""
+    """Filtered and scaled samples, and the configuration in the middle of them; see ``simulate_block``.
+
+    swing: square of the angle through which a link swings with the displacements, summed over the links [rad^2]; that
+    of a sinusoid is twice its mean square.
+    """
 
     U: Array
     slope: Array
@@ -104,6 +109,7 @@ class Block(NamedTuple):
     rates: Array
     angle: float
     rate: float
+    swing: float
 
 
 def roles(config: IdentifierParameters) -> Roles | None:
@@ -220,9 +226,9 @@ def _filter(v: Varying) -> tuple[Array, Array, Array]:
 
 def signals_of(config: IdentifierParameters, rows: Rows, role: Roles) -> Array:
     """(N, r + h + 2) inputs, displacements, relative angle of the links and absolute angle of the first."""
-    angles = rows.angles
-    relative = angles[:, 1] - angles[:, 0] if config.arm.angle_convention == 'chord' else angles[:, 1]
-    return np.ascontiguousarray(np.column_stack([rows.u, rows.y[:, list(role.displacements)], relative, angles[:, 0]]))
+    relative = relative_angle(config, rows.angles)
+    columns = rows.u, rows.y[:, list(role.displacements)], relative, rows.angles[:, 0]
+    return np.ascontiguousarray(np.column_stack(columns))
 
 
 def passed(v: Varying, signals: Array, anew: bool) -> tuple[Array, Array, Array]:
@@ -245,7 +251,7 @@ def block_of(v: Varying, out: Array, second: Array) -> Block:
     U, Y = out[:, :r] * v.scale_u, out[:, r:r + h] * v.scale_y
     s = np.asarray((np.arange(n) - 0.5 * (n - 1)) / (0.5 * n), dtype=np.float64)
     lines = np.linalg.lstsq(np.column_stack([np.ones(n), s, Y - Y.mean(axis=0)]), out[:, r + h:], rcond=None)[0]
-    half = 0.5 * n * v.every * v.dt
+    half, turns = 0.5 * n * v.every * v.dt, Y @ lines[2:]
     middle, relative, first = float(lines[0, 0]), float(lines[1, 0]) / half, float(lines[1, 1]) / half
     bent = math.sin(middle) / v.shift
     slope = np.zeros_like(U)
@@ -255,7 +261,7 @@ def block_of(v: Varying, out: Array, second: Array) -> Block:
     return Block(
         np.ascontiguousarray(U), slope, V, np.ascontiguousarray(Y), s, v.every * v.dt * v.shift, math.cos(middle),
         -math.sin(middle) * relative * half, np.array([1.0, bent * first, bent * (first + relative)]),
-        middle + relative * half, relative)
+        middle + relative * half, relative, 2.0 * float(np.var(turns[:, 1]) + np.var(turns.sum(axis=1))))
 
 
 def _run(v: Varying, block: Block, theta: Array, x: Array, noise: Array) -> tuple[Array, Array, Array, Array, Array]:
@@ -327,6 +333,7 @@ def updated(v: Varying, block: Block, noise: Array, iterations: int) -> Varying 
         strikes = v.strikes + 1 if float(share.max()) > UNPREDICTED else 0
         share = v.share + (share - v.share) * max(1.0 / v.blocks, 1.0 / SHARE_BLOCKS)
     return v._replace(theta=theta, x=end, root=after, noise=known, share=share, angle=block.angle, rate=block.rate,
+                      swing=v.swing + (block.swing - v.swing) * max(1.0 / (v.blocks + 1.0), 1.0 / SHARE_BLOCKS),
                       blocks=v.blocks + 1, strikes=strikes)
 
 

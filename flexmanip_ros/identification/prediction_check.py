@@ -1,4 +1,4 @@
-"""Whether a model predicts: a quarter of its slowest period ahead, in the last second, against the sensors' noise.
+"""Whether a model predicts: 0.25 s ahead, over the last second, against the sensors' noise.
 
 A model that is wrong leaves residuals which it takes for its noise, so it must not be judged against them. White noise
 of a sensor shows in fourth differences, whatever the model.
@@ -9,17 +9,22 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from flexmanip_ros.identification.uncertainty import Identified, modes
+from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.identification.validation import simulate
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Array, StateSpace, Status
 
-LAST_S = 1.0
-"""Time over which predictions are judged [s]."""
+AHEAD_S = 0.25
+"""How far ahead predictions are judged [s]; less in the first 1.5 s after an event."""
+LAST_S = 1.5
+"""Time over which they are judged [s], with that of the first state."""
+INSTANTS = 10
+"""From how many instants in the time ahead one prediction each is made."""
 MOST_ROWS = 4096
 MISSED = 0.5
-"""Share of the outputs' power, in the mean over the outputs, that predictions may miss."""
+"""Share of an output's power that predictions may miss."""
 SILENT = 10.0
 """Power of an output, in units of its white noise, below which it says nothing."""
 FOURTH = 0.6744897501960817 * math.sqrt(70.0)
@@ -37,49 +42,56 @@ def white_noise(Y: Array) -> Array:
     return found
 
 
-def missed(model: StateSpace, U: Array, Y: Array, horizon: int) -> Array:
-    """(m,) share of the power of Y (N, m) that predictions up to ``horizon`` samples ahead miss, beyond white noise.
+def missed(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np.bool_] | None = None) -> Array:
+    """(m,) share of the power of Y (N, m) that predictions ``horizon`` samples ahead miss.
 
-    Each begins at the state that fits twice as many samples before it; no output after that is used. nan where an
-    output is silent.
+    Each begins at the state that fits as many samples before it, outputs at unit power; no output after that is used.
+    seen: (N,) rows that were measured, all of them by default. nan where an output is silent.
     """
     n, m = model.order, model.C.shape[0]
-    before = 2 * max(horizon, n)
-    free, row = np.empty((before, m, n)), model.C
-    for k in range(before):
+    before = max(horizon, 2 * n)
+    free, row = np.empty((before + horizon, m, n)), model.C
+    for k in range(len(free)):
         free[k], row = row, row @ model.A
-    end = np.linalg.matrix_power(model.A, before)
-    back = np.linalg.pinv(free.reshape(-1, n), rcond=1e-9)
-    errors = np.zeros(m)
-    count = 0
-    for first in range(before, len(Y) - horizon + 1, horizon):
-        u, y = U[first - before:first], Y[first - before:first]
-        x = back @ (y - simulate(model, u)).ravel()
-        forced = np.zeros(n)
-        for sample in u:
-            forced = model.A @ forced + model.B @ sample
-        ahead = slice(first, first + horizon)
-        errors += np.sum((Y[ahead] - simulate(model, U[ahead], end @ x + forced)) ** 2, axis=0)
-        count += horizon
     power, white = np.var(Y, axis=0), white_noise(Y)
-    if not count:
+    unit = 1.0 / np.sqrt(np.where(power > 0.0, power, 1.0))
+    free *= unit[:, None]
+    left = (Y - simulate(model, U)) * unit  # a free motion of the model, as far as it is right
+    if not np.all(np.isfinite(free)) or not np.all(np.isfinite(left)):  # a model that runs away
+        return np.full(m, np.inf)
+    known = np.ones(len(Y), dtype=np.bool_) if seen is None else seen
+    back = np.linalg.pinv(free[:before].reshape(-1, n), rcond=1e-9)
+    errors = []
+    for first in range(before, len(Y) - horizon + 1, max(1, horizon // INSTANTS)):
+        used, at = known[first - before:first], first + horizon - 1
+        if not known[at] or np.count_nonzero(used) < before // 2:
+            continue
+        y = left[first - before:first]
+        x = back @ y.ravel() if used.all() else np.linalg.lstsq(
+            free[:before][used].reshape(-1, n), y[used].ravel(), rcond=1e-9)[0]
+        errors.append((left[at] - free[-1] @ x) ** 2)
+    if not errors:
         return np.full(m, np.nan)
-    share = np.maximum(errors / count - 2.0 * white, 0.0) / np.where(power > 0.0, power, np.inf)
-    return np.where(power > SILENT * white, share, np.nan)
+    return np.where(power > SILENT * white, np.mean(errors, axis=0), np.nan)
 
 
 def judged(found: Identified, rows: Rows) -> Identified:
-    """Return the model, INCONSISTENT where its predictions of the last samples miss too much of an output."""
+    """Return the model with what its predictions of the last samples are worth.
+
+    INCONSISTENT where they miss too much of the outputs; ORDER_TOO_LOW where that is so of an output while the others
+    are predicted: rates may ring with modes above the order, which displacements hardly show.
+    """
     if found.status is not Status.TRACKING:
         return found
-    model = found.model
-    slowest = min((mode.frequency_hz for mode in modes(found)), default=1.0)
-    horizon = max(2, min(round(0.25 / (slowest * model.dt)), len(rows) // 6))
-    if 2 * len(rows) < length(model.dt) or len(rows) < 6 * max(horizon, model.order) or rows.gap[1:].any():
+    dt = found.model.dt
+    horizon = max(2, min(round(AHEAD_S / dt), len(rows) // 6))
+    if 3 * len(rows) < length(dt) or len(rows) < 6 * max(horizon, found.model.order) or rows.gap[1:].any():
         return found
     with np.errstate(over='ignore', invalid='ignore'):
-        shares = missed(model, np.ascontiguousarray(rows.u), np.ascontiguousarray(rows.y), horizon)
-    heard = shares[np.isfinite(shares)]  # rates may ring with modes above the order, which displacements hardly show
+        shares = missed(found.model, rows.u, rows.y, horizon, rows.missing == 0)
+    heard = shares[~np.isnan(shares)]
     if heard.size and float(heard.mean()) > MISSED:
         return found._replace(status=Status.INCONSISTENT)
+    if heard.size and float(heard.max()) > MISSED:
+        return found._replace(status=Status.ORDER_TOO_LOW)
     return found

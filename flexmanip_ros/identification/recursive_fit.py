@@ -24,6 +24,8 @@ CHUNK = 64
 """Samples handed over at once."""
 FIRST, LONGEST = 256, 2048
 """Samples of the first fit, and of the last one that sees them all; multiples of CHUNK."""
+SOON = (640, 768)
+"""Further ones after an event, where the arm was known before."""
 DELAY = 4
 SOONEST = 128
 """A fit of N samples is taken N / DELAY samples later, and at least so many."""
@@ -131,13 +133,18 @@ def take(refined: Refined, rows: Rows) -> Refined:
     return refined._replace(end=rows.until)
 
 
-def is_fit_due(refined: Refined) -> bool:
-    """Whether the whole stretch is to be fitted now: at FIRST samples and each time they double."""
+def is_fit_due(config: IdentifierParameters, refined: Refined) -> bool:
+    """Whether the whole stretch is to be fitted now: at FIRST samples and each time they double.
+
+    A model of every configuration from before an event is fitted to more stretches, as soon as it may be right.
+    """
     total = refined.total
-    if not refined.batch or refined.request is not None or total <= 0 or total % FIRST:
+    if not refined.batch or refined.request is not None or total <= 0:
         return False
+    if total in SOON and refined.varying_before is not None:
+        return parameter_varying.roles(config) is not None
     doublings = total // FIRST
-    return doublings & (doublings - 1) == 0
+    return total % FIRST == 0 and doublings & (doublings - 1) == 0
 
 
 def is_block_due(refined: Refined) -> bool:
@@ -154,7 +161,7 @@ def result_delay(refined: Refined, now_ns: int) -> int:
     """
     count = refined.total
     needed = _chunks(refined, now_ns, max(SOONEST_S, EACH_S * count), LATEST)
-    return max(SOONEST, count // DELAY, needed)
+    return max(SOONEST, count // DELAY // CHUNK * CHUNK, needed)
 
 
 def _chunks(refined: Refined, now_ns: int, duration: float, most: int) -> int:
@@ -413,7 +420,7 @@ def refine(config: IdentifierParameters, refined: Refined, rows: Rows, outcome: 
     if refined.request is not None and refined.end >= refined.due:
         refined = delivered(refined, background)
     before = refined.request
-    if is_fit_due(refined):
+    if is_fit_due(config, refined):
         refined = ask_fit(config, refined, rows, R, scale)
     elif is_block_due(refined):
         refined = ask_block(config, refined, rows)

@@ -11,6 +11,7 @@ from flexmanip_ros.identification.batch_fit import BLOCK
 from flexmanip_ros.identification.parameter_varying import AT_REST, QUALITIES, Roles, Varying, local, shown, to_local
 from flexmanip_ros.identification.uncertainty import Identified, Tangent, modes
 from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.samples.signals import relative_angle
 from flexmanip_ros.types import Array, StateSpace, Status
 
 TERMS = 12
@@ -38,8 +39,7 @@ class Configurations(NamedTuple):
 
     def at(self, angles: Array) -> Identified:
         """Return the model at measured angles (2,) [rad]."""
-        relative = angles[1] - angles[0] if self.config.arm.angle_convention == 'chord' else angles[1]
-        return self.with_relative(float(relative))
+        return self.with_relative(float(relative_angle(self.config, angles)))
 
     def now(self, waiting: int) -> Identified:
         """Return the model at the present configuration; waiting: samples that the fit has not taken yet."""
@@ -67,18 +67,21 @@ def judge(found: Identified, v: Varying) -> Status:
     oscillations = modes(found)
     if len(oscillations) < len(v.scale_y):
         return Status.INCONSISTENT
-    if any(mode.frequency_std_hz > VAGUE * mode.frequency_hz for mode in oscillations):
+    vague = math.hypot(VAGUE, v.swing)  # a wide band for the amplitude is no lack of information
+    if any(mode.frequency_std_hz > vague * mode.frequency_hz for mode in oscillations):
         return Status.WARMING_UP if v.blocks < EARLY else Status.POORLY_EXCITED
     return Status.TRACKING
 
 
 def unmodelled(v: Varying) -> float:
-    """Return the relative error of frequencies that explains what predictions over a block miss.
+    """Return the relative error of frequencies that explains what predictions over a block miss, and the amplitude's.
 
     A frequency off by the share e turns the phase by shift t e in a time t, in the mean over a block of the time T
-    by shift T e / sqrt(3) (root of the mean square).
+    by shift T e / sqrt(3) (root of the mean square). An arm softens or stiffens with its amplitude by the order of the
+    square of the angle through which it swings (cos a = 1 - a^2 / 2): a model of small bends leaves that out.
     """
-    return math.sqrt(3.0) * float(v.share.mean()) / (v.shift * BLOCK * v.dt)
+    phase = math.sqrt(3.0) * float(v.share.mean()) / (v.shift * BLOCK * v.dt)
+    return math.hypot(phase, v.swing)
 
 
 def _matrices(read: Configurations, c: float, role: Roles) -> tuple[StateSpace, Tangent]:

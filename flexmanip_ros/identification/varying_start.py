@@ -36,7 +36,7 @@ SETTLE = 2.0
 """Periods of the corner frequency after which a filter that began anew is trusted."""
 WINDOW = 1024
 """Samples of the longest stretch that is fitted at once, as one block."""
-GROWTH = (256, 512, WINDOW)
+GROWTH = (256, 512, 640, 768, WINDOW)
 """Samples of the stretches that lead there, each started from the one before."""
 ITERATIONS = 8
 LATE = 16.0
@@ -122,7 +122,7 @@ def _from_recursion(old: Recursion, role: Roles, r: int, dt: float) -> Varying |
     theta, root = _around(G / shift ** 2, H / shift ** 2, D / shift)
     return Varying(
         shift=shift, scale_u=scale[:r].copy(), scale_y=scale[r:][list(role.displacements)].copy(), theta=theta,
-        x=np.zeros(2 * h), root=root, noise=np.zeros((h, h)), share=np.zeros(h), corner=corner,
+        x=np.zeros(2 * h), root=root, noise=np.zeros((h, h)), share=np.zeros(h), swing=0.0, corner=corner,
         every=every, filtered=np.zeros((4, r + h + 2)), dt=dt, angle=0.0, rate=0.0, blocks=0, strikes=0, lost=False,
         gain=np.zeros((0, 0)))
 

@@ -21,6 +21,7 @@ from matplotlib.patches import Patch
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
+from flexmanip_ros.studies.configurations import Sweep
 from flexmanip_ros.studies.holdout import Scores
 from flexmanip_ros.studies.smoothing import Smoothed
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointRecord, Status
@@ -338,6 +339,27 @@ def frequency_figure(made: Run) -> Figure:
             axes[0].plot([part.start_s, part.end_s], [mode.frequency_hz] * 2, color=SMOOTHED_COLOUR, linewidth=1.0,
                          linestyle=LINES[1])
     events(axes, made.events)
+    return drawn
+
+
+def configurations_figure(found: Sweep) -> Figure:
+    """Draw the frequencies over the angle between the links with their bands, and where the recording has been."""
+    drawn, (ax,) = figure([3.2], share_time=False)
+    angle = np.degrees(found.relative)
+    ax.axvspan(*np.degrees(found.seen), color='#F0F0F0', linewidth=0, label='configurations\nof the recording')
+    for k in range(found.frequency.shape[1]):
+        colour, middle, spread = COLOURS[k % len(COLOURS)], found.frequency[:, k], 1.96 * found.std[:, k]
+        ax.fill_between(angle, middle - spread, middle + spread, color=colour, alpha=0.2, linewidth=0)
+        ax.plot(angle, middle, color=colour, linestyle=LINES[k % len(LINES)], linewidth=1.4,
+                label=f'mode {k + 1}, 95 % band')
+    inside = (found.seen[0] <= found.relative) & (found.relative <= found.seen[1])
+    limit(ax, found.frequency[inside] if inside.any() else found.frequency, found.frequency[np.isfinite(
+        found.frequency)].tolist())
+    ax.set_xlim(0.0, 180.0)
+    ax.set_xticks(range(0, 181, 30))
+    ax.set_xlabel('angle between the links, to either side [degrees]')
+    ax.set_ylabel('frequency\n[Hz]')
+    legend(ax)
     return drawn
 
 

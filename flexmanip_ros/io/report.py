@@ -18,6 +18,7 @@ from flexmanip_ros.io.outputs import write_text
 from flexmanip_ros.parameters import IdentifierParameters, flatten
 from flexmanip_ros.parameters.document import written
 from flexmanip_ros.parameters.field import leaves
+from flexmanip_ros.studies.configurations import Sweep
 from flexmanip_ros.studies.holdout import Scores
 from flexmanip_ros.studies.metrics import Score, score
 from flexmanip_ros.studies.smoothing import Smoothed
@@ -122,11 +123,12 @@ def identification_report(
     path: str | Path, source: str, config: IdentifierParameters, summary: Summary, made: plots.Run,
     model: StateSpace | None, scores: Scores | None, messages: dict[str, int], bound: float | None = None,
     fault: str = '', *, modes: Sequence[Mode] = (), events: str = '', player: str = '',
+    configurations: Sweep | None = None,
 ) -> None:
     """Write the report of identify_bag: the answer, then pictures, then tables.
 
     events: what was found in the signals where captures were looked for; empty where they are known. player: the page
-    that plays the recording.
+    that plays the recording; configurations: the modes at other angles, where the model knows them.
     """
     sections = [Section('Result', _answer(config, summary, modes, events, fault))]
     if player:
@@ -138,6 +140,9 @@ def identification_report(
         sections.append(Section('Frequencies', picture(
             plots.frequency_figure(made), 'identified frequencies with 95 % bands over time')
             + _smoothed(summary.smoothed or ())))
+    if configurations is not None:
+        sections.append(Section('Configurations', picture(
+            plots.configurations_figure(configurations), 'frequencies over the angle between the links')))
     sections.append(Section('Signals', picture(plots.signals_figure(made), 'torques and measured signals over time')))
     if scores is not None:
         note = '' if not scores.until_gap else '<p class="note">Scored up to the first gap.</p>'

@@ -70,6 +70,12 @@ def reads_angles(config: IdentifierParameters) -> bool:
     return bool(config.angles) and (config.payload_method != 'none' or config.angles != IdentifierParameters.angles)
 
 
+def relative_angle(config: IdentifierParameters, angles: Array) -> Array:
+    """Return the angle of link 2 seen from link 1 [rad] (...,) of measured angles (..., 2)."""
+    is_absolute = config.arm.angle_convention == 'chord'
+    return np.asarray(angles[..., 1] - angles[..., 0] if is_absolute else angles[..., 1], dtype=np.float64)
+
+
 def wrong_size(record: JointRecord | JointBlock) -> Rejection | None:
     """Reject a record whose arrays have neither the length of its names nor zero."""
     count = len(record.names)

@@ -161,6 +161,12 @@ def test_the_report_is_one_page_that_needs_nothing_else(recording, capsys, tmp_p
         assert f'>{word}</h2>' in text
 
 
+def test_frequencies_over_configurations_need_a_model_of_every_one(recording, capsys, tmp_path):
+    status, _, err = _run(capsys, recording, *SETTINGS, '--configurations', tmp_path / 'out.csv')
+    assert status == 2
+    assert 'moving_arm.md' in err
+
+
 def test_a_capture_time_can_be_given_by_hand(recording, capsys):
     status, out, _ = _run(capsys, recording, *SETTINGS, '--json', '--capture-time', 5, '--release-time', 8)
     found = json.loads(out)
@@ -180,8 +186,14 @@ def test_what_the_arm_taught_is_saved_and_given_back_as_parameters(capsys, tmp_p
               'joint_viscous_friction': (0.8, 0.4)}
     given = [part for name, value in faults.items() for part in ('--set', f'arm.{name}={list(value)}')]
     assert simulate([str(place), '--duration', '4', '--capture-time', '3', '--payload', '20', *given]) == 0
-    code, *_ = _run(capsys, place, '--save-arm', saved, '--json', '--output', tmp_path / 'estimates')
+    table = tmp_path / 'configurations.csv'
+    code, *_ = _run(capsys, place, '--save-arm', saved, '--json', '--output', tmp_path / 'estimates',
+                    '--configurations', table)
     assert code == 0
+    with table.open(encoding='utf-8') as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row['relative_angle_deg']) for row in rows] == pytest.approx(np.arange(0.0, 181.0, 2.5))
+    assert all(float(row['frequency1_hz']) < float(row['frequency2_hz']) for row in rows if row['seen'] == '1')
     written = read(saved, 'rpbsid_identifier')
     for name, value in faults.items():
         assert written[f'arm.{name}'] == pytest.approx(value, rel=0.05, abs=2e-5), name
