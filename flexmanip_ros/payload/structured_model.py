@@ -472,7 +472,9 @@ def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, 
     state = np.zeros((2 * n, change.size, profiles.shape[1]))
     for profile in profiles:
         state = np.tensordot(step[:2 * n, :2 * n], state, 1) + step[:2 * n, 2 * n:, None] * profile
-    found = np.linalg.solve(step[:2 * n, :2 * n], state.reshape(2 * n, -1))
+    back = -dt * flow[:2 * n, :2 * n]  # what is damped within a sample cannot be carried back over one
+    back[n:, n:] /= max(1.0, dt * float(np.linalg.norm(motion.dqd, 2)))
+    found = expm(back) @ state.reshape(2 * n, -1)
     columns = np.zeros((m.x.size, found.shape[1]))
     columns[:2 * n] = found
     return columns
