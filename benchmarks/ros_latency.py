@@ -122,7 +122,10 @@ def node(name: str, rate: float) -> list[str]:
 def measure(seconds: float = SECONDS) -> dict[str, float]:
     """Return what the claims are about, by name."""
     together = case({name: node(name, 1000.0) for name in NODES}, seconds, 1 + os.getpid() % 100)
-    player = [sys.executable, str(HERE / 'parts' / 'bare_nodes.py'), 'player', '4000', str(seconds + 3 * SETTLE_S)]
+    parts = [sys.executable, str(HERE / 'parts' / 'bare_nodes.py')]
+    bare = case({NODES[0]: [*parts, 'echo', '1000'], 'plant_simulator': node('plant_simulator', 1000.0)},
+                min(seconds, 20.0), 1 + (os.getpid() + 3) % 100)
+    player = [*parts, 'player', '4000', str(seconds + 3 * SETTLE_S)]
     alone = case({NODES[0]: node(NODES[0], 4000.0), 'player': player}, seconds, 1 + (os.getpid() + 7) % 100)
     p50, p99 = np.percentile(together['latency_ms'], [50, 99])
     return {
@@ -130,6 +133,7 @@ def measure(seconds: float = SECONDS) -> dict[str, float]:
         'sample to payload, 99 of 100 [ms]': float(p99),
         'samples lost at 1 kHz': float(together['lost']),
         'identifier at 1 kHz [% of a core]': float(together['cpu_percent']),
+        'bare node at 1 kHz [% of a core]': float(bare['cpu_percent']),
         'samples lost at 4 kHz by the identifier alone': float(alone['lost']),
         'payloads at 4 kHz': float(alone['latency_ms'].size),
     }

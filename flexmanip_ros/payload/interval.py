@@ -58,9 +58,10 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         status = Status.DIVERGED
     body = m.x[state:state + model.body].copy()
     spread = (widening ** 2) * (m.S[state:state + model.body] @ m.S[state:state + model.body].T)
-    spread[0, 0] += (reckoned * inertia_error(config, model, max(float(body[0]), 0.0) if held else 0.0)) ** 2
+    considered = inertia_error(config, model, max(float(body[0]), 0.0) if held else 0.0)
+    spread[0, 0] += (reckoned * considered) ** 2
     if not held:
-        return empty(float(body[0]), math.sqrt(spread[0, 0]), consistency, status)
+        return empty(float(body[0]), math.sqrt(spread[0, 0]), considered, consistency, status)
     known_point = model.body > 1 and not spread[1:, 1:].any()
     if model.body > 1 and not known_point:
         body, spread = point_or_body(body, spread, structured_model.body_mean(config, model),
@@ -107,22 +108,22 @@ def with_body(found: Payload, body: Array, spread: Array) -> Payload:
                           covariance=tuple((J @ spread @ J.T).ravel().tolist()))
 
 
-def empty(seeming: float, std: float, consistency: float, status: Status) -> Payload:
+def empty(seeming: float, std: float, considered: float, consistency: float, status: Status) -> Payload:
     """Return the payload of an arm that should be empty and seems to hold ``seeming`` kg.
 
-    An arm that does not move as an empty one may hold anything: nobody said so, or it is another arm.
+    An arm that does not move as an empty one may hold anything: nobody said so, or it is another arm. After minutes std
+    is a thousandth of what any arm's inertia is known to. So what it seems to hold is tested against the consider
+    covariance (Schmidt), in which a parameter that is not estimated, the error of the inertia, has its deviation
+    ``considered`` [kg].
     """
     if status is Status.INCONSISTENT:
         return Payload(0.0, math.inf, 0.0, math.inf, consistency, status)
+    if abs(seeming) > 3.0 * std:
+        std = math.hypot(std, considered)
     upper = max(seeming, 0.0) + QUANTILE * std
     if abs(seeming) > 3.0 * std and status is Status.TRACKING:
         return Payload(max(seeming, 0.0), std, 0.0, upper, consistency, Status.INCONSISTENT)
     return Payload(0.0, std, 0.0, upper, consistency, status)
-
-
-def inexact(config: IdentifierParameters, model: Model, m: mem.FilterState, mass: float) -> float:
-    """Deviation [kg] of a payload by the error to reckon with in the arm's inertia; 0 for an exact arm."""
-    return misjudged(m.noise, m.counts) * inertia_error(config, model, mass)
 
 
 def inertia_error(config: IdentifierParameters, model: Model, mass: float) -> float:

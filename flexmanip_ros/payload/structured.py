@@ -14,7 +14,7 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured_model
 from flexmanip_ros.payload.capture_detection_kernel import filtered
-from flexmanip_ros.payload.interval import inexact, judge
+from flexmanip_ros.payload.interval import inertia_error, judge
 from flexmanip_ros.payload.measurement_update import MeasurementModel
 from flexmanip_ros.payload.process_model import predict
 from flexmanip_ros.payload.structured_model import Model, build, sensors
@@ -158,7 +158,8 @@ def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterSta
         if square > 0.0:
             if m.counts[mem.SINCE_EVENT] > mem.ENOUGH:
                 m.score[mem.EMPTY_ARM_BIAS] = m.x[payload] / np.sqrt(square)
-                m.score[mem.EXCESS_BIAS] = m.x[payload] / np.hypot(np.sqrt(square), inexact(config, model, m, 0.0))
+                considered = inertia_error(config, model, 0.0)
+                m.score[mem.EXCESS_BIAS] = m.x[payload] / np.hypot(np.sqrt(square), considered)
             gain = m.S @ f / square
             m.x[:] -= gain * m.x[payload]
             m.S[:] -= np.outer(gain, f)

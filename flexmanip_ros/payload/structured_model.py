@@ -444,15 +444,16 @@ def jump(config: IdentifierParameters, model: Model, m: mem.FilterState) -> Arra
 
 
 BRIDGE_TERMS = 64
-"""Terms of the series of a Brownian bridge at most; over 0.1 s they reach to 320 Hz, beyond the modes of the arm."""
+"""Terms of a Brownian bridge at most; over 0.1 s they reach to 320 Hz, beyond the modes of the arm."""
 
 
 def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, dt: float) -> Array:
     """Columns (nx, c) by which torques that change by ``change`` (L,) [N m] in ``count`` samples leave the state open.
 
-    Each torque jumped at an instant as likely as any other, and was interpolated linearly: the difference has the
-    covariance of a Brownian bridge, change^2 (min(s, t) - s t) over a time of 1. Its Karhunen-Loeve series has
-    the terms change sqrt(2) sin(k pi t) / (k pi); a column is what one of them does to the arm as it is now.
+    Each torque jumped at a sample as likely as any other, and was interpolated linearly: in interval i of ``count`` the
+    difference has the covariance of a Brownian bridge, change^2 (min(p, q) - p q) with p, q = i / (count + 1). A column
+    is what one of its principal components (Karhunen and Loeve) does to the arm as it is now. The last interval ends
+    at the sample that follows the state, so columns are carried back over it.
     """
     motion = model.motion
     n = motion.arm.stiffness.size
@@ -465,13 +466,17 @@ def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, 
         else mass_matrix(motion.arm, motion.payload, m.x[:n])
     flow[n:2 * n, 2 * n:] = np.linalg.solve(M, motion.arm.torque * (motion.gain * change))
     step = expm(flow * dt)
-    k = np.arange(1, min(count, BRIDGE_TERMS) + 1)
-    state = np.zeros((2 * n, change.size, k.size))
-    for t in (np.arange(count) + 0.5) / count:
-        profile = np.sqrt(2.0) * np.sin(np.pi * k * t) / (np.pi * k)
+    p = np.arange(1, count + 1) / (count + 1)
+    power, shape = np.linalg.eigh(np.minimum.outer(p, p) - np.outer(p, p))
+    profiles = (shape * np.sqrt(np.maximum(power, 0.0)))[:, -BRIDGE_TERMS:]
+    state = np.zeros((2 * n, change.size, profiles.shape[1]))
+    for profile in profiles:
         state = np.tensordot(step[:2 * n, :2 * n], state, 1) + step[:2 * n, 2 * n:, None] * profile
-    columns = np.zeros((m.x.size, change.size * k.size))
-    columns[:2 * n] = state.reshape(2 * n, -1)
+    back = -dt * flow[:2 * n, :2 * n]  # what is damped within a sample cannot be carried back over one
+    back[n:, n:] /= max(1.0, dt * float(np.linalg.norm(motion.dqd, 2)))
+    found = expm(back) @ state.reshape(2 * n, -1)
+    columns = np.zeros((m.x.size, found.shape[1]))
+    columns[:2 * n] = found
     return columns
 
 

@@ -25,6 +25,8 @@ pytestmark = [
 
 
 FRESH = bool(os.environ.get('FLEXMANIP_FRESH'))
+BUILD = re.findall(r'^colcon build.*$', (ROOT / 'README.md').read_text(encoding='utf-8'), re.MULTILINE)[0]
+"""As the first page says."""
 
 
 def run(command: str, folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -42,8 +44,9 @@ def workspace(folder: Path, *options: str, **variables: str) -> Path:
     """Build a copy of the package in ``folder`` and return it."""
     source = folder / 'src' / 'flexmanip_ros'
     shutil.copytree(ROOT, source, ignore=LEFT_OUT)
-    built = run(' '.join(['colcon build', *options]), folder, **variables)
+    built = run(' '.join([BUILD, *options]), folder, **variables)
     assert built.returncode == 0, built.stdout + built.stderr
+    (folder / 'shown.txt').write_text(built.stdout, encoding='utf-8')
     return folder
 
 
@@ -84,6 +87,12 @@ def test_an_installed_program_runs_from_the_install_folder(installed: Path) -> N
 def test_kernels_are_compiled_while_installing(installed: Path) -> None:
     rooms = {path.parent.parent.name for path in (installed / 'install').rglob('*.nbi')}
     assert {'identification', 'payload', 'simulation'} <= rooms
+    assert 'compiling 2 parts side by side' in (installed / 'shown.txt').read_text(encoding='utf-8')
+
+
+def test_what_a_build_prints_is_seen_while_it_builds(installed: Path) -> None:
+    """Kernels compile for a minute, and colcon keeps the output of a package to itself unless it is asked for it."""
+    assert 'running install' in (installed / 'shown.txt').read_text(encoding='utf-8')
 
 
 def test_an_installed_node_starts_and_ends_on_interrupt(installed: Path) -> None:

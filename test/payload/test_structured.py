@@ -82,6 +82,14 @@ def test_an_empty_arm_holds_nothing(caught):
     assert found.status is Status.TRACKING
 
 
+def test_an_empty_arm_heavier_by_the_model_error_is_not_taken_for_another_one():
+    heavier = replace(ARM, tip_mass=ARM.tip_mass + 0.05)  # 5 deviations, 0.3 % of what is at the tip
+    found = structured.estimate(config(), run(config(), record(8.0, arm=heavier)))
+    assert found.status is Status.TRACKING
+    assert (found.mass, found.lower) == (0.0, 0.0)
+    assert 0.05 < found.upper < 0.3
+
+
 def test_a_load_that_was_never_announced_is_not_taken_for_an_empty_arm():
     samples = record(3.0, (event(0.0),))
     found = structured.estimate(config(), run(config(), samples))

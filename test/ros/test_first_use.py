@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -33,6 +35,9 @@ from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
 from flexmanip_ros.ros.nodes.rpbsid_identifier import RpbsidIdentifier
 
 NODES = (PlantSimulator, Excitation, CaptureTrigger, PayloadController, PayloadAdapter, RpbsidIdentifier, LiveView)
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = [path for path in sorted((ROOT / 'config').rglob('*.yaml'))
+          if 'ros__parameters' in path.read_text(encoding='utf-8') and path.stem != 'ros2_control']  # other nodes' too
 
 
 @pytest.fixture
@@ -60,6 +65,33 @@ def test_a_node_that_waits_to_be_configured_reports_that_it_is_not_active(ros: R
     assert heard[0].status[0].message.startswith('not active')
 
 
+def documented() -> list[str]:
+    """Return what follows `ros2 run flexmanip_ros` in the commands of the documentation."""
+    pages = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
+    text = '\n'.join(page.read_text(encoding='utf-8') for page in pages).replace('\\\n', ' ')
+    return re.findall(r"^ros2 run (?:--prefix '[^']*' )?flexmanip_ros (.*)$", text, re.MULTILINE)
+
+
+def test_the_documentation_starts_nodes() -> None:
+    assert 'rpbsid_identifier --ros-args -p autostart:=false' in documented()
+    assert len(documented()) > 5
+
+
+@pytest.mark.parametrize('command', documented())
+def test_a_documented_command_starts_a_node_that_reports(ros: Ros, command: str) -> None:
+    share = command.replace('$(ros2 pkg prefix --share flexmanip_ros)', str(ROOT))
+    name, *arguments = shlex.split(share, comments=True)
+    port = ['-p', 'port:=0'] if name == 'live_view' else []  # any that is free
+    (cls,) = [cls for cls in NODES if cls.__module__.endswith(f'.{name}')]
+    heard = ros.listen(DiagnosticArray, '/diagnostics', 10)
+    node = ros.add(cls(context=ros.context, cli_args=['--ros-args', *arguments[1:], *port]))
+    if not node.autostart():
+        assert 'config/drivers/' in command
+        pytest.skip("the driver's messages are not installed here")
+    ros.wait(lambda: any(message.status[0].name == f'/{name}: status' for message in heard))
+    assert node.active is ('autostart:=false' not in command)
+
+
 @pytest.mark.parametrize('remapping', [['-r', '__ns:=/left'], ['-r', '__node:=arm'], []])
 def test_a_written_parameter_file_holds_in_any_namespace_and_under_any_name(
         ros: Ros, tmp_path: Path, remapping: list[str]) -> None:
@@ -82,10 +114,9 @@ def test_the_identifier_takes_a_suggested_file(ros: Ros, tmp_path: Path) -> None
     assert {name: getattr(node.config, name) for name in values} == values
 
 
-@pytest.mark.parametrize('name', ['rpbsid_identifier', 'plant_simulator', 'capture_trigger', 'quanser_2dsfl'])
-def test_the_files_in_config_are_for_every_name(name: str) -> None:
-    text = (Path(__file__).resolve().parents[2] / 'config' / f'{name}.yaml').read_text(encoding='utf-8')
-    assert '\n/**:\n' in text
+@pytest.mark.parametrize('path', CONFIG, ids=lambda path: path.stem)
+def test_the_files_in_config_are_for_every_name(path: Path) -> None:
+    assert re.findall(r'^(\S+):\n  ros__parameters:', path.read_text(encoding='utf-8'), re.MULTILINE) == ['/**']
 
 
 def test_a_node_logs_its_arm_and_where_it_comes_from(
