@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import struct
 import sys
 import time
@@ -127,12 +128,18 @@ def _run(config: DemoParameters, folder: Path, console: Console, view: Viewer | 
         yaml_text('rpbsid_identifier', flatten(identifier), 'The identifier as it ran in this demonstration.'),
         encoding='utf-8')
     console.print(f"\nbag      {folder / 'bag'}\npicture  {folder / 'overview.png'}\n"
-                  f"again    identify_bag {folder / 'bag'} --params {folder / 'identifier.yaml'}")
+                  f"again    {beside('identify_bag')} {folder / 'bag'} --params {folder / 'identifier.yaml'}")
     if view is not None and sys.stdout.isatty():
         console.print(f'\nthe live view stays open at {view.url} until Ctrl-C')
         with suppress(KeyboardInterrupt):
             view.wait()
     return FAILED if different else 0
+
+
+def beside(program: str) -> str:
+    """Return how to call another program of this package: by its name, or by its path where that is not on PATH."""
+    path = Path(sys.argv[0]).with_name(program)
+    return str(path) if shutil.which(program) is None and path.is_file() else program
 
 
 def _wait_for_a_page(view: Viewer, composition: Composition, console: Console) -> None:
