@@ -89,6 +89,7 @@ class Source(NamedTuple):
                     'angles': [*range(r + m, r + 2 * m)],
                     'chords': arm.angle_convention == 'chord'} if self.is_arm else None,
             'statuses': [[status.name, status.value, STATUS_LOOKS[status][0]] for status in Status],
+            'tracking': STATUSES[Status.TRACKING.name],
             'colours': COLOURS, 'payload_colour': PAYLOAD_COLOUR, 'event_colour': EVENT_COLOUR,
             'modes_apart': MODES_APART, 'stale_after': config.stale_after, 'exaggeration': config.exaggeration,
             'window': config.window, 'windows': WINDOWS,
