@@ -32,8 +32,9 @@ def estimates(folder: Path, name: str, torque: str, settings: list[str]) -> list
     arm = folder / 'my_arm.yaml'
     arm.write_text(re.findall(r'^```yaml\n(.*?)^```', page, re.MULTILINE | re.DOTALL)[0], encoding='utf-8')
     bag, table = str(folder / name), str(folder / f'{name}.csv')
-    simulate_bag.main([bag, '--params', str(arm), '--payload', str(TRUE_MASS), '--set',
-                       'noise=std' if settings or torque == WEAK else 'noise=snr', '--set', f'excitation.amplitude={torque}'])
+    noise = 'std' if settings or torque == WEAK else 'snr'
+    simulate_bag.main([bag, '--params', str(arm), '--payload', str(TRUE_MASS), '--set', f'noise={noise}',
+                       '--set', f'excitation.amplitude={torque}'])
     chosen = [part for item in settings for part in ('--set', item)]
     identify_bag.main([bag, '--params', str(arm), '--output', table, *chosen])
     with Path(table).open(encoding='utf-8') as lines:
