@@ -92,9 +92,10 @@ def programs() -> Iterator[str]:
         if '\ndef _parser(' in path.read_text(encoding='utf-8'):
             made = importlib.import_module(f'flexmanip_ros.cli.{path.stem}')._parser()
             yield f'### {path.stem}\n\n{made.description}\n\n| argument | meaning |\n|---|---|'
+            expanded = made._get_formatter()._expand_help
             for action in made._actions[1:]:  # all but --help
                 name = ' '.join([*action.option_strings[-1:], *([action.metavar] if action.metavar else [])])
-                yield f'| `{cell(name)}` | {cell(action.help or "")} |'
+                yield f'| `{cell(name)}` | {cell(expanded(action))} |'
             yield f'\n```text\n{PARAMETERS.split(made.epilog or "")[0].rstrip()}\n```\n'
 
 

@@ -1,4 +1,4 @@
-"""The arm in RViz: its joint states through a URDF made from the plant's parameters, and the identifier's ~/arm.
+"""The arm in RViz: its joint states through a URDF made from the parameters arm.*, and the identifier's ~/arm.
 
 ros2 launch flexmanip_ros view.launch.py params_file:=my_arm.yaml
 """
@@ -13,17 +13,15 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from flexmanip_ros.arm.urdf import urdf
-from flexmanip_ros.io.parameter_file import load
-from flexmanip_ros.parameters import PlantParameters
+from flexmanip_ros.io.parameter_file import load_arm
 
 
 def describe(context):
     """Make the URDF once the arguments are known."""
     path = LaunchConfiguration('params_file').perform(context) or None
-    arm = load(PlantParameters, 'plant_simulator', path).arm
     return [
         Node(package='robot_state_publisher', executable='robot_state_publisher', output='screen',
-             parameters=[{'robot_description': urdf(arm)}],
+             parameters=[{'robot_description': urdf(load_arm(path))}],
              remappings=[('joint_states', LaunchConfiguration('joint_states'))]),
         Node(package='rviz2', executable='rviz2', output='screen',
              arguments=['--display-config', LaunchConfiguration('layout')],
@@ -35,7 +33,8 @@ def generate_launch_description():
     """Return robot_state_publisher and, unless it is turned off, RViz."""
     layout = Path(get_package_share_directory('flexmanip_ros')) / 'config' / 'layouts' / 'arm.rviz'
     return LaunchDescription([
-        DeclareLaunchArgument('params_file', default_value='', description='parameter file with the arm'),
+        DeclareLaunchArgument('params_file', default_value='',
+                              description='parameter file of the plant or the identifier, with the arm'),
         DeclareLaunchArgument('joint_states', default_value='joint_states',
                               description='topic of the joint states'),
         DeclareLaunchArgument('rviz', default_value='true', description='start RViz too'),

@@ -17,8 +17,8 @@ from numba.core import event
 
 PATIENCE = 2.0
 """Time [s] for which a kernel is compiled before the user is told; one that takes less is not worth a line."""
-WORDS = ('flexmanip_ros: compiling the kernels for this machine. This happens once after an installation and takes '
-         'a minute or two.')
+WORDS = ('flexmanip_ros: compiling the kernels for this machine. It takes a minute or two, at the first use of each '
+         'method after an installation.')
 
 
 def tell() -> None:

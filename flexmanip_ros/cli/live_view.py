@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from flexmanip_ros.cli import console
+from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import help_text
@@ -68,15 +70,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _play(options: argparse.Namespace) -> int:
+    from flexmanip_ros import pipeline
+    from flexmanip_ros.cli import first_use
     from flexmanip_ros.io import bag
+    from flexmanip_ros.payload import capture_detection
     from flexmanip_ros.view import recording
     from flexmanip_ros.view.screen import of_identifier, page
     from flexmanip_ros.view.server import Server
 
     config = load(IdentifierParameters, 'rpbsid_identifier', options.params, options.set)
     source = of_identifier(config, Path(options.bag).name)
-    with console.progress('identifying', 'messages') as progress:
-        items = bag.read_blocks(options.bag, bag.Topics(options.joint_states), progress)
+    topics = bag.Topics(options.joint_states)
+    with console.progress('identifying', 'messages') as progress, first_use.announced():
+        items: Iterable[pipeline.Item] = bag.read_blocks(options.bag, topics, progress)
+        if config.payload_method != 'none' and not bag.event_topics(options.bag, topics):
+            with suppress(ParameterError):  # as identify_bag, captures are looked for in signals that can show them
+                items = capture_detection.with_detected(capture_detection.watch(config), items)
         found, fault = recording.read(config, items, source)
     if fault is not None:
         console.print_error(PROG, fault)

@@ -338,6 +338,8 @@ def _report(request: Request, summary: Summary, messages: _Messages, kept: list[
 
     assert request.report is not None
     config = state.config or request.config
+    if last is not None and kept and last.stamp_ns > kept[-1].stamp_ns:
+        kept = [*kept, last]  # so that pictures and replay end with the numbers of the answer
     made = replace(plots.run(config, signals, kept, messages.events), smoothed=summary.smoothed or ())
     bound, mass = None, summary.payload_mass_kg
     if summary.capture_time_s is not None and mass is not None:

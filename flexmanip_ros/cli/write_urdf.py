@@ -7,8 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from flexmanip_ros.cli import console
-from flexmanip_ros.io.parameter_file import load
-from flexmanip_ros.parameters import PlantParameters
+from flexmanip_ros.io.parameter_file import load_arm
 
 PROG = 'write_urdf'
 EXAMPLES = """examples:
@@ -22,7 +21,7 @@ exit status: 0 on success; 2 on bad arguments, with one line on stderr.
 def _parser() -> console.Parser:
     made = console.parser(
         PROG, 'Write the arm as URDF. Its links are chains of segments that bend with the joint states.', EXAMPLES)
-    console.add_parameters(made, 'plant_simulator')
+    console.add_parameters(made, 'plant_simulator or rpbsid_identifier')
     made.add_argument('--segments', metavar='N', type=int, default=12, help='segments of each link; default: 12')
     made.add_argument('--output', metavar='FILE', help='file to write; default: standard output')
     return made
@@ -38,7 +37,7 @@ def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.arm.urdf import urdf
     from flexmanip_ros.io.outputs import write_text
 
-    text = urdf(load(PlantParameters, 'plant_simulator', given.params, given.set).arm, given.segments)
+    text = urdf(load_arm(given.params, given.set), given.segments)
     if given.output:
         write_text(given.output, text)
     else:

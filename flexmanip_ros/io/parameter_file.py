@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import yaml
 
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.parameters import configure
+from flexmanip_ros.parameters import ArmParameters, PlantParameters, configure
 
 Config = TypeVar('Config')
 STANDARD = re.compile(r'^(use_sim_time|start_type_description_service|qos_overrides\..*)$')
@@ -148,3 +148,14 @@ def load(cls: type[Config], node: str, path: str | Path | None, overrides: Itera
                 raise
             raise ParameterError(f"{err.problem} in parameter file '{path}'", err.remedy) from err
     return configure(cls, from_line)
+
+
+def load_arm(path: str | Path | None, overrides: Iterable[str] = ()) -> ArmParameters:
+    """Return the arm in a parameter file of the plant or of the identifier, whatever else stands there."""
+    found: dict[str, Any] = {}
+    if path is not None:
+        for node in ('plant_simulator', 'rpbsid_identifier'):
+            found.update(item for item in read(path, node, optional=True).items() if item[0].startswith('arm.'))
+        if not found:
+            raise ParameterError(f"parameter file '{path}' has no parameters arm.*", "write the arm's measures there")
+    return configure(PlantParameters, {**found, **parse_overrides(overrides)}).arm

@@ -196,8 +196,8 @@ def _result(config: IdentifierParameters, summary: Summary, outputs: Sequence[st
         if summary.payload_std_kg is not None:
             rows.append(('standard deviation', f'{number(summary.payload_std_kg)} kg'))
         if bound is not None:
-            rows.append(('best possible', f'standard deviation {number(bound, 3)} kg (Cramer-Rao bound of '
-                         'the samples after the capture, at the noise they show)'))
+            rows.append(('Cramer-Rao bound', f'standard deviation {number(bound, 3)} kg from the samples after the '
+                         'capture alone; what the empty arm taught lowers it'))
         rows.append(('residual power', f'{number(summary.consistency)} (1: noise only)'))
     for name, value in (('capture', summary.capture_time_s), ('release', summary.release_time_s)):
         if value is not None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.arm import ArmParameters
 from flexmanip_ros.parameters.field import check_all, parameter
-from flexmanip_ros.parameters.identifier import check_signals
+from flexmanip_ros.parameters.identifier import check_signals, fit_signals
 
 WINDOWS = (5, 10, 30)
 """Lengths of time that the page can show [s]."""
@@ -32,12 +32,13 @@ class ViewParameters:
         ('link1_bend/position', 'link2_bend/position'), 'bends, each NAME/FIELD of JointState; where one is a '
         'position, only positions are shown')
     angles: tuple[str, ...] = parameter(
-        ('joint1/position', 'joint2/position'), "the two joint angles, each NAME/FIELD of JointState; ['']: none, and "
+        ('joint1/position', 'joint2/position'), "a joint angle a link, each NAME/FIELD of JointState; ['']: none, and "
         'no arm is drawn')
     arm: ArmParameters = field(default_factory=ArmParameters)
 
     def __post_init__(self) -> None:
         check_all(self)
+        fit_signals(self, len(self.arm.link_length))
         if self.window not in WINDOWS:
             raise ParameterError(f"parameter 'window' is {self.window} s",
                                  f'give one of {", ".join(map(str, WINDOWS))}')

@@ -11,6 +11,7 @@ import argparse
 import json
 import os
 import select
+import shutil
 import signal
 import struct
 import subprocess
@@ -125,6 +126,8 @@ NAME = 'demo'
 PAGE_TIMEOUT_S = 20.0
 LOOK_AROUND_S = 0.5
 """Time in which an arm that is on the domain already is noticed."""
+LATEST_NS = 500_000_000
+"""Time over which the configuration is averaged, of which the true frequencies are shown."""
 FAILED, INTERRUPTED = 1, 130
 """Exit codes: it could not run, or live and replay differ; it was stopped by a signal."""
 
@@ -207,12 +210,18 @@ def _run(config: DemoParameters, folder: Path, console: Console, view: Viewer | 
         yaml_text('rpbsid_identifier', flatten(identifier), 'The identifier as it ran in this demonstration.'),
         encoding='utf-8')
     console.print(f"\nbag      {folder / 'bag'}\npicture  {folder / 'overview.png'}\n"
-                  f"again    identify_bag {folder / 'bag'} --params {folder / 'identifier.yaml'}")
+                  f"again    {beside('identify_bag')} {folder / 'bag'} --params {folder / 'identifier.yaml'}")
     if view is not None and sys.stdout.isatty():
         console.print(f'\nthe live view stays open at {view.url} until Ctrl-C')
         with suppress(KeyboardInterrupt):
             view.wait()
     return FAILED if different else 0
+
+
+def beside(program: str) -> str:
+    """Return how to call another program of this package: by its name, or by its path where that is not on PATH."""
+    path = Path(sys.argv[0]).with_name(program)
+    return str(path) if shutil.which(program) is None and path.is_file() else program
 
 
 def _wait_for_a_page(view: Viewer, composition: Composition, console: Console) -> None:
@@ -243,7 +252,7 @@ class Progress:
         if estimate is None:
             return 'warming up'
         words = [' '.join(f'{mode.frequency_hz:.2f}' for mode in estimate.modes[:2]) + ' Hz'] if estimate.modes else []
-        if event is not None:
+        if event is not None and event.stamp_ns <= estimate.stamp_ns:  # announced ahead
             words.append(event.kind.value)
         if estimate.payload is not None:
             words.append(payload_words(estimate.payload))
@@ -367,15 +376,16 @@ def _bits(value: Value) -> bytes:
 def known_truth(config: DemoParameters, plant: PlantParameters, items: Sequence[JointRecord | CaptureEvent]) -> Truth:
     """Return what the simulation knows: the payload, and the frequencies of the arm.
 
-    The arm moves, and the identifier's memory grows from the start and again from the capture on: the frequencies are
-    those of the mean configuration of that time.
+    The arm moves, and its frequencies with it: they are those of the mean configuration of the last half second, as
+    the table shows the last estimate before the capture and the last one of all.
     """
     records = [item for item in items if isinstance(item, JointRecord)]
     first_ns, end_ns = records[0].stamp_ns, records[-1].stamp_ns
     caught_ns = min((item.stamp_ns for item in items if isinstance(item, CaptureEvent)), default=end_ns)
 
     def lowest(mass: float, from_ns: int, until_ns: int) -> tuple[float, ...]:
-        angles = [np.cumsum(record.position[:2]) for record in records if from_ns <= record.stamp_ns <= until_ns]
+        angles = [np.cumsum(record.position[:2]) for record in records
+                  if max(from_ns, until_ns - LATEST_NS) <= record.stamp_ns <= until_ns]
         found = frequencies(vibration_model(plant.arm, np.mean(angles, axis=0), mass)[0])
         return tuple(float(f) for f in found[:2])
 

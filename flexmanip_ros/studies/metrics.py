@@ -113,9 +113,9 @@ def payload_bound(config: IdentifierParameters, signals: Signals, capture_time: 
                 dt: float) -> float | None:
     """Return the Cramer-Rao bound of the payload's standard deviation at the end of a run [kg].
 
-    It is computed from the samples after the capture, for the moving arm. An estimator that learned stiffness and
-    damping from the empty arm can be a little better. mass: the payload, or its estimate [kg]; the noise is measured
-    on the signals. None where there is no bound: no angles, no sample after the capture, or no noise.
+    It is computed from the samples after the capture, for the moving arm. An estimator that learned gains and
+    friction from the empty arm can be several times better. mass: the payload, or its estimate [kg]; the noise is
+    measured on the signals. None where there is no bound: no angles, no sample after the capture, or no noise.
     """
     if signals.angles.shape[1] != len(config.arm.link_length) or not mass > 0.0 or dt <= 0.0:
         return None

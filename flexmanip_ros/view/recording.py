@@ -24,7 +24,7 @@ def show(screen: Screen, estimate: Estimate) -> None:
             screen.status(value)
 
 
-def read(config: IdentifierParameters, items: Iterable[JointBlock | CaptureEvent], source: Source
+def read(config: IdentifierParameters, items: Iterable[pipeline.Item], source: Source
          ) -> tuple[dict[str, Any], BagError | None]:
     """Identify a recording; return what the page shows of it, and what was wrong with it.
 
@@ -34,14 +34,14 @@ def read(config: IdentifierParameters, items: Iterable[JointBlock | CaptureEvent
     screen = Screen(source)
     fault: BagError | None = None
 
-    def tapped() -> Iterator[JointBlock | CaptureEvent]:
+    def tapped() -> Iterator[pipeline.Item]:
         nonlocal fault
         try:
             for item in items:
                 if isinstance(item, CaptureEvent):
                     screen.event(item)
                 else:
-                    screen.joint_states(item)
+                    screen.joint_states(item if isinstance(item, JointBlock) else JointBlock.of(item))
                 yield item
         except BagError as error:
             if not screen.samples:

@@ -70,8 +70,8 @@ class Source(NamedTuple):
 
     @property
     def is_arm(self) -> bool:
-        """Whether a two-link arm can be drawn."""
-        return len(self.config.angles) == 2 and len(self.bends) == 2
+        """Whether the arm can be drawn: an angle and a bend a link."""
+        return len(self.config.angles) == len(self.bends) == len(self.config.arm.link_length)
 
     def layout(self) -> dict[str, Any]:
         """Return what a page has to know before the first sample."""
@@ -85,9 +85,11 @@ class Source(NamedTuple):
             'bends': {'title': 'bend' if self.is_arm else 'position' if positions else 'output',
                       'unit': 'mm' if self.is_arm else '', 'scale': 1000 if self.is_arm else 1,
                       'lines': [[_short(name, positions), r + k] for k, name in enumerate(self.bends)]},
-            'arm': {'length': arm.link_length, 'sensor': arm.sensor_position, 'bends': [r, r + 1],
-                    'angles': [r + m, r + m + 1], 'chords': arm.angle_convention == 'chord'} if self.is_arm else None,
+            'arm': {'length': arm.link_length, 'sensor': arm.sensor_position, 'bends': [*range(r, r + m)],
+                    'angles': [*range(r + m, r + 2 * m)],
+                    'chords': arm.angle_convention == 'chord'} if self.is_arm else None,
             'statuses': [[status.name, status.value, STATUS_LOOKS[status][0]] for status in Status],
+            'tracking': STATUSES[Status.TRACKING.name],
             'colours': COLOURS, 'payload_colour': PAYLOAD_COLOUR, 'event_colour': EVENT_COLOUR,
             'modes_apart': MODES_APART, 'stale_after': config.stale_after, 'exaggeration': config.exaggeration,
             'window': config.window, 'windows': WINDOWS,

@@ -10,7 +10,8 @@ import pytest
 from flexmanip_ros.arm import manipulator
 from flexmanip_ros.arm.urdf import urdf
 from flexmanip_ros.cli import write_urdf
-from flexmanip_ros.errors import ModelError
+from flexmanip_ros.errors import ModelError, ParameterError
+from flexmanip_ros.io.parameter_file import load_arm
 from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
@@ -92,3 +93,14 @@ def test_the_program_writes_what_the_library_makes(
     assert target.read_text() == urdf(ArmParameters(), 4)
     assert write_urdf.main(['--set', 'arm.modes=many']) == 2
     assert 'arm.modes' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('section', ['/**', 'rpbsid_identifier', 'plant_simulator'])
+def test_the_arm_of_any_parameter_file_is_drawn(section: str, tmp_path: Path) -> None:
+    path = tmp_path / 'my_arm.yaml'
+    more = {'/**': 'order: 6', 'rpbsid_identifier': 'order: 6', 'plant_simulator': 'rate: 500.0'}[section]
+    path.write_text(f'{section}:\n  ros__parameters: {{{more}, arm: {{joint_mass: 1.2}}}}\n', encoding='utf-8')
+    assert load_arm(path).joint_mass == 1.2
+    path.write_text(f'{section}:\n  ros__parameters: {{{more}}}\n', encoding='utf-8')
+    with pytest.raises(ParameterError, match=r'has no parameters arm'):
+        load_arm(path)
