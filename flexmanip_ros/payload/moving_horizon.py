@@ -42,12 +42,13 @@ from flexmanip_ros.payload.filter_state import (
     SINCE_NOISE,
     SLOW,
     STORED,
+    TRIED,
     USED,
     VARIANCE,
     WHITE,
 )
 from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, observe
-from flexmanip_ros.payload.process_model import confine, predict
+from flexmanip_ros.payload.process_model import INERTIA, confine, predict
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -71,9 +72,15 @@ LOST = 1e4
 """A trajectory that costs more, for each measurement, says nothing of the arm."""
 TRUSTED = 2.0
 """Standard deviations that the filter is moved by a step of the moving-horizon estimation."""
+TELLS = 50
+"""Samples whose cost tells a fit from none: the cost of white noise varies by 0.1 of itself."""
 UNFIT = 2.0
 """Times the cost of white noise: more is no fit."""
-MOST_REFITS = 3
+TRIALS = 10
+"""Iterations over the same samples after which a fit is not expected to come: those that come take three to nine."""
+STARTS = 2
+"""Fits of what was caught from the event on, given up as soon as they converge without fitting: a point, a body."""
+MOST_REFITS = 4
 """How often a fit is begun again after an event: an arm that is another one never fits."""
 STRAY, STRAY_EVERY = 3.0, 500
 """Power over white noise of every sensor with which the filter is begun again; samples between two looks."""
@@ -154,6 +161,7 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
         return False
     gained = dot(m.g, m.gradient)
     m.counts[AGAIN] = 0 if fits or gained < CONVERGED * m.counts[ITERATED] else 1
+    m.counts[TRIED] = m.counts[TRIED] + 1 if m.counts[AGAIN] else 0
     if m.counts[ITERATED] == m.counts[STORED]:
         if not factor_information(m.N):
             return False
@@ -243,9 +251,24 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
             m.counts[IN_BATCH] = 0
             m.score[MOVE] = 0.0
             m.score[VARIANCE] = 0.0
-            if not finish_iteration(motion, sensors, m):
+            if not finish_iteration(motion, sensors, m) or misfits(motion, m):
                 return False
     return True
+
+
+@inner
+def misfits(motion: ProcessModel, m: FilterState) -> bool:
+    """Whether the fit of what was caught costs far more than white noise, and will go on to: another start is due."""
+    if motion.kind.size <= INERTIA or motion.kind[INERTIA] != INERTIA:
+        return False
+    if m.counts[HELD] == 0 or m.counts[REFITS] >= STARTS or m.counts[ITERATED] < TELLS:
+        return False
+    if m.counts[AGAIN] == 1 and m.counts[TRIED] < TRIALS:
+        return False
+    expected = m.xi.size + m.noise.shape[0] * m.counts[MEASURED]
+    failed = bool(m.score[COST_BEFORE] > UNFIT * expected)
+    m.counts[REFITS] += failed
+    return failed
 
 
 @inner
