@@ -152,6 +152,10 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
         for c in range(i + 1):
             m.normal[i, c] = m.N[i, c]
     fits = m.score[COST] < FITS * (nx + m.noise.shape[0] * m.counts[MEASURED])
+    enough = CONVERGED * m.counts[ITERATED]
+    # two steps may undo each other for ever where the valley bends
+    still = (m.counts[BEFORE] == m.counts[ITERATED] and m.score[LAMBDA] <= LEAST_DAMPING
+             and m.score[COST_BEFORE] - m.score[COST] < enough)
     m.counts[BEFORE] = m.counts[ITERATED]
     m.score[COST_BEFORE] = m.score[COST]
     m.score[LAMBDA] = m.score[LAMBDA] / 8.0 if m.score[LAMBDA] > LEAST_DAMPING and not fits else 0.0
@@ -160,7 +164,7 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
     if not damped_step(motion, sensors, m):
         return False
     gained = dot(m.g, m.gradient)
-    m.counts[AGAIN] = 0 if fits or gained < CONVERGED * m.counts[ITERATED] else 1
+    m.counts[AGAIN] = 0 if fits or still or gained < enough else 1
     m.counts[TRIED] = m.counts[TRIED] + 1 if m.counts[AGAIN] else 0
     if m.counts[ITERATED] == m.counts[STORED]:
         if not factor_information(m.N):
@@ -258,10 +262,11 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
 
 @inner
 def misfits(motion: ProcessModel, m: FilterState) -> bool:
-    """Whether the fit of what was caught costs far more than white noise, and will go on to: another start is due."""
-    if motion.kind.size <= INERTIA or motion.kind[INERTIA] != INERTIA:
-        return False
-    if m.counts[HELD] == 0 or m.counts[REFITS] >= STARTS or m.counts[ITERATED] < TELLS:
+    """Whether the fit costs far more than white noise, and will go on to: another start is due."""
+    most = MOST_REFITS - 1
+    if m.counts[HELD] == 1:
+        most = STARTS if motion.kind.size > INERTIA and motion.kind[INERTIA] == INERTIA else 0
+    if m.counts[REFITS] >= most or m.counts[ITERATED] < TELLS:
         return False
     if m.counts[AGAIN] == 1 and m.counts[TRIED] < TRIALS:
         return False
@@ -284,16 +289,23 @@ def fails(m: FilterState) -> bool:
 
 @inner
 def strays(sensors: MeasurementModel, m: FilterState) -> bool:
-    """Whether the filter left the arm after all: every sensor shows far more than its noise, block after block."""
-    if m.counts[LEARNED] == 0 or m.counts[HELD] == 0 or m.counts[REFITS] >= MOST_REFITS:
+    """Whether the filter left the arm after all: sensors show far more than their noise, block after block.
+
+    Of an arm that holds something all must: a fit is begun again at a cost. Of an empty arm one of displacements does.
+    """
+    if m.counts[REFITS] >= MOST_REFITS or (m.counts[HELD] == 1 and m.counts[LEARNED] == 0):
         return False
     if m.counts[STORED] < HORIZON or m.counts[SINCE_EVENT] % STRAY_EVERY != 0:
         return False
-    least = STRAY
+    least, most = STRAY, 0.0
     for i in range(m.noise.shape[0]):
-        least = min(least, m.noise[i, POWER] / max(m.noise[i, WHITE], m.noise[i, FLOOR]))
-    m.counts[REFITS] += least >= STRAY
-    return least >= STRAY
+        ratio = m.noise[i, POWER] / max(m.noise[i, WHITE], m.noise[i, FLOOR])
+        least = min(least, ratio)
+        if not sensors.rate[i]:
+            most = max(most, ratio)
+    left = bool(least >= STRAY if m.counts[HELD] == 1 else most >= UNFIT)
+    m.counts[REFITS] += left
+    return left
 
 
 @inner
