@@ -29,6 +29,11 @@ MOTION_ERROR = 1e-8
 """Share of the fastest mode that the motion's exponential leaves out in a step."""
 SPREAD_ERROR = 1e-4
 """Of the spread's: it weighs, and need not be exact."""
+STEP_ERROR = 1e-8
+"""Correction of a step, positions and rates times the step, over the length of link 1, with which it is not taken again
+at half the length. With ten times as much an undamped arm that rings, 20 kg, was 0.15 % off after 20 s."""
+HALVINGS = 3
+"""How often a step is halved: its correction is of third order, so 512 times smaller then."""
 MOST_TERMS = 30
 """Terms of an exponential at most: more than ``STEP_ANGLE`` needs."""
 STIFF_STEP = 2.0
@@ -327,11 +332,30 @@ def predict(motion: ProcessModel, x: Array, S: Array, used: int, reported: Array
         if not steps < MOST_STEPS:
             return False
         h = left / max(steps, 1.0)
-        angle = max(STEP_ANGLE * h / motion.substeps, stiff * h)
-        if not exponential_step(motion, x, h, terms(angle, MOTION_ERROR)):
-            return False
+        for halved in range(HALVINGS + 1):
+            angle = max(STEP_ANGLE * h / motion.substeps, stiff * h)
+            for i in range(n):
+                motion.k[8, i], motion.k[9, i] = x[i], x[n + i]
+            if not exponential_step(motion, x, h, terms(angle, MOTION_ERROR)):
+                return False
+            if halved == HALVINGS or exact(motion, h):
+                break
+            for i in range(n):
+                x[i], x[n + i] = motion.k[8, i], motion.k[9, i]
+            h *= 0.5
         spread(motion, S, used, h, terms(angle, SPREAD_ERROR))
-        left = left - h if steps > 1.0 else 0.0
+        left = left - h if left > 1.5 * h else 0.0
+    return True
+
+
+@inner
+def exact(motion: ProcessModel, h: float) -> bool:
+    """Whether the last step's correction, what the linearization missed, is as small as it must be."""
+    if motion.frozen:
+        return True
+    for i in range(motion.k.shape[1]):
+        if not max(abs(motion.k[1, i]), h * abs(motion.k[2, i])) < STEP_ERROR * motion.arm.length[0]:
+            return False
     return True
 
 
