@@ -18,12 +18,14 @@ from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, fact
 from flexmanip_ros.payload.filter_state import (
     AGAIN,
     BEFORE,
+    CALM,
     COST,
     COST_BEFORE,
     EFFECTIVE,
     ENOUGH,
     FIT,
     FLOOR,
+    HALVED,
     HELD,
     HORIZON,
     IN_A_ROW,
@@ -48,7 +50,7 @@ from flexmanip_ros.payload.filter_state import (
     WHITE,
 )
 from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, observe
-from flexmanip_ros.payload.process_model import INERTIA, confine, predict
+from flexmanip_ros.payload.process_model import INERTIA, confine, correction, predict
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -84,6 +86,12 @@ MOST_REFITS = 4
 """How often a fit is begun again after an event: an arm that is another one never fits."""
 STRAY, STRAY_EVERY = 3.0, 500
 """Power over white noise of every sensor with which the filter is begun again; samples between two looks."""
+HALVINGS = 3
+"""How often a step is halved: its correction is of third order, so 512 times smaller then."""
+DOUBLED = 0.1
+"""Correction, over what is allowed, with which a step of twice the length would be allowed: it is of third order."""
+CALM_SAMPLES = 1000
+"""For so many samples, several periods of the slowest vibration."""
 SLACK = 1.0
 """By so much may the cost rise: less than the estimate can tell."""
 LEAST_DAMPING = 1e-3
@@ -120,7 +128,7 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
     sample = table[m.counts[ITERATED]]
     n, nx, used = sensors.H.shape[1], m.x.size, m.counts[USED]
     links, f = motion.effort.size, sensors.f[:used]
-    if not predict(motion, m.xr, m.Sr, used, sample[1:1 + links], sample[0]):
+    if not predict(motion, m.xr, m.Sr, used, sample[1:1 + links], sample[0], m.counts[HALVED]):
         return False
     measured = sample[1 + links] == sample[1 + links]
     if measured:
@@ -309,6 +317,21 @@ def strays(sensors: MeasurementModel, m: FilterState) -> bool:
 
 
 @inner
+def control_step(motion: ProcessModel, m: FilterState, duration: float) -> None:
+    """Halve the longest step where its correction is too large, double it where it has long been small enough."""
+    size = correction(motion, duration)
+    m.counts[CALM] += 1
+    if size > 1.0 and m.counts[HALVED] < HALVINGS:
+        m.counts[HALVED] += 1
+        m.counts[CALM] = 0
+    elif size > DOUBLED or m.counts[HALVED] == 0:
+        m.counts[CALM] = 0
+    elif m.counts[CALM] >= CALM_SAMPLES:
+        m.counts[HALVED] -= 1
+        m.counts[CALM] = 0
+
+
+@inner
 def diffuse(sensors: MeasurementModel, m: FilterState, duration: float) -> None:
     """Add the process noise of a while, so that the memory stays finite."""
     m.score[NOW] += duration
@@ -334,8 +357,9 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     """
     links = motion.effort.size
     duration, effort, y = table[k, 0], table[k, 1:1 + links], table[k, 1 + links:]
-    if not predict(motion, m.x, m.S, m.counts[USED], effort, duration):
+    if not predict(motion, m.x, m.S, m.counts[USED], effort, duration, m.counts[HALVED]):
         return False
+    control_step(motion, m, duration)
     came = y[0] == y[0]
     if came:
         measure(sensors, m, y)

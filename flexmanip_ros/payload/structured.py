@@ -114,7 +114,8 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     assert state.effort is not None
     assert state.sensors is not None
     ahead = max(event.stamp_ns - state.last_ns, 0)
-    predict(state.model.motion, m.x, m.S, m.x.size, state.effort, min(ahead * 1e-9, LONGEST_S))
+    predict(state.model.motion, m.x, m.S, m.x.size, state.effort, min(ahead * 1e-9, LONGEST_S),
+            m.counts[mem.HALVED])
     _change(config, state.model, m, event.kind)
     last_ns = state.last_ns + ahead
     return state._replace(memory=m, last_ns=last_ns, horizon=Horizon(state.cursor, last_ns, state.effort))

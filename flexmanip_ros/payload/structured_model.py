@@ -213,7 +213,7 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         M0=np.zeros((n, n)), Mp=np.zeros((4, n, n)), stiffness=nominal.stiffness, damping=unit, rotary=nominal.rotary,
         scale=lightest, least=_least(nominal, lightest),
         least_rotor=_least_rotor(nominal), substeps=STEP_ANGLE / fastest, payload=np.zeros(4),
-        effort=np.zeros(links), gain=np.ones(links), p=np.zeros(size), a=np.zeros(n), k=np.zeros((10, n)),
+        effort=np.zeros(links), gain=np.ones(links), p=np.zeros(size), a=np.zeros(n), k=np.zeros((8, n)),
         dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)), G=np.zeros((n, size)), X=np.zeros((2 * n, nx)),
         Y=np.zeros((2 * n, nx)))
 
