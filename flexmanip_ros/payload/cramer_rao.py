@@ -115,7 +115,7 @@ def nonlinear(
         for i, deviation in enumerate(measured):
             observe(seen, i, n, m.x, m.S, f)
             information += np.outer(f, f) / deviation ** 2
-        if not predict(model.motion, m.x, m.S, m.x.size, efforts[k], dt):
+        if not predict(model.motion, m.x, m.S, m.x.size, efforts[k], dt, 0):
             raise ModelError('the arm diverges under these torques', 'use smaller torques')
         if k + 1 in counts:
             spread = np.linalg.solve(np.eye(m.x.size) + information, m.S[p])

@@ -20,7 +20,8 @@ ENOUGH = 512
 EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT = range(9)
 # Elements of ``counts``.
 (HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN, BEFORE,
- REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED) = range(19)
+ REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
+ HALVED, CALM) = range(22)
 # Elements of ``score``.
 MOVE, VARIANCE, DRIFT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA = range(9)
 
@@ -37,8 +38,10 @@ class FilterState(NamedTuple):
     recent: Array
     """(m, 4) its last measurements."""
     counts: NDArray[np.int64]
-    """(19,) counters; USED: number of columns of S and S0, the first ones, that are not zero; IN_A_ROW: samples since
-    the last one that was missing; MEASURED: samples of this iteration that were not."""
+    """(22,) counters; USED: number of columns of S and S0, the first ones, that are not zero; IN_A_ROW: samples since
+    the last one that was missing; MEASURED: samples of this iteration that were not; TRIED: iterations that did
+    not fit, over the same samples; HALVED: how often the longest step of the motion is; CALM: samples since a
+    longer one was too long."""
     score: Array
     """(9,) MOVE: sum of the payload's updates in this batch, VARIANCE: the variance they should have; DRIFT: mean of
     MOVE^2 / VARIANCE; NOW: time since process noise was added [s]; EMPTY_ARM_BIAS: payload of the arm before the event,
@@ -75,7 +78,7 @@ def memory(nx: int, m: int) -> FilterState:
     """Allocate for nx states and m sensors."""
     return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 9)), recent=np.zeros((m, 4)),
-        counts=np.zeros(19, dtype=np.int64), score=np.zeros(9), x0=np.zeros(nx), S0=np.zeros((nx, nx)),
+        counts=np.zeros(22, dtype=np.int64), score=np.zeros(9), x0=np.zeros(nx), S0=np.zeros((nx, nx)),
         xi=np.zeros(nx), accepted=np.zeros(nx), normal=np.zeros((nx, nx)), gradient=np.zeros(nx),
         xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
         g=np.zeros(nx), innovation=np.zeros((m, 2)), power=np.ones(m))

@@ -18,12 +18,14 @@ from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, fact
 from flexmanip_ros.payload.filter_state import (
     AGAIN,
     BEFORE,
+    CALM,
     COST,
     COST_BEFORE,
     EFFECTIVE,
     ENOUGH,
     FIT,
     FLOOR,
+    HALVED,
     HELD,
     HORIZON,
     IN_A_ROW,
@@ -42,12 +44,13 @@ from flexmanip_ros.payload.filter_state import (
     SINCE_NOISE,
     SLOW,
     STORED,
+    TRIED,
     USED,
     VARIANCE,
     WHITE,
 )
 from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, observe
-from flexmanip_ros.payload.process_model import confine, predict
+from flexmanip_ros.payload.process_model import INERTIA, confine, correction, predict
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -71,12 +74,24 @@ LOST = 1e4
 """A trajectory that costs more, for each measurement, says nothing of the arm."""
 TRUSTED = 2.0
 """Standard deviations that the filter is moved by a step of the moving-horizon estimation."""
+TELLS = 50
+"""Samples whose cost tells a fit from none: the cost of white noise varies by 0.1 of itself."""
 UNFIT = 2.0
 """Times the cost of white noise: more is no fit."""
-MOST_REFITS = 3
+TRIALS = 10
+"""Iterations over the same samples after which a fit is not expected to come: those that come take three to nine."""
+STARTS = 2
+"""Fits of what was caught from the event on, given up as soon as they converge without fitting: a point, a body."""
+MOST_REFITS = 4
 """How often a fit is begun again after an event: an arm that is another one never fits."""
 STRAY, STRAY_EVERY = 3.0, 500
 """Power over white noise of every sensor with which the filter is begun again; samples between two looks."""
+HALVINGS = 3
+"""How often a step is halved: its correction is of third order, so 512 times smaller then."""
+DOUBLED = 0.1
+"""Correction, over what is allowed, with which a step of twice the length would be allowed: it is of third order."""
+CALM_SAMPLES = 1000
+"""For so many samples, several periods of the slowest vibration."""
 SLACK = 1.0
 """By so much may the cost rise: less than the estimate can tell."""
 LEAST_DAMPING = 1e-3
@@ -113,7 +128,7 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
     sample = table[m.counts[ITERATED]]
     n, nx, used = sensors.H.shape[1], m.x.size, m.counts[USED]
     links, f = motion.effort.size, sensors.f[:used]
-    if not predict(motion, m.xr, m.Sr, used, sample[1:1 + links], sample[0]):
+    if not predict(motion, m.xr, m.Sr, used, sample[1:1 + links], sample[0], m.counts[HALVED]):
         return False
     measured = sample[1 + links] == sample[1 + links]
     if measured:
@@ -145,6 +160,10 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
         for c in range(i + 1):
             m.normal[i, c] = m.N[i, c]
     fits = m.score[COST] < FITS * (nx + m.noise.shape[0] * m.counts[MEASURED])
+    enough = CONVERGED * m.counts[ITERATED]
+    # two steps may undo each other for ever where the valley bends
+    still = (m.counts[BEFORE] == m.counts[ITERATED] and m.score[LAMBDA] <= LEAST_DAMPING
+             and m.score[COST_BEFORE] - m.score[COST] < enough)
     m.counts[BEFORE] = m.counts[ITERATED]
     m.score[COST_BEFORE] = m.score[COST]
     m.score[LAMBDA] = m.score[LAMBDA] / 8.0 if m.score[LAMBDA] > LEAST_DAMPING and not fits else 0.0
@@ -153,7 +172,8 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
     if not damped_step(motion, sensors, m):
         return False
     gained = dot(m.g, m.gradient)
-    m.counts[AGAIN] = 0 if fits or gained < CONVERGED * m.counts[ITERATED] else 1
+    m.counts[AGAIN] = 0 if fits or still or gained < enough else 1
+    m.counts[TRIED] = m.counts[TRIED] + 1 if m.counts[AGAIN] else 0
     if m.counts[ITERATED] == m.counts[STORED]:
         if not factor_information(m.N):
             return False
@@ -243,9 +263,25 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
             m.counts[IN_BATCH] = 0
             m.score[MOVE] = 0.0
             m.score[VARIANCE] = 0.0
-            if not finish_iteration(motion, sensors, m):
+            if not finish_iteration(motion, sensors, m) or misfits(motion, m):
                 return False
     return True
+
+
+@inner
+def misfits(motion: ProcessModel, m: FilterState) -> bool:
+    """Whether the fit costs far more than white noise, and will go on to: another start is due."""
+    most = MOST_REFITS - 1
+    if m.counts[HELD] == 1:
+        most = STARTS if motion.kind.size > INERTIA and motion.kind[INERTIA] == INERTIA else 0
+    if m.counts[REFITS] >= most or m.counts[ITERATED] < TELLS:
+        return False
+    if m.counts[AGAIN] == 1 and m.counts[TRIED] < TRIALS:
+        return False
+    expected = m.xi.size + m.noise.shape[0] * m.counts[MEASURED]
+    failed = bool(m.score[COST_BEFORE] > UNFIT * expected)
+    m.counts[REFITS] += failed
+    return failed
 
 
 @inner
@@ -261,16 +297,38 @@ def fails(m: FilterState) -> bool:
 
 @inner
 def strays(sensors: MeasurementModel, m: FilterState) -> bool:
-    """Whether the filter left the arm after all: every sensor shows far more than its noise, block after block."""
-    if m.counts[LEARNED] == 0 or m.counts[HELD] == 0 or m.counts[REFITS] >= MOST_REFITS:
+    """Whether the filter left the arm after all: sensors show far more than their noise, block after block.
+
+    Of an arm that holds something all must: a fit is begun again at a cost. Of an empty arm one of displacements does.
+    """
+    if m.counts[REFITS] >= MOST_REFITS or (m.counts[HELD] == 1 and m.counts[LEARNED] == 0):
         return False
     if m.counts[STORED] < HORIZON or m.counts[SINCE_EVENT] % STRAY_EVERY != 0:
         return False
-    least = STRAY
+    least, most = STRAY, 0.0
     for i in range(m.noise.shape[0]):
-        least = min(least, m.noise[i, POWER] / max(m.noise[i, WHITE], m.noise[i, FLOOR]))
-    m.counts[REFITS] += least >= STRAY
-    return least >= STRAY
+        ratio = m.noise[i, POWER] / max(m.noise[i, WHITE], m.noise[i, FLOOR])
+        least = min(least, ratio)
+        if not sensors.rate[i]:
+            most = max(most, ratio)
+    left = bool(least >= STRAY if m.counts[HELD] == 1 else most >= UNFIT)
+    m.counts[REFITS] += left
+    return left
+
+
+@inner
+def control_step(motion: ProcessModel, m: FilterState, duration: float) -> None:
+    """Halve the longest step where its correction is too large, double it where it has long been small enough."""
+    size = correction(motion, duration)
+    m.counts[CALM] += 1
+    if size > 1.0 and m.counts[HALVED] < HALVINGS:
+        m.counts[HALVED] += 1
+        m.counts[CALM] = 0
+    elif size > DOUBLED or m.counts[HALVED] == 0:
+        m.counts[CALM] = 0
+    elif m.counts[CALM] >= CALM_SAMPLES:
+        m.counts[HALVED] -= 1
+        m.counts[CALM] = 0
 
 
 @inner
@@ -299,8 +357,9 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     """
     links = motion.effort.size
     duration, effort, y = table[k, 0], table[k, 1:1 + links], table[k, 1 + links:]
-    if not predict(motion, m.x, m.S, m.counts[USED], effort, duration):
+    if not predict(motion, m.x, m.S, m.counts[USED], effort, duration, m.counts[HALVED]):
         return False
+    control_step(motion, m, duration)
     came = y[0] == y[0]
     if came:
         measure(sensors, m, y)

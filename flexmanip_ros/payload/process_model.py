@@ -29,6 +29,9 @@ MOTION_ERROR = 1e-8
 """Share of the fastest mode that the motion's exponential leaves out in a step."""
 SPREAD_ERROR = 1e-4
 """Of the spread's: it weighs, and need not be exact."""
+STEP_ERROR = 2e-8
+"""Correction of a step, positions and rates times the sample time, over the length of link 1, beyond which the
+following ones are halved. Steps that change from sample to sample let the energy of a vibration drift."""
 MOST_TERMS = 30
 """Terms of an exponential at most: more than ``STEP_ANGLE`` needs."""
 STIFF_STEP = 2.0
@@ -304,10 +307,10 @@ def terms(angle: float, error: float) -> int:
 
 
 @kernel
-def predict(motion: ProcessModel, x: Array, S: Array, used: int, reported: Array, duration: float) -> bool:
+def predict(motion: ProcessModel, x: Array, S: Array, used: int, reported: Array, duration: float, halved: int) -> bool:
     """Carry x and S over a time [s] with the torque held; False when numbers left the finite range.
 
-    used: number of columns of S, the first ones, that are not zero.
+    used: number of columns of S, the first ones, that are not zero; halved: how often the longest step is halved.
     """
     if duration <= 0.0:
         return True
@@ -322,7 +325,7 @@ def predict(motion: ProcessModel, x: Array, S: Array, used: int, reported: Array
         stiff = 0.0
         for r in range(n):
             stiff -= motion.dqd[r, r]
-        longest = min(motion.substeps * slower(motion, left), STIFF_STEP / max(stiff, 1e-9))
+        longest = min(motion.substeps * slower(motion, left) * 0.5 ** halved, STIFF_STEP / max(stiff, 1e-9))
         steps = np.ceil(left / longest - 1e-9)
         if not steps < MOST_STEPS:
             return False
@@ -333,6 +336,16 @@ def predict(motion: ProcessModel, x: Array, S: Array, used: int, reported: Array
         spread(motion, S, used, h, terms(angle, SPREAD_ERROR))
         left = left - h if steps > 1.0 else 0.0
     return True
+
+
+@inner
+def correction(motion: ProcessModel, duration: float) -> float:
+    """Return what the linearization missed in the last step, over ``STEP_ERROR``; duration: from sample to sample [s]."""
+    largest = 0.0
+    if not motion.frozen:
+        for i in range(motion.k.shape[1]):
+            largest = max(largest, abs(motion.k[1, i]), duration * abs(motion.k[2, i]))
+    return largest / (STEP_ERROR * motion.arm.length[0])
 
 
 @merged

@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
@@ -16,6 +17,7 @@ from flexmanip_ros.payload import structured_model
 from flexmanip_ros.payload.capture_detection_kernel import filtered
 from flexmanip_ros.payload.interval import inertia_error, judge
 from flexmanip_ros.payload.measurement_update import MeasurementModel
+from flexmanip_ros.payload.moving_horizon import STARTS
 from flexmanip_ros.payload.process_model import predict
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.samples.sample_log import Rows
@@ -112,7 +114,8 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     assert state.effort is not None
     assert state.sensors is not None
     ahead = max(event.stamp_ns - state.last_ns, 0)
-    predict(state.model.motion, m.x, m.S, m.x.size, state.effort, min(ahead * 1e-9, LONGEST_S))
+    predict(state.model.motion, m.x, m.S, m.x.size, state.effort, min(ahead * 1e-9, LONGEST_S),
+            m.counts[mem.HALVED])
     _change(config, state.model, m, event.kind)
     last_ns = state.last_ns + ahead
     return state._replace(memory=m, last_ns=last_ns, horizon=Horizon(state.cursor, last_ns, state.effort))
@@ -179,13 +182,46 @@ def _set_arrival_cost(m: mem.FilterState) -> None:
     m.power[:] = 1.0
 
 
+def _open_body(config: IdentifierParameters, model: Model, m: mem.FilterState) -> None:
+    """What was caught is no point: fit a body to the samples since the event, from the state just before it.
+
+    If that was tried, the fit ended in a wrong minimum: it begins anew with the centre of mass on the other side. The
+    filter goes on as it is until the fit takes its place.
+    """
+    body = slice(model.payload, model.payload + model.body)
+    if m.S0[body][1:].any():
+        there = m.x0 + m.S0 @ m.accepted
+        _refit(m)
+        aim = np.zeros(m.x.size)
+        aim[body] = structured_model.body_mean(config, model)
+        aim[model.payload + 1:model.payload + 3] = -there[model.payload + 1:model.payload + 3]
+        aim[body] -= m.x0[body]
+        unknown = m.S0.any(axis=1)
+        rank = int(unknown.sum())
+        m.xi[:rank] = solve_triangular(m.S0[unknown, :rank], aim[unknown], lower=True)
+        m.accepted[:] = m.xi
+        return
+    opened = np.zeros((m.x.size, model.body))
+    opened[body] = np.diag(structured_model.body_std(config, model))
+    m.S0[body] = 0.0
+    m.S0[:] = structured_model.widen(m.S0, opened)
+    m.x0[body] = structured_model.body_mean(config, model)
+    _refit(m)
+
+
 def _begin_horizon(m: mem.FilterState) -> None:
     """Begin a new moving horizon here: the present state is its arrival cost."""
     m.x0[:], m.S0[:] = m.x, m.S
-    m.counts[mem.USED] = int(m.S.any(axis=1).sum())
+    m.counts[mem.STORED] = 0
+    _refit(m)
+
+
+def _refit(m: mem.FilterState) -> None:
+    """Begin the iterations again, with the first samples of the horizon."""
+    m.counts[mem.USED] = int(m.S0.any(axis=1).sum())
     m.xi[:] = 0.0
-    for counter in (mem.STORED, mem.ITERATED, mem.ITERATING, mem.SINCE_NOISE, mem.IN_BATCH, mem.BEFORE, mem.REJECTED,
-                    mem.AGAIN):
+    for counter in (mem.ITERATED, mem.ITERATING, mem.SINCE_NOISE, mem.IN_BATCH, mem.BEFORE, mem.REJECTED, mem.AGAIN,
+                    mem.TRIED):
         m.counts[counter] = 0
     m.score[mem.MOVE] = m.score[mem.VARIANCE] = m.score[mem.LAMBDA] = 0.0
 
@@ -351,11 +387,17 @@ def _restart(config: IdentifierParameters, state: StructuredState, m: mem.Filter
     refits = int(m.counts[mem.REFITS])
     unfit = refits > state.memory.counts[mem.REFITS]
     following = rows.since(rows.first + 1)
+    payload = model.payload
+    if unfit and refits <= STARTS and m.counts[mem.HELD] and model.body > 1 and m.counts[mem.STORED] < mem.HORIZON:
+        m = mem.copy(m)
+        _open_body(config, model, m)
+        last = rows.between(rows.first, rows.first + 1)
+        same = state._replace(memory=m, cursor=rows.first + 1, last_ns=int(last.stamp_ns[0]), effort=last.u[0].copy())
+        return advance(config, same, following)
     at_once = m.counts[mem.SINCE_EVENT] < FIRST_LOOK  # what was learned moves as no arm does
     if m.counts[mem.HELD] and m.counts[mem.LEARNED] and np.isfinite(m.S0).all() and not at_once:
         m = mem.copy(m)
         m.x[:], m.S[:] = m.x0, m.S0
-        payload = model.payload
         parameters, spread = m.x[payload:].copy(), m.S[payload:].copy()
         first = rows.between(rows.first, rows.first + 1)
         structured_model.first(config, model, m, measurements(model, first)[0])
