@@ -258,6 +258,19 @@ def payload_speed(rows: list[dict[str, Any]]) -> Claims:
         yield Claim(f'kappa {row["kappa"]}: filter over a step of the plant', row['ratio_filter_to_plant'], high=3.0)
 
 
+def payload_real_arms(rows: list[dict[str, Any]]) -> Claims:
+    """Told the ideal arm, `structured` knows what an arm as it is holds: mass within 0.7 %, in its interval."""
+    for row in rows:
+        runs = row['runs']
+        yield Claim(f'{row["case"]}: runs within 0.7 %', row['within_0.7_percent'] / runs, 1.0)
+        chance = 2.0 * math.sqrt(0.95 * 0.05 / runs)
+        yield Claim(f'{row["case"]}: runs inside their interval', row['inside'] / runs, 0.95 - chance)
+        yield Claim(f'{row["case"]}: TRACKING and outside', row['wrong_and_tracking_percent'], high=5.0, unit='%')
+        if 'com_worst_mm' in row:
+            yield Claim(f'{row["case"]}: centre of mass, worst', row['com_worst_mm'], high=6.0, unit='mm')
+            yield Claim(f'{row["case"]}: inertia, worst', row['inertia_worst_percent'], high=5.0, unit='%')
+
+
 def plant_convergence(result: dict[str, Any]) -> Claims:
     """Assumed modes converge to the finite element plant as kappa grows: frequencies, bends and encoder angles."""
     rows = result['rows']
@@ -373,7 +386,7 @@ CLAIMS: dict[str, Callable[[Any], Claims]] = {
         control_payload, detection_delay, identification_coverage, identification_measured_arms,
         identification_moving_arm, identification_paper_settings, identification_soak, identification_speed,
         identification_status, identification_suggested,
-        io_bag_reading, payload_block, payload_coverage, payload_elements, payload_linear, payload_mismatched,
+        io_bag_reading, payload_block, payload_coverage, payload_elements, payload_linear, payload_mismatched, payload_real_arms,
         payload_speed, plant_convergence, plant_hour, plant_live, plant_segment_chain, plant_speed,
         replay_speed, ros_fuzz, ros_latency, ros_loss, ros_signals, setup_time, study_scaling)}
 

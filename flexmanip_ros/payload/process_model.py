@@ -340,12 +340,13 @@ def predict(motion: ProcessModel, x: Array, S: Array, used: int, reported: Array
 
 @inner
 def correction(motion: ProcessModel, duration: float) -> float:
-    """Return what the linearization missed in the last step, over ``STEP_ERROR``; duration: from sample to sample [s]."""
+    """What the linearization missed in the last step, over ``STEP_ERROR``; duration: of a sample [s]."""
     largest = 0.0
     if not motion.frozen:
         for i in range(motion.k.shape[1]):
             largest = max(largest, abs(motion.k[1, i]), duration * abs(motion.k[2, i]))
-    return largest / (STEP_ERROR * motion.arm.length[0])
+    allowed: float = STEP_ERROR * motion.arm.length[0]
+    return largest / allowed
 
 
 @merged

@@ -12,7 +12,7 @@ from sensor_msgs.msg import JointState
 
 from flexmanip_ros import messages
 from flexmanip_ros.ros import conversions, qos
-from flexmanip_ros.ros.demo.program import compare
+from flexmanip_ros.ros.demo import compare
 
 PORTION = 200
 """Messages that are under way at a time: what a busy machine has not read yet is not lost too."""
