@@ -386,8 +386,8 @@ CLAIMS: dict[str, Callable[[Any], Claims]] = {
         control_payload, detection_delay, identification_coverage, identification_measured_arms,
         identification_moving_arm, identification_paper_settings, identification_soak, identification_speed,
         identification_status, identification_suggested,
-        io_bag_reading, payload_block, payload_coverage, payload_elements, payload_linear, payload_mismatched, payload_real_arms,
-        payload_speed, plant_convergence, plant_hour, plant_live, plant_segment_chain, plant_speed,
+        io_bag_reading, payload_block, payload_coverage, payload_elements, payload_linear, payload_mismatched,
+        payload_real_arms, payload_speed, plant_convergence, plant_hour, plant_live, plant_segment_chain, plant_speed,
         replay_speed, ros_fuzz, ros_latency, ros_loss, ros_signals, setup_time, study_scaling)}
 
 
