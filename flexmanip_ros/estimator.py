@@ -120,7 +120,7 @@ class ModelRequest:
         config, identifier, payload = self.config, self.identifier, self.payload
         found, without = _identified(config, identifier.rpbsid, self.dt)
         if found is not None and self.rows is not None and config.decimation == 1:
-            found = prediction_check.judged(found, self.rows)
+            found = prediction_check.judged(found, self.rows, config.outputs)
         if config.payload_method == 'block' and found is not None:
             payload = block_extraction.estimate(config, found, identifier.angles, identifier.configuration_range)
         if found is None:

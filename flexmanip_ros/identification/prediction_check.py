@@ -75,11 +75,12 @@ def missed(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np
     return np.where(power > SILENT * white, np.mean(errors, axis=0), np.nan)
 
 
-def judged(found: Identified, rows: Rows) -> Identified:
-    """Return the model with what its predictions of the last samples are worth.
+def judged(found: Identified, rows: Rows, outputs: tuple[str, ...]) -> Identified:
+    """Return the model with what its predictions of the last samples are worth; outputs: their names.
 
-    INCONSISTENT where they miss too much of the outputs; ORDER_TOO_LOW where that is so of an output while the others
-    are predicted: rates may ring with modes above the order, which displacements hardly show.
+    INCONSISTENT where they miss too much of the outputs in the mean; ORDER_TOO_LOW where that is so of one while the
+    others are predicted. Rates count in the mean alone where there are others: they ring with modes above the order,
+    which displacements hardly show, so that right models of the first modes would be refused.
     """
     if found.status is not Status.TRACKING:
         return found
@@ -92,6 +93,8 @@ def judged(found: Identified, rows: Rows) -> Identified:
     heard = shares[~np.isnan(shares)]
     if heard.size and float(heard.mean()) > MISSED:
         return found._replace(status=Status.INCONSISTENT)
-    if heard.size and float(heard.max()) > MISSED:
+    rates = np.array([name.endswith('/velocity') for name in outputs])
+    alone = shares[~np.isnan(shares) & (~rates | rates.all())]
+    if alone.size and float(alone.max()) > MISSED:
         return found._replace(status=Status.ORDER_TOO_LOW)
     return found

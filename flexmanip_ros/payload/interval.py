@@ -24,6 +24,8 @@ FEW = 50
 """Samples after an event before anything is claimed."""
 POWER_LIMIT = 2.0
 """Innovation power over white noise beyond which the model does not fit."""
+UNKNOWN_POWER = 4.0
+"""Beyond this most of the residuals is no noise: the fit may stand in any minimum, and the object weigh anything."""
 WIDENING_LIMIT = 4.0
 """Factor on the standard deviation, the model error apart, beyond which the model does not fit."""
 FREE_BIAS = 2.0
@@ -62,6 +64,8 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     spread[0, 0] += (reckoned * considered) ** 2
     if not held:
         return empty(float(body[0]), math.sqrt(spread[0, 0]), considered, consistency, status)
+    if consistency > UNKNOWN_POWER:
+        return Payload(max(float(body[0]), 0.0), math.inf, 0.0, math.inf, consistency, status)
     known_point = model.body > 1 and not spread[1:, 1:].any()
     if model.body > 1 and not known_point:
         body, spread = point_or_body(body, spread, structured_model.body_mean(config, model),
