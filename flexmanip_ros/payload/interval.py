@@ -126,7 +126,7 @@ def empty(seeming: float, std: float, considered: float, consistency: float, sta
         std = math.hypot(std, considered)
     upper = max(seeming, 0.0) + QUANTILE * std
     if abs(seeming) > 3.0 * std and status is Status.TRACKING:
-        return Payload(max(seeming, 0.0), std, 0.0, upper, consistency, Status.INCONSISTENT)
+        return Payload(0.0, math.inf, 0.0, math.inf, consistency, Status.INCONSISTENT)
     return Payload(0.0, std, 0.0, upper, consistency, status)
 
 

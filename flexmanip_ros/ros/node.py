@@ -316,11 +316,13 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
     try:
         node = make()
         executor = rclpy_workarounds.make_executor()
-        rclpy_workarounds.interrupt_on_signals()
+        caught = rclpy_workarounds.interrupt_on_signals()
         executor.add_node(node)
-        if not node.autostart():
+        started = node.autostart()
+        if not started and not caught:
             return BAD_INPUT  # the node has logged why
-        rclpy_workarounds.spin(executor)
+        if not caught:
+            rclpy_workarounds.spin(executor)
     except (FlexmanipError, ParameterException) as error:
         return reject(name, str(error))
     except KeyboardInterrupt:

@@ -42,14 +42,24 @@ def make_executor(context: Context | None = None) -> Executor:
     return EventsExecutor(context=context)
 
 
-def interrupt_on_signals() -> None:
+def interrupt_on_signals() -> list[int]:
     """Let SIGINT and SIGTERM raise KeyboardInterrupt; call it again after an executor was made.
+
+    Return a list that holds the signals which have come: an exception in a callback from C, such as those with which
+    numba loads a kernel, is printed and lost.
 
     rclpy's own handlers end the context before a node can send its last message, such as zero torque. With
     ``SignalHandlerOptions.NO`` SIGTERM ends the process at once, and the events executor sets handlers of its own.
     """
+    caught: list[int] = []
+
+    def interrupt(number: int, frame: object) -> None:
+        caught.append(number)
+        raise KeyboardInterrupt
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, interrupt)
+    return caught
 
 
 def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:

@@ -66,10 +66,13 @@ def test_a_node_that_waits_to_be_configured_reports_that_it_is_not_active(ros: R
 
 
 def documented() -> list[str]:
-    """Return what follows `ros2 run flexmanip_ros` in the commands of the documentation."""
+    """Return what follows `ros2 run flexmanip_ros` in the commands of the documentation that start a node."""
     pages = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
     text = '\n'.join(page.read_text(encoding='utf-8') for page in pages).replace('\\\n', ' ')
-    return re.findall(r"^ros2 run (?:--prefix '[^']*' )?flexmanip_ros (.*)$", text, re.MULTILINE)
+    commands = re.findall(r"^ros2 run (?:--prefix '[^']*' )?flexmanip_ros (.*)$", text, re.MULTILINE)
+    names = [cls.__module__.rpartition('.')[2] for cls in NODES]
+    words = [(command, shlex.split(command, comments=True)) for command in commands]
+    return [command for command, (name, *rest) in words if name in names and rest[:1] in ([], ['--ros-args'])]
 
 
 def test_the_documentation_starts_nodes() -> None:
