@@ -92,3 +92,25 @@ def test_hubs_do_not_bias_a_light_payload() -> None:
     found = simulated(ArmParameters(hub_inertia=(0.5, 0.3)), 1.5, (10.0, 5.0))
     assert found.status is Status.TRACKING
     assert abs(found.mass - 1.5) < 3.5 * found.std
+
+
+def test_a_body_is_known_half_a_second_after_its_capture() -> None:
+    plant = PlantParameters(arm=ArmParameters(damping_ratio=0.003), payload_mass=20.0, payload_com=(0.08, 0.05),
+                            payload_inertia=1.0, seed=2)
+    caught = (CaptureEvent(2_000_000_000, EventKind.CAPTURE),)
+    run = simulator.simulate(plant, excitation.sequence(ExcitationParameters(), 2600), caught)
+    config = IdentifierParameters(arm=plant.arm, model_rate=0.1)
+    found = [one.payload for one in pipeline.run(config, simulator.records(run, caught)) if one.payload is not None]
+    assert found[-1].status is Status.TRACKING
+    assert found[-1].com[:2] == pytest.approx(plant.payload_com, abs=0.006)
+    assert found[-1].lower < 20.0 < found[-1].upper
+
+
+def test_an_undamped_arm_that_rings_ever_more_is_followed() -> None:
+    caught = (CaptureEvent(2_000_000_000, EventKind.CAPTURE),)
+    run = simulator.simulate(PlantParameters(), excitation.sequence(ExcitationParameters(), 18000), caught)
+    config = IdentifierParameters(model_rate=0.05)
+    late = [one.payload for one in pipeline.run(config, simulator.records(run, caught))
+            if one.payload is not None and one.stamp_ns > run.stamp_ns[0] + 14_000_000_000]
+    assert all(one.status is Status.TRACKING for one in late)
+    assert all(one.mass == pytest.approx(20.0, rel=0.001) for one in late)
