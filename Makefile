@@ -74,7 +74,7 @@ demo: setup
 	@$(BIN)/demo $(DEMO_ARGS)
 
 # Two halves side by side, of about the same length: what runs nodes and programs, and what computes.
-RUNNING := test/ros test/cli test/view
+RUNNING := test/ros test/cli test/view test/studies
 test: setup $(VENV)/.development
 ifeq ($(strip $(PYTEST_ARGS)),)
 	@mkdir -p log; status=0; \
