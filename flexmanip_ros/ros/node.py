@@ -301,15 +301,22 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
         argv: Sequence[str] | None = None) -> int:
     """Run one node until it is asked to stop; return the exit code.
 
-    0 after SIGINT or SIGTERM, 2 with one line on stderr for bad arguments or parameters.
+    0 after SIGINT or SIGTERM at any moment, 2 with one line on stderr for bad arguments or parameters.
     """
     arguments = list(sys.argv if argv is None else argv)
-    rclpy_workarounds.interrupt_on_signals()
     try:
-        parser(name, about, cls).parse_args(remove_ros_args(arguments)[1:])
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # rcl raises types of its C extension for --ros-args and parameter files
-        return reject(name, rclpy_workarounds.first_line(error))
+        rclpy_workarounds.interrupt_on_signals()
+        try:
+            parser(name, about, cls).parse_args(remove_ros_args(arguments)[1:])
+            rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        except Exception as error:  # rcl raises types of its C extension for --ros-args and parameter files
+            return reject(name, rclpy_workarounds.first_line(error))
+        return _spin(make, name)
+    except KeyboardInterrupt:
+        return 0
+
+
+def _spin(make: Callable[[], FlexmanipNode[Any]], name: str) -> int:
     warnings.simplefilter('ignore', RuntimeWarning)  # numbers out of range have a status
     node: FlexmanipNode[Any] | None = None
     executor: Executor | None = None
@@ -325,8 +332,6 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
             rclpy_workarounds.spin(executor)
     except (FlexmanipError, ParameterException) as error:
         return reject(name, str(error))
-    except KeyboardInterrupt:
-        pass
     finally:
         with rclpy_workarounds.shutdown():
             if node is not None:

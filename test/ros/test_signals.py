@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -55,3 +56,19 @@ def test_a_signal_ends_a_program_cleanly_and_leaves_whole_files(
     trial = ros_signals.attempt(program, number, delay, places)
     assert trial.problem == ''
     assert trial.took_s < 20.0
+
+
+@pytest.mark.parametrize('moment', ['rclpy.init', 'flexmanip_ros.ros.node.parser', 'rclpy.node.Node.__init__'])
+def test_a_signal_while_a_node_starts_ends_it_as_any_other(moment: str) -> None:
+    where, _, name = moment.rpartition('.')
+    owner = where if where != 'rclpy.node.Node' else 'rclpy.node'
+    holder = owner if where == owner else 'rclpy.node.Node'
+    begin = (f'import os, signal, sys, {owner}, flexmanip_ros.ros.nodes.excitation as node\n'
+             f'before = {holder}.{name}\n'
+             'def interrupted(*given, **named):\n'
+             '    os.kill(os.getpid(), signal.SIGINT)\n'
+             '    return before(*given, **named)\n'
+             f'{holder}.{name} = interrupted\n'
+             'sys.exit(node.main([]))')
+    ended = subprocess.run([sys.executable, '-c', begin], text=True, capture_output=True, timeout=60.0)
+    assert (ended.returncode, ended.stderr) == (0, '')
