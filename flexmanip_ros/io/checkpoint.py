@@ -24,7 +24,7 @@ import numpy as np
 import flexmanip_ros
 from flexmanip_ros.errors import CheckpointError
 
-NAME, FORMAT = b'flexmanip_ros checkpoint ', b'2\n'
+NAME, FORMAT = b'flexmanip_ros checkpoint ', b'3\n'
 """Format 1 held queues of samples where format 2 holds the sample log."""
 CHECKSUM = hashlib.sha256().digest_size
 PACKAGE = 'flexmanip_ros.'

@@ -23,7 +23,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT = rang
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
  HALVED, CALM) = range(22)
 # Elements of ``score``.
-MOVE, VARIANCE, DRIFT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA = range(9)
+MOVE, VARIANCE, SHIFT, DOUBT, DRIFT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA = range(11)
 
 
 class FilterState(NamedTuple):
@@ -43,11 +43,12 @@ class FilterState(NamedTuple):
     not fit, over the same samples; HALVED: how often the longest step of the motion is; CALM: samples since a
     longer one was too long."""
     score: Array
-    """(9,) MOVE: sum of the payload's updates in this batch, VARIANCE: the variance they should have; DRIFT: mean of
-    MOVE^2 / VARIANCE; NOW: time since process noise was added [s]; EMPTY_ARM_BIAS: payload of the arm before the event,
-    when it was empty, in standard deviations, EXCESS_BIAS: in those left with the inertia error allowed for; COST: of
-    the samples in this iteration, COST_BEFORE: of the first BEFORE samples in the last one;
-    LAMBDA: damping of Levenberg and Marquardt."""
+    """(11,) MOVE: sum of the payload's updates in this batch, VARIANCE: the variance they should have; SHIFT: by how
+    many standard deviations the last iteration moved the payload, DOUBT: root of the sum of the squares of that step
+    and of the deviation [kg]; DRIFT: mean of MOVE^2 / VARIANCE; NOW: time since process noise was added
+    [s]; EMPTY_ARM_BIAS: payload of the arm before the event, when it was empty, in standard deviations, EXCESS_BIAS:
+    in those left with the inertia error allowed for; COST: of the samples in this iteration, COST_BEFORE: of the first
+    BEFORE samples in the last one; LAMBDA: damping of Levenberg and Marquardt."""
     x0: Array
     """(nx,) mean just after the last event."""
     S0: Array
@@ -78,7 +79,7 @@ def memory(nx: int, m: int) -> FilterState:
     """Allocate for nx states and m sensors."""
     return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 9)), recent=np.zeros((m, 4)),
-        counts=np.zeros(22, dtype=np.int64), score=np.zeros(9), x0=np.zeros(nx), S0=np.zeros((nx, nx)),
+        counts=np.zeros(22, dtype=np.int64), score=np.zeros(11), x0=np.zeros(nx), S0=np.zeros((nx, nx)),
         xi=np.zeros(nx), accepted=np.zeros(nx), normal=np.zeros((nx, nx)), gradient=np.zeros(nx),
         xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
         g=np.zeros(nx), innovation=np.zeros((m, 2)), power=np.ones(m))

@@ -11,7 +11,18 @@ from flexmanip_ros.numerics.compiled import kernel
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured_model
-from flexmanip_ros.payload.filter_state import BATCHES, BLOCKS, DRIFT, EFFECTIVE, FLOOR, POWER, WEIGHT, WHITE
+from flexmanip_ros.payload.filter_state import (
+    BATCHES,
+    BLOCKS,
+    DOUBT,
+    DRIFT,
+    EFFECTIVE,
+    FLOOR,
+    POWER,
+    SHIFT,
+    WEIGHT,
+    WHITE,
+)
 from flexmanip_ros.payload.measurement_update import MeasurementModel
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import Array, Payload, Status
@@ -48,7 +59,8 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     consistency, drift, reckoned = figures(m.noise, sensors.rate, m.score, m.counts)
     if math.isnan(consistency):
         consistency = plain_misfit(sensors, m)
-    restless = math.sqrt(drift * max(1.0, consistency / POWER_LIMIT))
+    shift, doubted = float(m.score[SHIFT]), float(m.score[DOUBT])
+    restless = math.sqrt(max(drift, 1.0 + shift * shift) * max(1.0, consistency / POWER_LIMIT))
     widening, doubt = (restless * max(1.0, abs(float(m.score[bias])) / FREE_BIAS)
                        for bias in (mem.EMPTY_ARM_BIAS, mem.EXCESS_BIAS))
     status = Status.TRACKING
@@ -71,7 +83,7 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         body, spread = point_or_body(body, spread, structured_model.body_mean(config, model),
                                      structured_model.body_std(config, model))
     mass, std = max(float(body[0]), 0.0), math.sqrt(spread[0, 0])
-    if std > UNKNOWN_STD * mass:  # a linearization tells too much of what moves hardly
+    if max(std, doubted) > UNKNOWN_STD * mass:  # a linearization tells too much of what moves hardly
         std = max(std, float(structured_model.body_std(config, model)[0]))
         status = Status.POORLY_EXCITED if status is Status.TRACKING else status
     found = Payload(mass, std, max(0.0, mass - QUANTILE * std), mass + QUANTILE * std, consistency, status)

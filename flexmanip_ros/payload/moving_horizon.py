@@ -21,6 +21,7 @@ from flexmanip_ros.payload.filter_state import (
     CALM,
     COST,
     COST_BEFORE,
+    DOUBT,
     EFFECTIVE,
     ENOUGH,
     FIT,
@@ -40,6 +41,7 @@ from flexmanip_ros.payload.filter_state import (
     POWER,
     REFITS,
     REJECTED,
+    SHIFT,
     SINCE_EVENT,
     SINCE_NOISE,
     SLOW,
@@ -66,6 +68,10 @@ FIRST_ITERATION = 8
 
 ROWS = 8
 """Rows that are read again for each new sample."""
+GROWTH = 4
+"""A fit that has come is repeated with a quarter more samples: fewer add little to what it is linearized at."""
+AT_REST = 0.5
+"""A fit has come whose last step moved the payload by at most so many standard deviations."""
 CONVERGED = 0.02
 """A step that lowers the cost by less, for each sample, has converged: the horizon may grow."""
 FITS = 1.5
@@ -184,11 +190,16 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
             m.counts[STORED] = HORIZON
         # the step was not seen to lower the cost yet: the filter takes no more of it than it can tell
         part = min(1.0, TRUSTED / np.sqrt(max(gained, 1e-300)))
+        payload = 2 * sensors.H.shape[1]
+        shift = dot(m.Sr[payload], m.g)
         for i in range(nx):
             m.x[i] = m.xr[i] + part * dot(m.Sr[i], m.g)
             forward(m.N, m.Sr[i])
             for c in range(nx):
                 m.S[i, c] = m.Sr[i, c]
+        variance = dot(m.S[payload], m.S[payload])
+        m.score[SHIFT] = abs(shift) / np.sqrt(max(variance, 1e-300))
+        m.score[DOUBT] = np.sqrt(variance + shift * shift)
     return True
 
 
@@ -239,7 +250,7 @@ def reject_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
 
 @merged
 def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array) -> bool:
-    """Let the Gauss-Newton iteration take up to three samples."""
+    """Let the Gauss-Newton iteration take up to ``ROWS`` samples."""
     stored = m.counts[STORED]
     if stored >= HORIZON:
         return True
@@ -250,7 +261,9 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
         return not fails(m)
     for _ in range(ROWS):
         if m.counts[ITERATING] == 0:
-            if m.counts[AGAIN] == 0 and m.counts[BEFORE] == m.counts[STORED]:
+            before = m.counts[BEFORE]
+            more = max(before // GROWTH, 1) if m.score[SHIFT] < AT_REST else 1
+            if m.counts[AGAIN] == 0 and m.counts[STORED] < before + more:
                 break
             begin_iteration(m)
         until = m.counts[BEFORE]

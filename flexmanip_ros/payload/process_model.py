@@ -340,9 +340,12 @@ def predict(motion: ProcessModel, x: Array, S: Array, used: int, reported: Array
 
 @inner
 def correction(motion: ProcessModel, duration: float) -> float:
-    """What the linearization missed in the last step, over ``STEP_ERROR``; duration: of a sample [s]."""
+    """What the linearization missed in the last step, over ``STEP_ERROR``; duration: of a sample [s].
+
+    Where Coulomb friction may change its sign it is 0: a shorter step does not straighten that bend of the motion.
+    """
     largest = 0.0
-    if not motion.frozen:
+    if not motion.frozen and slower(motion, duration) == 1.0:
         for i in range(motion.k.shape[1]):
             largest = max(largest, abs(motion.k[1, i]), duration * abs(motion.k[2, i]))
     allowed: float = STEP_ERROR * motion.arm.length[0]

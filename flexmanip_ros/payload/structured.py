@@ -149,7 +149,7 @@ def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, kind
         m.counts[mem.HELD] = 0
     m.S[:] = structured_model.widen(m.S, np.hstack([columns, opened]))
     structured_model.shake(model, m)
-    _set_arrival_cost(m)
+    _set_arrival_cost(model, m)
 
 
 def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterState) -> None:
@@ -170,13 +170,14 @@ def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterSta
     m.S[payload:payload + model.body] = 0.0
 
 
-def _set_arrival_cost(m: mem.FilterState) -> None:
+def _set_arrival_cost(model: Model, m: mem.FilterState) -> None:
     """An event: the present state is the arrival cost, and what was gathered of its consistency is void."""
     _begin_horizon(m)
     for counter in (mem.SINCE_EVENT, mem.BATCHES):
         m.counts[counter] = 0
     m.counts[mem.BLOCKS] = min(m.counts[mem.BLOCKS], 40)
     m.score[:mem.EMPTY_ARM_BIAS] = 0.0
+    m.score[mem.DOUBT] = np.linalg.norm(m.S[model.payload])
     m.score[mem.DRIFT] = 1.0
     m.noise[:, mem.WEIGHT] = 0.0
     m.power[:] = 1.0
@@ -239,7 +240,7 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     if not state.refits:  # the simplest arm first; all that may be learned where that does not fit
         structured_model.take_as_known(model, m)
     m.S[:] = structured_model.triangular(m.S)
-    _set_arrival_cost(m)
+    _set_arrival_cost(model, m)
     m.counts[mem.REFITS] = state.refits
     seen = sensors(config, model, dt, structured_model.diffusion(config, model, m))
     events = state.early
@@ -330,7 +331,7 @@ def reopen(
     m.x[2 * n:] = parameters
     m.S[2 * n:] = 0.0
     m.S[:] = structured_model.widen(m.S, np.vstack([np.zeros((2 * n, spread.shape[1])), spread]))
-    _set_arrival_cost(m)
+    _set_arrival_cost(state.model, m)
     assert state.effort is not None
     return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.effort))
 
@@ -342,11 +343,13 @@ def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> St
     assert state.sensors is not None
     m = mem.copy(state.memory, horizon=False)
     table, first = input_table(state, rows)
-    taken = filtered(state.model.motion, state.sensors, m, table, first)
-    if taken < len(table):
-        return _restart(config, state, m, rows.since(rows.first + taken - first))
-    return state._replace(memory=m, cursor=rows.until, last_ns=int(rows.stamp_ns[-1]), effort=rows.u[-1].copy(),
-                          missing=int(rows.missing[-1]), peak=_peaks(state, rows)[-1])
+    failed = filtered(state.model.motion, state.sensors, m, table, first) - first
+    taken = rows.between(rows.first, min(rows.first + failed + 1, rows.until))
+    after = state._replace(cursor=taken.until, last_ns=int(taken.stamp_ns[-1]), effort=taken.u[-1].copy(),
+                           missing=int(taken.missing[-1]), peak=_peaks(state, taken)[-1])
+    if failed == len(rows):
+        return after._replace(memory=m)
+    return advance(config, _restart(config, after, m, taken.since(taken.until - 1)), rows.since(taken.until))
 
 
 def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
@@ -375,32 +378,29 @@ def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
     return table, rows.first - begin
 
 
-def _restart(config: IdentifierParameters, state: StructuredState, m: mem.FilterState, rows: Rows) -> StructuredState:
-    """Begin again after the first of the rows: numbers left the finite range, or a fit failed.
+def _restart(config: IdentifierParameters, state: StructuredState, m: mem.FilterState, last: Rows) -> StructuredState:
+    """Begin again after the last row, at which numbers left the finite range or a fit failed, with memory m.
 
     The first fit is that of the simplest arm and of a point; the next ones learn all that they may, and a body. What is
     held begins with its prior, and the arm with what was learned before the event, or as given if that fails at once.
     """
     assert state.model is not None
     assert state.memory is not None
+    assert state.effort is not None
     model = state.model
     refits = int(m.counts[mem.REFITS])
     unfit = refits > state.memory.counts[mem.REFITS]
-    following = rows.since(rows.first + 1)
-    payload = model.payload
     if unfit and refits <= STARTS and m.counts[mem.HELD] and model.body > 1 and m.counts[mem.STORED] < mem.HORIZON:
         m = mem.copy(m)
         _open_body(config, model, m)
-        last = rows.between(rows.first, rows.first + 1)
-        same = state._replace(memory=m, cursor=rows.first + 1, last_ns=int(last.stamp_ns[0]), effort=last.u[0].copy())
-        return advance(config, same, following)
+        return state._replace(memory=m)
     at_once = m.counts[mem.SINCE_EVENT] < FIRST_LOOK  # what was learned moves as no arm does
     if m.counts[mem.HELD] and m.counts[mem.LEARNED] and np.isfinite(m.S0).all() and not at_once:
         m = mem.copy(m)
         m.x[:], m.S[:] = m.x0, m.S0
+        payload = model.payload
         parameters, spread = m.x[payload:].copy(), m.S[payload:].copy()
-        first = rows.between(rows.first, rows.first + 1)
-        structured_model.first(config, model, m, measurements(model, first)[0])
+        structured_model.first(config, model, m, measurements(model, last)[0])
         body = slice(payload, payload + model.body)
         spread[:model.body] = 0.0
         m.x[payload:], m.S[payload:] = parameters, 0.0
@@ -410,16 +410,13 @@ def _restart(config: IdentifierParameters, state: StructuredState, m: mem.Filter
         m.S[:] = structured_model.widen(m.S, np.hstack([np.vstack([np.zeros((payload, spread.shape[1])), spread]),
                                                         opened]))
         m.counts[mem.REFITS] = refits
-        _set_arrival_cost(m)
-        last_ns, effort = int(first.stamp_ns[0]), first.u[0].copy()
-        fresh = state._replace(memory=m, cursor=rows.first + 1, last_ns=last_ns, effort=effort,
-                               horizon=Horizon(rows.first + 1, last_ns, effort))
-        return advance(config, fresh, following)
-    fresh = init(config)._replace(restarts=state.restarts + (not unfit), cursor=rows.first + 1, refits=refits)
+        _set_arrival_cost(model, m)
+        return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.effort))
+    fresh = init(config)._replace(restarts=state.restarts + (not unfit), cursor=state.cursor, refits=refits)
     if m.counts[mem.HELD]:
-        grasped = CaptureEvent(int(rows.stamp_ns[0]), EventKind.CAPTURE)
-        fresh = fresh._replace(early=((rows.first + 1, grasped),))
-    return advance(config, fresh, following)
+        grasped = CaptureEvent(state.last_ns, EventKind.CAPTURE)
+        fresh = fresh._replace(early=((state.cursor, grasped),))
+    return fresh
 
 
 def measurements(model: Model, rows: Rows) -> Array:
