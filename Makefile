@@ -60,7 +60,7 @@ $(VENV)/.warm: $(SOURCES) $(VENV)/.package
 	@$(BIN)/python -m flexmanip_ros.cli.warm_up
 	@touch $@
 
-$(VENV)/.development: requirements/development.txt $(VENV)/.runtime
+$(VENV)/.development: requirements/development.txt $(VENV)/.package
 	@echo 'Installing the tools for tests'
 	@$(PIP) install --require-hashes -r $<
 	@touch $@

@@ -16,8 +16,9 @@ ENOUGH = 512
 
 # Columns of ``noise``, one row a sensor: variance used by the filter; variance of the innovations; its slow part;
 # sum and sum of squares of the residuals in this block; least variance assumed; variance of the fourth differences
-# (white noise only); information on the payload that came from this sensor; sum of squares in this iteration.
-EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT = range(9)
+# (white noise only); information on the payload that came from this sensor; sum of squares in this iteration; variance
+# used at the last event.
+EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EVENT = range(10)
 # Elements of ``counts``.
 (HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN, BEFORE,
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
@@ -34,7 +35,7 @@ class FilterState(NamedTuple):
     S: Array
     """(nx, nx) square root of the covariance."""
     noise: Array
-    """(m, 9) what is known of each sensor's noise."""
+    """(m, 10) what is known of each sensor's noise."""
     recent: Array
     """(m, 4) its last measurements."""
     counts: NDArray[np.int64]
@@ -45,7 +46,7 @@ class FilterState(NamedTuple):
     score: Array
     """(11,) MOVE: sum of the payload's updates in this batch, VARIANCE: the variance they should have; SHIFT: by how
     many standard deviations the last iteration moved the payload, DOUBT: root of the sum of the squares of that step
-    and of the deviation [kg]; DRIFT: mean of MOVE^2 / VARIANCE; NOW: time since process noise was added
+    and of the deviation, over the payload; DRIFT: mean of MOVE^2 / VARIANCE; NOW: time since process noise was added
     [s]; EMPTY_ARM_BIAS: payload of the arm before the event, when it was empty, in standard deviations, EXCESS_BIAS:
     in those left with the inertia error allowed for; COST: of the samples in this iteration, COST_BEFORE: of the first
     BEFORE samples in the last one; LAMBDA: damping of Levenberg and Marquardt."""
@@ -78,7 +79,7 @@ class FilterState(NamedTuple):
 def memory(nx: int, m: int) -> FilterState:
     """Allocate for nx states and m sensors."""
     return FilterState(
-        x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 9)), recent=np.zeros((m, 4)),
+        x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 10)), recent=np.zeros((m, 4)),
         counts=np.zeros(22, dtype=np.int64), score=np.zeros(11), x0=np.zeros(nx), S0=np.zeros((nx, nx)),
         xi=np.zeros(nx), accepted=np.zeros(nx), normal=np.zeros((nx, nx)), gradient=np.zeros(nx),
         xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),

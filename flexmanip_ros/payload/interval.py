@@ -18,8 +18,11 @@ from flexmanip_ros.payload.filter_state import (
     DRIFT,
     EFFECTIVE,
     FLOOR,
+    HORIZON,
     POWER,
+    REFITS,
     SHIFT,
+    STORED,
     WEIGHT,
     WHITE,
 )
@@ -36,7 +39,8 @@ FEW = 50
 POWER_LIMIT = 2.0
 """Innovation power over white noise beyond which the model does not fit."""
 UNKNOWN_POWER = 4.0
-"""Beyond this most of the residuals is no noise: the fit may stand in any minimum, and the object weigh anything."""
+"""Beyond this most of the residuals is no noise: the fit may stand in any minimum, and the object weigh anything. After
+a fit that was given up, so it is beyond ``POWER_LIMIT``."""
 WIDENING_LIMIT = 4.0
 """Factor on the standard deviation, the model error apart, beyond which the model does not fit."""
 FREE_BIAS = 2.0
@@ -59,8 +63,10 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     consistency, drift, reckoned = figures(m.noise, sensors.rate, m.score, m.counts)
     if math.isnan(consistency):
         consistency = plain_misfit(sensors, m)
-    shift, doubted = float(m.score[SHIFT]), float(m.score[DOUBT])
-    restless = math.sqrt(max(drift, 1.0 + shift * shift) * max(1.0, consistency / POWER_LIMIT))
+    fitting = held and m.counts[STORED] < HORIZON
+    if fitting:  # the next step may be as long as the last one
+        drift = max(drift, 1.0 + float(m.score[SHIFT]) ** 2)
+    restless = math.sqrt(drift * max(1.0, consistency / POWER_LIMIT))
     widening, doubt = (restless * max(1.0, abs(float(m.score[bias])) / FREE_BIAS)
                        for bias in (mem.EMPTY_ARM_BIAS, mem.EXCESS_BIAS))
     status = Status.TRACKING
@@ -76,14 +82,15 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     spread[0, 0] += (reckoned * considered) ** 2
     if not held:
         return empty(float(body[0]), math.sqrt(spread[0, 0]), considered, consistency, status)
-    if consistency > UNKNOWN_POWER:
+    if consistency > (POWER_LIMIT if m.counts[REFITS] else UNKNOWN_POWER):
         return Payload(max(float(body[0]), 0.0), math.inf, 0.0, math.inf, consistency, status)
     known_point = model.body > 1 and not spread[1:, 1:].any()
     if model.body > 1 and not known_point:
         body, spread = point_or_body(body, spread, structured_model.body_mean(config, model),
                                      structured_model.body_std(config, model))
     mass, std = max(float(body[0]), 0.0), math.sqrt(spread[0, 0])
-    if max(std, doubted) > UNKNOWN_STD * mass:  # a linearization tells too much of what moves hardly
+    # a linearization tells too much of what moves hardly, or where the payload was not known at which it was made
+    if std > UNKNOWN_STD * mass or (fitting and m.score[DOUBT] > UNKNOWN_STD):
         std = max(std, float(structured_model.body_std(config, model)[0]))
         status = Status.POORLY_EXCITED if status is Status.TRACKING else status
     found = Payload(mass, std, max(0.0, mass - QUANTILE * std), mass + QUANTILE * std, consistency, status)

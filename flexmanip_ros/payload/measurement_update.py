@@ -165,12 +165,16 @@ def learn_noise(sensors: MeasurementModel, m: FilterState) -> None:
 
 @inner
 def judge_payload(sensors: MeasurementModel, m: FilterState) -> None:
-    """At the end of a batch: see whether the payload moved farther than its variance allows."""
+    """At the end of a batch: see whether the payload moved farther than its variance allows.
+
+    While the horizon is open the step of the last iteration tells it (SHIFT): the filter is replaced by the fit.
+    """
     m.counts[IN_BATCH] += 1
-    if m.counts[IN_BATCH] < 8 * sensors.block:
+    fitting = m.counts[STORED] < HORIZON
+    if m.counts[IN_BATCH] < 8 * sensors.block and not fitting:
         return
     m.counts[IN_BATCH] = 0
-    if m.score[VARIANCE] > 0.0:
+    if m.score[VARIANCE] > 0.0 and not fitting:
         m.counts[BATCHES] = min(m.counts[BATCHES] + 1, BATCH_MEMORY)
         square = m.score[MOVE] * m.score[MOVE] / m.score[VARIANCE]
         m.score[DRIFT] += (square - m.score[DRIFT]) / m.counts[BATCHES]

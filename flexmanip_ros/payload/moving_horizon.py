@@ -30,13 +30,11 @@ from flexmanip_ros.payload.filter_state import (
     HELD,
     HORIZON,
     IN_A_ROW,
-    IN_BATCH,
     ITERATED,
     ITERATING,
     LAMBDA,
     LEARNED,
     MEASURED,
-    MOVE,
     NOW,
     POWER,
     REFITS,
@@ -48,7 +46,6 @@ from flexmanip_ros.payload.filter_state import (
     STORED,
     TRIED,
     USED,
-    VARIANCE,
     WHITE,
 )
 from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, observe
@@ -71,7 +68,7 @@ ROWS = 8
 GROWTH = 4
 """A fit that has come is repeated with a quarter more samples: fewer add little to what it is linearized at."""
 AT_REST = 0.5
-"""A fit has come whose last step moved the payload by at most so many standard deviations."""
+"""A fit has come whose last step moved the payload by less than this share of its deviation."""
 CONVERGED = 0.02
 """A step that lowers the cost by less, for each sample, has converged: the horizon may grow."""
 FITS = 1.5
@@ -186,8 +183,6 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
         for i in range(m.noise.shape[0]):
             m.noise[i, POWER] = m.noise[i, FIT] / max(m.counts[MEASURED], 1)
             m.noise[i, SLOW] = m.noise[i, POWER]
-        if m.counts[ITERATED] >= ENOUGH and gained < 0.5 * nx:
-            m.counts[STORED] = HORIZON
         # the step was not seen to lower the cost yet: the filter takes no more of it than it can tell
         part = min(1.0, TRUSTED / np.sqrt(max(gained, 1e-300)))
         payload = 2 * sensors.H.shape[1]
@@ -199,7 +194,9 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
                 m.S[i, c] = m.Sr[i, c]
         variance = dot(m.S[payload], m.S[payload])
         m.score[SHIFT] = abs(shift) / np.sqrt(max(variance, 1e-300))
-        m.score[DOUBT] = np.sqrt(variance + shift * shift)
+        m.score[DOUBT] = np.sqrt(variance + shift * shift) / max(m.x[payload], 1e-300)
+        if m.counts[ITERATED] >= ENOUGH and gained < 0.5 * nx and m.score[SHIFT] < AT_REST:
+            m.counts[STORED] = HORIZON
     return True
 
 
@@ -272,12 +269,8 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
         if not iterate_sample(motion, sensors, m, table):
             if m.counts[BEFORE] == 0 or not reject_step(motion, sensors, m):
                 return False
-        elif m.counts[ITERATED] == until:
-            m.counts[IN_BATCH] = 0
-            m.score[MOVE] = 0.0
-            m.score[VARIANCE] = 0.0
-            if not finish_iteration(motion, sensors, m) or misfits(motion, m):
-                return False
+        elif m.counts[ITERATED] == until and (not finish_iteration(motion, sensors, m) or misfits(motion, m)):
+            return False
     return True
 
 

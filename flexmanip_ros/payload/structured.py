@@ -149,6 +149,7 @@ def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, kind
         m.counts[mem.HELD] = 0
     m.S[:] = structured_model.widen(m.S, np.hstack([columns, opened]))
     structured_model.shake(model, m)
+    m.noise[:, mem.AT_EVENT] = m.noise[:, mem.EFFECTIVE]
     _set_arrival_cost(model, m)
 
 
@@ -177,7 +178,7 @@ def _set_arrival_cost(model: Model, m: mem.FilterState) -> None:
         m.counts[counter] = 0
     m.counts[mem.BLOCKS] = min(m.counts[mem.BLOCKS], 40)
     m.score[:mem.EMPTY_ARM_BIAS] = 0.0
-    m.score[mem.DOUBT] = np.linalg.norm(m.S[model.payload])
+    m.score[mem.DOUBT] = np.linalg.norm(m.S[model.payload]) / max(m.x[model.payload], 1e-300)
     m.score[mem.DRIFT] = 1.0
     m.noise[:, mem.WEIGHT] = 0.0
     m.power[:] = 1.0
@@ -410,6 +411,8 @@ def _restart(config: IdentifierParameters, state: StructuredState, m: mem.Filter
         m.S[:] = structured_model.widen(m.S, np.hstack([np.vstack([np.zeros((payload, spread.shape[1])), spread]),
                                                         opened]))
         m.counts[mem.REFITS] = refits
+        for column in (mem.EFFECTIVE, mem.POWER, mem.SLOW):  # what did not fit was taken for noise
+            m.noise[:, column] = m.noise[:, mem.AT_EVENT]
         _set_arrival_cost(model, m)
         return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.effort))
     fresh = init(config)._replace(restarts=state.restarts + (not unfit), cursor=state.cursor, refits=refits)

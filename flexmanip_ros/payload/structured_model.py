@@ -341,13 +341,13 @@ def noise(model: Model, Y: Array) -> Array:
     """First guess of every sensor's noise from its first samples Y (N, m), as ``FilterState.noise``."""
     differences = np.diff(Y, n=4, axis=0)
     white = (1.4826 * np.median(np.abs(differences), axis=0)) ** 2 / 70
-    rows = np.zeros((len(model.roles), 9))
+    rows = np.zeros((len(model.roles), 10))
     for i, role in enumerate(model.roles):
         rate = role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE)
         rows[i, mem.FLOOR] = FLOORS[role.quantity] ** 2
         rows[i, mem.WHITE] = max(white[i], rows[i, mem.FLOOR])
         rows[i, mem.POWER] = rows[i, mem.WHITE] * (RATE_NOISE if rate else 2.0)
-        rows[i, mem.SLOW] = rows[i, mem.EFFECTIVE] = rows[i, mem.POWER]
+        rows[i, mem.SLOW] = rows[i, mem.EFFECTIVE] = rows[i, mem.AT_EVENT] = rows[i, mem.POWER]
     return rows
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +35,7 @@ class Run(NamedTuple):
     chords: Array
 
 
+@cache
 def record() -> tuple[simulator.Trajectory, CaptureEvent, Array]:
     plant = replace(PlantParameters(), payload_mass=PAYLOAD)
     torque = excitation.sequence(ExcitationParameters(), round(DURATION_S * 1000))

@@ -10,6 +10,7 @@ from flexmanip_ros.parameters import (
     IdentifierParameters,
     PlantParameters,
 )
+from flexmanip_ros.payload import structured
 from flexmanip_ros.samples.sample_log import Rows, log_of
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
@@ -32,17 +33,29 @@ def event(seconds: float, kind: EventKind = EventKind.CAPTURE) -> CaptureEvent:
 def record(
         seconds: float, events: tuple[CaptureEvent, ...] = (), degrees=(60.0, 45.0), payload: float = 20.0,
         outputs: tuple[str, ...] = BENDS + RATES, seed: int = 1, arm: ArmParameters = ARM, scale: float = 1.0,
-        **plant,
+        peaks: tuple[float, float] = (10.0, 5.0), **plant,
 ) -> Rows:
     """Samples at 1 kHz under the paper's square waves, 40 dB."""
     parameters = PlantParameters(
         initial_angles=tuple(np.radians(degrees)), payload_mass=payload, seed=seed, arm=arm, **plant)
-    efforts = scale * excitation.sequence(ExcitationParameters(), round(1000 * seconds))
+    efforts = scale * excitation.sequence(ExcitationParameters(amplitude=peaks), round(1000 * seconds))
     trajectory = simulator.simulate(parameters, efforts, events)
     columns = {'position': trajectory.position, 'velocity': trajectory.velocity}
     parts = [name.split('/') for name in outputs]
     Y = np.column_stack([columns[field][:, trajectory.names.index(joint)] for joint, field in parts])
     return rows_of(trajectory.effort[:, :2], Y, trajectory.position[:, :2], trajectory.stamp_ns)
+
+
+def run(
+        settings: IdentifierParameters, samples: Rows, events: tuple[CaptureEvent, ...] = (),
+) -> structured.StructuredState:
+    """The estimator after the samples, each event before the first one that is not older."""
+    state, start = structured.init(settings), 0
+    for one in events:
+        stop = samples.log.row_at(one.stamp_ns, start)
+        state = structured.event(settings, structured.advance(settings, state, samples.between(start, stop)), one)
+        start = stop
+    return structured.advance(settings, state, samples.since(start))
 
 
 def rows_of(u: np.ndarray, y: np.ndarray, angles: np.ndarray, stamp_ns: np.ndarray,

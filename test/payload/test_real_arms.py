@@ -8,28 +8,25 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from recording import event, record, run
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.parameter_file import read
-from flexmanip_ros.parameters import (
-    ArmParameters,
-    ExcitationParameters,
-    IdentifierParameters,
-    PlantParameters,
-    configure,
-)
-from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import CaptureEvent, EventKind, Payload, Status
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
+from flexmanip_ros.payload import structured
+from flexmanip_ros.types import Payload, Status
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
+@cache
 def last_payload(name: str) -> tuple[Payload, dict[str, Any]]:
     """What is known of the payload at the end of a recording, and the truth."""
     folder = Path(os.environ.get('FLEXMANIP_DATA', ROOT.parent / 'shared' / 'data'))
@@ -65,16 +62,11 @@ def test_centre_and_inertia_of_a_body_are_known(name: str) -> None:
     assert np.all(np.abs(errors) < 3.5 * deviations)
 
 
-def simulated(arm: ArmParameters, mass: float, peaks: tuple[float, float]) -> Payload:
-    """What is known of a point mass 3 s after the capture, on a simulation of the very same arm."""
-    plant = PlantParameters(arm=arm, payload_mass=mass, seed=3)
-    caught = (CaptureEvent(3_000_000_000, EventKind.CAPTURE),)
-    run = simulator.simulate(plant, excitation.sequence(ExcitationParameters(amplitude=peaks), 6000), caught)
-    payload = None
-    for estimate in pipeline.run(IdentifierParameters(arm=arm, model_rate=0.1), simulator.records(run, caught)):
-        payload = estimate.payload
-    assert payload is not None
-    return payload
+def simulated(arm: ArmParameters, mass: float, peaks: tuple[float, float] = (10.0, 5.0)) -> Payload:
+    """What is known of a point mass 2 s after the capture, on a simulation of the very same arm."""
+    caught, config = event(2.0), IdentifierParameters(arm=arm)
+    samples = record(4.0, (caught,), payload=mass, arm=arm, peaks=peaks, seed=3)
+    return structured.estimate(config, run(config, samples, (caught,)))
 
 
 @pytest.mark.parametrize(('preset', 'mass', 'peaks'), [
@@ -89,28 +81,27 @@ def test_every_arm_that_is_shipped_knows_its_payload(preset: str, mass: float, p
 
 
 def test_hubs_do_not_bias_a_light_payload() -> None:
-    found = simulated(ArmParameters(hub_inertia=(0.5, 0.3)), 1.5, (10.0, 5.0))
+    found = simulated(ArmParameters(hub_inertia=(0.5, 0.3)), 1.5)
     assert found.status is Status.TRACKING
     assert abs(found.mass - 1.5) < 3.5 * found.std
 
 
 def test_a_body_is_known_half_a_second_after_its_capture() -> None:
-    plant = PlantParameters(arm=ArmParameters(damping_ratio=0.003), payload_mass=20.0, payload_com=(0.08, 0.05),
-                            payload_inertia=1.0, seed=2)
-    caught = (CaptureEvent(2_000_000_000, EventKind.CAPTURE),)
-    run = simulator.simulate(plant, excitation.sequence(ExcitationParameters(), 2600), caught)
-    config = IdentifierParameters(arm=plant.arm, model_rate=0.1)
-    found = [one.payload for one in pipeline.run(config, simulator.records(run, caught)) if one.payload is not None]
-    assert found[-1].status is Status.TRACKING
-    assert found[-1].com[:2] == pytest.approx(plant.payload_com, abs=0.006)
-    assert found[-1].lower < 20.0 < found[-1].upper
+    arm, caught = ArmParameters(damping_ratio=0.003), event(2.0)
+    config, truth = IdentifierParameters(arm=arm), (0.08, 0.05)
+    samples = record(2.6, (caught,), arm=arm, payload_com=truth, payload_inertia=1.0, seed=2)
+    found = structured.estimate(config, run(config, samples, (caught,)))
+    assert found.status is Status.TRACKING
+    assert found.com[:2] == pytest.approx(truth, abs=0.006)
+    assert found.lower < 20.0 < found.upper
 
 
 def test_an_undamped_arm_that_rings_ever_more_is_followed() -> None:
-    caught = (CaptureEvent(2_000_000_000, EventKind.CAPTURE),)
-    run = simulator.simulate(PlantParameters(), excitation.sequence(ExcitationParameters(), 18000), caught)
-    config = IdentifierParameters(model_rate=0.05)
-    late = [one.payload for one in pipeline.run(config, simulator.records(run, caught))
-            if one.payload is not None and one.stamp_ns > run.stamp_ns[0] + 14_000_000_000]
-    assert all(one.status is Status.TRACKING for one in late)
-    assert all(one.mass == pytest.approx(20.0, rel=0.001) for one in late)
+    config, caught = IdentifierParameters(), event(2.0)
+    samples = record(18.0, (caught,), arm=config.arm, seed=0)
+    state = run(config, samples.between(0, 14000), (caught,))
+    for first in range(14000, 18000, 50):
+        found = structured.estimate(config, state)
+        assert found.status is Status.TRACKING
+        assert found.mass == pytest.approx(20.0, rel=0.001)
+        state = structured.advance(config, state, samples.between(first, first + 50))

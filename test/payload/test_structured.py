@@ -6,22 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recording import ARM, BENDS, RATES, altered, config, event, joined, record
+from recording import ARM, BENDS, RATES, altered, config, event, joined, record, run
 
 from flexmanip_ros.parameters import ArmParameters, PayloadParameters
 from flexmanip_ros.payload import structured
 from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.types import EventKind, Status
-
-
-def run(settings, samples, events=()):
-    state = structured.init(settings)
-    start = 0
-    for one in events:
-        stop = samples.log.row_at(one.stamp_ns, start)
-        state = structured.event(settings, structured.advance(settings, state, samples.between(start, stop)), one)
-        start = stop
-    return structured.advance(settings, state, samples.since(start))
 
 
 @pytest.fixture(scope='module')
