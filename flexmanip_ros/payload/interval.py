@@ -139,7 +139,7 @@ def empty(seeming: float, std: float, considered: float, consistency: float, sta
     covariance (Schmidt), in which a parameter that is not estimated, the error of the inertia, has its deviation
     ``considered`` [kg].
     """
-    if status is Status.INCONSISTENT:
+    if status in (Status.INCONSISTENT, Status.DIVERGED):
         return Payload(0.0, math.inf, 0.0, math.inf, consistency, status)
     if abs(seeming) > 3.0 * std:
         std = math.hypot(std, considered)
