@@ -59,25 +59,40 @@ class Blocks(NamedTuple):
     B_eta: Array
 
 
-def blocks(arm: ArmParameters, theta: Array, payload_mass: float = 0.0, kappa: int | None = None) -> Blocks:
-    """Return the block matrices at chord angles theta (L,) [rad], eta = 0, for a point-mass payload [kg].
+def blocks(arm: ArmParameters, theta: Array, payload: float | Array = 0.0, kappa: int | None = None) -> Blocks:
+    """Return the block matrices at chord angles theta (L,) [rad], eta = 0.
 
-    With the arm's own shape functions, or kappa sines a link. A floating base counts as fixed.
+    payload: a point mass [kg], or the inertial parameters (4,) of a body. With the arm's own shape functions, or kappa
+    sines a link. A floating base counts as fixed; ``floating_blocks`` lets it float.
     Raises ModelError when theta or the payload is not finite or kappa is below 1.
     """
-    theta = _checked(arm, theta, payload_mass)
-    fixed = manipulator(replace(arm, base_mass=0.0) if arm.base_mass else arm, kappa)
-    L = len(theta)
-    M = mass_matrix(fixed, payload_array(payload_mass), np.append(theta, np.zeros(L * fixed.kappa)))
-    return Blocks(M[:L, :L], M[:L, L:], M[L:, L:], np.diag(fixed.stiffness[L:]), np.diag(fixed.damping[L:]),
-                  fixed.torque[:L], fixed.torque[L:])
+    return floating_blocks(replace(arm, base_mass=0.0) if arm.base_mass else arm, theta, payload, kappa)
+
+
+def floating_blocks(arm: ArmParameters, theta: Array, payload: float | Array = 0.0, kappa: int | None = None) -> Blocks:
+    """Return the same where the base floats if it can; theta, the chords, are then relative to the base.
+
+    The angle phi of the base is cyclic: nothing turns it back. So its own equation is solved for phi'' and put into the
+    others (with chords theta + phi the motion of phi is a turn of all), as exact as they are where all turns slowly.
+    """
+    theta, payload = _checked(arm, theta, payload)
+    own = manipulator(arm, kappa)
+    L, n = len(theta), len(theta) * (1 + own.kappa)
+    M, B = mass_matrix(own, payload, np.append(theta, np.zeros(own.stiffness.size - L))), own.torque
+    if own.floating:
+        turn = np.eye(n + 1)
+        turn[:L, n] = 1.0
+        M, B = turn.T @ M @ turn, turn.T @ B
+        share = M[:n, n] / M[n, n]
+        M, B = M[:n, :n] - np.outer(share, M[n, :n]), B[:n] - np.outer(share, B[n])
+    return Blocks(M[:L, :L], M[:L, L:], M[L:, L:], np.diag(own.stiffness[L:n]), np.diag(own.damping[L:n]), B[:L], B[L:])
 
 
 def vibration_model(
-    arm: ArmParameters, theta: Array, payload_mass: float = 0.0, kappa: int | None = None,
+    arm: ArmParameters, theta: Array, payload: float | Array = 0.0, kappa: int | None = None,
 ) -> tuple[Array, Array]:
-    """Return (Ac (2 L k, 2 L k), Bc (2 L k, L)), x = [eta; eta'], chords free, damped (paper eqs. 19-21)."""
-    b = blocks(arm, theta, payload_mass, kappa)
+    """Return (Ac (2 L k, 2 L k), Bc (2 L k, L)), x = [eta; eta'], chords and base free, damped (paper eqs. 19-21)."""
+    b = floating_blocks(arm, theta, payload, kappa)
     h = len(b.Mc)
     solved = cho_solve(cho_factor(b.Ma), np.hstack([b.Mb, b.B_theta]))
     return first_order(b.Mc - b.Mb.T @ solved[:, :h], b.Kc, b.Dc, b.B_eta - b.Mb.T @ solved[:, h:])
@@ -100,10 +115,12 @@ def frequencies(Ac: Array) -> Array:
     return np.sort(poles.imag[poles.imag > 0]) / (2 * np.pi)
 
 
-def _checked(arm: ArmParameters, theta: Array, payload_mass: float) -> Array:
+def _checked(arm: ArmParameters, theta: Array, payload: float | Array) -> tuple[Array, Array]:
     theta, links = np.asarray(theta, dtype=np.float64), len(arm.link_length)
     if theta.shape != (links,) or not np.all(np.isfinite(theta)):
         raise ModelError(f'the chord angles are {theta!r}', f'give {links} finite angles in rad')
-    if not (np.isfinite(payload_mass) and payload_mass >= 0):
-        raise ModelError(f'the payload mass is {payload_mass}', 'give a mass of zero or more in kg')
-    return theta
+    body = payload_array(float(payload)) if np.ndim(payload) == 0 else np.asarray(payload, dtype=np.float64)
+    if body.shape != (4,) or not np.all(np.isfinite(body)) or body[0] < 0:
+        raise ModelError(f'the payload is {payload}', 'give a mass of zero or more in kg, or the four parameters of a '
+                         'body')
+    return theta, body

@@ -1,11 +1,12 @@
 """The regulator: its design at a configuration with a payload, its path to a setpoint, and its work over time.
 
 ``step`` takes a sample and gives the torques, ``estimate`` takes a payload estimate, ``goto`` a new setpoint. The gains
-follow configuration and trusted payload, without a bump in the torque.
+follow configuration and trusted payload, a body with mass, centre of mass and inertia, without a bump in the torque.
 
-x = [theta, eta, theta', eta'] (2n,), n = L (1 + kappa): chord angles theta [rad] and modal coordinates eta [m] of the
-arm's shape functions (with one mode alone the second and third of a real link are driven unstable). A link at rest
-under no torque is straight, so the regulator needs no integrator: the plane has no gravity.
+x = [theta, eta, theta', eta'] (2n,), n = L (1 + kappa): chord angles theta [rad], relative to a base that floats, and
+modal coordinates eta [m] of the arm's shape functions (with one mode alone the second and third of a real link are
+driven unstable). A link at rest under no torque is straight, so the regulator needs no integrator: the plane has no
+gravity.
 
 The path is a polynomial of fifth degree (minimum jerk: Flash and Hogan, J. Neuroscience 5, 1985) whose duration follows
 from what the arm must bear on it, hence from the payload: a heavier arm is moved more slowly.
@@ -14,14 +15,13 @@ from what the arm must bear on it, hence from the payload: a heavier arm is move
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve, solve_discrete_are
 
-from flexmanip_ros.arm.linearization import blocks, discretize, first_order
-from flexmanip_ros.arm.manipulator import manipulator
+from flexmanip_ros.arm.linearization import discretize, first_order, floating_blocks
+from flexmanip_ros.arm.manipulator import manipulator, payload_array
 from flexmanip_ros.control.handover import PayloadEstimate, Verdict, judge
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ControllerParameters
@@ -31,12 +31,17 @@ RATE_SCALE = 8.0
 """A rate [1/s] costs as much as the deviation that is RATE_SCALE times smaller."""
 FLOOR = 1e-6
 """Process noise on every state, so that the filter never stops to listen."""
+BODY_SIZE = 0.1
+"""Least size of a body over the length of the last link: first moments and inertia, divided by the size and its square,
+change the arm's motion about as much as so many kg do."""
 
 
 def observation(config: ControllerParameters) -> Array:
     """Return T (2 L, n): [encoder angles, bends] = T [theta, eta], and the same for their rates."""
     arm = config.arm
-    output = manipulator(replace(arm, base_mass=0.0) if arm.base_mass else arm).output
+    output = manipulator(arm).output
+    if arm.base_mass:  # angles are relative to the base
+        output = output[:, :-1]
     return np.asarray(np.append(np.ones(len(arm.bend_gain)), arm.bend_gain)[:, None] * output)
 
 
@@ -45,9 +50,12 @@ def reference(config: ControllerParameters, angles: Array) -> Array:
     return np.cumsum(angles) if config.arm.angle_convention == 'encoder' else np.array(angles, dtype=np.float64)
 
 
-def model(config: ControllerParameters, between: float, payload: float) -> tuple[Array, Array]:
-    """Return (A (2n, 2n), B (2n, L)) of one sample at theta2 - theta1 = ``between`` [rad], payload [kg]."""
-    b = blocks(config.arm, turned(config, between), payload)
+def model(config: ControllerParameters, theta: Array, payload: float | Array) -> tuple[Array, Array]:
+    """Return (A (2n, 2n), B (2n, L)) of one sample at chords theta (L,) [rad].
+
+    payload: a mass [kg], or inertial parameters (4,).
+    """
+    b = floating_blocks(config.arm, theta, payload)
     links = len(b.Ma)
     n = links + len(b.Mc)
     M = np.block([[b.Ma, b.Mb], [b.Mb.T, b.Mc]])
@@ -58,17 +66,21 @@ def model(config: ControllerParameters, between: float, payload: float) -> tuple
     return discretize(*first_order(M, K, D, B * np.array(config.arm.torque_gain)), 1.0 / config.rate)
 
 
-def turned(config: ControllerParameters, between: float) -> Array:
-    """Return chord angles (L,) [rad] with that angle between the links: the blocks depend on it alone."""
-    return np.array([0.0, between])[:len(config.arm.link_length)]
+def configuration(config: ControllerParameters, theta: Array) -> Array:
+    """Return chord angles (L,) [rad] at which the arm moves equally, the same for all of those.
+
+    They differ by a turn of the whole arm, unless joint 1 is beside the centre of mass of a floating base.
+    """
+    beside = config.arm.base_mass and any(config.arm.base_joint_offset)
+    return np.array(theta) if beside else np.asarray(theta) - theta[0]
 
 
-def feedforward(config: ControllerParameters, between: float, payload: float) -> tuple[Array, Array]:
+def feedforward(config: ControllerParameters, theta: Array, payload: float | Array) -> tuple[Array, Array]:
     """Return (F (L, L), E (L kappa, L)): torques and modal coordinates per acceleration of the chords.
 
     The quasi-static solution of M q'' + K q = B u with eta'' = 0.
     """
-    b = blocks(config.arm, turned(config, between), payload)
+    b = floating_blocks(config.arm, theta, payload)
     F = solve(b.B_theta, b.Ma)
     E = solve(b.Kc, b.B_eta @ F - b.Mb.T, assume_a='pos')
     return F / np.array(config.arm.torque_gain)[:, None], E
@@ -90,9 +102,9 @@ class Design(NamedTuple):
     E: Array
 
 
-def design(config: ControllerParameters, between: float, payload: float) -> Design:
+def design(config: ControllerParameters, theta: Array, payload: float | Array) -> Design:
     """Return the regulator and the filter. Raises ModelError when there is no stabilizing one."""
-    A, B = model(config, between, payload)
+    A, B = model(config, theta, payload)
     T = observation(config)
     C = np.kron(np.eye(2), T)
     links = len(T) // 2
@@ -108,9 +120,9 @@ def design(config: ControllerParameters, between: float, payload: float) -> Desi
         L: Array = solve(C @ S @ C.T + V, C @ S, assume_a='pos').T
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ModelError(
-            f'there is no regulator at {between:.3f} rad with {payload:.3f} kg',
+            f'there is no regulator at {np.round(theta, 3)} rad with a payload of {np.round(payload, 3)}',
             'change angle_scale, bend_scale or effort_scale') from error
-    return Design(A, B, G, L, *feedforward(config, between, payload))
+    return Design(A, B, G, L, *feedforward(config, theta, payload))
 
 
 PEAK_RATE, PEAK_ACCELERATION = 15.0 / 8.0, 10.0 / math.sqrt(3.0)
@@ -201,11 +213,12 @@ class ControllerState(NamedTuple):
     now: Design
     old: Design
     """The design that ``now`` takes over from."""
-    payload: float
-    """Payload scheduled on [kg]; it follows ``trusted``."""
-    trusted: float
-    designed_payload: float
-    designed_between: float
+    payload: Array
+    """Inertial parameters (4,) scheduled on, see ``manipulator.payload_array``; they follow ``trusted``."""
+    trusted: Array
+    designed_payload: Array
+    designed_at: Array
+    """Chords (L,), see ``configuration``."""
     x: Array | None = None
     """Predicted state (2n,) at the next sample; None before the first."""
     way: Path | None = None
@@ -233,12 +246,12 @@ class ControllerState(NamedTuple):
 
 def init(config: ControllerParameters) -> ControllerState:
     """Start with the gains of the straight arm and the initial payload."""
-    first = design(config, 0.0, config.initial_payload)
+    straight, payload = np.zeros(len(config.arm.link_length)), payload_array(config.initial_payload)
+    first = design(config, straight, payload)
     C: Array = np.kron(np.eye(2), observation(config)).astype(np.float64)
     return ControllerState(
         C=C, now=first, old=first,
-        payload=config.initial_payload, trusted=config.initial_payload,
-        designed_payload=config.initial_payload, designed_between=0.0,
+        payload=payload, trusted=payload, designed_payload=payload, designed_at=straight,
         setpoint=None if config.hold_present else np.asarray(config.setpoint, dtype=np.float64))
 
 
@@ -253,7 +266,8 @@ def estimate(config: ControllerParameters, state: ControllerState, found: Payloa
     """Take or refuse a payload estimate; the gains follow in ``step``."""
     verdict = judge(config, found)
     if verdict is Verdict.TRUSTED and config.use_estimate:
-        return state._replace(verdict=verdict, trusted=max(found.mass, 0.0))
+        return state._replace(verdict=verdict, trusted=payload_array(max(found.mass, 0.0), found.inertia,
+                                                                               found.com))
     return state._replace(verdict=verdict)
 
 
@@ -262,7 +276,7 @@ def step(config: ControllerParameters, state: ControllerState, measured: Measure
     """Return the torques (L,) [N m] for a sample, within the limits."""
     x = _filtered(config, state, measured)
     links = len(config.arm.link_length)
-    state = _scheduled(config, state, float(x[links - 1] - x[0]))
+    state = _scheduled(config, state, configuration(config, x[:links]))
     way = _onward(config, state, measured.position[:links])
     state = state._replace(way=way, goal=state.setpoint)
     wanted, acceleration = _wanted(config, state, way)
@@ -315,21 +329,28 @@ def _wanted(config: ControllerParameters, state: ControllerState, way: Path) -> 
     return np.concatenate([position, bends @ acceleration, rate, bends @ jerk]), acceleration
 
 
-def _scheduled(config: ControllerParameters, state: ControllerState, between: float) -> ControllerState:
+def _scheduled(config: ControllerParameters, state: ControllerState, theta: Array) -> ControllerState:
     """Follow the trusted payload; design the gains again when it or the configuration changed enough."""
+    change = state.trusted - state.payload
     reach = config.payload_rate / config.rate
-    payload = state.payload + float(np.clip(state.trusted - state.payload, -reach, reach))
+    payload = state.payload + change * min(reach / max(_weight(config, state.trusted, change), reach), 1.0)
     share = 1.0 / (config.blend_time * config.rate) if config.blend_time > 0.0 else 1.0
     state = state._replace(payload=payload, blend=min(state.blend + share, 1.0))
     if state.blend < 1.0:
         return state  # one change after the other keeps the torque continuous and designs rare
-    held_mass = config.arm.tip_mass + state.designed_payload
-    same_mass = abs(payload - state.designed_payload) <= config.reschedule_mass * held_mass
-    if same_mass and abs(between - state.designed_between) <= config.reschedule_angle:
+    held_mass = config.arm.tip_mass + state.designed_payload[0]
+    same = _weight(config, payload, payload - state.designed_payload) <= config.reschedule_mass * held_mass
+    if same and np.abs(theta - state.designed_at).max() <= config.reschedule_angle:
         return state
-    state = state._replace(designed_payload=payload, designed_between=between)
+    state = state._replace(designed_payload=payload, designed_at=theta)
     try:
-        wanted = design(config, between, payload)
+        wanted = design(config, theta, payload)
     except ModelError:  # the gains in use go on
         return state._replace(failed_designs=state.failed_designs + 1)
     return state._replace(old=state.now, now=wanted, blend=0.0, designs=state.designs + 1)
+
+
+def _weight(config: ControllerParameters, body: Array, change: Array) -> float:
+    """Return how many kg a change of the inertial parameters (4,) of a body like this is worth."""
+    size = max(BODY_SIZE * config.arm.link_length[-1], math.sqrt(body[3] / body[0]) if body[0] > 0.0 else 0.0)
+    return float(np.abs(change / (1.0, size, size, size * size)).max())

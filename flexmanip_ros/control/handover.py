@@ -3,20 +3,42 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from enum import Enum
 from typing import NamedTuple
 
 from flexmanip_ros.parameters import AdapterParameters, ControllerParameters
+from flexmanip_ros.types import Payload
 
 
 class PayloadEstimate(NamedTuple):
-    """What ``~/payload_estimate`` says: mass, standard deviation, 95 % interval [kg], residual power."""
+    """What ``~/payload_estimate`` says: mass, standard deviation, 95 % interval [kg], residual power; and the body."""
 
     mass: float
     std: float
     lower: float
     upper: float
     consistency: float
+    com: tuple[float, float] = (0.0, 0.0)
+    """Centre of mass in the frame of the tip [m]; a point at the tip where nothing else is known."""
+    inertia: float = 0.0
+    """About the centre of mass [kg m^2]."""
+
+    @classmethod
+    def of(cls, payload: Payload) -> PayloadEstimate:
+        """Return what a controller needs of a payload."""
+        return cls(*payload[:5], payload.com[:2], payload.inertia[5])
+
+    def having(self, body: Sequence[float]) -> PayloadEstimate | None:
+        """Return it with the body (20,) that ``~/payload_body`` tells; None where that is of another time.
+
+        body: mass, centre of mass x, y, inertia about it, then their covariance. The two are at most a few samples
+        apart, and so are their masses.
+        """
+        near = abs(body[0] - self.mass) <= max(3.0 * self.std, 1e-3 * abs(self.mass))
+        if not near or not all(map(math.isfinite, body)):
+            return None
+        return self._replace(com=(body[1], body[2]), inertia=max(body[3], 0.0))
 
 
 class Verdict(Enum):
@@ -24,7 +46,7 @@ class Verdict(Enum):
 
     TRUSTED = 'trusted'
     NOT_FINITE = 'the estimate is not finite'
-    OUT_OF_RANGE = 'the mass is negative or above max_payload'
+    OUT_OF_RANGE = 'the mass is negative or above max_payload, or the body larger than the arm'
     UNSURE = 'the interval is wider than max_interval'
     INCONSISTENT = 'the residual power is above max_consistency'
 
@@ -34,9 +56,10 @@ def judge(config: ControllerParameters, estimate: PayloadEstimate) -> Verdict:
 
     A payload just above zero with an interval below it is range enough: the interval, not the sign, decides.
     """
-    if not all(map(math.isfinite, (estimate.mass, estimate.std, estimate.lower, estimate.upper))):
+    if not all(map(math.isfinite, (*estimate[:4], *estimate.com, estimate.inertia))):
         return Verdict.NOT_FINITE
-    if estimate.mass > config.max_payload or estimate.upper < 0.0:
+    size = math.hypot(*estimate.com, gyration(estimate))
+    if estimate.mass > config.max_payload or estimate.upper < 0.0 or size > sum(config.arm.link_length):
         return Verdict.OUT_OF_RANGE
     half = max(estimate.upper - estimate.mass, estimate.mass - estimate.lower)
     if half > config.max_interval * (config.arm.tip_mass + max(estimate.mass, 0.0)):
@@ -47,10 +70,10 @@ def judge(config: ControllerParameters, estimate: PayloadEstimate) -> Verdict:
 
 
 class HandoverState(NamedTuple):
-    """Since when the estimate is trusted [s], which mass the driver accepted [kg], and when it was last asked [s]."""
+    """Since when the estimate is trusted [s], which one the driver accepted, and when it was last asked [s]."""
 
     trusted_since: float | None = None
-    sent_mass: float | None = None
+    sent: PayloadEstimate | None = None
     sent_at: float = -math.inf
 
 
@@ -71,14 +94,24 @@ def step(config: AdapterParameters, state: HandoverState, found: PayloadEstimate
     state = state._replace(trusted_since=since)
     if now - since < config.settle_time or now - state.sent_at < config.min_period:
         return state, False
-    sent = state.sent_mass
-    same = sent is not None and abs(found.mass - sent) <= max(config.max_std, config.min_change * sent)
-    return state, not same
+    return state, state.sent is None or changed(config, state.sent, found)
 
 
-def accepted(state: HandoverState, mass: float, now: float) -> HandoverState:
+def changed(config: AdapterParameters, sent: PayloadEstimate, found: PayloadEstimate) -> bool:
+    """Whether a body differs from the one that was sent by more than the parameters allow."""
+    moved = max(math.dist(sent.com, found.com), abs(gyration(sent) - gyration(found)))
+    return abs(found.mass - sent.mass) > max(config.max_std, config.min_change * sent.mass) \
+        or moved > config.min_displacement
+
+
+def gyration(body: PayloadEstimate) -> float:
+    """Radius of gyration [m] about the centre of mass."""
+    return math.sqrt(max(body.inertia, 0.0) / body.mass) if body.mass > 0.0 else 0.0
+
+
+def accepted(state: HandoverState, sent: PayloadEstimate, now: float) -> HandoverState:
     """The driver accepted a payload."""
-    return state._replace(sent_mass=mass, sent_at=now)
+    return state._replace(sent=sent, sent_at=now)
 
 
 def rejected(state: HandoverState, now: float) -> HandoverState:

@@ -63,7 +63,8 @@ class ControllerParameters:
         0.02, 'change of the payload that asks for new gains, as a fraction of tip mass plus payload', low=1e-4,
         high=1.0)
     reschedule_angle: float = parameter(
-        0.05, 'change of the angle between the links that asks for new gains', unit='rad', low=1e-3, high=3.0)
+        0.05, 'change of a chord angle that the arm depends on (that between the links) that asks for new gains',
+        unit='rad', low=1e-3, high=3.0)
     blend_time: float = parameter(0.1, 'time over which new gains replace the old ones', unit='s', low=0.0, high=10.0)
     stale_after: float = parameter(
         0.1, 'time without joint states (or added efforts) after which the torque (or the added torque) is zero',
@@ -110,6 +111,9 @@ class AdapterParameters:
     min_change: float = parameter(
         0.05, 'a payload is sent again when it changed by this fraction of it, or by max_std', low=0.0, high=10.0,
         live=True)
+    min_displacement: float = parameter(
+        0.02, 'a payload is sent again when its centre of mass moved, or its radius of gyration changed, by this',
+        unit='m', low=0.0, high=100.0, live=True)
     min_period: float = parameter(
         1.0, 'shortest time between two requests to the driver', unit='s', low=0.01, high=3600.0)
 

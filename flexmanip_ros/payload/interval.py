@@ -124,11 +124,18 @@ def with_body(found: Payload, body: Array, spread: Array) -> Payload:
     """Add centre of mass and inertia about it, with the covariance of mass, both coordinates and inertia."""
     m = max(float(body[0]), 1e-9)
     x, y = body[1] / m, body[2] / m
-    J = np.array([[1.0, 0.0, 0.0, 0.0], [-x / m, 1.0 / m, 0.0, 0.0], [-y / m, 0.0, 1.0 / m, 0.0],
-                  [x * x + y * y, -2.0 * x, -2.0 * y, 1.0]])
+    J = about_com(body)
     inertia = max(float(body[3] - m * (x * x + y * y)), 0.0)
     return found._replace(com=(float(x), float(y), 0.0), inertia=(0.0, 0.0, 0.0, 0.0, 0.0, inertia),
                           covariance=tuple((J @ spread @ J.T).ravel().tolist()))
+
+
+def about_com(body: Array) -> Array:
+    """Return the derivative (4, 4) of mass, centre of mass x, y and inertia about it by the inertial parameters."""
+    m = max(float(body[0]), 1e-9)
+    x, y = body[1] / m, body[2] / m
+    return np.array([[1.0, 0.0, 0.0, 0.0], [-x / m, 1.0 / m, 0.0, 0.0], [-y / m, 0.0, 1.0 / m, 0.0],
+                     [x * x + y * y, -2.0 * x, -2.0 * y, 1.0]])
 
 
 def empty(seeming: float, std: float, considered: float, consistency: float, status: Status) -> Payload:

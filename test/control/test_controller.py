@@ -62,7 +62,7 @@ def test_a_new_payload_moves_the_torque_without_a_step() -> None:
     _, torques, state = run(CONFIG, 0.8)
     around = np.abs(np.diff(torques[400:800], axis=0)).max()
     assert state.designs >= 1
-    assert state.payload == pytest.approx(20.0)
+    assert state.payload[0] == pytest.approx(20.0)
     assert around < 0.5
 
 
@@ -88,12 +88,12 @@ def test_only_a_trusted_estimate_is_scheduled_on(changed: dict[str, float], verd
     found = GOOD._replace(**changed)
     assert judge(CONFIG, found) is verdict
     state = controller.estimate(CONFIG, controller.init(CONFIG), found)
-    assert state.trusted == (20.0 if verdict is Verdict.TRUSTED else 0.0)
+    assert state.trusted[0] == (20.0 if verdict is Verdict.TRUSTED else 0.0)
 
 
 def test_estimates_can_be_left_out_of_the_schedule() -> None:
     blind = replace(CONFIG, use_estimate=False)
-    assert controller.estimate(blind, controller.init(blind), GOOD).trusted == 0.0
+    assert controller.estimate(blind, controller.init(blind), GOOD).trusted[0] == 0.0
 
 
 def test_a_sensor_at_the_end_of_a_link_is_refused() -> None:

@@ -20,7 +20,7 @@ def config(modes: int = 2, **values: object) -> ControllerParameters:
 @settings(max_examples=20, deadline=None)
 @given(BETWEEN, PAYLOAD)
 def test_the_closed_loop_and_the_filter_are_stable_everywhere(between: float, payload: float) -> None:
-    made = design(config(), between, payload)
+    made = design(config(), np.array([0.0, between]), payload)
     C = np.kron(np.eye(2), observation(config()))
     assert np.abs(np.linalg.eigvals(made.A - made.B @ made.G)).max() < 1.0
     assert np.abs(np.linalg.eigvals(made.A - made.A @ made.L @ C)).max() < 1.0
@@ -29,7 +29,7 @@ def test_the_closed_loop_and_the_filter_are_stable_everywhere(between: float, pa
 @pytest.mark.parametrize('convention', ['joint', 'paper'])
 def test_the_model_has_the_arms_frequencies_and_two_free_joints(convention: str) -> None:
     made = config(3, torque_convention=convention)
-    A, _ = model(made, 0.4, 20.0)
+    A, _ = model(made, np.array([0.0, 0.4]), 20.0)
     poles = np.log(np.linalg.eigvals(A)) * made.rate
     expected = frequencies(vibration_model(made.arm, np.array([0.0, 0.4]), 20.0)[0])
     assert np.allclose(np.sort(poles.imag[poles.imag > 1.0]) / 2 / np.pi, expected, rtol=1e-6)

@@ -19,7 +19,7 @@ def told_times(estimates: list[tuple[float, PayloadEstimate]]) -> list[float]:
         state, due = handover.step(CONFIG, state, found, now)
         if due:
             times.append(now)
-            state = handover.accepted(state, found.mass, now)
+            state = handover.accepted(state, found, now)
     return times
 
 
@@ -36,6 +36,12 @@ def test_another_payload_is_told_again_but_not_too_soon() -> None:
     heavier = GOOD._replace(mass=30.0)
     found = told_times([(0.1 * k, GOOD if k < 8 else heavier) for k in range(40)])
     assert found == pytest.approx([0.5, 1.5])
+
+
+def test_another_place_of_its_centre_of_mass_or_another_inertia_is_told_again() -> None:
+    for changed in (GOOD._replace(com=(0.03, 0.0)), GOOD._replace(inertia=0.05)):
+        assert told_times([(0.1 * k, GOOD if k < 8 else changed) for k in range(40)]) == pytest.approx([0.5, 1.5])
+    assert told_times([(0.1 * k, GOOD if k < 8 else GOOD._replace(com=(0.01, 0.0))) for k in range(40)]) == [0.5]
 
 
 @pytest.mark.parametrize('bad', [

@@ -80,4 +80,4 @@ def test_an_estimate_of_the_wrong_size_changes_nothing(ros: Ros) -> None:
     bench = Bench(ros, 'payload_controller')
     bench.send([('rpbsid_identifier/payload_estimate', Float64MultiArray(data=[20.0] * size))
                 for size in (0, 4, 6)])
-    assert (bench.node.state.trusted, bench.node.dropped) == (0.0, 3)
+    assert (bench.node.state.trusted[0], bench.node.dropped) == (0.0, 3)

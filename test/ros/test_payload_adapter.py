@@ -50,7 +50,7 @@ def test_a_trusted_payload_becomes_a_parameter_of_another_node(ros: Ros) -> None
     say(ros, 31.5, 0.1)
     ros.wait(lambda: plant.config.payload_mass == 31.5, what='the parameter')
     ros.wait(lambda: adapter.sent == 1)
-    assert adapter.state.sent_mass == 31.5
+    assert adapter.state.sent.mass == 31.5
 
 
 def test_a_doubtful_payload_is_not_told(ros: Ros) -> None:
@@ -98,7 +98,7 @@ def test_a_payload_that_is_not_that_of_its_estimate_is_not_told(ros: Ros) -> Non
     ros.wait(lambda: adapter.sent == 1)
     payload.publish(InertiaStamped(inertia=Inertia(m=90.0)))
     ros.wait(lambda: adapter._inertia.m == 90.0)
-    adapter.state = adapter.state._replace(sent_mass=None, sent_at=-1e9)
+    adapter.state = adapter.state._replace(sent=None, sent_at=-1e9)
     ros.wait(lambda: adapter.doubtful > 0)
     assert (plant.config.payload_mass, adapter.sent) == (31.5, 1)
 

@@ -10,6 +10,7 @@ from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from flexmanip_ros.arm.manipulator import payload_array
 from flexmanip_ros.control import controller
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.ros import qos
@@ -61,10 +62,14 @@ def test_a_trusted_latched_estimate_changes_the_schedule_and_a_wild_one_does_not
         Float64MultiArray, 'rpbsid_identifier/payload_estimate', qos.latched())
     estimates.publish(Float64MultiArray(data=[20.0, 0.1, 19.8, 20.2, 1.0]))
     node = start(ros, readers=0)
-    ros.wait(lambda: node.state.trusted == 20.0, what='the estimate from before the start')
+    ros.wait(lambda: node.state.trusted[0] == 20.0, what='the estimate from before the start')
+    bodies = ros.helper.create_publisher(Float64MultiArray, 'rpbsid_identifier/payload_body', qos.latched())
+    bodies.publish(Float64MultiArray(data=[20.05, 0.1, -0.2, 1.5, *[0.0] * 16]))
+    ros.wait(lambda: node.state.trusted[3] > 0.0, what='the body')
+    assert node.state.trusted == pytest.approx(payload_array(20.0, 1.5, (0.1, -0.2)))
     estimates.publish(Float64MultiArray(data=[80.0, 40.0, 0.0, 160.0, 1.0]))
     ros.wait(lambda: node.state.verdict.name == 'UNSURE')
-    assert node.state.trusted == 20.0
+    assert node.state.trusted[0] == 20.0
 
 
 def test_a_clock_that_was_set_back_is_followed(ros: Ros) -> None:

@@ -7,7 +7,8 @@ calls       the driver's service (`service`, `service_type`), whose request has 
             where it has places for them, centre of mass, inertia and transition time (UR, Franka);
             with `target_node` its SetParameters for `mass_parameter`
 
-A payload is sent once it has been trusted for `settle_time`, and again when it changed by `min_change`.
+A payload is sent once it has been trusted for `settle_time`, and again when its mass changed by
+`min_change`, its centre of mass or radius of gyration by `min_displacement`.
 """
 
 from __future__ import annotations
@@ -80,7 +81,8 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         if not self.active or len(message.data) != 5 or self._inertia is None:
             return
         now = time.monotonic()
-        found = PayloadEstimate(*message.data)
+        body = self._inertia
+        found = PayloadEstimate(*message.data)._replace(com=(body.com.x, body.com.y), inertia=body.izz)
         self.state, due = handover.step(self.config, self.state, found, now)
         if self._asked is not None and now - self._asked[1] >= ANSWER_S:
             self.problem = f"service '{self._client.srv_name}' has not answered within {ANSWER_S:g} s"
@@ -93,9 +95,9 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
             self.log_throttled('payload', 'a payload was not sent: its mass is not that of the estimate, or it '
                           'has a value that is not finite')
             return
-        self._send(self._inertia, now)
+        self._send(self._inertia, found._replace(mass=self._inertia.m), now)
 
-    def _send(self, inertia: Inertia, now: float) -> None:
+    def _send(self, inertia: Inertia, found: PayloadEstimate, now: float) -> None:
         if not self._client.service_is_ready():
             self.problem = f"service '{self._client.srv_name}' is not available"
             self.log_throttled('service', f'{self.problem}; start the driver, or correct the parameters')
@@ -103,7 +105,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
             return
         future = self._client.call_async(self._request(inertia))
         self._asked = future, now
-        future.add_done_callback(lambda future: self._answered(future, inertia.m))
+        future.add_done_callback(lambda future: self._answered(future, found))
 
     def _forget_request(self) -> None:
         """Stop waiting for the answer; the client would keep the request without end."""
@@ -117,25 +119,25 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         parameter = Parameter(self.config.mass_parameter, value=float(inertia.m))
         return SetParameters.Request(parameters=[parameter.to_parameter_msg()])
 
-    def _answered(self, future: Any, mass: float) -> None:
+    def _answered(self, future: Any, sent: PayloadEstimate) -> None:
         if self._asked is None or self._asked[0] is not future:
             return  # the answer to a request that was given up
         self._asked = None
         reason = rejection(future.result())
         if reason:
-            self.problem = f'{mass:.3f} kg was rejected: {reason}'
+            self.problem = f'{sent.mass:.3f} kg was rejected: {reason}'
             self.log_throttled('rejected', self.problem)
             self.state = handover.rejected(self.state, time.monotonic())
             return
         self.problem = ''
         self.sent += 1
-        self.state = handover.accepted(self.state, mass, time.monotonic())
-        self.get_logger().info(f'the driver accepted a payload of {mass:.3f} kg')
+        self.state = handover.accepted(self.state, sent, time.monotonic())
+        self.get_logger().info(f'the driver accepted a payload of {sent.mass:.3f} kg')
 
     def report(self, report: Report) -> None:
         """What was sent, and what went wrong."""
         report.values['sent'] = self.sent
-        report.values['sent_mass_kg'] = 'none' if self.state.sent_mass is None else self.state.sent_mass
+        report.values['sent_mass_kg'] = 'none' if self.state.sent is None else self.state.sent.mass
         report.values['trusted'] = self.state.trusted_since is not None
         report.values['doubtful'] = self.doubtful
         if self.problem:

@@ -2,6 +2,7 @@
 
 subscribes  joint_states                        sensor_msgs/JointState  best effort; a torque for each sample
             rpbsid_identifier/payload_estimate  std_msgs/Float64MultiArray  mass, std, interval, consistency
+            rpbsid_identifier/payload_body      std_msgs/Float64MultiArray  its centre of mass and inertia
             ~/added_efforts                     std_msgs/Float64MultiArray  torques to add (excitation) [N m]
 publishes   effort_controller/commands          std_msgs/Float64MultiArray  one torque per joint [N m]
             /diagnostics                        diagnostic_msgs/DiagnosticArray  1 Hz
@@ -48,6 +49,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         super().__init__(NAME, ControllerParameters, **options)
         self.state: controller.ControllerState | None = None
         self._estimate: PayloadEstimate | None = None
+        self._body: tuple[float, ...] | None = None
         self.dropped = 0
         self.sent = 0
         self._added, self._added_at = np.zeros(len(self.config.joints)), -np.inf
@@ -65,6 +67,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self.subscription(JointState, 'joint_states', self._on_joint_states, qos.sensor_input(), raw=True)
         self.subscription(Float64MultiArray, 'rpbsid_identifier/payload_estimate', self._on_estimate,
                           qos.latched_input())
+        self.subscription(Float64MultiArray, 'rpbsid_identifier/payload_body', self._on_body, qos.latched_input())
         self.subscription(Float64MultiArray, '~/added_efforts', self._on_added, qos.command())
         self.create_timer(self.config.stale_after / 4.0, self._watch, clock=self._steady)
 
@@ -153,13 +156,25 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
             self._drop('payload_estimate', f'a payload estimate was dropped: it has {len(message.data)} values, not 5')
             return
         self._estimate = PayloadEstimate(*message.data)  # kept: a latched one may come before activation
+        if self._body is not None and self._estimate.having(self._body) is None:
+            self._body = None  # of what was held before
         self._judge(self._estimate)
+
+    def _on_body(self, message: Float64MultiArray) -> None:
+        if len(message.data) != 20:
+            self._drop('payload_body', f'a body was dropped: it has {len(message.data)} values, not 20')
+            return
+        self._body = tuple(message.data)
+        if self._estimate is not None:
+            self._judge(self._estimate)
 
     def _judge(self, estimate: PayloadEstimate) -> None:
         if self.state is None:
             return
-        before = self.state.verdict
-        self.state = controller.estimate(self.config, self.state, estimate)
+        before, body = self.state.verdict, None
+        if self._body is not None:
+            body = estimate.having(self._body)
+        self.state = controller.estimate(self.config, self.state, estimate if body is None else body)
         if self.state.verdict is not before and self.state.verdict is not None:
             self.get_logger().info(f'payload {estimate.mass:.2f} kg: {self.state.verdict.value}')
 
@@ -201,7 +216,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
             report.worse(WARN, f'{self.state.failed_designs} times no regulator was found; the gains before stay')
         verdict = self.state.verdict
         report.values.update(
-            scheduled_payload_kg=self.state.payload, trusted_payload_kg=self.state.trusted,
+            scheduled_payload_kg=float(self.state.payload[0]), trusted_payload_kg=float(self.state.trusted[0]),
             designs=self.state.designs, estimate='none' if verdict is None else verdict.value)
         if verdict not in (None, Verdict.TRUSTED):
             report.worse(WARN, f'payload estimate not trusted: {verdict.value}')
