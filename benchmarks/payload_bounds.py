@@ -1,4 +1,4 @@
-"""Claim: 3 s after a capture, each parameter of an arm as it is and of the body is known to 2 Cramer-Rao bounds.
+"""Claim: 3 s after a capture, each parameter of an arm as it is and of the body is known to 2.5 Cramer-Rao bounds.
 
 Friction, rotors, gains and offsets that `structured` is not told, a floating base, a body that spins and drifts; 40 dB,
 square waves of 10 and 5 N m, capture after 3 s. The simulated arm has the estimator's shape functions, so that its

@@ -37,8 +37,8 @@ class PayloadParameters:
     capture_speed: float = parameter(
         0.3, 'expected speed of the object relative to the tip at a capture', unit='m/s', low=0.0, high=100.0)
     model_error: float = parameter(
-        0.003, "relative error of the arm's inertia that widens the interval where a sensor shows more than its noise; "
-        'half of it where the arm shows modes beyond kappa', low=0.0, high=1.0)
+        0.003, "relative error of the arm's inertia that widens the interval where a sensor shows more than its noise",
+        low=0.0, high=1.0)
     object: str = parameter(
         'body', 'method structured: point, the object is a mass at the tip; body, it has a centre of mass and an '
         'inertia, which are estimated too', choices=('point', 'body'))
