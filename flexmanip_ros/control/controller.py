@@ -331,15 +331,18 @@ def _wanted(config: ControllerParameters, state: ControllerState, way: Path) -> 
 
 def _scheduled(config: ControllerParameters, state: ControllerState, theta: Array) -> ControllerState:
     """Follow the trusted payload; design the gains again when it or the configuration changed enough."""
-    change = state.trusted - state.payload
-    reach = config.payload_rate / config.rate
-    payload = state.payload + change * min(reach / max(_weight(config, state.trusted, change), reach), 1.0)
+    payload = state.payload
+    if payload is not state.trusted:
+        change, reach = state.trusted - payload, config.payload_rate / config.rate
+        distance = _weight(config, state.trusted, change)
+        payload = state.trusted if distance <= reach else payload + change * (reach / distance)
     share = 1.0 / (config.blend_time * config.rate) if config.blend_time > 0.0 else 1.0
     state = state._replace(payload=payload, blend=min(state.blend + share, 1.0))
     if state.blend < 1.0:
         return state  # one change after the other keeps the torque continuous and designs rare
     held_mass = config.arm.tip_mass + state.designed_payload[0]
-    same = _weight(config, payload, payload - state.designed_payload) <= config.reschedule_mass * held_mass
+    same = payload is state.designed_payload \
+        or _weight(config, payload, payload - state.designed_payload) <= config.reschedule_mass * held_mass
     if same and np.abs(theta - state.designed_at).max() <= config.reschedule_angle:
         return state
     state = state._replace(designed_payload=payload, designed_at=theta)
