@@ -172,6 +172,13 @@ def test_a_ur_driver_gets_inertia_and_transition_time() -> None:
     assert (filled.transition_time.sec, filled.transition_time.nanosec) == (0, 250_000_000)
 
 
+def test_a_driver_gets_a_tensor_that_a_body_can_have_where_only_the_plane_is_known() -> None:
+    filled = fill(Ur(), Inertia(m=2.0, com=Vector3(x=0.1, y=-0.05), izz=1.5), 0.25)
+    assert (filled.ixx, filled.iyy, filled.izz) == (0.75, 0.75, 1.5)
+    assert (filled.ixy, filled.ixz, filled.iyz) == (0.0, 0.0, 0.0)
+    assert (filled.center_of_gravity.x, filled.center_of_gravity.y) == (0.1, -0.05)
+
+
 def test_a_franka_driver_gets_arrays() -> None:
     filled = fill(Franka(), BODY)
     assert (filled.mass, filled.center_of_mass) == (2.0, [0.1, 0.2, 0.3])

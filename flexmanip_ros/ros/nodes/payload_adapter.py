@@ -174,7 +174,7 @@ def fill(request: Any, inertia: Inertia, transition_time: float = 0.0) -> Any:
     numbers), the inertia about it (six numbers by name, or nine of a matrix) and the transition time [s].
     Raises ParameterError when it has no place for a payload.
     """
-    fields = request.get_fields_and_field_types()
+    fields, inertia = request.get_fields_and_field_types(), physical(inertia)
     for name, kind in fields.items():
         if kind == 'geometry_msgs/Inertia':
             setattr(request, name, inertia)
@@ -198,6 +198,18 @@ def fill(request: Any, inertia: Inertia, transition_time: float = 0.0) -> Any:
         elif name in INERTIA and kind in ('float', 'double'):
             setattr(request, name, float(getattr(inertia, name)))
     return request
+
+
+def physical(inertia: Inertia) -> Inertia:
+    """Return the inertia of a flat body where only that in the plane is known.
+
+    ixx = iyy = izz / 2 are the least that a body can have (izz <= ixx + iyy); a driver may reject less.
+    """
+    if inertia.ixx or inertia.iyy or not inertia.izz > 0.0:
+        return inertia
+    half = inertia.izz / 2.0
+    return Inertia(m=inertia.m, com=inertia.com, ixx=half, iyy=half, izz=inertia.izz, ixy=inertia.ixy, ixz=inertia.ixz,
+                   iyz=inertia.iyz)
 
 
 def rejection(response: Any) -> str:
