@@ -24,6 +24,11 @@ def mass_matrix(arm: Manipulator, payload: Array, q: Array) -> Array:
     return lower + np.tril(lower, -1).T
 
 
+def gravity_forces(arm: Manipulator, payload: Array, q: Array) -> Array:
+    """Return the generalized forces (n,) that hold q against gravity; zero where the base floats."""
+    return _assembled(arm, payload, q).E
+
+
 def momentum(arm: Manipulator, payload: Array, q: Array) -> tuple[Array, float]:
     """Return P (2, n), linear momentum by the rates where the base does not translate, and the mass of all [kg]."""
     work = _assembled(arm, payload, q)

@@ -5,8 +5,8 @@ follow configuration and trusted payload, a body with mass, centre of mass and i
 
 x = [theta, eta, theta', eta'] (2n,), n = L (1 + kappa): chord angles theta [rad], relative to a base that floats, and
 modal coordinates eta [m] of the arm's shape functions (with one mode alone the second and third of a real link are
-driven unstable). A link at rest under no torque is straight, so the regulator needs no integrator: the plane has no
-gravity.
+driven unstable). Under gravity they count from the rest of the arm that hangs in its joints, which the torques of that
+rest keep there (``hold``). The arm is at rest where the model says so: the regulator has no integrator.
 
 The path is a polynomial of fifth degree (minimum jerk: Flash and Hogan, J. Neuroscience 5, 1985) whose duration follows
 from what the arm must bear on it, hence from the payload: a heavier arm is moved more slowly.
@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import solve, solve_discrete_are
 
-from flexmanip_ros.arm.linearization import discretize, first_order, floating_blocks
+from flexmanip_ros.arm.linearization import discretize, first_order, floating_blocks, gravity_forces
 from flexmanip_ros.arm.manipulator import manipulator, payload_array
 from flexmanip_ros.control.handover import PayloadEstimate, Verdict, judge
 from flexmanip_ros.errors import ModelError
@@ -84,6 +84,23 @@ def feedforward(config: ControllerParameters, theta: Array, payload: float | Arr
     F = solve(b.B_theta, b.Ma)
     E = solve(b.Kc, b.B_eta @ F - b.Mb.T, assume_a='pos')
     return F / np.array(config.arm.torque_gain)[:, None], E
+
+
+def hold(config: ControllerParameters, theta: Array, payload: Array) -> tuple[Array, Array]:
+    """Return torques (L,) that hold the arm at chords theta (L,) against gravity, and what sensors (2 L,) then show.
+
+    payload: inertial parameters (4,). In two iterations, as the bends move what is held.
+    """
+    links = len(theta)
+    if not any(config.arm.gravity) or config.arm.base_mass:
+        return np.zeros(links), np.zeros(2 * links)
+    arm = manipulator(config.arm)
+    eta = np.zeros(arm.stiffness.size - links)
+    for _ in range(2):
+        force = gravity_forces(arm, payload, np.concatenate([theta, eta]))
+        torque = solve(arm.torque[:links], force[:links])
+        eta = (arm.torque[links:] @ torque - force[links:]) / arm.stiffness[links:]
+    return torque / np.array(config.arm.torque_gain), observation(config)[:, links:] @ eta
 
 
 class Design(NamedTuple):
@@ -198,6 +215,10 @@ def duration(distance: Array, rate: Array, fastest: float, loads: Array, limits:
     return max(by_rate, math.sqrt(by_load), braking, SHORTEST)
 
 
+SPARE = 0.1
+"""Part of the torque limits that a move counts on, however much gravity asks for."""
+
+
 class Measured(NamedTuple):
     """Encoder angles and bends (2 L,) [rad, m], their rates (2 L,), and torques (L,) to add [N m]."""
 
@@ -274,34 +295,38 @@ def estimate(config: ControllerParameters, state: ControllerState, found: Payloa
 def step(config: ControllerParameters, state: ControllerState, measured: Measured
          ) -> tuple[ControllerState, Array]:
     """Return the torques (L,) [N m] for a sample, within the limits."""
-    x = _filtered(config, state, measured)
     links = len(config.arm.link_length)
+    theta = reference(config, measured.position[:links]) if state.x is None else state.x[:links]
+    holding, sag = hold(config, theta, state.payload)
+    x = _filtered(config, state, measured, sag)
     state = _scheduled(config, state, configuration(config, x[:links]))
-    way = _onward(config, state, measured.position[:links])
+    way = _onward(config, state, measured.position[:links], holding)
     state = state._replace(way=way, goal=state.setpoint)
     wanted, acceleration = _wanted(config, state, way)
-    feedforward = state.between(state.old.F, state.now.F) @ acceleration
+    wanted[:links] -= reference(config, sag[:links])
+    feedforward = state.between(state.old.F, state.now.F) @ acceleration + holding
     limit = np.asarray(config.effort_limit)
     torque: Array = np.clip(measured.added + feedforward - state.gain @ (x - wanted), -limit, limit)
-    return state._replace(x=state.now.A @ x + state.now.B @ torque), torque
+    return state._replace(x=state.now.A @ x + state.now.B @ (torque - holding)), torque
 
 
-def _filtered(config: ControllerParameters, state: ControllerState, measured: Measured) -> Array:
-    """Correct the prediction by the sample; at the first one the arm is taken for straight and at rest."""
+def _filtered(config: ControllerParameters, state: ControllerState, measured: Measured, sag: Array) -> Array:
+    """Correct the prediction by the sample; at the first one the arm is at rest. sag: (2 L,) what gravity shows."""
     if state.x is None:
         first = np.zeros(len(state.now.A))
         links = len(measured.position) // 2
-        first[:links] = reference(config, measured.position[:links])
+        first[:links] = reference(config, (measured.position - sag)[:links])
         return first
     offset = np.zeros(len(state.C))
-    offset[len(config.joints):len(measured.position)] = config.arm.bend_offset
+    offset[:len(sag)] = sag
+    offset[len(config.joints):len(measured.position)] += config.arm.bend_offset
     innovation = np.concatenate([measured.position, measured.velocity]) - offset - state.C @ state.x
     x: Array = state.x + state.now.L @ innovation
     return x
 
 
-def _onward(config: ControllerParameters, state: ControllerState, present: Array) -> Path:
-    """Stay at the first angles, go towards the setpoint when there is another one."""
+def _onward(config: ControllerParameters, state: ControllerState, present: Array, holding: Array) -> Path:
+    """Stay at the first angles, go towards the setpoint when there is another one; holding (L,): torques of gravity."""
     way = rest(present) if state.way is None else state.way.after(1.0 / config.rate)
     if state.setpoint is None or state.setpoint is state.goal:
         return way
@@ -309,7 +334,8 @@ def _onward(config: ControllerParameters, state: ControllerState, present: Array
     design = state.now
     links = len(position)
     bends = state.C[links:2 * links, links:len(design.A) // 2] @ design.E
-    limits = np.concatenate([config.move_effort * np.asarray(config.effort_limit), [config.move_bend] * links])
+    left = np.maximum(np.asarray(config.effort_limit) - np.abs(holding), SPARE * np.asarray(config.effort_limit))
+    limits = np.concatenate([config.move_effort * left, [config.move_bend] * links])
     seconds = duration(
         reference(config, state.setpoint - position), reference(config, rate), config.setpoint_rate,
         np.vstack([design.F, bends]), limits)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from flexmanip_ros.arm.linearization import mass_matrix
+from flexmanip_ros.arm.linearization import gravity_forces, mass_matrix
 from flexmanip_ros.arm.manipulator import manipulator, payload_array
 from flexmanip_ros.control import controller
 from flexmanip_ros.control.handover import PayloadEstimate, Verdict, judge
@@ -152,3 +152,41 @@ def test_a_body_that_is_not_that_of_the_estimate_is_not_taken() -> None:
     assert taken is not None
     assert judge(CONTROL, taken) is Verdict.TRUSTED
     assert judge(CONTROL, taken._replace(com=(9.0, 0.0))) is Verdict.OUT_OF_RANGE
+
+
+def test_the_torques_that_hold_a_stiff_arm_are_the_moments_of_all_weights_about_its_joints() -> None:
+    arm = replace(ARM, base_mass=0.0, base_joint_offset=(0.0, 0.0), bending_stiffness=(1e9, 1e9), gravity=(0.0, -9.81))
+    elbow, tip = 3.0 * np.cos(THETA[0]), 3.0 * np.cos(THETA[0]) + 3.0 * np.cos(THETA[1])
+    body = tip + 0.5 * np.cos(THETA[1]) - 0.2 * np.sin(THETA[1])
+    about_2 = 15.0 * (tip - elbow) / 2.0 + 10.0 * (tip - elbow) + 60.0 * (body - elbow)
+    about_1 = 15.0 * elbow / 2.0 + 10.0 * elbow + 15.0 * (tip + elbow) / 2.0 + 10.0 * tip + 60.0 * body
+    torque, _ = controller.hold(replace(CONTROL, arm=arm), THETA, payload_array(60.0, 10.0, (0.5, 0.2)))
+    assert torque == pytest.approx([9.81 * about_1, 9.81 * about_2], rel=1e-5)
+
+
+def test_an_arm_under_gravity_stays_where_it_is_and_sags_where_the_controller_knows_none() -> None:
+    light = ArmParameters(modes=1, damping_ratio=0.003)
+    arm = replace(light, gravity=(0.0, -0.5))
+    plant = PlantParameters(arm=arm, noise='none', payload_mass=20.0, payload_com=(0.1, 0.05), payload_inertia=1.0)
+    held, made = payload_array(20.0, 1.0, (0.1, 0.05)), manipulator(arm)
+    rest, holding = np.append(THETA, np.zeros(6)), np.zeros(2)
+    for _ in range(3):  # the bent links at rest
+        force = gravity_forces(made, held, rest)
+        holding = np.linalg.solve(made.torque[:2], force[:2])
+        rest[2:] = (made.torque[2:] @ holding - force[2:]) / made.stiffness[2:]
+
+    def falls(told: ArmParameters) -> float:
+        config, body = ControllerParameters(arm=told), simulator.attach(plant, simulator.init(plant))
+        body = replace(body, x=np.append(rest, np.zeros(8)))
+        control, torque = controller.init(config)._replace(payload=held, trusted=held), holding
+        angles = []
+        for _ in range(600):
+            body, record = simulator.step(plant, body, torque)
+            assert record is not None
+            angles.append(record.position[:2])
+            control, torque = controller.step(
+                config, control, controller.Measured(record.position, record.velocity, np.zeros(2)))
+        return float(np.abs(angles[-1] - angles[0]).max())
+
+    assert falls(arm) < 1e-3
+    assert falls(light) > 1e-2
