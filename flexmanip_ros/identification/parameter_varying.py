@@ -115,8 +115,8 @@ class Block(NamedTuple):
 def roles(config: IdentifierParameters) -> Roles | None:
     """Return the roles of the outputs, or None where the model cannot be one of the configuration.
 
-    It needs angles, half as many displacements as states, and no other outputs than these and their rates. A payload
-    that is read out of the model, or has linear dynamics, is weighed at one working point, with the model of that.
+    It needs angles, at most half as many displacements as states, and no other outputs than these and their rates. A
+    payload that is read out of the model, or has linear dynamics, is weighed at one working point, with that model.
     """
     at_one_point = config.payload_method in ('block', 'frequency') or config.payload.dynamics == 'linear'
     return None if at_one_point or not reads_angles(config) else shown(config)
@@ -126,7 +126,7 @@ def shown(config: IdentifierParameters) -> Roles | None:
     """Return the roles of the outputs by their names alone."""
     names = config.outputs
     places = tuple(k for k, name in enumerate(names) if name.endswith('/position'))
-    if 2 * len(places) != config.order or config.decimation > 1:
+    if not 0 < 2 * len(places) <= config.order or config.decimation > 1:
         return None
     joints = [names[k].rpartition('/')[0] for k in places]
     states = []
@@ -135,7 +135,7 @@ def shown(config: IdentifierParameters) -> Roles | None:
         if joint not in joints or field not in ('position', 'velocity'):
             return None
         states.append(joints.index(joint) + (len(places) if field == 'velocity' else 0))
-    if len(names) not in (len(places), config.order):
+    if len(names) not in (len(places), 2 * len(places)):
         return None
     return Roles(places, tuple(states))
 

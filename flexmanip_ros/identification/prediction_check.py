@@ -1,20 +1,25 @@
-"""Whether a model predicts: 0.25 s ahead, over the last second, against the sensors' noise.
+"""Whether a model predicts: 0.25 s ahead, over the last second, against the sensors' noise, with the right frequencies.
 
 A model that is wrong leaves residuals which it takes for its noise, so it must not be judged against them. White noise
-of a sensor shows in fourth differences, whatever the model.
+of a sensor shows in fourth differences, whatever the model. A frequency that is a few percent off costs such a
+prediction little, so the frequencies are asked for by themselves (``frequency_errors``).
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from flexmanip_ros.identification.uncertainty import Identified
+from flexmanip_ros.identification.uncertainty import REAL, Identified, modes
 from flexmanip_ros.identification.validation import simulate
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Array, StateSpace, Status
+
+Complex = NDArray[np.complex128]
 
 AHEAD_S = 0.25
 """How far ahead predictions are judged [s]; less in the first 1.5 s after an event."""
@@ -29,6 +34,20 @@ SILENT = 10.0
 """Power of an output, in units of its white noise, below which it says nothing."""
 FOURTH = 0.6744897501960817 * math.sqrt(70.0)
 """Median of the fourth differences of white noise, in standard deviations."""
+
+
+OFF, VAGUE = 0.02, 0.01
+"""Relative error of a frequency that the last samples may show, and its relative standard deviation."""
+EARLY = 4096
+"""Samples before which a model whose frequencies are not known so well is still warming up."""
+DAMPED = 0.3
+"""Damping ratio above which a mode has no frequency worth a verdict."""
+MOST_MODES = 4
+"""The lowest ones are judged."""
+MOST_SKEW = 1e8
+"""Condition of the eigenvectors of an A that is as good as defective."""
+CERTAIN = 2.57
+"""Deviations within which Student's t with five degrees of freedom lies in 95 %: six stretches are compared."""
 
 
 def length(dt: float) -> int:
@@ -75,15 +94,90 @@ def missed(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np
     return np.where(power > SILENT * white, np.mean(errors, axis=0), np.nan)
 
 
+@njit(cache=True, nogil=True)
+def swing(poles: Complex, turns: Complex, gains: Complex, U: Array, Z: Complex, S: Complex) -> None:
+    """Run modes z+ = pole z + gain u from rest over U (N, r), and their derivatives S = dz by ln(pole) = turn.
+
+    poles, turns: (n,), gains: (n, r), Z, S: (N, n).
+    """
+    for i in range(poles.size):
+        z, s = 0j, 0j
+        for k in range(U.shape[0]):
+            Z[k, i], S[k, i] = z, s
+            s = poles[i] * (s + turns[i] * z)
+            z = poles[i] * z
+            for j in range(U.shape[1]):
+                z += gains[i, j] * U[k, j]
+
+
+def frequency_errors(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np.bool_] | None = None
+                     ) -> tuple[Array, Array]:
+    """Relative errors (g,) of the model's lowest frequencies that the samples show, and their standard deviations.
+
+    One Gauss-Newton step from the model's own frequencies (Rao's score over its information) on stretches of
+    ``horizon`` samples of Y (N, m), outputs at unit power; the state at the begin of each is free. The deviations are
+    White's sandwich: from the scatter of the scores of the stretches. Empty where there is no mode, nan where there
+    are too few stretches. seen: as in ``missed``.
+    """
+    values, right = np.linalg.eig(model.A + 0j)
+    logs = np.log(np.where(values == 0.0, 1e-300, values))
+    swings = (logs.imag > REAL) & (-logs.real < DAMPED * np.abs(logs))
+    chosen = sorted(np.flatnonzero(swings), key=lambda k: float(logs[k].imag))[:MOST_MODES]
+    g, n = len(chosen), model.order
+    if not g or not np.linalg.cond(right) < MOST_SKEW:
+        return np.zeros(0), np.zeros(0)
+    left, power = np.linalg.inv(right), np.var(Y, axis=0)
+    unit = 1.0 / np.sqrt(np.where(power > 0.0, power, 1.0))
+    shape, turns = (model.C @ right) * unit[:, None], 1j * logs.imag
+    Z, S = np.empty((2, len(Y), n), dtype=np.complex128)
+    swing(values, turns, left @ (model.B + 0j), np.ascontiguousarray(U), Z, S)
+    rest = (Y - U @ model.D.T) * unit - np.real(Z @ shape.T)
+    forced = 2.0 * np.real(S[:, None, chosen] * shape[:, chosen])  # (N, m, g)
+    steps = np.arange(horizon)[:, None]
+    moving = shape * (values ** steps)[:, None, :]  # (horizon, m, n)
+    free = np.real(moving @ left)
+    turned = 2.0 * np.real(((steps * turns)[:, None, :] * moving)[..., chosen, None] * left[chosen])
+    if not np.all(np.isfinite(rest)) or not np.all(np.isfinite(free)):
+        return np.full(g, np.nan), np.full(g, np.nan)
+    whole = np.linalg.svd(free.reshape(-1, n), full_matrices=False)
+    known = np.ones(len(Y), dtype=np.bool_) if seen is None else seen
+    scores, informations = [], []
+    for first in range(len(Y) % horizon, len(Y) - horizon + 1, horizon):
+        at = slice(first, first + horizon)
+        used = known[at]
+        if np.count_nonzero(used) < max(horizon // 2, n):
+            continue
+        basis, size, back = whole if used.all() else np.linalg.svd(free[used].reshape(-1, n), full_matrices=False)
+        kept = size > 1e-9 * size[0]
+        basis, error = basis[:, kept], rest[at][used].ravel()
+        x = back[kept].T @ ((basis.T @ error) / size[kept])
+        slope = (forced[at] + turned @ x)[used].reshape(-1, g)
+        error, slope = error - basis @ (basis.T @ error), slope - basis @ (basis.T @ slope)
+        scores.append(slope.T @ error)
+        informations.append(slope.T @ slope)
+    if len(scores) < 3:
+        return np.full(g, np.nan), np.full(g, np.nan)
+    inverse = np.linalg.pinv(np.sum(informations, axis=0))
+    step = inverse @ np.sum(scores, axis=0)
+    scatter = np.array([score - information @ step for score, information in zip(scores, informations, strict=True)])
+    root = scatter @ inverse
+    return step, np.sqrt(np.sum(root ** 2, axis=0) * len(scores) / (len(scores) - 1))
+
+
 def judged(found: Identified, rows: Rows, outputs: tuple[str, ...]) -> Identified:
     """Return the model with what its predictions of the last samples are worth; outputs: their names.
 
-    INCONSISTENT where they miss too much of the outputs in the mean; ORDER_TOO_LOW where that is so of one while the
-    others are predicted. Rates count in the mean alone where there are others: they ring with modes above the order,
-    which displacements hardly show, so that right models of the first modes would be refused.
+    INCONSISTENT where they miss too much of the outputs in the mean, or where the last samples show another frequency;
+    ORDER_TOO_LOW where they miss one output while the others are predicted; POORLY_EXCITED, at first WARMING_UP, where
+    a frequency is not known well enough. Rates count in the mean alone where there are others: they ring with modes
+    above the order, which displacements hardly show, so that right models of the first modes would be refused.
     """
     if found.status is not Status.TRACKING:
         return found
+    light = [mode for mode in modes(found) if abs(mode.damping_ratio) < DAMPED][:MOST_MODES]
+    # a model of every configuration has a rule of its own
+    if found.configurations is None and any(mode.frequency_std_hz > VAGUE * mode.frequency_hz for mode in light):
+        return found._replace(status=Status.WARMING_UP if found.samples < EARLY else Status.POORLY_EXCITED)
     dt = found.model.dt
     horizon = max(2, min(round(AHEAD_S / dt), len(rows) // 6))
     if 3 * len(rows) < length(dt) or len(rows) < 6 * max(horizon, found.model.order) or rows.gap[1:].any():
@@ -94,7 +188,13 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...]) -> Identifie
     if heard.size and float(heard.mean()) > MISSED:
         return found._replace(status=Status.INCONSISTENT)
     rates = np.array([name.endswith('/velocity') for name in outputs])
-    alone = shares[~np.isnan(shares) & (~rates | rates.all())]
+    chosen = ~rates | rates.all()
+    alone = shares[~np.isnan(shares) & chosen]
     if alone.size and float(alone.max()) > MISSED:
         return found._replace(status=Status.ORDER_TOO_LOW)
+    model = replace(found.model, C=found.model.C[chosen], D=found.model.D[chosen])
+    with np.errstate(over='ignore', invalid='ignore'):
+        error, deviation = frequency_errors(model, rows.u, rows.y[:, chosen], horizon, rows.missing == 0)
+    if np.any(np.abs(error) - CERTAIN * deviation > OFF):
+        return found._replace(status=Status.INCONSISTENT)
     return found

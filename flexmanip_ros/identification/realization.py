@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -94,6 +95,28 @@ def lightly_damped(A: Array, most: float) -> Array:
         return A
     moved = values * np.where(damped, slow / np.where(radius > 0.0, radius, 1.0), 1.0)
     return np.asarray(np.real(np.linalg.solve(vectors.T, (vectors * moved).T).T), dtype=np.float64)
+
+
+def slowest(model: StateSpace, count: int, most: float) -> StateSpace | None:
+    """Return the ``count`` slowest oscillations damped by at most the ratio ``most``; None where there are fewer.
+
+    Two states each, real and imaginary part of the modal coordinate. What the others do is left out.
+    """
+    values, right = np.linalg.eig(model.A)
+    if np.linalg.cond(right) > WORST_BASIS:
+        return None
+    logs = np.log(np.where(values == 0.0, 1e-300, values + 0j))
+    light = [k for k in np.argsort(logs.imag) if logs[k].imag > 1e-9 and -logs[k].real <= most * abs(logs[k])][:count]
+    if len(light) < count:
+        return None
+    left = np.linalg.inv(right)[light]
+    shapes = 2.0 * (model.C @ right[:, light])
+    A = np.zeros((2 * count, 2 * count))
+    for i, pole in enumerate(values[light]):
+        A[2 * i:2 * i + 2, 2 * i:2 * i + 2] = [[pole.real, -pole.imag], [pole.imag, pole.real]]
+    B, K = (np.stack([(left @ X).real, (left @ X).imag], axis=1).reshape(2 * count, -1) for X in (model.B, model.K))
+    C = np.stack([shapes.real, -shapes.imag], axis=2).reshape(len(shapes), -1)
+    return replace(model, A=A, B=B, C=C, K=K)
 
 
 def known_output_basis(model: StateSpace) -> Array | None:

@@ -35,8 +35,9 @@ BLOCK_S = 0.06
 """A block is taken so much later [s], at least CHUNK samples, and less than BLOCK: so it catches up."""
 LATEST = 4096
 """Nor later than this: what is kept meanwhile is bounded, at any rate."""
-PARAMETERS = 80
-"""With more parameters than this the subspace model is published as it is."""
+PARAMETERS, USUAL = 120, 80
+"""Numbers in A, B, C, D and K beyond which the subspace model is published as it is, and up to which the times above
+hold: the time that a fit takes grows as the square of their number."""
 PAUSE = 8192
 """Samples from a fit that failed to the next attempt; a multiple of CHUNK."""
 
@@ -147,6 +148,11 @@ def is_fit_due(config: IdentifierParameters, refined: Refined) -> bool:
     return total % FIRST == 0 and doublings & (doublings - 1) == 0
 
 
+def is_first_under_way(refined: Refined) -> bool:
+    """Whether the first fit of a stretch is being made."""
+    return refined.batch and refined.request is not None and len(refined.request.rows) == FIRST
+
+
 def is_block_due(refined: Refined) -> bool:
     """Whether a recursive update is due."""
     waiting = refined.closed - refined.seen
@@ -154,13 +160,25 @@ def is_block_due(refined: Refined) -> bool:
     return is_there and refined.request is None and waiting >= BLOCK
 
 
-def result_delay(refined: Refined, now_ns: int) -> int:
+def size(config: IdentifierParameters) -> int:
+    """Return the count of numbers in A, B, C, D and K."""
+    n, r, m = config.order, len(config.inputs), len(config.outputs)
+    return n * (n + r + 2 * m + 1) + m * r
+
+
+def fitted(config: IdentifierParameters) -> IdentifierParameters:
+    """Return what is fitted: of a large order only the begin of a model of every configuration, where there is one."""
+    role = parameter_varying.roles(config) if size(config) > USUAL else None
+    return config if role is None else replace(config, order=2 * len(role.displacements))
+
+
+def result_delay(config: IdentifierParameters, refined: Refined, now_ns: int) -> int:
     """Samples until the result of a fit is taken, a multiple of CHUNK; now_ns: stamp of the last sample.
 
     From the stamps of the stretch, so that a replay waits as long as the live node.
     """
-    count = refined.total
-    needed = _chunks(refined, now_ns, max(SOONEST_S, EACH_S * count), LATEST)
+    count, longer = refined.total, max(1.0, (size(config) / USUAL) ** 2)
+    needed = _chunks(refined, now_ns, longer * max(SOONEST_S, EACH_S * count), LATEST)
     return max(SOONEST, count // DELAY // CHUNK * CHUNK, needed)
 
 
@@ -173,7 +191,8 @@ def _chunks(refined: Refined, now_ns: int, duration: float, most: int) -> int:
 def ask_fit(config: IdentifierParameters, refined: Refined, rows: Rows, R: Array, scale: Array) -> Refined:
     """Ask for a fit of the whole stretch, see ``batch_fit.fit_stretch``; rows: the latest."""
     old, older, *_ = *(fit for fit in (refined.recursion, refined.before) if fit is not None), None, None
-    later = result_delay(refined, int(rows.stamp_ns[-1]))
+    config = fitted(config)
+    later = result_delay(config, refined, int(rows.stamp_ns[-1]))
     request = FitRequest(config, rows.since(refined.begin).between(refined.begin, refined.closed), R.copy(),
                          scale.copy(), old, older, later, refined.varying_before)
     return refined._replace(request=request, due=refined.end + later)

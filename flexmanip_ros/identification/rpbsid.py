@@ -75,17 +75,16 @@ def init(config: IdentifierParameters) -> RpbsidState:
     return RpbsidState(
         z=np.zeros(p * (r + m)), scale=np.zeros(r + m), mean=np.zeros((2, r + m)), variance=np.zeros(m),
         scalars=scalars, counts=np.zeros(factor.COUNTS, dtype=np.int64), memory=memory,
-        refined=recursive_fit.start(0) if _is_refined(config, r, m) else None,
+        refined=recursive_fit.start(0) if _is_refined(config) else None,
         decimator=decimation.start(config.decimation, r + m) if config.decimation > 1 else None,
         decimated=SampleLog(Width(r, m, 0)) if config.decimation > 1 else None)
 
 
-def _is_refined(config: IdentifierParameters, r: int, m: int) -> bool:
+def _is_refined(config: IdentifierParameters) -> bool:
     """Whether the prediction-error fit runs: it needs a growing memory and a model of bearable size."""
-    n = config.order
-    size = n * (n + r + 2 * m + 1) + m * r
     return (config.refinement != 'none' and config.estimator == 'factor'
-            and config.forgetting == 'innovation' and size <= recursive_fit.PARAMETERS)
+            and config.forgetting == 'innovation'
+            and recursive_fit.size(recursive_fit.fitted(config)) <= recursive_fit.PARAMETERS)
 
 
 def _regressors(config: IdentifierParameters, r: int, m: int) -> int:
@@ -262,12 +261,13 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> I
             config, refined.varying, dt, model_output.excitation(state.memory[0][:d, :d]), float(state.scalars[POWER]),
             np.zeros(0) if last is None else last.singular_values, float('nan') if last is None else last.condition,
         ).now(state.cursor - refined.seen)
-    if refined is not None and refined.recursion and FRESH * refined.recursion.weight >= state.counts[USED]:
-        fitted = model_output.from_fit(
+    # it is followed by a model of every configuration, which starts from displacements alone
+    follows = (refined is not None and refined.batch and refined.total < LATEST_VARYING and roles(config) is not None)
+    if refined is not None and refined.recursion and len(refined.recursion.theta.A) == config.order \
+            and FRESH * refined.recursion.weight >= state.counts[USED]:
+        published = model_output.from_fit(
             config, refined.recursion, state.scalars, model_output.excitation(state.memory[0][:d, :d]), dt)
-        # it is followed by a model of the configuration, which starts from displacements alone
-        early = refined.batch and roles(config) is not None and refined.total < LATEST_VARYING
-        return fitted._replace(status=Status.WARMING_UP) if early and fitted.status is Status.TRACKING else fitted
+        return published._replace(status=Status.WARMING_UP) if follows else published
     few = state.counts[USED] <= max(config.past_window, config.order)
     if few or not np.all(np.isfinite(state.memory[0])):
         return None
@@ -281,7 +281,8 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> I
         return None
     found = model_output.publish(
         config, realized, R, scale, state.scalars, state.variance, int(state.counts[USED]), d, dt)
-    early = refined is not None and state.counts[USED] < recursive_fit.FIRST + recursive_fit.SOONEST
+    early = refined is not None and (follows or state.counts[USED] < recursive_fit.FIRST + recursive_fit.SOONEST
+                                     or recursive_fit.is_first_under_way(refined))
     if found is not None and early and found.status is Status.TRACKING:
         return found._replace(status=Status.WARMING_UP)  # a short past is biased, and no fit has been made
     return found

@@ -23,7 +23,7 @@ from flexmanip_ros.identification.parameter_varying import (
     signals_of,
     updated,
 )
-from flexmanip_ros.identification.realization import known_output_basis, to_continuous, transform
+from flexmanip_ros.identification.realization import known_output_basis, slowest, to_continuous, transform
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Array, StateSpace
@@ -39,6 +39,8 @@ WINDOW = 1024
 GROWTH = (256, 512, 640, 768, WINDOW)
 """Samples of the stretches that lead there, each started from the one before."""
 ITERATIONS = 8
+LIGHTLY = 0.3
+"""Largest damping ratio of a mode that the fit may begin with."""
 LATE = 16.0
 """Times the noise by which the first stretches may miss, as their start may be far off."""
 ZETA = 0.8
@@ -48,8 +50,16 @@ SAME = 0.3
 
 
 def from_model(model: StateSpace, role: Roles) -> tuple[Array, Array, Array] | None:
-    """G, D, H of a model of one configuration, in its own units; None where it does not swing as it should."""
+    """G, D, H of a model of one configuration, in its own units; None where it does not swing as it should.
+
+    Of more modes than displacements the slowest are taken.
+    """
     h = len(role.displacements)
+    if model.order > 2 * h:
+        slow = slowest(model, h, LIGHTLY)
+        if slow is None:
+            return None
+        model = slow
     seen = model.C[list(role.displacements)]  # x = [w; w'] by these alone: then w' is the derivative of w
     W = known_output_basis(replace(model, C=seen, D=model.D[list(role.displacements)]))
     if W is None:
@@ -62,7 +72,7 @@ def from_model(model: StateSpace, role: Roles) -> tuple[Array, Array, Array] | N
     G, D, H = -A[h:, :h], -A[h:, h:], B[h:]
     values = np.linalg.eigvals(np.block([[np.zeros((h, h)), np.eye(h)], [-G, -D]]))
     swings = values[values.imag > 0.0]
-    if len(swings) != h or not np.all(np.abs(swings.real) < 0.3 * swings.imag):
+    if len(swings) != h or not np.all(np.abs(swings.real) < LIGHTLY * swings.imag):
         return None
     return G, D, H
 

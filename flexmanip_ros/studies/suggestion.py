@@ -157,7 +157,7 @@ def _values(shape: Shape) -> dict[str, Any]:
 
 def _is_refinable(search: Search, shape: Shape) -> bool:
     n, r, m = shape.order, search.r, search.m
-    return n * (n + r + 2 * m + 1) + m * r <= recursive_fit.PARAMETERS
+    return n * (n + r + 2 * m + 1) + m * r <= recursive_fit.USUAL  # fits of more would take most of the search's time
 
 
 def _identified_error(search: Search, values: Mapping[str, Any]) -> float:

@@ -191,7 +191,8 @@ def test_the_inverse_mass_matrix_is_exact_in_the_functions_of_the_configuration(
 
 def test_only_displacements_and_their_rates_beside_angles_have_a_model_of_every_configuration() -> None:
     assert parameter_varying.roles(CONFIG) == ((0, 1), (0, 1, 2, 3))
-    assert parameter_varying.roles(replace(CONFIG, order=6)) is None
+    assert parameter_varying.roles(replace(CONFIG, order=6)) == ((0, 1), (0, 1, 2, 3))
+    assert parameter_varying.roles(replace(CONFIG, order=3)) is None
     assert parameter_varying.roles(replace(CONFIG, angles=())) is None
     assert parameter_varying.roles(IdentifierParameters())
     assert parameter_varying.roles(replace(CONFIG, payload_method='block')) is None

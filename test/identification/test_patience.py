@@ -17,7 +17,7 @@ CONFIG = configuration(1, 2, order=2, past_window=4, future_window=2)
 def due(rate: float, count: int) -> int:
     """Samples from the request of a fit after ``count`` of them to its result."""
     refined = recursive_fit.start(0)._replace(end=count)
-    return recursive_fit.result_delay(refined, round((count - 1) * 1e9 / rate))
+    return recursive_fit.result_delay(CONFIG, refined, round((count - 1) * 1e9 / rate))
 
 
 @pytest.mark.parametrize('count', [256, 512, 1024, 2048])
