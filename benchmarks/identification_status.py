@@ -126,13 +126,12 @@ def unexplained(model: StateSpace, U: Array, Y: Array, steps: int) -> Array:
 
 def readings(case: Case) -> tuple[list[Estimate], Signals]:
     """Return the readings of a model, and the signals that they are read from."""
-    found, last = [], pipeline.init(keep_log=True)
-    for state, estimate in pipeline.replay(case.config, case.items, last):
-        last = state
-        if estimate is not None and estimate.model_is_new and estimate.model is not None:
-            found.append(estimate)
-    assert last.config is not None
-    return found, sampling.signals(last.config, last.clock, last.log)
+    found, state = [], pipeline.init(keep_log=True)
+    for item in case.items:
+        state, ready = pipeline.step(case.config, state, item)
+        found += [estimate for estimate in ready if estimate.model_is_new and estimate.model is not None]
+    assert state.config is not None
+    return found, sampling.signals(state.config, state.clock, state.log)
 
 
 def row_of(case: Case) -> dict[str, Any]:

@@ -12,13 +12,15 @@ import pytest
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm import linearization
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.identification import parameter_varying, prediction_check, rpbsid
+from flexmanip_ros.identification import parameter_varying, prediction_check, rpbsid, validation
+from flexmanip_ros.identification.realization import to_discrete
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.identification.varying_kernel import basis
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
+from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.studies import configurations
-from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, Status
+from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, StateSpace, Status
 
 CAPTURE_S, DURATION_S, SETTLED_S = 3.0, 16.0, 6.0
 PAYLOAD = 20.0
@@ -145,6 +147,22 @@ def test_deviations_of_frequencies_are_the_derivatives_of_the_matrices(run: Run)
     assert np.all(change <= 1e-4 * np.array(expected) * np.sqrt(model.spread.shape[1]) * 1.1)
 
 
+@pytest.mark.parametrize(('order', 'outputs'), [(6, 4), (12, 4), (5, 2)])
+def test_an_order_above_twice_the_displacements_follows_the_arm_as_well(order: int, outputs: int) -> None:
+    trajectory, _, chords = record()
+    short = trajectory._replace(**{name: getattr(trajectory, name)[:2000]
+                                   for name in ('stamp_ns', 'position', 'velocity', 'effort')})
+    config = replace(CONFIG, order=order, outputs=CONFIG.outputs[:outputs], future_window=10)
+    found = [one for one in pipeline.run(config, blocks(short, 2000)) if one.model_is_new and one.stamp_ns > 1.5e9]
+    assert found
+    for one in found:
+        assert one.model is not None
+        assert one.model.order == 4
+        row = round(one.stamp_ns * 1e-6)
+        known = true_frequencies(float(chords[row, 1] - chords[row, 0]), 0.0)
+        np.testing.assert_allclose([mode.frequency_hz for mode in one.modes], known, rtol=0.01)
+
+
 def test_a_replay_in_blocks_gives_the_bits_of_another_one() -> None:
     trajectory, event, _ = record()
     short = trajectory._replace(**{name: getattr(trajectory, name)[:5200]
@@ -215,6 +233,50 @@ def test_a_prediction_is_judged_against_white_noise_and_not_against_its_own_resi
     wrong = replace(model, A=model.A @ model.A, B=2.0 * model.B)
     assert np.nanmax(prediction_check.missed(wrong, u, y, 45)) > 0.5
     np.testing.assert_allclose(np.sqrt(prediction_check.white_noise(y)), 0.01 * y.std(axis=0), rtol=0.2)
+
+
+def swinging(frequencies: tuple[float, float], u: Array | None = None) -> tuple[StateSpace, Array]:
+    """Two modes that two displacements see, and what they do under torques (N, 2), with 2 % of noise."""
+    A, B = np.zeros((4, 4)), np.zeros((4, 2))
+    for i, frequency in enumerate(frequencies):
+        at = slice(2 * i, 2 * i + 2)
+        A[at, at] = [[0.0, 1.0], [-(2.0 * np.pi * frequency) ** 2, -0.01 * 2.0 * np.pi * frequency]]
+        B[2 * i + 1] = [1.0, -0.7 + i]
+    model = StateSpace(*to_discrete(A, B, 1e-3), np.array([[1.0, 0.0, 0.6, 0.0], [-0.8, 0.0, 1.0, 0.0]]),
+                       np.zeros((2, 2)), np.zeros((4, 2)), 1e-3)
+    y = validation.simulate(model, u) if u is not None else np.zeros((0, 2))
+    return model, y + 0.02 * y.std(axis=0) * np.random.default_rng(1).standard_normal(y.shape) if len(y) else y
+
+
+@pytest.mark.parametrize('lost', [False, True])
+def test_a_frequency_that_is_three_per_cent_off_is_found_out_though_it_predicts(lost: bool) -> None:
+    u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
+    right, y = swinging((5.6, 6.1), u)
+    rows = log_of(u, y).rows(0, len(u))
+    seen = np.random.default_rng(2).random(len(u)) > 0.05 if lost else None
+    for frequencies in ((5.6, 6.1), (5.6 * 1.03, 6.1), (5.6, 6.1 * 0.97)):
+        model, _ = swinging(frequencies)
+        error, deviation = prediction_check.frequency_errors(model, u, y, 250, seen)
+        known = np.array([5.6, 6.1]) / frequencies - 1.0
+        assert np.all(np.abs(error - known) < 0.006)
+        assert np.all(deviation < 0.004)
+        assert np.nanmax(prediction_check.missed(model, u, y, 250)) < prediction_check.MISSED
+        found = Identified(model, np.zeros((44, 1)), np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING)
+        said = prediction_check.judged(found, rows, ('a/position', 'b/position')).status
+        assert said is (Status.TRACKING if frequencies == (5.6, 6.1) else Status.INCONSISTENT)
+    assert right.order == 4
+
+
+def test_a_frequency_that_is_not_known_to_one_per_cent_is_not_tracking() -> None:
+    u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
+    model, y = swinging((5.6, 6.1), u)
+    rows, along = log_of(u, y).rows(0, len(u)), np.eye(44, 1)
+    found = Identified(model, along, np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=1e4)
+    largest = max(mode.frequency_std_hz / mode.frequency_hz for mode in modes(found))
+    found = found._replace(spread=0.02 / largest * along)
+    assert prediction_check.judged(found, rows, ('a/position', 'b/position')).status is Status.POORLY_EXCITED
+    early = found._replace(samples=1000.0)
+    assert prediction_check.judged(early, rows, ('a/position', 'b/position')).status is Status.WARMING_UP
 
 
 def test_missing_samples_cost_no_more_than_the_blocks_they_are_in() -> None:
