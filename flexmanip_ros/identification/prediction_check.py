@@ -69,12 +69,13 @@ def missed(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np
     """
     n, m = model.order, model.C.shape[0]
     before = max(horizon, 2 * n)
-    free, row = np.empty((before + horizon, m, n)), model.C
-    for k in range(len(free)):
-        free[k], row = row, row @ model.A
+    free, ahead = model.C[None], model.A
+    while len(free) < before + horizon:  # C A^k, twice as many each time
+        free, ahead = np.concatenate([free, free @ ahead]), ahead @ ahead
+    free = free[:before + horizon]
     power, white = np.var(Y, axis=0), white_noise(Y)
     unit = 1.0 / np.sqrt(np.where(power > 0.0, power, 1.0))
-    free *= unit[:, None]
+    free = free * unit[:, None]
     left = (Y - simulate(model, U)) * unit  # a free motion of the model, as far as it is right
     if not np.all(np.isfinite(free)) or not np.all(np.isfinite(left)):  # a model that runs away
         return np.full(m, np.inf)
