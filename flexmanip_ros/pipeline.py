@@ -151,7 +151,8 @@ def run(config: IdentifierParameters, items: Iterable[Item]) -> Iterator[Estimat
             yield estimate
 
 
-def replay(config: IdentifierParameters, items: Iterable[Item]) -> Iterator[tuple[State, Estimate | None]]:
+def replay(config: IdentifierParameters, items: Iterable[Item], background: Background = INLINE
+           ) -> Iterator[tuple[State, Estimate | None]]:
     """Yield the state with each estimate of a recording, and at the end the last state with None.
 
     Payload and model of one stamp come in one estimate. Raises SignalError when no message can be used.
@@ -160,7 +161,7 @@ def replay(config: IdentifierParameters, items: Iterable[Item]) -> Iterator[tupl
 
     def all_estimates() -> Iterator[tuple[State, Estimate]]:
         nonlocal last
-        for now, found in _steps(config, last, items):
+        for now, found in _steps(config, last, items, background):
             last = now
             yield from ((now, estimate) for estimate in found)
 
@@ -187,15 +188,15 @@ def _one_a_stamp(estimates: Iterable[tuple[State, Estimate]]) -> Iterator[tuple[
         yield waiting
 
 
-def _steps(config: IdentifierParameters, state: State, items: Iterable[Item]
+def _steps(config: IdentifierParameters, state: State, items: Iterable[Item], background: Background
            ) -> Iterator[tuple[State, tuple[Estimate, ...]]]:
     """Yield state and estimates after each message of a recording, and after its end."""
     for item in items:
-        state, found = step(config, state, item, group=HOPELESS)
+        state, found = step(config, state, item, background, HOPELESS)
         yield state, found
         if state.counters.accepted == 0 and state.counters.received >= HOPELESS:
             break
-    yield finish(config, state)
+    yield finish(config, state, background)
 
 
 def finish(config: IdentifierParameters, state: State, background: Background = INLINE

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, null_space
+import scipy
 
 from flexmanip_ros.arm.equations_of_motion import assemble
 from flexmanip_ros.arm.manipulator import Manipulator, payload_array, workspace
@@ -78,8 +78,8 @@ def rates_after(M: Array, J: Array, qd: Array, body: Body, mass: float = np.inf,
     """
     slip = np.array([*body.velocity, body.spin]) - J @ qd
     # the body meets the arm's mobility J M^-1 J' at its centre, and that of all as one mass
-    free = np.eye(qd.size) if held is None or not len(held) else null_space(held)
-    response = free @ cho_solve(cho_factor(free.T @ M @ free), (J @ free).T)
+    free = np.eye(qd.size) if held is None or not len(held) else scipy.linalg.null_space(held)
+    response = free @ scipy.linalg.cho_solve(scipy.linalg.cho_factor(free.T @ M @ free), (J @ free).T)
     yielding = J @ response + np.diag([1.0 / mass, 1.0 / mass, 0.0])
     weight = np.diag([body.mass, body.mass, body.inertia])
     # impulse p: weight (slip - yielding p) = p

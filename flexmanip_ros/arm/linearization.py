@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, expm
+import scipy
 
 from flexmanip_ros.arm.equations_of_motion import assemble, eliminate_translation
 from flexmanip_ros.arm.manipulator import Manipulator, Workspace, manipulator, payload_array, workspace
@@ -44,7 +44,7 @@ def _assembled(arm: Manipulator, payload: Array, q: Array) -> Workspace:
 def first_order(M: Array, K: Array, D: Array, B: Array) -> tuple[Array, Array]:
     """Return (A (2n, 2n), B (2n, r)) of x = [q; q'] with M q'' + D q' + K q = B u."""
     n, r = B.shape
-    rows = cho_solve(cho_factor(M), np.hstack([-K, -D, B]))
+    rows = scipy.linalg.cho_solve(scipy.linalg.cho_factor(M), np.hstack([-K, -D, B]))
     A = np.block([[np.zeros((n, n)), np.eye(n)], [rows[:, :2 * n]]])
     return A, np.vstack([np.zeros((n, r)), rows[:, 2 * n:]])
 
@@ -99,7 +99,7 @@ def vibration_model(
     """Return (Ac (2 L k, 2 L k), Bc (2 L k, L)), x = [eta; eta'], chords and base free, damped (paper eqs. 19-21)."""
     b = floating_blocks(arm, theta, payload, kappa)
     h = len(b.Mc)
-    solved = cho_solve(cho_factor(b.Ma), np.hstack([b.Mb, b.B_theta]))
+    solved = scipy.linalg.cho_solve(scipy.linalg.cho_factor(b.Ma), np.hstack([b.Mb, b.B_theta]))
     return first_order(b.Mc - b.Mb.T @ solved[:, :h], b.Kc, b.Dc, b.B_eta - b.Mb.T @ solved[:, h:])
 
 
@@ -110,7 +110,7 @@ def discretize(Ac: Array, Bc: Array, dt: float) -> tuple[Array, Array]:
         raise ModelError(f'the sample time is {dt}', 'give a positive number of seconds')
     stacked = np.zeros((n + r, n + r))
     stacked[:n, :n], stacked[:n, n:] = Ac, Bc
-    step = expm(stacked * dt)
+    step = scipy.linalg.expm(stacked * dt)
     return step[:n, :n], step[:n, n:]
 
 

@@ -22,7 +22,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import eigh
+import scipy
 
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
@@ -68,7 +68,7 @@ def shape_functions(sines: int, static: bool) -> ShapeFunctions:
     raw = ShapeFunctions(sines, np.eye(sines + STATIC), np.zeros(0))
     x, weight = quadrature(20 + 4 * sines)
     phi, _, curvature = raw.at(x)
-    square, V = eigh((curvature * weight) @ curvature.T, (phi * weight) @ phi.T)
+    square, V = scipy.linalg.eigh((curvature * weight) @ curvature.T, (phi * weight) @ phi.T)
     V *= np.sqrt(0.5) * np.sign(raw.at(np.zeros(1))[1].T @ V)
     return ShapeFunctions(sines, V.T.copy(), square / 2.0)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from flexmanip_ros.cli.console import Report, require_matplotlib
 from flexmanip_ros.errors import BagError, FlexmanipError, MissingSignalError, ModelError, ParameterError, SignalError
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.outputs import TableOutput, check_place, open_output, write_rows, write_text
+from flexmanip_ros.numerics.background import Threads, read_ahead
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import yaml_text
 from flexmanip_ros.payload import capture_detection
@@ -95,9 +96,9 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     kept: list[Estimate] = []
     state, interrupted = pipeline.init(), False
     output = None if request.output is None else open_output(request.output, request.config.payload_frame)
-    with output or nullcontext():
+    with output or nullcontext(), closing(Threads()) as background, closing(read_ahead(messages)) as items:
         try:
-            for now, estimate in pipeline.replay(request.config, messages):
+            for now, estimate in pipeline.replay(request.config, items, background):
                 state = now
                 if estimate is None:
                     continue

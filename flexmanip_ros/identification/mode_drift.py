@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numba import njit
-from scipy.linalg import solve_triangular
 
 from flexmanip_ros.identification.prediction_error import (
     Fit,
@@ -112,7 +112,7 @@ def drifting(U: Array, Y: Array, fit: Fit, structure: Structure, widening: float
     absent = np.isnan(Y[:, 0])
     E[absent], S[:, absent] = 0.0, 0.0
     lower = np.linalg.cholesky(fit.covariance)
-    e, *s = (solve_triangular(lower, part.T, lower=True, check_finite=False).ravel() for part in (E, *S))
+    e, *s = (scipy.linalg.solve_triangular(lower, part.T, lower=True, check_finite=False).ravel() for part in (E, *S))
     own = np.array(s)
     # what the parameters of the fit can take up: derivatives of the prediction against those by the drift
     shared = np.array([_gradient(U, Y - E + part, fit, structure) for part in S]).T

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from scipy.linalg.lapack import dtrtrs
+import scipy
 
 from flexmanip_ros.identification import realization, uncertainty
 from flexmanip_ros.identification.batch_fit import Recursion
@@ -200,7 +200,7 @@ def excitation(regression: Array) -> float:
     for _ in range(4):
         high = F.T @ (F @ high)
         high = high / np.sqrt(high @ high)
-        low = dtrtrs(F, dtrtrs(F, low, trans=1)[0])[0]
+        low = scipy.linalg.lapack.dtrtrs(F, scipy.linalg.lapack.dtrtrs(F, low, trans=1)[0])[0]
         norm = float(np.sqrt(low @ low))
         if not np.isfinite(norm) or norm == 0.0:
             return 0.0

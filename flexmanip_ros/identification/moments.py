@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
-from scipy.linalg.lapack import dtrtrs
+import scipy
 
 from flexmanip_ros.identification.varx import observability_controllability, open_loop_weight
 from flexmanip_ros.types import Array
@@ -57,7 +56,7 @@ def triangle(tall: Array) -> Array:
 
 def solved(upper: Array, target: Array, trans: int = 0) -> Array:
     """X with upper X = target (trans 1: upper' X). (d, d), (d, k); raises LinAlgError where singular."""
-    X, info = dtrtrs(upper, target, trans=trans)
+    X, info = scipy.linalg.lapack.dtrtrs(upper, target, trans=trans)
     if info:
         raise np.linalg.LinAlgError('the factor of the regressors is singular')
     return np.asarray(X)
@@ -119,7 +118,7 @@ def riccati_gain(A: Array, C: Array, process: Array, measurement: Array, fallbac
     scale = np.trace(R)
     Q, S = process.T @ process / scale, process.T @ measurement / scale
     try:
-        P = solve_discrete_are(A.T, C.T, Q, R / scale, s=S)
+        P = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R / scale, s=S)
         gain: Array = np.linalg.solve(C @ P @ C.T + R / scale, (A @ P @ C.T + S).T).T
     except (np.linalg.LinAlgError, ValueError):
         return fallback

@@ -16,7 +16,7 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import expm
+import scipy
 
 from flexmanip_ros.identification.moments import triangle
 from flexmanip_ros.identification.prediction_error import condition
@@ -220,7 +220,7 @@ def _filter(v: Varying) -> tuple[Array, Array, Array]:
     A[3, 0], B[1] = w * w, w * w
     C[0, 2], C[1] = 1.0, A[3, :4]
     A[:4, 4] = B
-    step = expm(A * v.dt)
+    step = scipy.linalg.expm(A * v.dt)
     return np.ascontiguousarray(step[:4, :4]), np.ascontiguousarray(step[:4, 4]), C
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import expm, logm
 
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.moments import triangle
@@ -40,7 +40,7 @@ def to_continuous(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
         return Ac, np.asarray(np.linalg.solve(held, Ac @ B), dtype=np.float64)
     joint = np.zeros((n + r, n + r))
     joint[:n, :n], joint[:n, n:], joint[n:, n:] = A, B, np.eye(r)
-    log = np.real(logm(joint)) / dt
+    log = np.real(scipy.linalg.logm(joint)) / dt
     return log[:n, :n], log[:n, n:]
 
 
@@ -54,7 +54,7 @@ def to_discrete(Ac: Array, Bc: Array, dt: float) -> tuple[Array, Array]:
     n, r = Bc.shape
     joint = np.zeros((n + r, n + r))
     joint[:n, :n], joint[:n, n:] = Ac, Bc
-    power = expm(joint * dt)
+    power = scipy.linalg.expm(joint * dt)
     return power[:n, :n], power[:n, n:]
 
 

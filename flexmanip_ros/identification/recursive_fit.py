@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
+import scipy
 
 from flexmanip_ros.identification import model_output, parameter_varying, varying_start
 from flexmanip_ros.identification.batch_fit import BLOCK, UNEXPLAINED, Recursion, arrive, fit_stretch, unexplained
@@ -407,11 +407,11 @@ def trend_of(trend: Array, before: Array, after: Array) -> tuple[float, float]:
     the share of an error that a block takes away: a steady drift stays (1 - T) / T steps ahead of the fit.
     """
     L = triangle(before.T).T
-    step = solve_triangular(L, trend, lower=True, check_finite=False)
+    step = scipy.linalg.solve_triangular(L, trend, lower=True, check_finite=False)
     size = float(step @ step)
     if not size > 0.0:
         return 0.0, 0.0
-    left = solve_triangular(L, after, lower=True, check_finite=False)
+    left = scipy.linalg.solve_triangular(L, after, lower=True, check_finite=False)
     T = np.eye(len(trend)) - left @ left.T
     likely = float(np.trace(T)) + CHANCE * np.sqrt(2.0) * float(np.linalg.norm(T))
     share = float(np.sqrt(max(1.0 - likely / (2.0 * TREND_BLOCKS - 1.0) / size, 0.0)))

@@ -7,7 +7,9 @@ the numbers do not depend on the thread that solved the request, nor on when it 
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Generator, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, Protocol, TypeVar
 
 
 class Request(Protocol):
@@ -39,3 +41,53 @@ class Inline:
 
 
 INLINE = Inline()
+
+THREADS = 2
+"""One for a fit, which takes up to a second, and one for the models that are read meanwhile, each in 1 to 3 ms."""
+KEPT = 8
+"""Requests kept with their results. A late event rewinds 0.2 s, and the results of that time are wanted again: at most
+a fit and, where every estimate has a model of its own, those of the last few estimates."""
+
+
+class Threads:
+    """Solves requests beside the samples, with the bits of ``INLINE``. A node or a program has it, not the core."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(THREADS, 'background')
+        self._solved: dict[Request, Future[Any]] = {}
+        self._closed = False
+
+    def start(self, request: Request) -> None:
+        """Begin to solve a request; the oldest one beyond ``KEPT`` is dropped. After ``close`` do nothing."""
+        if self._closed:
+            return
+        self._solved[request] = self._pool.submit(request.solve)
+        if len(self._solved) > KEPT:
+            self._solved.pop(next(iter(self._solved))).cancel()
+
+    def result(self, request: Request) -> Any:
+        """Return the result of a request: wait for the thread that solves it, or solve it here if none does yet."""
+        future = self._solved.get(request)
+        if future is None or future.cancel():
+            self._solved.pop(request, None)
+            return request.solve()
+        return future.result()
+
+    def close(self) -> None:
+        """Drop every request; wait for those that are being solved. Results are solved in place from here on."""
+        self._closed = True
+        self._solved.clear()
+        self._pool.shutdown(cancel_futures=True)
+
+
+T = TypeVar('T')
+
+
+def read_ahead(items: Iterable[T]) -> Generator[T]:
+    """Yield items; a thread makes the next one while one is used."""
+    stream, end = iter(items), object()
+    with ThreadPoolExecutor(1, 'ahead') as pool:
+        coming = pool.submit(next, stream, end)
+        while (item := coming.result()) is not end:
+            coming = pool.submit(next, stream, end)
+            yield item  # type: ignore[misc]

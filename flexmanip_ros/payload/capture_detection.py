@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # its parts are loaded where they are first used
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
@@ -101,9 +102,7 @@ def threshold(config: TriggerParameters, dt: float) -> float:
     """
     looks = 3600.0 / dt / INDEPENDENT
     chance = min(0.5, config.false_alarms_per_hour / looks)
-    from scipy.special import chdtri  # late: it is a tenth of what the programs import
-
-    return float(chdtri(kernel.CAUSES, chance))
+    return float(scipy.special.chdtri(kernel.CAUSES, chance))
 
 
 def _start(config: TriggerParameters, state: DetectionState, row: Rows) -> DetectionState:

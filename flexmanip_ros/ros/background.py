@@ -1,4 +1,4 @@
-"""Work of the identifier that must not wait in front of a sample: fits, models, saved states, compiling."""
+"""Work of the identifier that must not wait in front of a sample: saved states, compiling."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,49 +14,8 @@ from flexmanip_ros import pipeline
 from flexmanip_ros.errors import CheckpointError, SignalError
 from flexmanip_ros.identification import batch_fit, recursive_fit
 from flexmanip_ros.io import checkpoint
-from flexmanip_ros.numerics.background import Request
 from flexmanip_ros.parameters import IdentifierParameters, flatten, leaves
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
-
-THREADS = 2
-"""One for a fit, which takes up to a second, and one for the models that are read meanwhile, each in 1 to 3 ms."""
-KEPT = 8
-"""Requests kept with their results. A late event rewinds 0.2 s, and the results of that time are wanted again: at most
-a fit and, where every estimate has a model of its own, those of the last few estimates."""
-
-
-class Background:
-    """Solves requests on threads beside the samples; ``numerics.background.Background``.
-
-    A request is a pure function of its fields, so the results are those of ``INLINE`` to the bit.
-    """
-
-    def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(THREADS, 'background')
-        self._solved: dict[Request, Future[Any]] = {}
-        self._closed = False
-
-    def start(self, request: Request) -> None:
-        """Begin to solve a request; the oldest one beyond ``KEPT`` is dropped. After ``close`` do nothing."""
-        if self._closed:
-            return
-        self._solved[request] = self._pool.submit(request.solve)
-        if len(self._solved) > KEPT:
-            self._solved.pop(next(iter(self._solved))).cancel()
-
-    def result(self, request: Request) -> Any:
-        """Return the result of a request: wait for the thread that solves it, or solve it here if none does yet."""
-        future = self._solved.get(request)
-        if future is None or future.cancel():
-            self._solved.pop(request, None)
-            return request.solve()
-        return future.result()
-
-    def close(self) -> None:
-        """Drop every request; wait for those that are being solved. Results are solved in place from here on."""
-        self._closed = True
-        self._solved.clear()
-        self._pool.shutdown(cancel_futures=True)
 
 
 class Saved(NamedTuple):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import IdentifierParameters
@@ -63,11 +64,9 @@ def coverage(hits: int, runs: int) -> tuple[float, float, float]:
     """Return the share of hits and its Clopper-Pearson interval of 95 % confidence [%]."""
     if runs == 0:
         return math.nan, math.nan, math.nan
-    from scipy.special import betaincinv  # late: it is a tenth of what the programs import
-
     tail = (1.0 - 0.95) / 2.0
-    low = 0.0 if hits == 0 else float(betaincinv(hits, runs - hits + 1, tail))
-    high = 1.0 if hits == runs else float(betaincinv(hits + 1, runs - hits, 1.0 - tail))
+    low = 0.0 if hits == 0 else float(scipy.special.betaincinv(hits, runs - hits + 1, tail))
+    high = 1.0 if hits == runs else float(scipy.special.betaincinv(hits + 1, runs - hits, 1.0 - tail))
     return 100.0 * hits / runs, 100.0 * low, 100.0 * high
 
 

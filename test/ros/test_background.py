@@ -11,9 +11,8 @@ import pytest
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.identification.recursive_fit import FitRequest
-from flexmanip_ros.numerics.background import Request
+from flexmanip_ros.numerics.background import KEPT, Request, Threads
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
-from flexmanip_ros.ros.background import KEPT, Background
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord
 
@@ -34,7 +33,7 @@ class Sum:
         return sum(self.terms)
 
 
-class Recorded(Background):
+class Recorded(Threads):
     """Notes what was asked for, and what had to be solved in front of a sample."""
 
     def __init__(self) -> None:
@@ -97,7 +96,7 @@ def test_an_estimate_with_every_sample_is_that_of_the_replay(rate: float) -> Non
 def test_a_parameter_changed_meanwhile_counts_from_then_on_wherever_fits_are_solved() -> None:
     config = replace(CONFIG, forgetting='constant')
     factors = []
-    for background in (Background(), None):
+    for background in (Threads(), None):
         arguments = () if background is None else (background,)
         state = pipeline.init()
         for item in recording()[:702]:
@@ -111,7 +110,7 @@ def test_a_parameter_changed_meanwhile_counts_from_then_on_wherever_fits_are_sol
 
 
 def test_a_result_is_solved_once_and_is_there_again_after_a_rewind() -> None:
-    background, request = Background(), Sum(1, 2)
+    background, request = Threads(), Sum(1, 2)
     background.start(request)
     assert [background.result(request) for _ in range(3)] == [3, 3, 3]
     assert request.solved == 1
@@ -119,7 +118,7 @@ def test_a_result_is_solved_once_and_is_there_again_after_a_rewind() -> None:
 
 
 def test_a_request_that_no_thread_has_begun_is_solved_in_place() -> None:
-    background, gate = Background(), threading.Event()
+    background, gate = Threads(), threading.Event()
     busy, waiting, unknown = [Sum(k, gate=gate) for k in range(4)], Sum(5), Sum(6)
     for request in (*busy, waiting):
         background.start(request)
@@ -130,7 +129,7 @@ def test_a_request_that_no_thread_has_begun_is_solved_in_place() -> None:
 
 
 def test_requests_whose_result_nobody_takes_do_not_pile_up() -> None:
-    background = Background()
+    background = Threads()
     for k in range(5 * KEPT):
         background.start(Sum(k))
     assert len(background._solved) == KEPT
@@ -139,7 +138,7 @@ def test_requests_whose_result_nobody_takes_do_not_pile_up() -> None:
 
 
 def test_what_is_asked_for_after_the_end_is_solved_in_place() -> None:
-    background, request = Background(), Sum(1, 2)
+    background, request = Threads(), Sum(1, 2)
     background.close()
     background.start(request)
     assert background.result(request) == 3

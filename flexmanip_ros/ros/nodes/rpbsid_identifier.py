@@ -33,10 +33,11 @@ from visualization_msgs.msg import MarkerArray
 
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.errors import CheckpointError, FlexmanipError, SignalError
+from flexmanip_ros.numerics.background import Threads
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.arm_markers import ArmMarkers
-from flexmanip_ros.ros.background import Background, CheckpointWriter, too_old, warm_up
+from flexmanip_ros.ros.background import CheckpointWriter, too_old, warm_up
 from flexmanip_ros.ros.conversions import JointStateReader, capture_event, to_message
 from flexmanip_ros.ros.diagnostics import (
     ERROR,
@@ -82,7 +83,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self.losses = LossCounter()
         self.meter = Meter()
         self._reader = JointStateReader()
-        self._background = Background()
+        self._background = Threads()
         self._checkpoints: CheckpointWriter | None = None
         self._resumed = False
         self._logged: dict[str, object] = {}
@@ -126,7 +127,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def activated(self) -> None:
         """Have threads for fits and models."""
-        self._background = Background()
+        self._background = Threads()
 
     def deactivated(self) -> None:
         """Publish the model that is under way; save what is known."""
