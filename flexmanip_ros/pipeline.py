@@ -132,8 +132,8 @@ def catch_up(state: State, background: Background = INLINE, group: int = 1) -> t
     if state.payload is None or state.identifier is None:
         return state, estimates
     for row in _due_rows(state):
+        state = _advance_payload(state, row + 1, background)  # meanwhile a thread may read the model
         state, model = _take_model(state, background)
-        state = _advance_payload(state, row + 1, background)
         state, estimate = _estimate(state, background)
         estimates += [*model, *estimate]
     if state.log.end - _running(state)[2].cursor >= group:

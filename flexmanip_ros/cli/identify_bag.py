@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 PROG = 'identify_bag'
 NODE = 'rpbsid_identifier'
+SWITCH_S = 0.0002
+"""Time after which a waiting thread gets its turn [s]; a kernel for the samples between two estimates takes 2 ms."""
 EXAMPLES = """examples:
   identify_bag recording                                     the default arm; captures are found in the signals
                                                              where the recording has no topic of events
@@ -99,6 +101,7 @@ def _main(given: argparse.Namespace) -> int:
         capture_time=given.capture_time, release_time=given.release_time, detect=given.detect,
         validate_from=given.validate_from, horizon=given.horizon, smooth=given.smooth,
         output=given.output, report=given.report, save_arm=given.save_arm, configurations=given.configurations)
+    sys.setswitchinterval(SWITCH_S)
     with console.progress('identifying', 'messages') as progress, first_use.announced():
         result = identify(request, progress)
     if not given.json:
