@@ -57,7 +57,7 @@ class JointBlock(NamedTuple):
         """Return message number k."""
         return JointRecord(int(self.stamp_ns[k]), self.names, self.position[k], self.velocity[k], self.effort[k])
 
-    def part(self, taken: slice) -> JointBlock:
+    def part(self, taken: slice | NDArray[np.bool_]) -> JointBlock:
         """Return some of the messages."""
         return JointBlock(self.names, self.stamp_ns[taken], self.position[taken], self.velocity[taken],
                           self.effort[taken])
@@ -92,9 +92,7 @@ class Status(Enum):
     POORLY_EXCITED = 'the signals carry too little information; move the arm or raise the torque'
     ILL_CONDITIONED = 'the regression is nearly singular; lower the order or the past window'
     ORDER_TOO_LOW = 'the signals hold more dynamics than the order; raise the order'
-    SAMPLE_GAP = 'samples are missing; the regressor window restarted'
     INCONSISTENT = 'the residuals do not fit the model; the interval was widened'
-    NO_PAYLOAD_METHOD = 'no payload is estimated (payload_method: none)'
     UNOBSERVABLE = 'these signals cannot give a payload'
     DIVERGED = 'numbers left the finite range; the estimator restarted'
 

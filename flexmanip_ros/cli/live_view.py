@@ -14,7 +14,7 @@ from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import help_text
-from flexmanip_ros.parameters.view import PORT, ViewParameters
+from flexmanip_ros.parameters.nodes import PORT, ViewParameters
 
 PROG = 'live_view'
 LARGEST_PORT = 65535

@@ -251,8 +251,7 @@ class _Messages:
             yield from self._known_events(self.first_ns)
         used = block.stamp_ns < self._limit_ns()
         if used.any():
-            yield block if used.all() else JointBlock(
-                block.names, block.stamp_ns[used], block.position[used], block.velocity[used], block.effort[used])
+            yield block if used.all() else block.part(used)
 
     def signals(self) -> Signals:
         """Return the samples of the recording, held-out ones included."""

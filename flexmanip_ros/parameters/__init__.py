@@ -3,7 +3,7 @@
 from flexmanip_ros.parameters.arm import ArmParameters
 from flexmanip_ros.parameters.field import Leaf, check, configure, flatten, leaves
 from flexmanip_ros.parameters.identifier import IdentifierParameters, PayloadParameters
-from flexmanip_ros.parameters.nodes import AdapterParameters, ControllerParameters, TriggerParameters
+from flexmanip_ros.parameters.nodes import AdapterParameters, ControllerParameters, TriggerParameters, ViewParameters
 from flexmanip_ros.parameters.simulation import (
     ActuatorParameters,
     DemoParameters,
@@ -11,7 +11,6 @@ from flexmanip_ros.parameters.simulation import (
     PlantParameters,
     SensorParameters,
 )
-from flexmanip_ros.parameters.view import ViewParameters
 
 __all__ = [
     'ActuatorParameters', 'AdapterParameters', 'ArmParameters', 'ControllerParameters', 'DemoParameters',

@@ -11,9 +11,8 @@ import yaml
 
 from flexmanip_ros.parameters.field import LINKS, Leaf, leaves
 from flexmanip_ros.parameters.identifier import IdentifierParameters
-from flexmanip_ros.parameters.nodes import AdapterParameters, ControllerParameters, TriggerParameters
+from flexmanip_ros.parameters.nodes import AdapterParameters, ControllerParameters, TriggerParameters, ViewParameters
 from flexmanip_ros.parameters.simulation import ExcitationParameters, PlantParameters
-from flexmanip_ros.parameters.view import ViewParameters
 
 NODES: Mapping[str, type] = {
     'plant_simulator': PlantParameters,

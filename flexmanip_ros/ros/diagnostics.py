@@ -163,10 +163,8 @@ ADVICE = {
     Status.POORLY_EXCITED: 'move the arm, or raise the torque (node excitation)',
     Status.ILL_CONDITIONED: 'lower order or past_window',
     Status.ORDER_TOO_LOW: 'raise order (suggested_order in /diagnostics)',
-    Status.SAMPLE_GAP: 'look for lost or late joint states (gaps and lost in /diagnostics)',
     Status.INCONSISTENT: 'check the parameters of the arm; announce each capture and release, or set '
                          'trigger_mode:=auto at launch',
-    Status.NO_PAYLOAD_METHOD: 'set payload_method to structured for the payload',
     Status.UNOBSERVABLE: 'correct inputs, outputs and angles, or set payload_method to none',
     Status.DIVERGED: 'check units and signs of the signals',
 }
@@ -188,9 +186,9 @@ def report_estimate(report: Report, estimate: Estimate | None, order: int) -> No
     payload = None if estimate is None else estimate.payload
     report.values['status'] = status.name
     report.values['model_status'] = (Status.WARMING_UP if estimate is None else estimate.model_status).name
-    report.values['converged'] = status in (Status.TRACKING, Status.NO_PAYLOAD_METHOD)
+    report.values['converged'] = status is Status.TRACKING
     report.values['consistent'] = payload is None or payload.status is not Status.INCONSISTENT
-    if status not in (Status.TRACKING, Status.WARMING_UP, Status.NO_PAYLOAD_METHOD):
+    if status not in (Status.TRACKING, Status.WARMING_UP):
         report.worse(WARN, status.value)
     if estimate is None:
         return

@@ -25,7 +25,6 @@ DECIMATIONS = (1, 2, 3, 5, 10, 20, 50, 100)
 WINDOWS_S = (0.05, 0.1, 0.2, 0.3, 0.5)
 """Lengths of the past window that are tried [s]; those of ``WINDOWS`` samples too."""
 WINDOWS = (6, 10, 20)
-LONGEST_WINDOW = 200
 ORDERS = tuple(range(2, 17))
 COARSE = (4, 6, 8, 10, 12, 16)
 """Orders of the first pass."""

@@ -21,9 +21,7 @@ ADVICE: Mapping[Status, str] = {
     Status.POORLY_EXCITED: 'move the arm more, or raise the torque',
     Status.ILL_CONDITIONED: 'lower the order or the past window',
     Status.ORDER_TOO_LOW: 'raise the order',
-    Status.SAMPLE_GAP: 'record without losses',
     Status.INCONSISTENT: 'check the parameters arm.* and the time of the capture',
-    Status.NO_PAYLOAD_METHOD: 'for a payload set payload_method=structured and the parameters arm.*',
     Status.UNOBSERVABLE: 'add the torques, angles and bends of both links to inputs, outputs and angles',
     Status.DIVERGED: 'check the units of the signals and the parameters arm.*',
 }

@@ -12,8 +12,7 @@ PAYLOAD_COLOUR = '#009E73'
 EVENT_COLOUR = '#AA0000'
 STATUS_LOOKS: dict[Status, tuple[str, str]] = {
     Status.WARMING_UP: ('#C8C8C8', '..'), Status.TRACKING: ('#009E73', ''), Status.POORLY_EXCITED: ('#E69F00', '//'),
-    Status.ILL_CONDITIONED: ('#CC79A7', 'xx'), Status.SAMPLE_GAP: ('#56B4E9', '||'),
-    Status.INCONSISTENT: ('#D55E00', '\\\\'), Status.NO_PAYLOAD_METHOD: ('#56B4E9', '--'),
+    Status.ILL_CONDITIONED: ('#CC79A7', 'xx'), Status.INCONSISTENT: ('#D55E00', '\\\\'),
     Status.UNOBSERVABLE: ('#7F7F7F', '++'), Status.DIVERGED: ('#000000', 'OO'), Status.ORDER_TOO_LOW: ('#F0E442', '**'),
 }
 """Colour and hatch of each status, so that they differ by more than their colour."""

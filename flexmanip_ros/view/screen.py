@@ -16,11 +16,10 @@ from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexmanip_ros.messages import Diagnostics, DiagnosticStatus
 from flexmanip_ros.parameters import IdentifierParameters, ViewParameters
-from flexmanip_ros.parameters.view import WINDOWS
+from flexmanip_ros.parameters.nodes import WINDOWS
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointBlock, Status
 from flexmanip_ros.view.looks import COLOURS, EVENT_COLOUR, MODES_APART, PAYLOAD_COLOUR, STATUS_LOOKS
 
@@ -134,12 +133,12 @@ class Screen:
         if self.first_ns is not None and back.size:
             k = int(back[0])
             if k:
-                self.joint_states(_part(block, slice(0, k)))
+                self.joint_states(block.part(slice(0, k)))
             ahead = [event for event in self._known if event.stamp_ns >= stamps[k]]
             self._begin()
             for event in ahead:
                 self.event(event)
-            self.joint_states(_part(block, slice(k, None)))
+            self.joint_states(block.part(slice(k, None)))
             return
         self.samples += len(stamps)
         if self.first_ns is None and len(stamps):
@@ -269,11 +268,6 @@ def _short(name: str, by_joint: bool) -> str:
 def _place(name: str, block: JointBlock) -> tuple[str, int] | None:
     joint, _, field = name.rpartition('/')
     return (field, block.names.index(joint)) if joint in block.names else None
-
-
-def _part(block: JointBlock, taken: slice) -> JointBlock:
-    stamps: NDArray[np.int64] = block.stamp_ns[taken]
-    return JointBlock(block.names, stamps, block.position[taken], block.velocity[taken], block.effort[taken])
 
 
 def _numbers(status: DiagnosticStatus) -> list[Any] | None:
