@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
+import scipy
 
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
@@ -200,7 +200,7 @@ def _open_body(config: IdentifierParameters, model: Model, m: mem.FilterState) -
         aim[body] -= m.x0[body]
         unknown = m.S0.any(axis=1)
         rank = int(unknown.sum())
-        m.xi[:rank] = solve_triangular(m.S0[unknown, :rank], aim[unknown], lower=True)
+        m.xi[:rank] = scipy.linalg.solve_triangular(m.S0[unknown, :rank], aim[unknown], lower=True)
         m.accepted[:] = m.xi
         return
     opened = np.zeros((m.x.size, model.body))

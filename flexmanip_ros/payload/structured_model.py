@@ -8,7 +8,7 @@ from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import expm
+import scipy
 
 from flexmanip_ros.arm.capture import tip_jacobian
 from flexmanip_ros.arm.linearization import mass_matrix
@@ -465,7 +465,7 @@ def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, 
     M = motion.M0 + np.tensordot(motion.payload, motion.Mp, 1) if motion.frozen \
         else mass_matrix(motion.arm, motion.payload, m.x[:n])
     flow[n:2 * n, 2 * n:] = np.linalg.solve(M, motion.arm.torque * (motion.gain * change))
-    step = expm(flow * dt)
+    step = scipy.linalg.expm(flow * dt)
     p = np.arange(1, count + 1) / (count + 1)
     power, shape = np.linalg.eigh(np.minimum.outer(p, p) - np.outer(p, p))
     profiles = (shape * np.sqrt(np.maximum(power, 0.0)))[:, -BRIDGE_TERMS:]
@@ -474,7 +474,7 @@ def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, 
         state = np.tensordot(step[:2 * n, :2 * n], state, 1) + step[:2 * n, 2 * n:, None] * profile
     back = -dt * flow[:2 * n, :2 * n]  # what is damped within a sample cannot be carried back over one
     back[n:, n:] /= max(1.0, dt * float(np.linalg.norm(motion.dqd, 2)))
-    found = expm(back) @ state.reshape(2 * n, -1)
+    found = scipy.linalg.expm(back) @ state.reshape(2 * n, -1)
     columns = np.zeros((m.x.size, found.shape[1]))
     columns[:2 * n] = found
     return columns
