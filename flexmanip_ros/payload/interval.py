@@ -19,14 +19,12 @@ from flexmanip_ros.payload.filter_state import (
     EFFECTIVE,
     FLOOR,
     HORIZON,
-    POWER,
     REFITS,
     SHIFT,
     STORED,
-    WEIGHT,
     WHITE,
 )
-from flexmanip_ros.payload.measurement_update import MeasurementModel
+from flexmanip_ros.payload.measurement_update import MeasurementModel, misfit
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import Array, Payload, Status
 
@@ -168,22 +166,6 @@ def plain_misfit(sensors: MeasurementModel, m: mem.FilterState) -> float:
 
 
 Integers = NDArray[np.int64]
-Booleans = NDArray[np.bool_]
-
-
-@kernel
-def misfit(noise: Array, rate: Booleans) -> float:
-    """Innovation power over white noise, each sensor weighted by what it tells of the payload; nan: none yet.
-
-    noise: (m, 8), see ``memory``; rate: (m,) whether a sensor is one of rates. Those are left out where there
-    are displacements: they show the modes that the model leaves out, and have been given a larger noise.
-    """
-    total = sum_of_weights = 0.0
-    for i in range(noise.shape[0]):
-        if not rate[i]:
-            total += noise[i, WEIGHT] * noise[i, POWER] / max(noise[i, WHITE], noise[i, FLOOR])
-            sum_of_weights += noise[i, WEIGHT]
-    return total / sum_of_weights if sum_of_weights > 0.0 else math.nan
 
 
 @kernel
@@ -209,6 +191,6 @@ def misjudged(noise: Array, counts: Integers) -> float:
 
 
 @kernel
-def figures(noise: Array, rate: Booleans, score: Array, counts: Integers) -> tuple[float, float, float]:
+def figures(noise: Array, rate: NDArray[np.bool_], score: Array, counts: Integers) -> tuple[float, float, float]:
     """Return misfit, drift and ``misjudged``, in one call."""
     return misfit(noise, rate), drift(score, counts), misjudged(noise, counts)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.numerics.compiled import inner
+from flexmanip_ros.numerics.compiled import inlined, inner
 from flexmanip_ros.numerics.square_root import absorb_measurement, dot, project
 from flexmanip_ros.payload.filter_state import (
     BATCHES,
@@ -161,6 +161,21 @@ def learn_noise(sensors: MeasurementModel, m: FilterState) -> None:
         # white noise has SLOW = POWER; a slow part that is no chance makes samples worth less
         # trust comes back slowly: the first guess, or a shock, may have been right
         row[EFFECTIVE] = max(row[POWER], row[SLOW] - doubt * row[POWER], row[FLOOR], 0.7 * row[EFFECTIVE])
+
+
+@inlined
+def misfit(noise: Array, rate: NDArray[np.bool_]) -> float:
+    """Innovation power over white noise, each sensor weighted by what it tells of the payload; nan: none yet.
+
+    noise: (m, 8), see ``memory``; rate: (m,) whether a sensor is one of rates. Those are left out where there
+    are displacements: they show the modes that the model leaves out, and have been given a larger noise.
+    """
+    total = sum_of_weights = 0.0
+    for i in range(noise.shape[0]):
+        if not rate[i]:
+            total += noise[i, WEIGHT] * noise[i, POWER] / max(noise[i, WHITE], noise[i, FLOOR])
+            sum_of_weights += noise[i, WEIGHT]
+    return total / sum_of_weights if sum_of_weights > 0.0 else np.nan
 
 
 @inner

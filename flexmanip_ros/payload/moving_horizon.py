@@ -48,7 +48,7 @@ from flexmanip_ros.payload.filter_state import (
     USED,
     WHITE,
 )
-from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, observe
+from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, misfit, observe
 from flexmanip_ros.payload.process_model import INERTIA, confine, correction, predict
 from flexmanip_ros.types import Array
 
@@ -305,19 +305,17 @@ def fails(m: FilterState) -> bool:
 def strays(sensors: MeasurementModel, m: FilterState) -> bool:
     """Whether the filter left the arm after all: sensors show far more than their noise, block after block.
 
-    Of an arm that holds something all must: a fit is begun again at a cost. Of an empty arm one of displacements does.
+    Of an arm that holds something all must: a fit is begun again at a cost. Of an empty arm those must in the mean that
+    tell of its inertia.
     """
     if m.counts[REFITS] >= MOST_REFITS or (m.counts[HELD] == 1 and m.counts[LEARNED] == 0):
         return False
     if m.counts[STORED] < HORIZON or m.counts[SINCE_EVENT] % STRAY_EVERY != 0:
         return False
-    least, most = STRAY, 0.0
+    least = STRAY
     for i in range(m.noise.shape[0]):
-        ratio = m.noise[i, POWER] / max(m.noise[i, WHITE], m.noise[i, FLOOR])
-        least = min(least, ratio)
-        if not sensors.rate[i]:
-            most = max(most, ratio)
-    left = bool(least >= STRAY if m.counts[HELD] == 1 else most >= UNFIT)
+        least = min(least, m.noise[i, POWER] / max(m.noise[i, WHITE], m.noise[i, FLOOR]))
+    left = bool(least >= STRAY if m.counts[HELD] == 1 else misfit(m.noise, sensors.rate) >= UNFIT)
     m.counts[REFITS] += left
     return left
 

@@ -318,22 +318,27 @@ def predict(motion: ProcessModel, x: Array, S: Array, used: int, reported: Array
     set_parameters(motion, x)
     for i in range(motion.effort.size):
         motion.effort[i] = motion.gain[i] * reported[i]
-    left = duration
+    left, fine = duration, 0.5 ** halved
     while left > 0.0:
         if not linearize(motion, x[:n], x[n:2 * n], motion.k[0]):
             return False
         stiff = 0.0
         for r in range(n):
             stiff -= motion.dqd[r, r]
-        longest = min(motion.substeps * slower(motion, left) * 0.5 ** halved, STIFF_STEP / max(stiff, 1e-9))
+        longest = min(motion.substeps * slower(motion, left), STIFF_STEP / max(stiff, 1e-9))
         steps = np.ceil(left / longest - 1e-9)
         if not steps < MOST_STEPS:
             return False
         h = left / max(steps, 1.0)
-        angle = max(STEP_ANGLE * h / motion.substeps, stiff * h)
-        if not exponential_step(motion, x, h, terms(angle, MOTION_ERROR)):
-            return False
-        spread(motion, S, used, h, terms(angle, SPREAD_ERROR))
+        turn = max(STEP_ANGLE / motion.substeps, stiff)
+        spread(motion, S, used, h, terms(turn * h, SPREAD_ERROR))  # it weighs: the linearization at the begin will do
+        parts = 0
+        while parts * fine < 1.0:
+            if parts and not linearize(motion, x[:n], x[n:2 * n], motion.k[0]):
+                return False
+            if not exponential_step(motion, x, h * fine, terms(turn * h * fine, MOTION_ERROR)):
+                return False
+            parts += 1
         left = left - h if steps > 1.0 else 0.0
     return True
 
