@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -187,7 +188,8 @@ def attempt(program: Program, number: signal.Signals, delay: float, places: dict
         killed = number == signal.SIGKILL
         allowed = {-number} if killed else {0, 128 + number, 130}
         loud = 'Traceback' in err or 'terminate called' in err
-        early = process.returncode in (-number, 1) and ', in main\n' not in err
+        # Python's own site.py has a function main too, which runs before ours
+        early = process.returncode in (-number, 1) and not re.search(r'flexmanip_ros/.*, in main\n', err)
         if process.returncode not in allowed and not early and not finished:
             problem.append(f'exit code {process.returncode}')
         if loud and not early:
