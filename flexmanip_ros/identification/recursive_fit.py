@@ -62,8 +62,9 @@ class FitRequest:
     varying: Varying | None = None
 
     def solve(self) -> FitResult:
-        """Make the fit."""
-        return solve(self)
+        """Make the fit. Numbers that leave the finite range are found where the result is looked at."""
+        with np.errstate(over='ignore', invalid='ignore'):
+            return solve(self)
 
 
 class FitResult(NamedTuple):
