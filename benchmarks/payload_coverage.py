@@ -2,7 +2,7 @@
 
 The nonlinear plant the estimator models (kappa = 2), random payloads of 3-100 kg, configurations, capture
 instants and noise at 40 dB; with displacements and rates, and with displacements alone. A tenth of the runs more for
-each arm of config/arms that carries payloads (nasa_type has a stub of 10 g for a second link).
+each arm of config/arms that carries payloads (nasa_type has a stub of 1 g for a second link).
 
 Use: python benchmarks/payload_coverage.py [--runs 150]   (1000 for the claim)
 """

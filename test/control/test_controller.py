@@ -41,8 +41,9 @@ def run(config: ControllerParameters, seconds: float, payload: float = 20.0, tol
 CONFIG = ControllerParameters(arm=ArmParameters(modes=2))
 
 
-def test_the_arm_goes_where_it_should_and_rests_with_modes_not_modelled_too() -> None:
-    positions, torques, _ = run(CONFIG, 6.0, plant_modes=4)
+@pytest.mark.parametrize('plant_modes', [2, 5])
+def test_the_arm_goes_where_it_should_and_rests_with_modes_not_modelled_too(plant_modes: int) -> None:
+    positions, torques, _ = run(CONFIG, 7.0, plant_modes=plant_modes)
     end = positions[-300:]
     assert np.abs(end[:, :2].mean(axis=0) - positions[0, :2] - [0.1, -0.1]).max() < 5e-3
     assert np.abs(end[:, 2:]).max() < 3e-4

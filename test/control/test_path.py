@@ -12,7 +12,7 @@ LIMITS = np.array([150.0, 75.0, 0.01])
 distances = st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)).map(np.array)
 
 
-def along(way: controller.Path, count: int = 100) -> np.ndarray:
+def along(way: controller.Path, count: int = 400) -> np.ndarray:
     """Return position, rate, acceleration and jerk (count + 1, 4, 2) from beginning to end."""
     return np.array([way.after(way.duration * k / count).now() for k in range(count + 1)])
 

@@ -16,13 +16,13 @@ from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Status
 
-COUNT, CAPTURE = 5000, 2000
+COUNT, CAPTURE = 6000, 2000
 PLANT = PlantParameters()
 
 
 @pytest.fixture(scope='module')
 def messages() -> list[JointRecord | CaptureEvent]:
-    """5 s at 1 kHz, 20 kg caught at 2 s."""
+    """6 s at 1 kHz, 20 kg caught at 2 s."""
     events = (CaptureEvent(CAPTURE * 1_000_000, EventKind.CAPTURE),)
     torque = excitation.sequence(ExcitationParameters(), COUNT)
     return list(simulator.records(simulator.simulate(PLANT, torque, events), events))
@@ -135,7 +135,7 @@ def test_beyond_max_gap_or_where_the_torque_changed_the_window_begins_anew(
 
 
 def test_blocks_give_the_bits_of_single_messages_with_loss(messages: list[JointRecord | CaptureEvent]) -> None:
-    items = surviving(messages, at_random(0.05) | in_bursts(30))[:2400]
+    items = surviving(messages, at_random(0.05) | in_bursts(30))[:3000]
     alone = list(pipeline.run(IdentifierParameters(), items))
     state, found = pipeline.init(), []
     for item in items:
