@@ -20,7 +20,7 @@ from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.io.bag import read
 from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.samples.sample_log import Signals, log_of
-from flexmanip_ros.studies import holdout
+from flexmanip_ros.studies import whole_recording
 from flexmanip_ros.types import JointRecord
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,7 +50,7 @@ def ours(u: np.ndarray, y: np.ndarray, half: int, values: dict[str, object]) -> 
     stamps = (np.arange(len(u)) * round(DT * 1e9)).astype(np.int64)
     signals = Signals(stamps, u, y, np.empty((len(u), 0)), np.zeros(len(u), dtype=bool), np.zeros(len(u), dtype=int),
                       config.inputs, config.outputs)
-    scores = holdout.score(found.model, signals, half * DT)
+    scores = whole_recording.score(found.model, signals, half * DT)
     return {'simulation': scores.simulation.tolist(), 'prediction': scores.prediction.tolist()}
 
 

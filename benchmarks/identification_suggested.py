@@ -27,7 +27,7 @@ from flexmanip_ros.io import bag
 from flexmanip_ros.parameters import configure
 from flexmanip_ros.parameters.identifier import IdentifierParameters
 from flexmanip_ros.samples import sampling
-from flexmanip_ros.studies.holdout import HORIZON_S
+from flexmanip_ros.studies.whole_recording import HORIZON_S
 from flexmanip_ros.types import Array, StateSpace
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -19,7 +19,7 @@ from scipy.linalg import eigh
 
 from flexmanip_ros.arm import linearization
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
-from flexmanip_ros.simulation import excitation, linear_model, simulator
+from flexmanip_ros.simulation import excitation, models, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 mpl.use('Agg')
@@ -35,7 +35,7 @@ CONFIG = PlantParameters(noise='none', arm=ARM, elements=ELEMENTS)
 def main() -> int:
     """Compute, print, draw and write."""
     theta = np.array(CONFIG.initial_angles)
-    parts = linear_model.chain(ARM, CONFIG.initial_angles, ELEMENTS)
+    parts = models.chain(ARM, CONFIG.initial_angles, ELEMENTS)
     M = parts.M + CONFIG.payload_mass * parts.tip[:2].T @ parts.tip[:2]
     exact = np.sqrt(eigh(parts.K, M, eigvals_only=True)[2:6]) / (2 * np.pi)
     efforts = excitation.sequence(ExcitationParameters(), 2000)

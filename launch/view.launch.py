@@ -12,7 +12,7 @@ from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from flexmanip_ros.arm.urdf import urdf
+from flexmanip_ros.cli.write_urdf import urdf
 from flexmanip_ros.io.parameter_file import load_arm
 
 

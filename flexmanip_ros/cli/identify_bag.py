@@ -119,7 +119,7 @@ def _main(given: argparse.Namespace) -> int:
 
 def describe(result: Result) -> list[str]:
     """Return the result as lines for people."""
-    from flexmanip_ros.studies.summary import status_text
+    from flexmanip_ros.studies.results import status_text
     from flexmanip_ros.types import Status
 
     summary = result.summary

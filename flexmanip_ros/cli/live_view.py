@@ -5,19 +5,26 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from flexmanip_ros.cli import console
-from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.errors import BagError, ParameterError
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import help_text
 from flexmanip_ros.parameters.nodes import PORT, ViewParameters
 
+if TYPE_CHECKING:
+    from flexmanip_ros import pipeline
+    from flexmanip_ros.view.screen import Source
+
 PROG = 'live_view'
 LARGEST_PORT = 65535
+MOST_ROWS = 1_000_000
+"""Samples that the page gets: a quarter of an hour at 1 kHz without thinning."""
 EPILOG = """without a recording, as a node (ROS must run):
   live_view --ros-args -p port:=8765
   subscribes to joint_states, capture_event, capture_detected and rpbsid_identifier/status; only listens.
@@ -70,11 +77,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _play(options: argparse.Namespace) -> int:
-    from flexmanip_ros import pipeline
     from flexmanip_ros.cli import first_use
     from flexmanip_ros.io import bag
     from flexmanip_ros.payload import capture_detection
-    from flexmanip_ros.view import recording
     from flexmanip_ros.view.screen import of_identifier, page
     from flexmanip_ros.view.server import Server
 
@@ -86,7 +91,7 @@ def _play(options: argparse.Namespace) -> int:
         if config.payload_method != 'none' and not bag.event_topics(options.bag, topics):
             with suppress(ParameterError):  # as identify_bag, captures are looked for in signals that can show them
                 items = capture_detection.with_detected(capture_detection.watch(config), items)
-        found, fault = recording.read(config, items, source)
+        found, fault = read(config, items, source)
     if fault is not None:
         console.print_error(PROG, fault)
     server = Server(page(source, found, options.speed), options.port)
@@ -98,6 +103,40 @@ def _play(options: argparse.Namespace) -> int:
     finally:
         server.close()
     return console.SUCCESS
+
+
+def read(config: IdentifierParameters, items: Iterable[pipeline.Item], source: Source
+         ) -> tuple[dict[str, Any], BagError | None]:
+    """Identify a recording; return what the page shows of it, and what was wrong with it.
+
+    Of a damaged recording everything before the damage is shown. Raises SignalError when no message can be used, and
+    BagError when there is none.
+    """
+    from flexmanip_ros import pipeline
+    from flexmanip_ros.types import CaptureEvent, JointBlock
+    from flexmanip_ros.view.screen import Screen
+
+    screen = Screen(source)
+    fault: BagError | None = None
+
+    def tapped() -> Iterator[pipeline.Item]:
+        nonlocal fault
+        try:
+            for item in items:
+                if isinstance(item, CaptureEvent):
+                    screen.event(item)
+                else:
+                    screen.joint_states(item if isinstance(item, JointBlock) else JointBlock.of(item))
+                yield item
+        except BagError as error:
+            if not screen.samples:
+                raise
+            fault = error
+
+    for _, estimate in pipeline.replay(config, tapped()):
+        if estimate is not None:
+            screen.estimate(estimate)
+    return screen.frame(MOST_ROWS) or {}, fault
 
 
 if __name__ == '__main__':

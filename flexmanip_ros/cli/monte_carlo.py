@@ -146,7 +146,7 @@ def _compute(given: argparse.Namespace, todo: Sequence[workers.Task]) -> Iterato
 
 def describe(rows: Sequence[Row]) -> list[str]:
     """Return the scores of each estimator as lines for people."""
-    from flexmanip_ros.studies.metrics import score
+    from flexmanip_ros.studies.results import score
 
     lines = [f'{"estimator":24s} {"runs":>6s} {"failed":>6s} {"mean err %":>10s} {"median %":>9s} '
              f'{"rms %":>8s} {"bias kg":>9s} {"95 % interval holds":>22s} '

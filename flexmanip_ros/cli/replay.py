@@ -23,10 +23,10 @@ from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.payload.arm_parameters import as_parameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
-from flexmanip_ros.studies import configurations, holdout, smoothing
-from flexmanip_ros.studies.summary import Summary, summarize
+from flexmanip_ros.studies import whole_recording
+from flexmanip_ros.studies.results import Summary, payload_bound, summarize
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Mode, Status
-from flexmanip_ros.view.screen import Screen, of_identifier
+from flexmanip_ros.view.screen import Screen, embedded, of_identifier
 
 NEVER = (1 << 63) - 1
 """A stamp after all others [ns]."""
@@ -48,7 +48,7 @@ class Request:
     """Whether to look for captures and releases in the signals; None: where the recording has no topic of events, no
     time is given, and the signals can show one."""
     validate_from: float | None = None
-    horizon: float = holdout.HORIZON_S
+    horizon: float = whole_recording.HORIZON_S
     """How far ahead the held-out samples are predicted [s]."""
     smooth: bool = False
     """Fit each stretch between events with all of its samples too."""
@@ -124,19 +124,19 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     signals = messages.signals() if messages.is_kept else None
     if request.validate_from is not None and signals is not None:
         progress.phase('scoring the model')
-        scores = holdout.score(None if last is None else last.model, signals, request.validate_from,
+        scores = whole_recording.score(None if last is None else last.model, signals, request.validate_from,
                                factor=request.config.decimation, horizon_s=request.horizon)
         summary = replace(summary, vaf_simulation_percent=tuple(scores.simulation.tolist()),
                           vaf_prediction_percent=tuple(scores.prediction.tolist()),
                           vaf_horizon_percent=tuple(scores.horizon.tolist()))
     if request.smooth and signals is not None:
         events = [event.stamp_ns for event in messages.events]
-        summary = replace(summary, smoothed=smoothing.smooth(
+        summary = replace(summary, smoothed=whole_recording.smooth(
             state.config or request.config, signals, events, state.clock.dt, request.validate_from))
     fault = messages.fault or _dropped(state)
     if request.save_arm is not None:
         _save_arm(request, state, last)
-    found = None if signals is None else configurations.sweep(state, _angles_held(signals, messages.events))
+    found = None if signals is None else whole_recording.sweep(state, _angles_held(signals, messages.events))
     if request.configurations is not None:
         if found is None:
             raise ModelError('the model is not one of every configuration, so --configurations has nothing to write',
@@ -330,11 +330,9 @@ def _remark(state: pipeline.State, foreign: int) -> str:
 
 
 def _report(request: Request, summary: Summary, messages: _Messages, kept: list[Estimate], signals: Signals,
-            last: Estimate | None, scores: holdout.Scores | None, state: pipeline.State,
-            fault: FlexmanipError | None, found: configurations.Sweep | None) -> None:
+            last: Estimate | None, scores: whole_recording.Scores | None, state: pipeline.State,
+            fault: FlexmanipError | None, found: whole_recording.Sweep | None) -> None:
     from flexmanip_ros.io import plots, report
-    from flexmanip_ros.studies.metrics import payload_bound
-    from flexmanip_ros.view import recording
 
     assert request.report is not None
     config = state.config or request.config
@@ -349,4 +347,4 @@ def _report(request: Request, summary: Summary, messages: _Messages, kept: list[
         request.report, Path(request.bag).name, config, summary, made,
         None if last is None else last.model, scores, counts, bound, '' if fault is None else str(fault),
         modes=() if last is None else last.modes, events=messages.search(summary.status),
-        player=recording.embedded(messages.screen, messages.events, kept), configurations=found)
+        player=embedded(messages.screen, messages.events, kept), configurations=found)

@@ -23,6 +23,7 @@ from flexmanip_ros.identification.parameter_varying import (
     signals_of,
     updated,
 )
+from flexmanip_ros.identification.prediction_check import DAMPED
 from flexmanip_ros.identification.realization import known_output_basis, slowest, to_continuous, transform
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Rows
@@ -39,8 +40,6 @@ WINDOW = 1024
 GROWTH = (256, 512, 640, 768, WINDOW)
 """Samples of the stretches that lead there, each started from the one before."""
 ITERATIONS = 8
-LIGHTLY = 0.3
-"""Largest damping ratio of a mode that the fit may begin with."""
 LATE = 16.0
 """Times the noise by which the first stretches may miss, as their start may be far off."""
 ZETA = 0.8
@@ -56,7 +55,7 @@ def from_model(model: StateSpace, role: Roles) -> tuple[Array, Array, Array] | N
     """
     h = len(role.displacements)
     if model.order > 2 * h:
-        slow = slowest(model, h, LIGHTLY)
+        slow = slowest(model, h, DAMPED)  # the fit may begin with modes below this damping ratio alone
         if slow is None:
             return None
         model = slow
@@ -72,7 +71,7 @@ def from_model(model: StateSpace, role: Roles) -> tuple[Array, Array, Array] | N
     G, D, H = -A[h:, :h], -A[h:, h:], B[h:]
     values = np.linalg.eigvals(np.block([[np.zeros((h, h)), np.eye(h)], [-G, -D]]))
     swings = values[values.imag > 0.0]
-    if len(swings) != h or not np.all(np.abs(swings.real) < LIGHTLY * swings.imag):
+    if len(swings) != h or not np.all(np.abs(swings.real) < DAMPED * swings.imag):
         return None
     return G, D, H
 

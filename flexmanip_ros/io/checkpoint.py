@@ -14,18 +14,22 @@ import importlib
 import io
 import json
 import os
+import threading
+import time
 import zipfile
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import flexmanip_ros
+from flexmanip_ros import pipeline
 from flexmanip_ros.errors import CheckpointError
+from flexmanip_ros.parameters import IdentifierParameters, flatten, leaves
 
-NAME, FORMAT = b'flexmanip_ros checkpoint ', b'3\n'
-"""Format 1 held queues of samples where format 2 holds the sample log."""
+NAME, FORMAT = b'flexmanip_ros checkpoint ', b'4\n'
+"""The format changes with the place of a class that a state holds."""
 CHECKSUM = hashlib.sha256().digest_size
 PACKAGE = 'flexmanip_ros.'
 _NUMBERS = 'biuf'
@@ -156,3 +160,76 @@ def _class(name: str, base: type | None) -> Any:
     if not isinstance(found, type) or not fits or found.__module__ != module:
         raise ValueError(f"'{name}' is no value")
     return found
+
+
+class Saved(NamedTuple):
+    """What a checkpoint of the identifier holds."""
+
+    config: IdentifierParameters
+    state: pipeline.State
+
+
+class CheckpointWriter:
+    """Writes the identifier's state to ``checkpoint_file`` every ``checkpoint_period``, on a thread.
+
+    A state never changes after it was made, so the thread can write it while samples go on.
+    """
+
+    def __init__(self, config: IdentifierParameters) -> None:
+        self._path = config.checkpoint_file
+        self._period_s = config.checkpoint_period
+        self._next_s = time.monotonic() + self._period_s
+        self._thread: threading.Thread | None = None
+        self.saves = 0
+        self.problem = ''
+        """Why the last save failed; empty when it did not."""
+
+    def load(self, config: IdentifierParameters) -> pipeline.State | None:
+        """Return the saved state, None when there is no file.
+
+        Raises CheckpointError for a file that cannot be read or was written with other parameters.
+        """
+        found = load(self._path)
+        if found is None:
+            return None
+        if not isinstance(found, Saved):
+            raise CheckpointError(f"checkpoint '{self._path}' holds no state of the identifier", _EMPTY_START)
+        for name in changed(found.config, config):
+            raise CheckpointError(
+                f"parameter '{name}' has another value than when checkpoint '{self._path}' was written", _EMPTY_START)
+        return pipeline.reconfigure(config, found.state)
+
+    def save_when_due(self, config: IdentifierParameters, state: pipeline.State) -> None:
+        """Save on a thread if ``checkpoint_period`` has passed and no save is under way."""
+        if time.monotonic() < self._next_s or (self._thread is not None and self._thread.is_alive()):
+            return
+        self._next_s = time.monotonic() + self._period_s
+        self._thread = threading.Thread(target=self.save, args=(config, state), name='checkpoint')
+        self._thread.start()
+
+    def save(self, config: IdentifierParameters, state: pipeline.State) -> None:
+        """Save now; a failure is kept in ``problem`` for the diagnostics."""
+        try:
+            save(self._path, Saved(config, state))
+        except CheckpointError as error:
+            self.problem = str(error)
+        else:
+            self.saves += 1
+            self.problem = ''
+
+    def join(self) -> None:
+        """Wait for a save that is under way."""
+        if self._thread is not None:
+            self._thread.join()
+
+
+def changed(before: IdentifierParameters, now: IdentifierParameters) -> list[str]:
+    """Return the names of the parameters that differ and on which the state depends."""
+    free = {leaf.name for leaf in leaves(IdentifierParameters) if leaf.live or leaf.name.startswith('checkpoint_')}
+    old, new = flatten(before), flatten(now)
+    return [name for name in new if name not in free and old.get(name) != new[name]]
+
+
+def too_old(config: IdentifierParameters, state: pipeline.State, stamp_ns: int) -> bool:
+    """Whether a sample is further than ``checkpoint_max_age`` from the last sample of a saved state."""
+    return state.payload is not None and abs(stamp_ns - state.payload.last_ns) > config.checkpoint_max_age * 1e9

@@ -1,6 +1,6 @@
 """Figures of a run: first the parts that all figures share, then the figures of one run.
 
-Every axis has its unit, and every event is marked. The colours are those of ``view/looks.py``. matplotlib is imported
+Every axis has its unit, and every event is marked. The colours are those of ``view/screen.py``. matplotlib is imported
 only here and in other modules that draw.
 """
 
@@ -21,11 +21,9 @@ from matplotlib.patches import Patch
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
-from flexmanip_ros.studies.configurations import Sweep
-from flexmanip_ros.studies.holdout import Scores
-from flexmanip_ros.studies.smoothing import Smoothed
+from flexmanip_ros.studies.whole_recording import Scores, Smoothed, Sweep
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointRecord, Status
-from flexmanip_ros.view.looks import COLOURS, EVENT_COLOUR, MODES_APART, PAYLOAD_COLOUR, STATUS_LOOKS
+from flexmanip_ros.view.screen import COLOURS, EVENT_COLOUR, MODES_APART, PAYLOAD_COLOUR, STATUS_LOOKS
 
 LINES: tuple[Any, ...] = ('-', (0, (4, 1.2)), (0, (1.2, 1)), (0, (6, 1.2, 1.2, 1.2)))
 """Line styles, so that signals in one plot differ by more than their colour."""

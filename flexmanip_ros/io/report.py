@@ -18,14 +18,11 @@ from flexmanip_ros.io.outputs import write_text
 from flexmanip_ros.parameters import IdentifierParameters, flatten
 from flexmanip_ros.parameters.document import written
 from flexmanip_ros.parameters.field import leaves
-from flexmanip_ros.studies.configurations import Sweep
-from flexmanip_ros.studies.holdout import Scores
-from flexmanip_ros.studies.metrics import Score, score
-from flexmanip_ros.studies.smoothing import Smoothed
-from flexmanip_ros.studies.summary import Summary, status_text
+from flexmanip_ros.studies.results import Score, Summary, score, status_text
 from flexmanip_ros.studies.trial import Row
+from flexmanip_ros.studies.whole_recording import Scores, Smoothed, Sweep
 from flexmanip_ros.types import Array, Mode, StateSpace, Status
-from flexmanip_ros.view import looks
+from flexmanip_ros.view import screen
 
 STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;color:#1a1a1a;max-width:1100px;margin:2rem auto;padding:0 1rem}
@@ -279,8 +276,8 @@ def errors(rows: Sequence[Row]) -> Figure | None:
     relative = [100.0 * (part - true) / true for part in (mass, low, high)]
     covered = np.array([bool(row['covered']) for row in good])
     drawn, axes = plots.figure([3.4], share_time=False)
-    for chosen, colour, mark, label in ((covered, looks.PAYLOAD_COLOUR, 'o', 'truth inside\nthe 95 % interval'),
-                                        (~covered, looks.EVENT_COLOUR, 'x', 'truth outside')):
+    for chosen, colour, mark, label in ((covered, screen.PAYLOAD_COLOUR, 'o', 'truth inside\nthe 95 % interval'),
+                                        (~covered, screen.EVENT_COLOUR, 'x', 'truth outside')):
         if chosen.any():
             axes[0].vlines(true[chosen], relative[1][chosen], relative[2][chosen], color=colour, alpha=0.5)
             axes[0].plot(true[chosen], relative[0][chosen], mark, markersize=4, color=colour, label=label)

@@ -22,14 +22,14 @@ from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, config
 from flexmanip_ros.simulation import excitation
 from flexmanip_ros.simulation.simulator import Trajectory
 from flexmanip_ros.types import Array, EventKind, StateSpace
-from flexmanip_ros.view import looks
+from flexmanip_ros.view import screen
 
 Tracks = Mapping[str, Sequence[Track]]
 """Method -> one track a run."""
 LOOKS: Mapping[str, tuple[str, str]] = {
     'paper': ('#0072B2', 'o'), 'restart': ('#D55E00', 's'), 'known M_b': ('#E69F00', '^'),
     'rigid RLS': ('#CC79A7', 'v'), 'algebraic': ('#7F7F7F', 'D'), 'algebraic, 1 link': ('#56B4E9', 'P'),
-    'structured': (looks.PAYLOAD_COLOUR, 'X')}
+    'structured': (screen.PAYLOAD_COLOUR, 'X')}
 """Colour and marker of each method."""
 SHARE = 0.95
 """Share of the runs that a band contains."""
@@ -137,7 +137,7 @@ def arms(cases: Sequence[experiments.Case], arm: ArmParameters) -> Figure:
         y = np.concatenate([[0.0], np.cumsum(arm.link_length * np.sin(theta))])
         ax.plot(x, y, color='#444444', linewidth=3.0, solid_capstyle='round')
         for k, (marker, label) in enumerate((('s', 'joint 1'), ('o', 'joint 2'), ('*', 'payload'))):
-            ax.plot(x[k], y[k], marker, markersize=10, color=looks.COLOURS[k], label=label)
+            ax.plot(x[k], y[k], marker, markersize=10, color=screen.COLOURS[k], label=label)
         ax.set_xlim(-0.1 * reach, reach)
         ax.set_ylim(-0.55 * reach, 0.55 * reach)
         ax.set_aspect('equal')

@@ -19,7 +19,7 @@ from flexmanip_ros.paper import case_run, experiments, figures
 from flexmanip_ros.parameters import leaves
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.studies import trial
-from flexmanip_ros.studies.metrics import coverage
+from flexmanip_ros.studies.results import coverage
 from flexmanip_ros.types import Array, CaptureEvent, EventKind
 
 Bounds = Mapping[tuple[str, str], float]

@@ -1,16 +1,16 @@
 """Every parameter of the package: the only place of defaults, units, ranges and words."""
 
-from flexmanip_ros.parameters.arm import ArmParameters
-from flexmanip_ros.parameters.field import Leaf, check, configure, flatten, leaves
-from flexmanip_ros.parameters.identifier import IdentifierParameters, PayloadParameters
-from flexmanip_ros.parameters.nodes import AdapterParameters, ControllerParameters, TriggerParameters, ViewParameters
-from flexmanip_ros.parameters.simulation import (
+from flexmanip_ros.parameters.arm import (
     ActuatorParameters,
+    ArmParameters,
     DemoParameters,
     ExcitationParameters,
     PlantParameters,
     SensorParameters,
 )
+from flexmanip_ros.parameters.field import Leaf, check, configure, flatten, leaves
+from flexmanip_ros.parameters.identifier import IdentifierParameters, PayloadParameters
+from flexmanip_ros.parameters.nodes import AdapterParameters, ControllerParameters, TriggerParameters, ViewParameters
 
 __all__ = [
     'ActuatorParameters', 'AdapterParameters', 'ArmParameters', 'ControllerParameters', 'DemoParameters',

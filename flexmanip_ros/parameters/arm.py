@@ -1,8 +1,10 @@
-"""The arm: what a user measures or looks up before anything is identified."""
+"""The arm, what a user measures or looks up, and what is simulated: sensors and drives, torques, the demonstration."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
+from typing import Any
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.field import check_all, fit_links, parameter
@@ -85,3 +87,183 @@ class ArmParameters:
         if self.base_mass and any(self.gravity):
             raise ParameterError("parameters 'base_mass' and 'gravity' are both set",
                                  'a base that floats falls freely: leave gravity out')
+
+
+REFERENCE_ANGLES = (math.pi / 3, math.pi / 4)
+"""Chord angles of the paper's reference configuration [rad]: 60 and 45 degrees."""
+
+
+@dataclass(frozen=True)
+class SensorParameters:
+    """Errors of the measurement beside noise; all are off by default."""
+
+    encoder_resolution: float = parameter(
+        0.0, 'joint angles are rounded to multiples of this; 0: no rounding', unit='rad', low=0.0, high=1.0)
+    bend_resolution: float = parameter(
+        0.0, 'deflections are rounded to multiples of this; 0: no rounding', unit='m', low=0.0, high=1.0)
+    bias: tuple[float, ...] = parameter(
+        (0.0,) * 8, 'constant error of the angles, then bends, then of their rates', unit='rad, m, rad/s, m/s', size=8,
+        per_link=True)
+    strain_cutoff: float = parameter(
+        0.0, "corner frequency of the strain gauges' first-order low-pass, on deflections and their rates; 0: none",
+        unit='Hz', low=0.0, high=1e6)
+    stamp_jitter: float = parameter(
+        0.0, 'standard deviation of a stamp around its true instant (limited to three deviations)', unit='s',
+        low=0.0, high=1.0)
+    drop_probability: float = parameter(0.0, 'share of the samples that never arrive', low=0.0, high=0.99)
+
+    def __post_init__(self) -> None:
+        check_all(self)
+
+
+@dataclass(frozen=True)
+class ActuatorParameters:
+    """Limits of the drives; all are off by default."""
+
+    torque_limit: tuple[float, ...] = parameter(
+        (0.0, 0.0), 'largest torque of each joint; 0: no limit', unit='N m', low=0.0, size=2, per_link=True)
+    command_delay: int = parameter(
+        0, 'number of samples between a command and its torque', unit='samples', low=0, high=100)
+
+    def __post_init__(self) -> None:
+        check_all(self)
+
+
+@dataclass(frozen=True)
+class PlantParameters:
+    """The simulated arm (node ``plant_simulator``, program ``simulate_bag``): start, object, measurement."""
+
+    rate: float = parameter(1000.0, 'samples a second', unit='Hz', low=1.0, high=100000.0)
+    initial_angles: tuple[float, ...] = parameter(
+        REFERENCE_ANGLES, 'chord angles theta at the start', unit='rad', size=2, per_link=True)
+    model: str = parameter(
+        'nonlinear', 'nonlinear: assumed modes; linear: the same, linearized at the initial angles, without shortening '
+        '(the paper); finite_element: Hermite beams at the initial angles',
+        choices=('nonlinear', 'linear', 'finite_element'))
+    elements: int = parameter(10, 'number of finite elements of each link (model finite_element)', low=2, high=60)
+    locked: bool = parameter(False, 'hold both joints at their initial angles (encoder angles, or chords)')
+    substeps: int = parameter(
+        0, 'number of integration steps in a sample; 0: as many as the fastest mode needs', low=0, high=1000)
+    payload_mass: float = parameter(
+        20.0, 'mass of the object that a capture event attaches', unit='kg', low=0.0, live=True)
+    payload_inertia: float = parameter(
+        0.0, "rotary inertia of the object about its centre of mass", unit='kg m^2', low=0.0, live=True)
+    payload_com: tuple[float, ...] = parameter(
+        (0.0, 0.0), "centre of mass of the object seen from the tip: along the tip tangent, and to its left",
+        unit='m', size=2, live=True)
+    object_velocity: tuple[float, ...] = parameter(
+        (0.0, 0.0), 'velocity x, y of the object before the capture', unit='m/s', size=2, live=True)
+    object_spin: float = parameter(0.0, 'angular rate of the object before the capture', unit='rad/s', live=True)
+    capture_impact: str = parameter(
+        'momentum', 'momentum: momentum is conserved and rates jump; continuous: rates stay as they were (the paper)',
+        choices=('momentum', 'continuous'))
+    gripper_ramp: float = parameter(
+        0.0, 'time in which a soft gripper takes the object; 0: at once', unit='s', low=0.0, high=60.0)
+    noise: str = parameter(
+        'snr', 'measurement noise: none; snr, from snr_db; std, from noise_std', choices=('none', 'snr', 'std'))
+    snr_db: float = parameter(40.0, 'signal-to-noise ratio of every output', unit='dB', low=-20.0, high=200.0)
+    rehearsal_torque: tuple[float, ...] = parameter(
+        (10.0, 5.0), "peak torque of the paper's square waves, simulated before a live run to learn the signal levels "
+        'that snr_db refers to (noise snr)', unit='N m', low=0.0, size=2, per_link=True)
+    noise_std: tuple[float, ...] = parameter(
+        (1e-5, 1e-5, 1e-5, 1e-5, 1e-3, 1e-3, 1e-3, 1e-3),
+        'standard deviation of the angles, then bends, then of their rates (noise std)', unit='rad, m, rad/s, m/s',
+        low=0.0, size=8, per_link=True)
+    seed: int = parameter(1, 'seed of the noise', low=0)
+    sensors: SensorParameters = field(default_factory=SensorParameters)
+    actuators: ActuatorParameters = field(default_factory=ActuatorParameters)
+    arm: ArmParameters = field(default_factory=ArmParameters)
+
+    def __post_init__(self) -> None:
+        check_all(self)
+        for group in (self, self.sensors, self.actuators):
+            fit_links(group, len(self.arm.link_length))
+        if self.sensors.stamp_jitter * self.rate > 0.15:  # three deviations stay below half an interval
+            raise ParameterError(
+                f"parameter 'sensors.stamp_jitter' is {self.sensors.stamp_jitter} s, so that stamps change places",
+                f'stay below {0.15 / self.rate:g} s at {self.rate:g} Hz')
+
+
+@dataclass(frozen=True)
+class ExcitationParameters:
+    """The torque source (node ``excitation``): shape, amplitude and offset of each joint's torque."""
+
+    rate: float = parameter(1000.0, 'commands a second', unit='Hz', low=1.0, high=100000.0)
+    clock: str = parameter(
+        'wall', 'wall: the torque follows the time since activation; joint_states: it follows the stamps since the '
+        'first joint state, and so stays in step with a simulated arm that lags on a busy machine',
+        choices=('wall', 'joint_states'))
+    shape: str = parameter(
+        'square', 'form of the torque over time', choices=('square', 'multisine', 'prbs', 'chirp', 'zero'))
+    amplitude: tuple[float, ...] = parameter(
+        (10.0, 5.0), 'peak torque of each joint', unit='N m', low=0.0, size=2, per_link=True, live=True)
+    offset: tuple[float, ...] = parameter(
+        (0.0, 0.0), 'constant torque added to each joint', unit='N m', size=2, per_link=True, live=True)
+    period: tuple[float, ...] = parameter(
+        (1.0, 0.5), 'period of each square wave', unit='s', low=1e-3, size=2, per_link=True)
+    band: tuple[float, ...] = parameter(
+        (0.5, 15.0), 'lowest and highest frequency of multisine and chirp', unit='Hz', low=1e-3, size=2)
+    repeat_time: float = parameter(
+        4.0, 'period after which multisine, PRBS and chirp repeat', unit='s', low=0.01, high=600.0)
+    bit_time: float = parameter(0.05, 'shortest pulse of the PRBS', unit='s', low=1e-4, high=60.0)
+    seed: int = parameter(1, 'seed of the multisine phases and of the PRBS', low=0)
+    allowed_angle: float = parameter(
+        0.0, 'both amplitudes are scaled by one factor so that the chords of the empty arm turn exactly this far '
+        'within design_time; 0: no scaling', unit='rad', low=0.0, high=3.0)
+    design_time: float = parameter(
+        6.0, 'length of the run for which allowed_angle and the expected payload accuracy hold', unit='s',
+        low=0.1, high=60.0)
+    initial_angles: tuple[float, ...] = parameter(
+        REFERENCE_ANGLES, 'chord angles at which the torque is designed', unit='rad', size=2, per_link=True)
+    payload_mass: float = parameter(20.0, 'payload for which the expected accuracy is computed', unit='kg', low=0.0)
+    snr_db: float = parameter(
+        40.0, 'signal-to-noise ratio for which the expected accuracy is computed', unit='dB', low=-20.0, high=200.0)
+    arm: ArmParameters = field(default_factory=ArmParameters)
+
+    def __post_init__(self) -> None:
+        check_all(self)
+        fit_links(self, len(self.arm.link_length))
+        low, high = self.band
+        if not low < high:
+            raise ParameterError(f"parameter 'band' is {low} to {high} Hz", 'give the lower frequency first')
+        if self.shape in ('multisine', 'chirp') and high > self.rate / 2:
+            raise ParameterError(
+                f"parameter 'band' reaches {high} Hz", f'stay below half the rate ({self.rate / 2} Hz)')
+        if self.shape == 'multisine' and int(high * self.repeat_time) < math.ceil(low * self.repeat_time):
+            raise ParameterError(
+                f"parameter 'band' holds no harmonic of 1 / repeat_time ({1 / self.repeat_time:g} Hz)",
+                'widen the band or lengthen repeat_time')
+
+
+@dataclass(frozen=True)
+class DemoParameters:
+    """The demonstration (program ``demo``): how long it runs, how fast, what is caught and when."""
+
+    duration: float = parameter(6.0, 'length of the run', unit='s', low=0.5, high=3600.0)
+    rate: float = parameter(1000.0, 'samples a second', unit='Hz', low=100.0, high=10000.0)
+    payload_mass: float = parameter(20.0, 'mass of the object', unit='kg', low=0.0, high=1000.0)
+    capture_time: float = parameter(
+        3.0, 'time of the capture after the first sample; negative: no capture', unit='s', low=-1.0)
+    release_time: float = parameter(
+        -1.0, 'time of the release after the first sample; negative: no release', unit='s', low=-1.0)
+    snr_db: float = parameter(40.0, 'signal-to-noise ratio of every output', unit='dB', low=-20.0, high=200.0)
+    seed: int = parameter(1, 'seed of the noise', low=0)
+    view: bool = parameter(False, 'show the run live in a browser (node live_view)')
+
+    def __post_init__(self) -> None:
+        check_all(self)
+        for name in ('capture_time', 'release_time'):
+            if getattr(self, name) >= self.duration:
+                raise ParameterError(
+                    f"parameter '{name}' is {getattr(self, name):g} s",
+                    f'it must come before the end of the run ({self.duration:g} s)')
+
+
+def settings(config: DemoParameters) -> dict[str, dict[str, Any]]:
+    """Return the parameters of each node of the demonstration that differ from their defaults."""
+    return {
+        'plant_simulator': {'rate': config.rate, 'payload_mass': config.payload_mass, 'snr_db': config.snr_db,
+                            'seed': config.seed},
+        'excitation': {'rate': config.rate, 'clock': 'joint_states'},
+        'capture_trigger': {'mode': 'time', 'capture_time': config.capture_time, 'release_time': config.release_time},
+    }

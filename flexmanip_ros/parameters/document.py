@@ -9,10 +9,10 @@ from typing import Any
 
 import yaml
 
+from flexmanip_ros.parameters.arm import ExcitationParameters, PlantParameters
 from flexmanip_ros.parameters.field import LINKS, Leaf, leaves
 from flexmanip_ros.parameters.identifier import IdentifierParameters
 from flexmanip_ros.parameters.nodes import AdapterParameters, ControllerParameters, TriggerParameters, ViewParameters
-from flexmanip_ros.parameters.simulation import ExcitationParameters, PlantParameters
 
 NODES: Mapping[str, type] = {
     'plant_simulator': PlantParameters,

@@ -38,12 +38,12 @@ from flexmanip_ros.io import bag
 from flexmanip_ros.io.plots import Truth, collect, overview_figure
 from flexmanip_ros.messages import Inertia, LabelledArray, Value
 from flexmanip_ros.parameters import DemoParameters, PlantParameters, configure, flatten, leaves
+from flexmanip_ros.parameters.arm import settings
 from flexmanip_ros.parameters.document import NODES, written, yaml_text
-from flexmanip_ros.parameters.simulation import settings
 from flexmanip_ros.ros import rclpy_workarounds
 from flexmanip_ros.ros.composition import Composition, foreign_arm
 from flexmanip_ros.ros.node import BAD_INPUT
-from flexmanip_ros.studies.summary import status_text
+from flexmanip_ros.studies.results import status_text
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, Status
 
 START_TIMEOUT_S = 20.0

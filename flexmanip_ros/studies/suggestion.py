@@ -15,8 +15,9 @@ import numpy as np
 from flexmanip_ros.identification import recursive_fit, rpbsid
 from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.samples.sample_log import Signals, log_of
-from flexmanip_ros.studies import holdout, shape_search
+from flexmanip_ros.studies import shape_search
 from flexmanip_ros.studies.shape_search import PRIOR, Progress, Search, Shape
+from flexmanip_ros.studies.whole_recording import HORIZON_S
 
 PLAIN = 1.03
 """A departure from the plain settings is taken where it divides the error by this at least."""
@@ -41,7 +42,7 @@ class Suggestion:
     reasons: tuple[tuple[str, str], ...]
 
 
-def suggest(given: Mapping[str, Any], signals: Signals, dt: float, *, horizon_s: float = holdout.HORIZON_S,
+def suggest(given: Mapping[str, Any], signals: Signals, dt: float, *, horizon_s: float = HORIZON_S,
             progress: Progress | None = None) -> Suggestion:
     """Choose the parameters for a recording of one machine that does not change meanwhile.
 

@@ -18,9 +18,8 @@ from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import IdentifierParameters, PlantParameters
 from flexmanip_ros.samples.sampling import collect
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.studies.metrics import payload_bound, relative_error_percent
+from flexmanip_ros.studies.results import payload_bound, relative_error_percent, summarize
 from flexmanip_ros.studies.scenario import Faults, Run, Scenario
-from flexmanip_ros.studies.summary import summarize
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord
 
 Message = JointRecord | CaptureEvent

@@ -12,16 +12,30 @@ import base64
 import json
 import math
 from collections import deque
+from collections.abc import Iterable
 from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from flexmanip_ros import messages
 from flexmanip_ros.messages import Diagnostics, DiagnosticStatus
 from flexmanip_ros.parameters import IdentifierParameters, ViewParameters
 from flexmanip_ros.parameters.nodes import WINDOWS
-from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointBlock, Status
-from flexmanip_ros.view.looks import COLOURS, EVENT_COLOUR, MODES_APART, PAYLOAD_COLOUR, STATUS_LOOKS
+from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, Status
+
+COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#7F7F7F', '#000000')
+"""Of lines, on this page and in figures: those of Okabe and Ito, which people with any colour vision can tell apart."""
+PAYLOAD_COLOUR = '#009E73'
+EVENT_COLOUR = '#AA0000'
+STATUS_LOOKS: dict[Status, tuple[str, str]] = {
+    Status.WARMING_UP: ('#C8C8C8', '..'), Status.TRACKING: ('#009E73', ''), Status.POORLY_EXCITED: ('#E69F00', '//'),
+    Status.ILL_CONDITIONED: ('#CC79A7', 'xx'), Status.INCONSISTENT: ('#D55E00', '\\\\'),
+    Status.UNOBSERVABLE: ('#7F7F7F', '++'), Status.DIVERGED: ('#000000', 'OO'), Status.ORDER_TOO_LOW: ('#F0E442', '**'),
+}
+"""Colour and hatch of each status, so that they differ by more than their colour."""
+MODES_APART = 4.0
+"""Ratio to the lowest frequency above which a mode does not set the range of a plot [-]."""
 
 LOOPED_NS = 1_000_000_000
 """Stamps that go back further than this are a new run, and the page begins again."""
@@ -40,6 +54,8 @@ PAYLOAD_NUMBERS = ('mass_kg', 'std_kg', 'lower95_kg', 'upper95_kg', 'consistency
 STATUSES = {status.name: index for index, status in enumerate(Status)}
 SPACE_FOR = '"insert the layout here"', '"insert the recording here"'
 """Where the page takes its data."""
+EMBEDDED_ROWS = 40_000
+"""Samples inside a report, which is to stay below some megabytes."""
 
 
 class Source(NamedTuple):
@@ -198,6 +214,12 @@ class Screen:
             if row is not None:
                 (self._payloads if status.name == 'payload' else self._models).append((message.stamp_ns, row))
 
+    def estimate(self, estimate: Estimate) -> None:
+        """Take an estimate as the messages that the node would publish."""
+        for name, value in messages.outgoing(estimate, ''):
+            if name == messages.STATUS and isinstance(value, Diagnostics):
+                self.status(value)
+
     def frame(self, most_rows: int | None = None) -> dict[str, Any] | None:
         """Return what came since the frame before; None when that is nothing. most_rows: thin a longer run out."""
         if self.first_ns is None:  # without a first sample there is no time 0
@@ -253,6 +275,15 @@ def page(source: Source, recording: dict[str, Any] | None = None, speed: float =
         # A text that ends the script element would end it inside a string too.
         text = text.replace(place, encoded(value).replace('<', '\\u003c'), 1)
     return text
+
+
+def embedded(screen: Screen, events: Iterable[CaptureEvent], estimates: Iterable[Estimate]) -> str:
+    """Return a page with a recording inside, for a report. screen: it has the joint states already."""
+    for event in events:
+        screen.event(event)
+    for estimate in estimates:
+        screen.estimate(estimate)
+    return page(screen.source, screen.frame(EMBEDDED_ROWS) or {}, playing=False)
 
 
 def encoded(value: Any) -> str:

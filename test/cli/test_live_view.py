@@ -25,7 +25,6 @@ from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, JointRecord
-from flexmanip_ros.view import recording as playable
 from flexmanip_ros.view.screen import of_identifier
 
 START = 1_700_000_000_000_000_000
@@ -108,11 +107,11 @@ def test_of_a_damaged_recording_everything_before_the_damage_is_shown(recording:
             yield item
 
     config = IdentifierParameters()
-    frame, fault = playable.read(config, damaged(), of_identifier(config, 'damaged'))
+    frame, fault = live_view.read(config, damaged(), of_identifier(config, 'damaged'))
     assert 'it ends here' in str(fault)
     assert frame['samples']
     with pytest.raises(BagError, match='does not exist'):
-        playable.read(config, bag.read_blocks('nowhere'), of_identifier(config, 'nowhere'))
+        live_view.read(config, bag.read_blocks('nowhere'), of_identifier(config, 'nowhere'))
 
 
 def test_a_browser_plays_it(playing: tuple[subprocess.Popen[str], str], tmp_path: Path) -> None:

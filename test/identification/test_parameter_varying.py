@@ -19,7 +19,7 @@ from flexmanip_ros.identification.varying_kernel import basis
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.studies import configurations
+from flexmanip_ros.studies import whole_recording
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, StateSpace, Status
 
 CAPTURE_S, DURATION_S, SETTLED_S = 3.0, 16.0, 6.0
@@ -121,7 +121,7 @@ def test_the_model_can_be_asked_for_a_configuration_between_those_it_has_seen(ru
 
 def test_frequencies_over_configurations_are_right_where_the_arm_has_been_and_bands_grow_elsewhere(run: Run) -> None:
     plots = pytest.importorskip('flexmanip_ros.io.plots')
-    found = configurations.sweep(run.state, np.diff(run.chords[3000:], axis=1) * [0.0, 1.0])
+    found = whole_recording.sweep(run.state, np.diff(run.chords[3000:], axis=1) * [0.0, 1.0])
     assert found is not None
     truth = np.array([true_frequencies(float(angle)) for angle in found.relative])
     seen = (found.seen[0] <= found.relative) & (found.relative <= found.seen[1])

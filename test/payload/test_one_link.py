@@ -9,7 +9,7 @@ import pytest
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm.linearization import frequencies, vibration_model
-from flexmanip_ros.arm.urdf import urdf
+from flexmanip_ros.cli.write_urdf import urdf
 from flexmanip_ros.control import controller
 from flexmanip_ros.control.handover import PayloadEstimate
 from flexmanip_ros.errors import ParameterError

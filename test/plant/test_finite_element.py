@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 
 from flexmanip_ros.arm import linearization
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
-from flexmanip_ros.simulation import excitation, linear_model, simulator
+from flexmanip_ros.simulation import excitation, models, simulator
 from flexmanip_ros.types import Array, CaptureEvent, EventKind
 
 POINT = np.radians([60.0, 45.0])
@@ -19,7 +19,7 @@ SMALL = 1e-3 * excitation.sequence(ExcitationParameters(), 1500)
 CAPTURE = (CaptureEvent(700_000_000, EventKind.CAPTURE),)
 
 
-def loaded(beam: linear_model.Beam, mass: float, inertia: float) -> Array:
+def loaded(beam: models.Beam, mass: float, inertia: float) -> Array:
     """Mass matrix of a beam with a body at its end."""
     M = beam.M.copy()
     M[-2, -2] += mass
@@ -36,7 +36,7 @@ def test_clamped_links_of_de_luca_and_siciliano(
 ) -> None:
     """De Luca and Siciliano, IEEE Trans. SMC 21 (1991): 0.48 / 1.80 and 2.18 / 15.91 Hz."""
     inertia_exact = 0.1 + 0.2 * 0.5**3 / 3 + 0.1 * 0.5**2 + 0.0005 if mass > 1 else inertia
-    link = linear_model.beam(0.5, 0.2, 1.0, 40)
+    link = models.beam(0.5, 0.2, 1.0, 40)
     M = loaded(link, mass, inertia_exact)[2:, 2:]
     squares = eigh(link.K[2:, 2:], M, eigvals_only=True)
     assert np.sqrt(squares[:2]) / (2 * np.pi) == pytest.approx(published, abs=2e-5)
@@ -45,7 +45,7 @@ def test_clamped_links_of_de_luca_and_siciliano(
 def test_space_arm_whose_root_turns_freely() -> None:
     """DETC2007-35511: 5.28 / 20.9 / 46.7 rad/s."""
     rho, L = 2.82, 3.372
-    link = linear_model.beam(L, rho, 5.974**2 * rho, 40)
+    link = models.beam(L, rho, 5.974**2 * rho, 40)
     M = loaded(link, 5.18 * rho * L, 0.0)
     squares = eigh(link.K[1:, 1:], M[1:, 1:], eigvals_only=True)
     assert np.sqrt(squares[1:4]) == pytest.approx([5.283, 20.842, 46.770], abs=1e-3)
@@ -53,7 +53,7 @@ def test_space_arm_whose_root_turns_freely() -> None:
 
 @pytest.mark.parametrize('payload', [0.0, 20.0, 100.0])
 def test_frequencies_are_those_of_many_assumed_modes(payload: float) -> None:
-    parts = linear_model.chain(CONFIG.arm, tuple(POINT), 12)
+    parts = models.chain(CONFIG.arm, tuple(POINT), 12)
     M = parts.M + payload * parts.tip[:2].T @ parts.tip[:2]
     elements = np.sqrt(eigh(parts.K, M, eigvals_only=True)[2:6]) / (2 * np.pi)
     Ac, _ = linearization.vibration_model(replace(CONFIG.arm, damping_ratio=0.0), POINT, payload, 12)
@@ -62,7 +62,7 @@ def test_frequencies_are_those_of_many_assumed_modes(payload: float) -> None:
 
 def test_assumed_modes_converge_to_the_elements() -> None:
     arm = replace(CONFIG.arm, damping_ratio=0.0)
-    parts = linear_model.chain(arm, tuple(POINT), 40)
+    parts = models.chain(arm, tuple(POINT), 40)
     exact = np.sqrt(eigh(parts.K, parts.M, eigvals_only=True)[2]) / (2 * np.pi)
     errors = [
         linearization.frequencies(linearization.vibration_model(arm, POINT, 0.0, k)[0])[0] / exact - 1
@@ -105,12 +105,12 @@ def test_locked_frequencies_converge_to_clamped_ones() -> None:
     errors = []
     for kappa in (2, 4, 8):
         config = replace(fine, model='linear', arm=ArmParameters(modes=kappa))
-        errors.append(_lowest(linear_model.linear_model(config)) / exact - 1)
+        errors.append(_lowest(models.linear_model(config)) / exact - 1)
     assert np.all(np.diff(np.abs(errors)) < 0)
     assert abs(errors[-1]) < 0.05
 
 
-def _lowest(model: linear_model.LinearModel) -> float:
+def _lowest(model: models.LinearModel) -> float:
     return float(np.sqrt(eigh(model.K, model.M0, eigvals_only=True)[0]))
 
 

@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 from flexmanip_ros.arm import linearization
 from flexmanip_ros.io import parameter_file
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, PlantParameters, configure
-from flexmanip_ros.simulation import linear_model, simulator
+from flexmanip_ros.simulation import models, simulator
 
 FOLDER = Path(__file__).parents[2] / 'config' / 'arms'
 NAMES = ['reference', 'de_luca_siciliano', 'nasa_type', 'quanser']
@@ -52,7 +52,7 @@ def test_de_luca_and_sicilianos_links() -> None:
     J = preset.hub_inertia[1] + rho2 * L**3 / 3 + preset.tip_mass * L**2 + preset.tip_inertia
     carried = (preset.joint_mass + rho2 * L + preset.tip_mass, J), (preset.tip_mass, preset.tip_inertia)
     for (mass, inertia), published in zip(carried, ((0.48, 1.80), (2.18, 15.91)), strict=True):
-        link = linear_model.beam(L, rho, preset.bending_stiffness[0], 20)
+        link = models.beam(L, rho, preset.bending_stiffness[0], 20)
         link.M[-2, -2] += mass
         link.M[-1, -1] += inertia
         squares = eigh(link.K[2:, 2:], link.M[2:, 2:], eigvals_only=True)
@@ -60,7 +60,7 @@ def test_de_luca_and_sicilianos_links() -> None:
 
 
 def test_the_space_arm_with_its_stub() -> None:
-    parts = linear_model.chain(arm('nasa_type'), (0.0, 0.3), 20)
+    parts = models.chain(arm('nasa_type'), (0.0, 0.3), 20)
     poles = np.sqrt(np.abs(eigh(parts.K, parts.M, eigvals_only=True)[:12]))
     for published in (5.283, 20.842, 46.770):
         assert np.min(np.abs(poles - published)) < 5e-3 * published

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flexmanip_ros.arm import manipulator
-from flexmanip_ros.arm.urdf import urdf
 from flexmanip_ros.cli import write_urdf
+from flexmanip_ros.cli.write_urdf import urdf
 from flexmanip_ros.errors import ModelError, ParameterError
 from flexmanip_ros.io.parameter_file import load_arm
 from flexmanip_ros.parameters import ArmParameters

@@ -7,7 +7,7 @@ import pytest
 
 from flexmanip_ros.errors import ModelError, ParameterError
 from flexmanip_ros.samples.sample_log import Signals
-from flexmanip_ros.studies.holdout import score
+from flexmanip_ros.studies.whole_recording import score
 from flexmanip_ros.types import StateSpace
 
 DT = 0.01

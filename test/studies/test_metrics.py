@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from flexmanip_ros.studies.metrics import coverage, relative_error_percent, score
+from flexmanip_ros.studies.results import coverage, relative_error_percent, score
 
 
 def _row(mass: float, true: float = 20.0, *, covered: bool = True, error: str = '') -> dict[str, object]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.studies.summary import ADVICE, Summary, status_text
+from flexmanip_ros.studies.results import ADVICE, Summary, status_text
 from flexmanip_ros.types import Status
 
 

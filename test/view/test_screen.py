@@ -14,7 +14,6 @@ from flexmanip_ros import messages
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import IdentifierParameters, ViewParameters
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, Mode, Payload, Status
-from flexmanip_ros.view.recording import show
 from flexmanip_ros.view.screen import MOST_EVENTS, Screen, Source, encoded, of_identifier, page, thinned
 
 START_NS = 1_700_000_000_000_000_000
@@ -184,7 +183,7 @@ def test_of_another_machine_there_are_signals_and_no_arm() -> None:
 def test_an_estimate_of_a_recording_is_shown_as_the_node_would_publish_it() -> None:
     shown = Screen(of_identifier(IdentifierParameters(), 'bag'))
     shown.joint_states(block(0, 2))
-    show(shown, Estimate(START_NS, Status.TRACKING, None, (), Payload(20.0, 0.1, 19.8, 20.2, 1.0, Status.TRACKING)))
+    shown.estimate(Estimate(START_NS, Status.TRACKING, None, (), Payload(20.0, 0.1, 19.8, 20.2, 1.0, Status.TRACKING)))
     frame = shown.frame()
     assert frame is not None
     assert frame['payloads'] == [[0.0, 1, 20.0, 0.1, 19.8, 20.2, 1.0]]

@@ -156,9 +156,8 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
             self._drop('payload_estimate', f'a payload estimate was dropped: it has {len(message.data)} values, not 5')
             return
         self._estimate = PayloadEstimate(*message.data)  # kept: a latched one may come before activation
-        if self._body is not None and self._estimate.having(self._body) is None:
+        if self._judge(self._estimate) is None:
             self._body = None  # of what was held before
-        self._judge(self._estimate)
 
     def _on_body(self, message: Float64MultiArray) -> None:
         if len(message.data) != 20:
@@ -168,15 +167,15 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         if self._estimate is not None:
             self._judge(self._estimate)
 
-    def _judge(self, estimate: PayloadEstimate) -> None:
-        if self.state is None:
-            return
-        before, body = self.state.verdict, None
-        if self._body is not None:
-            body = estimate.having(self._body)
-        self.state = controller.estimate(self.config, self.state, estimate if body is None else body)
-        if self.state.verdict is not before and self.state.verdict is not None:
-            self.get_logger().info(f'payload {estimate.mass:.2f} kg: {self.state.verdict.value}')
+    def _judge(self, estimate: PayloadEstimate) -> PayloadEstimate | None:
+        """Let the controller judge an estimate; return it with the body that belongs to it, None without one."""
+        body = None if self._body is None else estimate.having(self._body)
+        if self.state is not None:
+            before = self.state.verdict
+            self.state = controller.estimate(self.config, self.state, body or estimate)
+            if self.state.verdict is not before and self.state.verdict is not None:
+                self.get_logger().info(f'payload {estimate.mass:.2f} kg: {self.state.verdict.value}')
+        return body
 
     def _on_added(self, message: Float64MultiArray) -> None:
         if len(message.data) != len(self.config.joints) or not np.isfinite(message.data).all():

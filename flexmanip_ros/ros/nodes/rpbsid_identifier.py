@@ -21,9 +21,11 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import InertiaStamped
 from sensor_msgs.msg import JointState
@@ -33,11 +35,12 @@ from visualization_msgs.msg import MarkerArray
 
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.errors import CheckpointError, FlexmanipError, SignalError
+from flexmanip_ros.identification import batch_fit, recursive_fit
+from flexmanip_ros.io.checkpoint import CheckpointWriter, too_old
 from flexmanip_ros.numerics.background import Threads
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.arm_markers import ArmMarkers
-from flexmanip_ros.ros.background import CheckpointWriter, too_old, warm_up
 from flexmanip_ros.ros.conversions import JointStateReader, capture_event, to_message
 from flexmanip_ros.ros.diagnostics import (
     ERROR,
@@ -65,6 +68,43 @@ TOPICS = {
 ARM = 'arm'
 ARM_RATE = 25.0
 """Pictures of the arm a second [Hz]."""
+
+
+WARM_UP_EVENT = 40
+"""Samples before the event of the warm-up: more than are needed to learn the sample time."""
+WARM_UP_SAMPLES = WARM_UP_EVENT + 3 * batch_fit.BLOCK + 2 * recursive_fit.CHUNK
+"""Samples of the warm-up: until the fits after the event were made and a block has followed."""
+WARM_UP_STEP_NS = 1_000_000
+
+
+def warm_up(config: IdentifierParameters) -> None:
+    """Compile or load every kernel: run the pipeline on made-up samples of the configured signals and an event.
+
+    Raises ParameterError when the configuration cannot work at all, before any message comes.
+    """
+    try:
+        for _ in pipeline.run(config, _made_up(config)):
+            pass
+    except SignalError:  # a configured signal that even these messages, with every field filled, do not carry
+        return
+
+
+def _made_up(config: IdentifierParameters) -> Iterator[JointRecord | CaptureEvent]:
+    """Yield joints that swing at two frequencies, driven by random torques, and a capture."""
+    names = tuple(dict.fromkeys(
+        signal.rpartition('/')[0] for signal in (*config.inputs, *config.outputs, *config.angles)))
+    rng = np.random.default_rng(0)
+    step = np.exp(1j * np.array([0.1, 0.2]) - 0.01)
+    shape = rng.standard_normal((2, len(names)))
+    state = np.zeros(2, dtype=complex)
+    for k in range(WARM_UP_SAMPLES):
+        if k == WARM_UP_EVENT:
+            yield CaptureEvent((k - 1) * WARM_UP_STEP_NS, EventKind.CAPTURE)
+        effort = rng.standard_normal(len(names))
+        noise = 1e-3 * rng.standard_normal((2, len(names)))
+        yield JointRecord(k * WARM_UP_STEP_NS, names, 0.01 * (state.imag @ shape + noise[0]),
+                          state.real @ shape + noise[1], effort)
+        state = step * state + shape @ effort / math.sqrt(len(names))
 
 
 class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):

@@ -1,0 +1,250 @@
+"""What a recording says once all of it is there.
+
+``score``: how well a model predicts the part that it was not identified on. ``smooth``: the best model of each stretch
+between events, from the samples that follow too. ``sweep``: the frequencies over configurations, of a model that holds
+in each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexmanip_ros import pipeline
+from flexmanip_ros.errors import ModelError, ParameterError
+from flexmanip_ros.identification import decimation, model_output, rpbsid, validation
+from flexmanip_ros.identification.batch_fit import fit_stretch
+from flexmanip_ros.identification.uncertainty import Identified, modes
+from flexmanip_ros.identification.varying_model import Configurations
+from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.samples.sample_log import Signals, log_of
+from flexmanip_ros.samples.signals import relative_angle
+from flexmanip_ros.types import Array, Mode, StateSpace, Status
+
+HORIZON_S = 0.25
+"""How far ahead the prediction is scored where nobody says [s]: what a controller of a flexible arm looks ahead."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Variance accounted for (VAF) per output (m,) [%], and the outputs it is of.
+
+    horizon: of the prediction a given time ahead of the last sample used, nan where too few samples are left.
+    time: (N,) [s]; measured, simulated, predicted (one step ahead): (N, m).
+    """
+
+    simulation: Array
+    prediction: Array
+    horizon: Array
+    time: Array
+    measured: Array
+    simulated: Array
+    predicted: Array
+    until_gap: bool
+    """Whether a gap ended the scored stretch before the end of the recording."""
+
+
+def score(model: StateSpace | None, signals: Signals, start_s: float, *, factor: int = 1,
+          horizon_s: float = HORIZON_S) -> Scores:
+    """Score a model that is not adapted further on the samples from ``start_s`` [s] on, up to the first gap.
+
+    The state at the start is estimated on the samples before it, by least squares over a free run of the
+    model and of its predictor; simulation then uses no measured output.
+    factor: decimation of the model, whose signals are then filtered as the identifier filters them; simulation and
+    one-step prediction are scored on these, the prediction ``horizon_s`` [s] ahead on the samples as they were
+    measured, from those that were there by then.
+    Raises ParameterError when nothing is left to score, ModelError when there is no model.
+    """
+    time = signals.time
+    first = int(np.searchsorted(time, start_s))
+    if first < 2 or time.size - first < 2:
+        length = f'{time[-1]:.3f} s' if time.size else 'nothing'
+        raise ParameterError(f'validation from {start_s:g} s leaves no samples to identify on or to score',
+                             f'the recording is {length} long; choose a time well inside it')
+    if model is None:
+        raise ModelError(f'there is no model yet at {start_s:g} s', 'validate from a later time')
+    gaps = np.flatnonzero(signals.gap)
+    before = int(gaps[gaps <= first][-1]) if (gaps <= first).any() else 0
+    after = int(gaps[gaps > first][0]) if (gaps > first).any() else time.size
+    measured = signals.y[before:after]
+    kept, rows = decimation.whole(np.hstack([signals.u[before:after], measured]), factor)
+    if factor > 1:  # the last of the samples that a filtered one is made of decides
+        lag = decimation.LAG
+        split = int(np.searchsorted(rows, first - before - lag * factor))
+    else:
+        lag, split = 0, first - before
+    if len(rows) - split < 2:
+        raise ParameterError(f'validation from {start_s:g} s leaves no samples to score at a decimation of {factor}',
+                             'choose an earlier time')
+    r = signals.u.shape[1]
+    U, Y = kept[:, :r], kept[:, r:]
+    u, y = U[split:], Y[split:]
+    steps = max(1, round(horizon_s / model.dt)) + lag
+    x0 = validation.state_at_end(model, U[:split], Y[:split])
+    with np.errstate(all='ignore'):  # an unstable model overflows and scores 0
+        simulated = validation.simulate(model, u, x0)
+        filtered = validation.state_at_end(_predictor(model), kept[:split], Y[:split])
+        predicted = validation.predict(model, u, y, filtered)
+        ahead = validation.predict_ahead(model, u, y, steps, filtered)
+    target = measured[rows[split + steps - 1:]]
+    horizon = validation.vaf(target, ahead) if len(target) > 1 else np.full(y.shape[1], np.nan)
+    return Scores(
+        validation.vaf(y, simulated), validation.vaf(y, predicted), horizon, time[before:after][rows[split:]], y,
+        simulated, predicted, after < time.size)
+
+
+def _predictor(model: StateSpace) -> StateSpace:
+    """Return the one-step predictor as a system with the inputs [u; y]."""
+    A = model.A - model.K @ model.C
+    B = np.hstack([model.B - model.K @ model.D, model.K])
+    D = np.hstack([model.D, np.zeros((model.C.shape[0], model.C.shape[0]))])
+    return StateSpace(A, B, model.C, D, np.zeros_like(model.K), model.dt)
+
+
+WORK = 2e9
+"""Samples x outputs x squared parameters above which an iteration of the fit takes more than about a second."""
+WHOLE = 0.8
+"""Share of a stretch that its longest part without a gap must hold, for a fit of that part to stand for it."""
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """The model of a stretch of samples, times from the first stamp of the recording [s].
+
+    method: ``maximum likelihood``, ``subspace``, or ``none`` where there is no model.
+    """
+
+    start_s: float
+    end_s: float
+    samples: int
+    method: str
+    status: Status
+    modes: tuple[Mode, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the values by the names that the JSON of identify_bag has."""
+        return {
+            'start_s': self.start_s, 'end_s': self.end_s, 'samples': self.samples, 'method': self.method,
+            'status': self.status.name,
+            'frequencies_hz': tuple(mode.frequency_hz for mode in self.modes),
+            'frequencies_std_hz': tuple(mode.frequency_std_hz for mode in self.modes),
+            'damping_ratios': tuple(mode.damping_ratio for mode in self.modes),
+            'damping_ratios_std': tuple(mode.damping_ratio_std for mode in self.modes)}
+
+
+def smooth(config: IdentifierParameters, signals: Signals, events_ns: Sequence[int], dt: float,
+           until_s: float | None = None) -> tuple[Smoothed, ...]:
+    """Fit each stretch between events with all of its samples.
+
+    events_ns: stamps of the events; dt: sample time [s]; until_s: later samples are left out [s].
+    """
+    count = len(signals.stamp_ns) if until_s is None else int(np.searchsorted(signals.time, until_s))
+    inside = np.searchsorted(signals.stamp_ns[:count], sorted(events_ns)).tolist()
+    borders = list(dict.fromkeys([0, *inside, count]))
+    return tuple(_stretch(config, signals, a, b, dt) for a, b in pairwise(borders))
+
+
+def _stretch(config: IdentifierParameters, signals: Signals, a: int, b: int, dt: float) -> Smoothed:
+    u, y, gap = signals.u[a:b], signals.y[a:b], signals.gap[a:b]
+    noise = 'sensor' if config.refinement == 'output_error' else 'any'
+    config = replace(config, estimator='factor', forgetting='innovation', forgetting_factor=(1.0,) * 3,
+                     refinement='none', state_basis='fixed' if config.state_basis == 'fixed' else 'singular')
+    log = log_of(u, y, stamp_ns=signals.stamp_ns[a:b], gap=gap)
+    found, method = None, 'none'
+    try:
+        state = rpbsid.advance(config, rpbsid.init(config), log.rows(0, b - a))
+        found = _fit(config, state, _longest(config, u, y, gap), noise, b - a, dt)
+        method = 'maximum likelihood'
+        if found is None:
+            found, method = rpbsid.identified(config, state, dt), 'subspace'
+    except np.linalg.LinAlgError:
+        found = None
+    start_s, end_s = float(signals.time[a]), float(signals.time[b - 1])
+    if found is None:
+        return Smoothed(start_s, end_s, b - a, 'none', Status.WARMING_UP, ())
+    return Smoothed(start_s, end_s, b - a, method, found.status, modes(found))
+
+
+def _longest(config: IdentifierParameters, u: Array, y: Array, gap: NDArray[np.bool_]) -> Array:
+    """Return inputs and outputs (N, r + m) of the longest part without a gap, as the identifier sees them."""
+    borders = [0, *(k for k in np.flatnonzero(gap).tolist() if k), len(u)]
+    a, b = max(pairwise(borders), key=lambda part: part[1] - part[0])
+    return decimation.whole(np.hstack([u[a:b], y[a:b]]), config.decimation)[0]
+
+
+def _fit(config: IdentifierParameters, state: rpbsid.RpbsidState, samples: Array, noise: str, count: int, dt: float
+         ) -> Identified | None:
+    """Return the maximum-likelihood fit; None where it would take too long, or no model simulates the stretch."""
+    n, r, m = config.order, len(config.inputs), len(config.outputs)
+    size = n * (n + r + 2 * m + 1) + m * r
+    if len(samples) * config.decimation < WHOLE * count or not 2 * size < len(samples) < WORK / (m * size ** 2):
+        return None
+    starts = [model_output.from_factor(config, state.memory[0], state.scale)]
+    if n > m and config.past_window > config.future_window:
+        longer = replace(config, future_window=config.past_window)
+        starts.append(model_output.from_factor(longer, state.memory[0], state.scale))
+    fit = fit_stretch(samples, [realized for realized, _, _ in starts if realized is not None], [], starts[0][2],
+                      config.direct_feedthrough, noise)
+    if fit is None:
+        return None
+    d = state.memory[4].shape[1]
+    return model_output.from_fit(config, fit, state.scalars, model_output.excitation(state.memory[0][:d, :d]),
+                                 dt * config.decimation)
+
+
+STEP_DEG = 2.5
+"""Between two configurations [degrees]."""
+
+
+class Sweep(NamedTuple):
+    """Modes at each angle between the links, NaN where one is not there. They are the same to either side.
+
+    relative: (N,) [rad]; frequency, std: (N, k) [Hz]; damping: (N, k); seen: (2,) smallest and largest angle between
+    the links since the last event [rad].
+    """
+
+    relative: Array
+    frequency: Array
+    std: Array
+    damping: Array
+    seen: Array
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return one row a configuration, as a table has them."""
+        found = []
+        for k, angle in enumerate(self.relative):
+            row: dict[str, Any] = {'relative_angle_deg': float(np.degrees(angle)),
+                                   'seen': int(self.seen[0] <= angle <= self.seen[1])}
+            for i in range(self.frequency.shape[1]):
+                for name, table in ((f'frequency{i + 1}_hz', self.frequency), (f'frequency{i + 1}_std_hz', self.std),
+                                    (f'damping{i + 1}_ratio', self.damping)):
+                    row[name] = float(table[k, i]) if np.isfinite(table[k, i]) else None
+            found.append(row)
+        return found
+
+
+def sweep(state: pipeline.State, angles: Array) -> Sweep | None:
+    """Ask the model for every angle between the links; None where it holds at one configuration only.
+
+    state: at the end of a recording; angles: (N, 2) measured ones since the last event [rad].
+    """
+    config, identifier = state.config, state.identifier
+    if config is None or identifier is None or not len(angles):
+        return None
+    last = rpbsid.finish(config, identifier.estimator.rpbsid)
+    found = rpbsid.identified(config, last, state.clock.dt)
+    if found is None or not isinstance(found.configurations, Configurations):
+        return None
+    relative = np.radians(np.arange(0.0, 180.0 + STEP_DEG, STEP_DEG))
+    count = config.order // 2
+    table = np.full((len(relative), count, 3), np.nan)
+    for k, angle in enumerate(relative):
+        for i, mode in enumerate(modes(found.configurations.with_relative(float(angle)))[:count]):
+            table[k, i] = mode.frequency_hz, mode.frequency_std_hz, mode.damping_ratio
+    seen = np.arccos(np.cos(relative_angle(config, angles)))
+    return Sweep(relative, table[:, :, 0], table[:, :, 1], table[:, :, 2], np.array([seen.min(), seen.max()]))
