@@ -119,41 +119,13 @@ def _main(given: argparse.Namespace) -> int:
 
 def describe(result: Result) -> list[str]:
     """Return the result as lines for people."""
-    from flexmanip_ros.studies.results import status_text
-    from flexmanip_ros.types import Status
+    from flexmanip_ros.studies.results import result_rows
 
-    summary = result.summary
-    lines = [f'samples      {summary.samples}, {summary.gaps} gaps, '
-             f'sample time {_text(summary.sample_time_s)} s, identified in {summary.wall_s:.2f} s']
-    if result.events:
-        lines.append(f'events       {result.events}')
-    lines += [f'{name:12s} at {time:.3f} s' for name, time in (
-        ('capture', summary.capture_time_s), ('release', summary.release_time_s)) if time is not None]
-    lines.append(f'status       {summary.status}: {status_text(Status[summary.status], result.config)}')
-    if summary.model_status not in (summary.status, Status.TRACKING.name):
-        lines.append(f'model        {summary.model_status}: {status_text(Status[summary.model_status])}')
-    for k, mode in enumerate(result.modes):
-        spread = f' +- {1.96 * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else ''
-        lines.append(f'mode {k + 1}       {mode.frequency_hz:.4f}{spread} Hz, damping ratio {mode.damping_ratio:.4f}')
-    if summary.payload_ci95_kg is not None:
-        lines.append(f'payload      {summary.payload_text()}')
-        if summary.consistency is not None and summary.payload_std_kg is not None:
-            lines.append(f'residuals    power {summary.consistency:.6g} times that of the noise (1: noise only)')
-    for words, values in (('simulation', summary.vaf_simulation_percent),
-                          ('prediction', summary.vaf_prediction_percent),
-                          ('ahead', summary.vaf_horizon_percent)):
-        if values is not None:
-            shares = [f'{name} {_text(value)} %' for name, value in zip(result.config.outputs, values, strict=True)]
-            lines.append(f'VAF {words:8s} {", ".join(shares)}')
-    for part in summary.smoothed or ():
+    rows = result_rows(result.summary, result.config, result.modes, result.events)
+    for part in result.summary.smoothed or ():
         told = ', '.join(f'{mode.frequency_hz:.4f} +- {1.96 * mode.frequency_std_hz:.2g} Hz' for mode in part.modes)
-        lines.append(f'smoothed     {part.start_s:.3f} to {part.end_s:.3f} s, {part.method}: {told or "no mode"}')
-    lines += [f'written      {place}' for place in result.written]
-    return lines
-
-
-def _text(value: float | None) -> str:
-    return 'unknown' if value is None else f'{value:.6g}'
+        rows.append(('smoothed', f'{part.start_s:.3f} to {part.end_s:.3f} s, {part.method}: {told or "no mode"}'))
+    return [f'{name:12s} {words}' for name, words in (*rows, *(('written', place) for place in result.written))]
 
 
 if __name__ == '__main__':

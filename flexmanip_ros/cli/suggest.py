@@ -128,8 +128,7 @@ def _recording(source: str, topics: bag.Topics, until_s: float | None, progress:
             first = found.blocks[0].stamp_ns[0] if found.blocks else item.stamp_ns[0]
             used = item.stamp_ns < first + (1e18 if until_s is None else round(until_s * 1e9))
             if used.any():
-                found.blocks.append(item if used.all() else JointBlock(
-                    item.names, item.stamp_ns[used], item.position[used], item.velocity[used], item.effort[used]))
+                found.blocks.append(item if used.all() else item.part(used))
     except BagError:
         if not found.blocks:
             raise

@@ -18,7 +18,7 @@ from flexmanip_ros.io.outputs import write_text
 from flexmanip_ros.parameters import IdentifierParameters, flatten
 from flexmanip_ros.parameters.document import written
 from flexmanip_ros.parameters.field import leaves
-from flexmanip_ros.studies.results import Score, Summary, score, status_text
+from flexmanip_ros.studies.results import Score, Summary, result_rows, score, status_text
 from flexmanip_ros.studies.trial import Row
 from flexmanip_ros.studies.whole_recording import Scores, Smoothed, Sweep
 from flexmanip_ros.types import Array, Mode, StateSpace, Status
@@ -145,7 +145,7 @@ def identification_report(
         note = '' if not scores.until_gap else '<p class="note">Scored up to the first gap.</p>'
         drawn = plots.validation_figure(scores, made.signals.outputs, has_arm=made.has_arm)
         sections.append(Section('Validation', note + picture(drawn, 'measured, simulated and predicted outputs')))
-    sections.append(Section('Numbers', _result(config, summary, made.signals.outputs, bound)))
+    sections.append(Section('Numbers', _result(config, summary, modes, bound)))
     if model is not None:
         sections.append(Section('Model', _model(model, made.signals.inputs, made.signals.outputs)))
     counts = [(name.replace('_', ' '), count) for name, count in messages.items()]
@@ -180,32 +180,13 @@ def _answer(config: IdentifierParameters, summary: Summary, modes: Sequence[Mode
     return ''.join(parts)
 
 
-def _result(config: IdentifierParameters, summary: Summary, outputs: Sequence[str], bound: float | None) -> str:
-    rows: list[tuple[str, str]] = [
-        ('status', f'{summary.status}: {status_text(Status[summary.status], config)}')]
-    if summary.model_status not in (summary.status, Status.TRACKING.name):
-        rows.append(('model', f'{summary.model_status}: {status_text(Status[summary.model_status])}'))
-    modes = zip(summary.frequencies_hz, summary.damping_ratios, strict=True)
-    for k, (frequency, damping) in enumerate(modes):
-        rows.append((f'mode {k + 1}', f'{frequency:.4f} Hz, damping ratio {damping:.4f}'))
-    if summary.payload_ci95_kg is not None:
-        rows.append(('payload', summary.payload_text()))
-        if summary.payload_std_kg is not None:
-            rows.append(('standard deviation', f'{number(summary.payload_std_kg)} kg'))
-        if bound is not None:
-            rows.append(('Cramer-Rao bound', f'standard deviation {number(bound, 3)} kg from the samples after the '
-                         'capture alone; what the empty arm taught lowers it'))
-        rows.append(('residual power', f'{number(summary.consistency)} (1: noise only)'))
-    for name, value in (('capture', summary.capture_time_s), ('release', summary.release_time_s)):
-        if value is not None:
-            rows.append((name, f'{value:.3f} s'))
-    rows.append(('sample time', f'{number(summary.sample_time_s)} s, {summary.gaps} gaps'))
-    for kind, values in (('simulation', summary.vaf_simulation_percent),
-                         ('one-step prediction', summary.vaf_prediction_percent),
-                         ('prediction ahead', summary.vaf_horizon_percent)):
-        if values is not None:
-            shares = [f'{name} {number(value, 4)} %' for name, value in zip(outputs, values, strict=True)]
-            rows.append((f'variance accounted for, {kind}', ', '.join(shares)))
+def _result(config: IdentifierParameters, summary: Summary, modes: Sequence[Mode], bound: float | None) -> str:
+    rows = result_rows(summary, config, modes)
+    if summary.payload_ci95_kg is not None and summary.payload_std_kg is not None:
+        rows.append(('standard deviation', f'{number(summary.payload_std_kg)} kg'))
+    if bound is not None:
+        rows.append(('Cramer-Rao bound', f'standard deviation {number(bound, 3)} kg from the samples after the '
+                     'capture alone; what the empty arm taught lowers it'))
     return table(['', ''], rows)
 
 

@@ -13,7 +13,6 @@ import os
 import select
 import shutil
 import signal
-import struct
 import subprocess
 import sys
 import time
@@ -36,13 +35,13 @@ from flexmanip_ros.arm.linearization import frequencies, vibration_model
 from flexmanip_ros.errors import FlexmanipError, ParameterError
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.plots import Truth, collect, overview_figure
-from flexmanip_ros.messages import Inertia, LabelledArray, Value
+from flexmanip_ros.messages import LabelledArray, Value
 from flexmanip_ros.parameters import DemoParameters, PlantParameters, configure, flatten, leaves
 from flexmanip_ros.parameters.arm import settings
 from flexmanip_ros.parameters.document import NODES, written, yaml_text
 from flexmanip_ros.ros import rclpy_workarounds
 from flexmanip_ros.ros.composition import Composition, foreign_arm
-from flexmanip_ros.ros.node import BAD_INPUT
+from flexmanip_ros.ros.node import BAD_INPUT, reject
 from flexmanip_ros.studies.results import status_text
 from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, Status
 
@@ -149,9 +148,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except OSError as error:
-        return _reject(f"'{options.output}' cannot be written: {error.strerror}; give another folder", BAD_INPUT)
+        return reject(NAME, f"'{options.output}' cannot be written: {error.strerror}; give another folder")
     except Exception as error:  # rcl raises types of its C extension for --ros-args and parameter files
-        return _reject(rclpy_workarounds.first_line(error), BAD_INPUT)
+        return reject(NAME, rclpy_workarounds.first_line(error))
     try:
         with viewer(given) if config.view else nullcontext() as view:
             return _run(config, folder, console, view)
@@ -159,7 +158,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         console.print(f"interrupted; the bag so far is '{folder / 'bag'}'")
         return INTERRUPTED
     except FlexmanipError as error:
-        return _reject(str(error), BAD_INPUT if isinstance(error, ParameterError) else FAILED)
+        return reject(NAME, str(error), BAD_INPUT if isinstance(error, ParameterError) else FAILED)
 
 
 def _run(config: DemoParameters, folder: Path, console: Console, view: Viewer | None) -> int:
@@ -338,11 +337,6 @@ def _occupied() -> bool:
     return found
 
 
-def _reject(problem: str, code: int) -> int:
-    print(f'{NAME}: {problem}', file=sys.stderr)
-    return code
-
-
 def outgoing(estimates: Iterable[Estimate], frame_id: str) -> dict[str, list[Value]]:
     """Return everything that estimates publish, per topic, in order."""
     published: dict[str, list[Value]] = {}
@@ -368,9 +362,7 @@ def _bits(value: Value) -> bytes:
     """Return a published value as bytes, equal only when every bit is."""
     if isinstance(value, LabelledArray):
         return repr(value.dimensions).encode() + np.asarray(value.data, dtype=np.float64).tobytes()
-    if isinstance(value, Inertia):
-        return repr(value).encode()
-    return struct.pack('<d', value) if isinstance(value, float) else repr(value).encode()
+    return repr(value).encode()
 
 
 def known_truth(config: DemoParameters, plant: PlantParameters, items: Sequence[JointRecord | CaptureEvent]) -> Truth:

@@ -344,10 +344,10 @@ def _spin(make: Callable[[], FlexmanipNode[Any]], name: str) -> int:
     return 0
 
 
-def reject(name: str, problem: str) -> int:
-    """Print to stderr why a program does not start; return its exit code."""
+def reject(name: str, problem: str, code: int = BAD_INPUT) -> int:
+    """Print to stderr why a program ends; return its exit code."""
     print(f'{name}: {problem}', file=sys.stderr)
-    return BAD_INPUT
+    return code
 
 
 def parser(name: str, about: str | None, cls: type) -> argparse.ArgumentParser:

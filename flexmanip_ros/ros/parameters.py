@@ -21,14 +21,7 @@ from flexmanip_ros.ros.rclpy_workarounds import declare, parameter_overrides
 
 Config = TypeVar('Config')
 
-_SCALAR = {
-    bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Parameter.Type.DOUBLE,
-    str: Parameter.Type.STRING,
-}
-_ARRAY = {
-    bool: Parameter.Type.BOOL_ARRAY, int: Parameter.Type.INTEGER_ARRAY, float: Parameter.Type.DOUBLE_ARRAY,
-    str: Parameter.Type.STRING_ARRAY,
-}
+_TYPES = {bool: 'BOOL', int: 'INTEGER', float: 'DOUBLE', str: 'STRING'}
 _EXAMPLE = {bool: 'true or false', int: 'a whole number such as 100',
             float: 'a number with a decimal point such as 100.0', str: 'a text'}
 _ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.', 'autostart')
@@ -104,7 +97,7 @@ def ros_value(leaf: Leaf, value: Any) -> Any:
 
 
 def _type(leaf: Leaf) -> Parameter.Type:
-    return (_ARRAY if leaf.is_array else _SCALAR)[leaf.kind]
+    return Parameter.Type[_TYPES[leaf.kind] + ('_ARRAY' if leaf.is_array else '')]
 
 
 def _declare(node: Node, leaf: Leaf) -> Any:

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexmanip_ros.types import Array
 
+Kind = TypeVar('Kind', bound=np.generic)
 SMALLEST = 1024
 """Rows of the first buffer: one second at 1 kHz."""
 
@@ -163,19 +164,22 @@ class Rows:
         """Return the same rows showing only these outputs."""
         return Rows(self.log, self.first, self.until, chosen)
 
-    def _values(self, begin: int, end: int) -> Array:
+    def _column(self, name: str, kind: type[Kind]) -> NDArray[Kind]:
         buffer = self.log._buffer
         if buffer is None:
-            return np.zeros((0, end - begin))
-        return buffer.values[self.first - buffer.first:self.until - buffer.first, begin:end]
+            return np.zeros(0, kind)
+        column: NDArray[Kind] = getattr(buffer, name)
+        return column[self.first - buffer.first:self.until - buffer.first]
+
+    def _values(self, begin: int, end: int) -> Array:
+        buffer = self.log._buffer
+        return np.zeros((0, end - begin)) if buffer is None else (
+            buffer.values[self.first - buffer.first:self.until - buffer.first, begin:end])
 
     @property
     def stamp_ns(self) -> NDArray[np.int64]:
         """(N,) stamps [ns]."""
-        buffer = self.log._buffer
-        if buffer is None:
-            return np.zeros(0, dtype=np.int64)
-        return buffer.stamp_ns[self.first - buffer.first:self.until - buffer.first]
+        return self._column('stamp_ns', np.int64)
 
     @property
     def u(self) -> Array:
@@ -204,18 +208,12 @@ class Rows:
 
         Its values are interpolated between the messages around it. No estimator takes its outputs for measured.
         """
-        buffer = self.log._buffer
-        if buffer is None:
-            return np.zeros(0, dtype=np.int64)
-        return buffer.missing[self.first - buffer.first:self.until - buffer.first]
+        return self._column('missing', np.int64)
 
     @property
     def gap(self) -> NDArray[np.bool_]:
         """(N,) the motion before the row is unknown, or its torques: no regressor may reach back over it."""
-        buffer = self.log._buffer
-        if buffer is None:
-            return np.zeros(0, dtype=np.bool_)
-        return buffer.gap[self.first - buffer.first:self.until - buffer.first]
+        return self._column('gap', np.bool_)
 
     def stretches(self) -> list[Rows]:
         """Return the rows in pieces, each of which has a gap at most before its first row."""

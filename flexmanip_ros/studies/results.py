@@ -22,7 +22,7 @@ from flexmanip_ros.payload import cramer_rao
 from flexmanip_ros.payload.structured_model import chords, unobservable_reason
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.whole_recording import Smoothed
-from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, Payload, Status
+from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, Mode, Payload, Status
 
 ADVICE: Mapping[Status, str] = {
     Status.WARMING_UP: 'record for longer, while the arm moves',
@@ -100,6 +100,39 @@ class Summary:
         """Time of the capture of what is held at the end [s]; None where nothing is held."""
         capture, release = self.capture_time_s, self.release_time_s
         return None if capture is None or (release is not None and release >= capture) else capture
+
+
+def result_rows(summary: Summary, config: IdentifierParameters, modes: Sequence[Mode], events: str = ''
+                ) -> list[tuple[str, str]]:
+    """Return the result as names and words for people, for the terminal and for the table of a report.
+
+    modes: of the last estimate, with their deviations; events: what was found in the signals.
+    """
+    found = [('samples', f'{summary.samples}, {summary.gaps} gaps, sample time {_text(summary.sample_time_s)} s, '
+              f'identified in {summary.wall_s:.2f} s'), *([('events', events)] if events else ())]
+    found += [(name, f'at {time:.3f} s') for name, time in (
+        ('capture', summary.capture_time_s), ('release', summary.release_time_s)) if time is not None]
+    found.append(('status', f'{summary.status}: {status_text(Status[summary.status], config)}'))
+    if summary.model_status not in (summary.status, Status.TRACKING.name):
+        found.append(('model', f'{summary.model_status}: {status_text(Status[summary.model_status])}'))
+    for k, mode in enumerate(modes):
+        spread = f' +- {1.96 * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else ''
+        found.append((f'mode {k + 1}',
+                      f'{mode.frequency_hz:.4f}{spread} Hz, damping ratio {mode.damping_ratio:.4f}'))
+    if summary.payload_ci95_kg is not None:
+        found.append(('payload', summary.payload_text()))
+        if summary.consistency is not None and summary.payload_std_kg is not None:
+            found.append(('residuals', f'power {summary.consistency:.6g} times that of the noise (1: noise only)'))
+    for words, values in (('simulation', summary.vaf_simulation_percent),
+                          ('prediction', summary.vaf_prediction_percent), ('ahead', summary.vaf_horizon_percent)):
+        if values is not None:
+            shares = [f'{name} {_text(value)} %' for name, value in zip(config.outputs, values, strict=True)]
+            found.append((f'VAF {words}', ', '.join(shares)))
+    return found
+
+
+def _text(value: float | None) -> str:
+    return 'unknown' if value is None else f'{value:.6g}'
 
 
 def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -> Summary:

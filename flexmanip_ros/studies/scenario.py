@@ -197,7 +197,7 @@ def _pair(name: str, value: Any) -> tuple[float, float]:
 
 def _check_varied(name: str, how: Mapping[str, Any]) -> None:
     group, _, rest = name.partition('.')
-    declared = {leaf.name for cls in (GROUPS[group],) for leaf in leaves(cls)} if group in GROUPS else set()
+    declared = {leaf.name for leaf in leaves(GROUPS[group])} if group in GROUPS else set()
     arm = {leaf.name for leaf in leaves(PlantParameters) if leaf.name.startswith('arm.')}
     if name != CAPTURE_TIME and rest not in declared and name not in arm:
         raise ParameterError(f"'{name}' cannot be varied",

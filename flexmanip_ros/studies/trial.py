@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from flexmanip_ros import pipeline
-from flexmanip_ros.arm import linearization
+from flexmanip_ros.arm.linearization import frequencies, vibration_model
 from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import IdentifierParameters, PlantParameters
 from flexmanip_ros.samples.sampling import collect
@@ -117,7 +117,8 @@ def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_k
             estimates.append(estimate)
     wall = time.perf_counter() - started
     last = pipeline.current(state)
-    row: Row = summarize(state, last, wall).as_json()
+    summary = summarize(state, last, wall)
+    row: Row = summary.as_json()
     interval: tuple[float | None, float | None] = row.pop('payload_ci95_kg') or (None, None)
     low, high = interval
     for name in ('vaf_simulation_percent', 'vaf_prediction_percent', 'vaf_horizon_percent', 'wall_s'):
@@ -128,8 +129,7 @@ def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_k
         for k, value in enumerate(row.pop(kind)):
             row[f'{kind.split("_")[0]}_{k + 1}'] = value
     row.update(payload_lower_kg=low, payload_upper_kg=high, us_per_sample=1e6 * wall / max(state.counters.accepted, 1))
-    is_loaded = row['capture_time_s'] is not None and (
-        row['release_time_s'] is None or row['release_time_s'] < row['capture_time_s'])
+    is_loaded = summary.held_since_s is not None
     true = None if true_kg is None else (true_kg if is_loaded else 0.0)
     row['payload_true_kg'] = true
     row['covered'] = None if true is None or low is None or high is None else bool(low <= true <= high)
@@ -138,13 +138,9 @@ def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_k
     row['error_percent'] = None if true is None else _window_error(state, estimates, true, (begin, window[1]))
     if bound and is_loaded and config.payload_method != 'none':
         mass = row['payload_mass_kg'] if true is None else true
-        row['bound_std_kg'] = _bound(config, items, row['capture_time_s'], mass, state.clock.dt)
+        row['bound_std_kg'] = None if mass is None else payload_bound(
+            config, collect(config, items), row['capture_time_s'], mass, state.clock.dt)
     return row
-
-
-def _bound(config: IdentifierParameters, items: Sequence[pipeline.Item], capture_time: float,
-           mass: float | None, dt: float) -> float | None:
-    return None if mass is None else payload_bound(config, collect(config, items), capture_time, mass, dt)
 
 
 def _window_error(state: pipeline.State, estimates: Sequence[Estimate], true: float,
@@ -170,9 +166,8 @@ def frequency_columns(run: Run, row: Mapping[str, Any]) -> Row:
 
 def true_frequencies(plant: PlantParameters, mass: float) -> list[float]:
     """Return the two lowest damped frequencies of the arm, linearized at its start, with a payload [kg]: [Hz]."""
-    Ac, _ = linearization.vibration_model(plant.arm, np.array(plant.initial_angles), mass)
-    poles = np.linalg.eigvals(Ac)
-    return sorted((poles.imag[poles.imag > 1e-9] / (2.0 * np.pi)).tolist())[:2]
+    found = frequencies(vibration_model(plant.arm, np.array(plant.initial_angles), mass)[0])
+    return [float(frequency) for frequency in found[:2]]
 
 
 def drawn_columns(drawn: Mapping[str, Any]) -> Row:
