@@ -126,12 +126,11 @@ def unexplained(model: StateSpace, U: Array, Y: Array, steps: int) -> Array:
 
 def readings(case: Case) -> tuple[list[Estimate], Signals]:
     """Return the readings of a model, and the signals that they are read from."""
-    found, state = [], pipeline.init(keep_log=True)
+    found, state = [], pipeline.init()
     for item in case.items:
         state, ready = pipeline.step(case.config, state, item)
         found += [estimate for estimate in ready if estimate.model_is_new and estimate.model is not None]
-    assert state.config is not None
-    return found, sampling.signals(state.config, state.clock, state.log)
+    return found, sampling.collect(case.config, case.items)
 
 
 def row_of(case: Case) -> dict[str, Any]:

@@ -79,8 +79,6 @@ class State(NamedTuple):
     """Number of the last second from the first stamp on in which an estimate carried the arm's parameters."""
     pending: PendingModel | None = None
     model: ModelEstimate | None = None
-    keep_log: bool = False
-    """Keep every row of the log, for reports and scores."""
 
     @property
     def counters(self) -> Counters:
@@ -92,9 +90,9 @@ class State(NamedTuple):
         return self.payload.stamp_of(kind) if self.payload is not None else None
 
 
-def init(*, keep_log: bool = False) -> State:
+def init() -> State:
     """Start with nothing known."""
-    return State(keep_log=keep_log)
+    return State()
 
 
 def step(config: IdentifierParameters, state: State, item: Item, background: Background = INLINE,
@@ -259,7 +257,7 @@ def _sampled(config: IdentifierParameters, state: State, sampled: sampling.Sampl
              background: Background) -> State:
     """Go on with clock and log after a message; build the estimators once the signals are known."""
     if sampled.reset:
-        state = State(config=state.config, keep_log=state.keep_log)
+        state = State(config=state.config)
     state = state._replace(clock=sampled.clock, log=sampled.log)
     outputs = sampled.clock.outputs
     if state.payload is not None or outputs is None:
@@ -295,8 +293,6 @@ def _running(state: State) -> tuple[IdentifierParameters, EventReplay[PayloadEst
 def _advance(state: State, until: int, background: Background) -> State:
     """Let both estimators take the rows up to ``until``; drop rows that neither reads again."""
     state = _advance_identifier(_advance_payload(state, until, background), until, background)
-    if state.keep_log:
-        return state
     _, payload, identifier = _running(state)
     needed = min(event_replay.first_needed(payload), event_replay.first_needed(identifier),
                  identifier.cursor - prediction_check.length(state.clock.dt))

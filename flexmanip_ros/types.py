@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
@@ -26,6 +27,12 @@ class CaptureEvent(NamedTuple):
 
     stamp_ns: int
     kind: EventKind
+
+
+def events_at(start_ns: int, capture_s: float, release_s: float, end_s: float = math.inf) -> tuple[CaptureEvent, ...]:
+    """Return a capture and a release at times from a stamp on [s]; none for a negative time, or one from end_s on."""
+    return tuple(CaptureEvent(start_ns + round(at * 1e9), kind) for at, kind in (
+        (capture_s, EventKind.CAPTURE), (release_s, EventKind.RELEASE)) if 0.0 <= at < end_s)
 
 
 class JointRecord(NamedTuple):

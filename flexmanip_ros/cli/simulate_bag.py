@@ -81,16 +81,13 @@ def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.io.bag_writer import BagWriter
     from flexmanip_ros.io.outputs import check_place, write_text
     from flexmanip_ros.simulation import excitation, simulator
-    from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+    from flexmanip_ros.types import CaptureEvent, JointRecord, events_at
 
     plant, torque = configurations(given)
     if not 0.0 < given.duration <= 1e6:
         raise ParameterError(f'--duration is {given.duration:g}', 'give seconds above 0, up to 1e6')
     count = max(round(given.duration * plant.rate), 1)
-    events = tuple(
-        CaptureEvent(START_NS + round(at * 1e9), kind)
-        for at, kind in ((given.capture_time, EventKind.CAPTURE), (given.release_time, EventKind.RELEASE))
-        if 0.0 <= at < given.duration)
+    events = events_at(START_NS, given.capture_time, given.release_time, given.duration)
     target = Path(given.bag)
     if not target.name:
         raise BagError(f"'{given.bag}' is no name for a recording", 'give the name of a directory to make')

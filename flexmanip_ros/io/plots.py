@@ -109,10 +109,7 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int, truth: Se
         for k, mode in enumerate(estimate.modes):
             values[row, k] = mode.frequency_hz, mode.frequency_std_hz
     for k in range(count):
-        colour, middle, spread = COLOURS[k % len(COLOURS)], values[:, k, 0], 1.96 * values[:, k, 1]
-        ax.fill_between(time, middle - spread, middle + spread, color=colour, alpha=0.2, linewidth=0)
-        ax.plot(time, middle, color=colour, linestyle=LINES[k % len(LINES)], linewidth=1.4,
-                label=f'mode {k + 1}, 95 % band')
+        _band(ax, time, values[:, k, 0], values[:, k, 1], k)
     for index, (begin, end, known) in enumerate(truth):
         for k, frequency in enumerate(known):
             ax.plot([begin, end], [frequency] * 2, color=TRUTH_COLOUR, linestyle=(0, (4, 3)), linewidth=1.1,
@@ -128,6 +125,14 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int, truth: Se
         _note_beyond(ax, values[-1, :, 0])
     ax.set_ylabel('frequency\n[Hz]')
     legend(ax)
+
+
+def _band(ax: Any, x: Array, frequency: Array, std: Array, k: int) -> None:
+    """Draw the frequency of mode k over x with its 95 % band."""
+    colour, spread = COLOURS[k % len(COLOURS)], 1.96 * std
+    ax.fill_between(x, frequency - spread, frequency + spread, color=colour, alpha=0.2, linewidth=0)
+    ax.plot(x, frequency, color=colour, linestyle=LINES[k % len(LINES)], linewidth=1.4,
+            label=f'mode {k + 1}, 95 % band')
 
 
 def _lowest(values: Array) -> Array:
@@ -346,10 +351,7 @@ def configurations_figure(found: Sweep) -> Figure:
     angle = np.degrees(found.relative)
     ax.axvspan(*np.degrees(found.seen), color='#F0F0F0', linewidth=0, label='configurations\nof the recording')
     for k in range(found.frequency.shape[1]):
-        colour, middle, spread = COLOURS[k % len(COLOURS)], found.frequency[:, k], 1.96 * found.std[:, k]
-        ax.fill_between(angle, middle - spread, middle + spread, color=colour, alpha=0.2, linewidth=0)
-        ax.plot(angle, middle, color=colour, linestyle=LINES[k % len(LINES)], linewidth=1.4,
-                label=f'mode {k + 1}, 95 % band')
+        _band(ax, angle, found.frequency[:, k], found.std[:, k], k)
     inside = (found.seen[0] <= found.relative) & (found.relative <= found.seen[1])
     limit(ax, found.frequency[inside] if inside.any() else found.frequency, found.frequency[np.isfinite(
         found.frequency)].tolist())

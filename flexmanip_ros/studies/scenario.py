@@ -11,13 +11,8 @@ from zlib import crc32
 import numpy as np
 
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.parameters import (
-    ExcitationParameters,
-    IdentifierParameters,
-    PlantParameters,
-    configure,
-    leaves,
-)
+from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure, leaves
+from flexmanip_ros.parameters.field import check_all, parameter
 
 GROUPS: Mapping[str, type] = {
     'plant': PlantParameters, 'excitation': ExcitationParameters, 'identifier': IdentifierParameters}
@@ -29,22 +24,15 @@ CAPTURE_TIME = 'capture_time'
 class Faults:
     """Faults between the arm and the estimator; probabilities are per message."""
 
-    drop: float = 0.0
-    duplicate: float = 0.0
-    swap: float = 0.0
-    """Two neighbours change places."""
-    nan: float = 0.0
-    """One value of the message is NaN."""
-    gap: tuple[float, float] = (0.0, 0.0)
-    """From and to [s]: every message between is lost."""
-    event_delay: float = 0.0
-    """The event arrives this late [s]."""
+    drop: float = parameter(0.0, 'probability that it never arrives', low=0.0, high=1.0)
+    duplicate: float = parameter(0.0, 'probability that it arrives twice', low=0.0, high=1.0)
+    swap: float = parameter(0.0, 'probability that it changes places with its neighbour', low=0.0, high=1.0)
+    nan: float = parameter(0.0, 'probability that one of its values is NaN', low=0.0, high=1.0)
+    gap: tuple[float, ...] = parameter((0.0, 0.0), 'from and to; every message between is lost', unit='s', size=2)
+    event_delay: float = parameter(0.0, 'the event arrives this late', unit='s')
 
     def __post_init__(self) -> None:
-        for name in ('drop', 'duplicate', 'swap', 'nan'):
-            value = getattr(self, name)
-            if not 0.0 <= value <= 1.0:
-                raise ParameterError(f"fault '{name}' is {value!r}", 'give a probability, 0 to 1')
+        check_all(self)
 
 
 @dataclass(frozen=True)
@@ -144,7 +132,7 @@ def scenario(tree: Any) -> Scenario:
                                for key, value in _mapping('estimators', given['estimators']).items()}
     given['vary'] = {str(key): _mapping(str(key), value)
                      for key, value in _mapping('vary', given.get('vary') or {}).items()}
-    given['faults'] = _faults(given.get('faults') or {})
+    given['faults'] = configure(Faults, _flat('faults', given.get('faults') or {}))
     for name in ('duration', 'capture_time', 'release_time'):
         if name in given:
             given[name] = _number(name, given[name])
@@ -153,16 +141,6 @@ def scenario(tree: Any) -> Scenario:
     if not isinstance(given.get('bound', True), bool):
         raise _wrong('bound', given['bound'], 'give true or false')
     return Scenario(**given)
-
-
-def _faults(tree: Any) -> Faults:
-    given = dict(_mapping('faults', tree))
-    known = {item.name for item in fields(Faults)}
-    for name, value in given.items():
-        if name not in known:
-            raise ParameterError(f"unknown fault '{name}'", f'known are {", ".join(sorted(known))}')
-        given[name] = _pair(name, value) if name == 'gap' else _number(name, value)
-    return Faults(**given)
 
 
 def _wrong(name: str, value: Any, remedy: str) -> ParameterError:

@@ -244,7 +244,7 @@ def moments(search: Search, kept: list[Kept], past: int) -> list[Array]:
         for (samples, rows), part in zip(kept, search.stretches, strict=True):
             ends = np.flatnonzero(folds[part.number[rows]] == fold)
             ends = ends[ends >= past]
-            for some in np.array_split(ends, len(ends) // 4096 + 1):
+            for some in np.array_split(ends, len(ends) // CHUNK + 1):
                 if len(some):
                     phi = np.hstack([samples[some - past + i] for i in range(past + 1)])
                     R = triangle(np.vstack([R, phi]))

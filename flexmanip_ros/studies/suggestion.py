@@ -116,7 +116,7 @@ def _settings(search: Search, shape: Shape, step: Callable[[], None]
         'refinement': 'none', **search.given}
     trials: list[tuple[str, float, dict[str, Any]]] = [
         ('forgetting where the model ceases to fit', PLAIN, {'forgetting_factor': (0.99,) * 3}),
-        (f'forgetting beyond {_memory_s(search):.3g} s', PLAIN,
+        (f'forgetting beyond {search.count * search.dt / FORGOTTEN:.3g} s', PLAIN,
          {'forgetting': 'constant', 'forgetting_factor': (memory,) * 3})]
     light = [s for s in search.tried if _is_refinable(search, s)]
     own = min(light, key=lambda s: (search.error(s), s), default=None)
@@ -143,11 +143,6 @@ def _settings(search: Search, shape: Shape, step: Callable[[], None]
         ('forgetting, refinement', f'{name}: run through the recording, unexplained {search.horizon_s:g} s ahead with '
                                    f'{", ".join(told)}{beside}'),
         ('regularization', f'{settled["regularization"][0]:g}: {ridge}')]
-
-
-def _memory_s(search: Search) -> float:
-    """Return the time constant of the constant forgetting that is tried [s]."""
-    return search.count * search.dt / FORGOTTEN
 
 
 def _values(shape: Shape) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from flexmanip_ros.samples.sampling import collect
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.studies.results import payload_bound, relative_error_percent, summarize
 from flexmanip_ros.studies.scenario import Faults, Run, Scenario
-from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord
+from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, events_at
 
 Message = JointRecord | CaptureEvent
 
@@ -92,10 +92,7 @@ def describe(error: BaseException) -> str:
 def messages(scenario: Scenario, run: Run, seed: int) -> list[JointRecord | CaptureEvent]:
     """Return the messages that the estimators of a run receive."""
     count = max(round(scenario.duration * run.plant.rate), 1)
-    events = tuple(
-        CaptureEvent(round(at * 1e9), kind)
-        for at, kind in ((run.capture_time, EventKind.CAPTURE), (scenario.release_time, EventKind.RELEASE))
-        if 0.0 <= at < scenario.duration)
+    events = events_at(0, run.capture_time, scenario.release_time, scenario.duration)
     trajectory = simulator.simulate(run.plant, excitation.sequence(run.excitation, count), events)
     rng = np.random.default_rng([seed, 1 << 20])  # another random stream than those of `vary`
     return inject(simulator.records(trajectory, events), scenario.faults, rng)

@@ -34,7 +34,7 @@ from flexmanip_ros.ros.conversions import JointStateReader, header
 from flexmanip_ros.ros.diagnostics import Meter, Report
 from flexmanip_ros.ros.node import FlexmanipNode, run
 from flexmanip_ros.samples import sampling
-from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, events_at
 
 NAME = 'capture_trigger'
 LOOPED_NS = 1_000_000_000
@@ -172,10 +172,8 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         self._pending, self.latest = (), None
         if self.config.mode != 'time':
             return
-        plan = ((self.config.capture_time, EventKind.CAPTURE), (self.config.release_time, EventKind.RELEASE))
-        self._pending = tuple(sorted(
-            (CaptureEvent(stamp + round(seconds * 1e9), kind) for seconds, kind in plan if seconds >= 0.0),
-            key=lambda event: event.stamp_ns))
+        planned = events_at(stamp, self.config.capture_time, self.config.release_time)
+        self._pending = tuple(sorted(planned, key=lambda event: event.stamp_ns))
 
     def _announce(self, event: CaptureEvent) -> None:
         self._publish(self.events_publisher, event, '')
