@@ -23,6 +23,7 @@ from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.payload.arm_parameters import as_parameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
+from flexmanip_ros.samples.signals import joints
 from flexmanip_ros.studies import whole_recording
 from flexmanip_ros.studies.results import Summary, payload_bound, summarize
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Mode, Status
@@ -173,8 +174,7 @@ class _Messages:
         """What the page in the report shows."""
         self._request = request
         self._progress = progress
-        config = request.config
-        self._joints = {name.rpartition('/')[0] for name in (*config.inputs, *config.outputs, *config.angles)}
+        self._joints = set(joints(request.config))
 
     def __iter__(self) -> Iterator[pipeline.Item]:
         request = self._request

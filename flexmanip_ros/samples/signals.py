@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
 from flexmanip_ros.types import Array, JointBlock, JointRecord, Sample
 
 _SHRINKABLE = IdentifierParameters().outputs
@@ -63,6 +63,11 @@ def resolve(
             places.append(place)
         groups.append(tuple(places))
     return Channels(record.names, wanted, groups[0], groups[1], groups[2], sum(groups, start=()))
+
+
+def joints(config: IdentifierParameters | TriggerParameters) -> tuple[str, ...]:
+    """Return the names of the joints, and of the bends, whose signals are configured."""
+    return tuple(dict.fromkeys(name.rpartition('/')[0] for name in (*config.inputs, *config.outputs, *config.angles)))
 
 
 def reads_angles(config: IdentifierParameters) -> bool:

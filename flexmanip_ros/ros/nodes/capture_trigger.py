@@ -34,6 +34,7 @@ from flexmanip_ros.ros.conversions import JointStateReader, header
 from flexmanip_ros.ros.diagnostics import Meter, Report
 from flexmanip_ros.ros.node import FlexmanipNode, run
 from flexmanip_ros.samples import sampling
+from flexmanip_ros.samples.signals import joints
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, events_at
 
 NAME = 'capture_trigger'
@@ -75,9 +76,7 @@ class Detector:
 
 def warm_up(config: TriggerParameters) -> None:
     """Run the detector once on made-up samples, so that nothing is compiled while real ones come."""
-    names = tuple(dict.fromkeys(
-        signal.rpartition('/')[0] for signal in (*config.inputs, *config.outputs, *config.angles)))
-    detector = Detector(config)
+    detector, names = Detector(config), joints(config)
     for k in range(WARM_UP_SAMPLES):
         wave = np.array([math.sin(0.05 * k * (i + 1)) for i in range(len(names))]) * 1e-3
         detector.take(JointRecord(k * 1_000_000, names, wave, wave * 0.0, wave * 1e3))

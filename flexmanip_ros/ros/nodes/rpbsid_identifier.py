@@ -54,6 +54,7 @@ from flexmanip_ros.ros.diagnostics import (
 )
 from flexmanip_ros.ros.node import FlexmanipNode, run
 from flexmanip_ros.ros.rclpy_workarounds import sequence_number, with_info
+from flexmanip_ros.samples.signals import joints
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Status
 
 NAME = 'rpbsid_identifier'
@@ -91,8 +92,7 @@ def warm_up(config: IdentifierParameters) -> None:
 
 def _made_up(config: IdentifierParameters) -> Iterator[JointRecord | CaptureEvent]:
     """Yield joints that swing at two frequencies, driven by random torques, and a capture."""
-    names = tuple(dict.fromkeys(
-        signal.rpartition('/')[0] for signal in (*config.inputs, *config.outputs, *config.angles)))
+    names = joints(config)
     rng = np.random.default_rng(0)
     step = np.exp(1j * np.array([0.1, 0.2]) - 0.01)
     shape = rng.standard_normal((2, len(names)))
