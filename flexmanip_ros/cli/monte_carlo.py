@@ -7,7 +7,7 @@ import hashlib
 import json
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -69,9 +69,11 @@ def _main(given: argparse.Namespace) -> int:
         left = [task for task in todo if task.key not in done]
         if done:
             print(f'continuing: {len(todo) - len(left)} of {len(todo)} runs are done already', file=sys.stderr)
+        outcomes = (workers.compute(workers.work, left, given.workers) if given.scheduler is None
+                    else workers.cluster(workers.work, left, given.scheduler))
         try:
             with console.progress('running', 'runs') as progress:
-                for count, outcome in enumerate(_compute(given, left), start=1):
+                for count, outcome in enumerate(outcomes, start=1):
                     journal.add(outcome.result if outcome.error is None
                                 else workers.failed(outcome.task, outcome.error))
                     progress(len(todo) - len(left) + count, len(todo))
@@ -134,14 +136,6 @@ def read_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
 def _digest(values: Any) -> str:
     text = json.dumps(values, sort_keys=True, default=str)
     return hashlib.sha256(text.encode('utf-8')).hexdigest()[:16]
-
-
-def _compute(given: argparse.Namespace, todo: Sequence[workers.Task]) -> Iterator[workers.Outcome]:
-    from flexmanip_ros.cli import workers
-
-    if given.scheduler is not None:
-        return workers.cluster(workers.work, todo, given.scheduler)
-    return workers.compute(workers.work, todo, given.workers)
 
 
 def describe(rows: Sequence[Row]) -> list[str]:

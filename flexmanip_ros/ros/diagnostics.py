@@ -184,10 +184,10 @@ def report_estimate(report: Report, estimate: Estimate | None, order: int) -> No
     """Add status, excitation, conditioning, order and payload to a report; order: the one configured."""
     status = Status.WARMING_UP if estimate is None else estimate.status
     payload = None if estimate is None else estimate.payload
-    report.values['status'] = status.name
-    report.values['model_status'] = (Status.WARMING_UP if estimate is None else estimate.model_status).name
-    report.values['converged'] = status is Status.TRACKING
-    report.values['consistent'] = payload is None or payload.status is not Status.INCONSISTENT
+    report.values.update(
+        status=status.name, model_status=(Status.WARMING_UP if estimate is None else estimate.model_status).name,
+        converged=status is Status.TRACKING,
+        consistent=payload is None or payload.status is not Status.INCONSISTENT)
     if status not in (Status.TRACKING, Status.WARMING_UP):
         report.worse(WARN, status.value)
     if estimate is None:
@@ -196,8 +196,8 @@ def report_estimate(report: Report, estimate: Estimate | None, order: int) -> No
         excitation=estimate.excitation, condition=estimate.condition,
         innovation_power=estimate.innovation_power)
     if estimate.singular_values is not None:
-        report.values['order'] = order
-        report.values['suggested_order'] = suggested_order(estimate.singular_values)
-        report.values['singular_values'] = ' '.join(f'{value:.4g}' for value in estimate.singular_values)
+        report.values.update(
+            order=order, suggested_order=suggested_order(estimate.singular_values),
+            singular_values=' '.join(f'{value:.4g}' for value in estimate.singular_values))
     if payload is not None:
         report.values.update(payload_mass_kg=payload.mass, payload_std_kg=payload.std, consistency=payload.consistency)

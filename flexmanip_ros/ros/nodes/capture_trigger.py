@@ -210,14 +210,12 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
 
     def report(self, report: Report) -> None:
         """Rate of the joint states and what was announced."""
-        report.values.update(self._meter.window())
-        report.values['mode'] = self.config.mode
-        report.values['announced'] = self.announced
-        report.values['pending'] = len(self._pending)
+        report.values.update(self._meter.window(), mode=self.config.mode, announced=self.announced,
+                             pending=len(self._pending))
         if self._detector is not None:
-            report.values['detected'] = self.detected
-            report.values['dropped'] = self._detector.clock.counters.dropped
-            report.values['statistic'], report.values['threshold'] = self._detector.statistic
+            statistic, threshold = self._detector.statistic
+            report.values.update(detected=self.detected, dropped=self._detector.clock.counters.dropped,
+                                 statistic=statistic, threshold=threshold)
         if self.active and report.values['rate_hz'] == 0.0:
             report.silent('joint_states')
 

@@ -110,9 +110,7 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
 
     def report(self, report: Report) -> None:
         """Rate and instants that passed without a command."""
-        report.values.update(self._meter.window())
-        report.values['skipped_instants'] = self.skipped
-        report.values['shape'] = self.config.shape
+        report.values.update(self._meter.window(), skipped_instants=self.skipped, shape=self.config.shape)
         if self.active and self.config.clock == 'joint_states' and report.values['rate_hz'] == 0.0:
             report.silent('joint_states')
         elif self.active and report.values['rate_hz'] < 0.9 * self.config.rate:

@@ -168,8 +168,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
             return
         report.values['rate_hz'] = (samples - self._reported) / max(now - self._asked, 1e-3)
         self._reported, self._asked = samples, now
-        report.values['samples'] = samples
-        report.values['pages'] = self.server.pages
+        report.values.update(samples=samples, pages=self.server.pages)
         if report.values['rate_hz'] == 0.0:
             report.silent('joint_states')
 

@@ -136,10 +136,9 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
 
     def report(self, report: Report) -> None:
         """What was sent, and what went wrong."""
-        report.values['sent'] = self.sent
-        report.values['sent_mass_kg'] = 'none' if self.state.sent is None else self.state.sent.mass
-        report.values['trusted'] = self.state.trusted_since is not None
-        report.values['doubtful'] = self.doubtful
+        report.values.update(
+            sent=self.sent, sent_mass_kg='none' if self.state.sent is None else self.state.sent.mass,
+            trusted=self.state.trusted_since is not None, doubtful=self.doubtful)
         if self.problem:
             report.worse(ERROR, self.problem)
         elif self.active and self.state.trusted_since is None:

@@ -193,12 +193,9 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
     def report(self, report: Report) -> None:
         """Rate, backlog, dropped commands and events that came late."""
         values = report.values
-        values.update(self._meter.window())
-        values['samples'] = self.samples
-        values['backlog'] = self.backlog
-        values['dropped_commands'] = self.dropped_commands
-        values['late_events'] = self.late_events
-        values['rejected_events'] = self.rejected_events
+        values.update(self._meter.window(), samples=self.samples, backlog=self.backlog,
+                      dropped_commands=self.dropped_commands, late_events=self.late_events,
+                      rejected_events=self.rejected_events)
         if self._fault:
             report.worse(ERROR, self._fault)
         elif self.active and values['rate_hz'] < 0.9 * self.config.rate:

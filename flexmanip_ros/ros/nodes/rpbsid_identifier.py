@@ -273,9 +273,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         values, counters = report.values, self.state.counters
         values.update(self.meter.window())
         self.losses.report(report, 'lost', 'messages')
-        values.update(counters._asdict())
-        values['dropped'] = counters.dropped
-        values['rejected'] = self.rejected
+        values.update(counters._asdict(), dropped=counters.dropped, rejected=self.rejected)
         if self._checkpoints is not None:
             values['checkpoints'] = self._checkpoints.saves
             if self._checkpoints.problem:
