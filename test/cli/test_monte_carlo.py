@@ -111,7 +111,7 @@ def test_a_worker_that_dies_costs_only_its_run(tmp_path, monkeypatch):
     ('vary: {plant.payload_mass: {gauss: [1, 2]}}', 'uniform'),
     ('plant: {ordre: 3}', "unknown parameter 'ordre'"),
     ('estimators: {}', 'estimators'),
-    ('faults: {drop: 2}', 'probability'),
+    ('faults: {drop: 2}', "'drop' is 2.0; give a value from 0 to 1"),
     ('vary: {plant.payload_mass: {uniform: [a, b]}}', 'two numbers'),
     ('vary: {plant.payload_mass: {uniform: [100, 12]}}', 'low, then high'),
     ('vary: {plant.payload_mass: {normal: [20, -1]}}', 'deviation from 0'),
