@@ -1,4 +1,4 @@
-"""Write docs/how_well.md: what every benchmark claims, and what it measured last.
+"""Write docs/how_well.md: what every benchmark claims, and what it measured last; and the shares in README.md.
 
 Use: ``python benchmarks/tables.py`` (``make docs``). The values come from ``benchmarks/results``, the bounds from
 ``benchmarks/claims.py``.
@@ -7,11 +7,15 @@ Use: ``python benchmarks/tables.py`` (``make docs``). The values come from ``ben
 from __future__ import annotations
 
 import inspect
+import json
+import math
+import re
 from pathlib import Path
 
 import claims
 
 TARGET = Path(__file__).resolve().parents[1] / 'docs' / 'how_well.md'
+README = TARGET.parents[1] / 'README.md'
 SUBJECTS = {
     'payload': 'The payload', 'identification': 'The identified model', 'detection': 'Captures found in the signals',
     'control': 'The controller', 'plant': 'The simulated arm', 'replay': 'Replay', 'ros': 'The nodes',
@@ -54,6 +58,33 @@ def table(found: list[claims.Claim]) -> str:
     return '\n'.join(rows) + '\n'
 
 
+def readme(text: str) -> str:
+    """Return README.md with the shares measured last. Each stands before words that are looked for here."""
+    matched = [share for row in _rows('payload_coverage') for share in row['coverage']]
+    elements = _rows('payload_elements')[0]
+    second, third = (elements['samples_after_capture'].index(count) for count in (1000, 2990))
+    for words, share in (
+            ('of the 95 % intervals hold the true mass', _percent(min(matched), max(matched))),
+            ('of the masses are less than 1 % off', _percent(1.0 - elements['share_beyond_1_percent'][second])),
+            ('of the intervals hold the true mass 3 s after', _percent(elements['coverage'][third]))):
+        pattern = words.replace(' ', r'\s+')
+        text, count = re.subn(rf'\d+(?: to \d+)?(?=\s%\s{pattern})', share, text)
+        if count != 1:
+            raise ValueError(f'README.md has to say once how many % {words}')
+    return text
+
+
+def _rows(name: str) -> list[dict[str, object]]:
+    return json.loads((claims.RESULTS / f'{name}.json').read_text(encoding='utf-8'))
+
+
+def _percent(low: float, high: float | None = None) -> str:
+    if high is None:
+        return f'{100.0 * low:.0f}'
+    return f'{math.floor(100.0 * low)} to {math.ceil(100.0 * high)}'
+
+
 if __name__ == '__main__':
     TARGET.write_text(page(), encoding='utf-8')
-    print(f'wrote {TARGET.name}')
+    README.write_text(readme(README.read_text(encoding='utf-8')), encoding='utf-8')
+    print(f'wrote {TARGET.name}, and the shares in {README.name}')

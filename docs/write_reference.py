@@ -26,8 +26,6 @@ ROW = re.compile(r'(\S+?(?:, \S+)*)\s+([a-z_]+/[A-Z]\w+)\s*(.*)')
 PARAMETERS = re.compile(r'\n\n?parameters (?:of|\()')
 """Where the list of the parameters begins in the help of a program."""
 LAUNCH = re.compile(r"\(\s*'(\w+)',\s*'([^']*)',\s*(?:'([^']*)'|\"([^\"]*)\")\)")
-DECLARED = re.compile(r"DeclareLaunchArgument\(\s*'(\w+)'(?:,\s*default_value=(.+?))?,"
-                      r"\s*description=(?:'([^']*)'|\"([^\"]*)\")", re.DOTALL)
 
 
 class Edge(NamedTuple):
@@ -106,11 +104,20 @@ def launch_files() -> Iterator[str]:
         text = path.read_text(encoding='utf-8')
         rows = [(name, f'`{default}`' if default else '', one or two)
                 for name, default, one, two in LAUNCH.findall(text)]
-        rows += [(name, f'`{default[1:-1]}`' if re.fullmatch(r"'[^']+'", default) else '', one or two)
-                 for name, default, one, two in DECLARED.findall(text)]
+        rows += declared(text)
         yield '| argument | default | meaning |\n|---|---|---|'
         yield from (f'| `{name}` | {default} | {cell(words)} |' for name, default, words in rows)
         yield ''
+
+
+def declared(text: str) -> Iterator[tuple[str, str, str]]:
+    """Yield name, default (where it is a plain text) and words of each DeclareLaunchArgument of a launch file."""
+    for call in ast.walk(ast.parse(text)):
+        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == 'DeclareLaunchArgument':
+            plain = {item.arg: item.value.value for item in call.keywords if isinstance(item.value, ast.Constant)}
+            if isinstance(call.args[0], ast.Constant):
+                default = plain.get('default_value')
+                yield call.args[0].value, f'`{default}`' if default else '', plain['description']
 
 
 def files() -> Iterator[str]:

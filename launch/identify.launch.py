@@ -36,7 +36,8 @@ def generate_launch_description():
     mode = {'mode': ParameterValue(LaunchConfiguration('trigger_mode'), value_type=str)}
     return LaunchDescription([
         DeclareLaunchArgument('params_file', default_value=str(config / 'rpbsid_identifier.yaml'),
-                              description='parameter file with the arm and the signals, for both nodes'),
+                              description='parameter file with the arm and the signals, for both nodes; default: '
+                                          'config/rpbsid_identifier.yaml, the reference arm'),
         DeclareLaunchArgument('joint_states', default_value='joint_states',
                               description='topic of the joint states'),
         DeclareLaunchArgument('namespace', default_value='', description='namespace of both nodes'),

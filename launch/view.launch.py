@@ -34,10 +34,12 @@ def generate_launch_description():
     layout = Path(get_package_share_directory('flexmanip_ros')) / 'config' / 'layouts' / 'arm.rviz'
     return LaunchDescription([
         DeclareLaunchArgument('params_file', default_value='',
-                              description='parameter file of the plant or the identifier, with the arm'),
+                              description='parameter file of the plant or the identifier, with the arm; default: the '
+                                          'reference arm'),
         DeclareLaunchArgument('joint_states', default_value='joint_states',
                               description='topic of the joint states'),
         DeclareLaunchArgument('rviz', default_value='true', description='start RViz too'),
-        DeclareLaunchArgument('layout', default_value=str(layout), description='display configuration of RViz'),
+        DeclareLaunchArgument('layout', default_value=str(layout), description='display configuration of RViz; default: '
+                                                                         'config/layouts/arm.rviz'),
         OpaqueFunction(function=describe),
     ])

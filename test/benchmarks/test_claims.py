@@ -98,3 +98,5 @@ def test_a_date_is_shown_for_the_result_that_it_was_recorded_with(claims, monkey
 def test_the_documentation_has_the_values_measured_last(claims):
     tables = importlib.import_module('tables')
     assert tables.TARGET.read_text(encoding='utf-8') == tables.page(), 'run `make docs`'
+    readme = tables.README.read_text(encoding='utf-8')
+    assert readme == tables.readme(readme), 'run `make docs`'
