@@ -32,7 +32,8 @@ if [ -e "$venv" ]; then
     echo "$venv exists and is not a virtual environment; move it away, then run make again" >&2
     exit 1
 fi
-for python in ${PYTHON:-} python3 python3.12 python3.13 python3.11 python /usr/bin/python3 /usr/local/bin/python3; do
+for python in ${PYTHON:-} python3 python3.12 python3.13 python3.11 python /usr/bin/python3 /usr/local/bin/python3 \
+        "$HOME"/.pyenv/versions/3.*/bin/python3; do
     if command -v "$python" >/dev/null 2>&1 && fits "$python"; then
         echo "Making $venv with $("$python" --version)"
         exec "$python" -m venv "$venv"
