@@ -39,7 +39,7 @@ def generate_launch_description():
         DeclareLaunchArgument('joint_states', default_value='joint_states',
                               description='topic of the joint states'),
         DeclareLaunchArgument('rviz', default_value='true', description='start RViz too'),
-        DeclareLaunchArgument('layout', default_value=str(layout), description='display configuration of RViz; default: '
-                                                                         'config/layouts/arm.rviz'),
+        DeclareLaunchArgument('layout', default_value=str(layout),
+                              description='display configuration of RViz; default: config/layouts/arm.rviz'),
         OpaqueFunction(function=describe),
     ])
