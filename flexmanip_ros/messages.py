@@ -97,11 +97,15 @@ def modes_matrix(modes: tuple[Mode, ...], order: int) -> LabelledArray:
 def modes_interval(modes: tuple[Mode, ...], order: int) -> LabelledArray:
     """Return (order // 2, 4), rows as in ``modes_matrix``: lower and upper 95 % of frequency [Hz] and damping ratio.
 
-    NaN where there is no mode, or where its deviation is not known.
+    NaN where there is no mode, where its deviation is not known, and where the interval says nothing: it would reach
+    below 0 Hz, or more than 1 to either side of the damping ratio. The first samples of a model give intervals of 1e10
+    Hz, which would set the scale of every viewer.
     """
     rows = []
     for mode in _known(modes):
         frequency, damping = QUANTILE * mode.frequency_std_hz, QUANTILE * mode.damping_ratio_std
+        frequency = frequency if frequency <= mode.frequency_hz else math.nan
+        damping = damping if damping <= 1.0 else math.nan
         rows.append((mode.frequency_hz - frequency, mode.frequency_hz + frequency,
                      mode.damping_ratio - damping, mode.damping_ratio + damping))
     return _matrix('modes', 'frequency_lower95_hz frequency_upper95_hz damping_lower95 damping_upper95',

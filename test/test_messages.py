@@ -48,6 +48,11 @@ def test_the_interval_of_a_mode_is_as_wide_as_its_deviation_says_and_nan_where_t
         [nan, nan, 0.3 - 0.1 * far, 0.3 + 0.1 * far], [nan] * 4], rtol=1e-15)
 
 
+def test_an_interval_that_says_nothing_sets_no_scale():
+    found = modes_interval((Mode(7.0, 0.1, 1e10, 0.01), Mode(8.0, 0.1, 0.01, 1e6)), 4).data.reshape(-1, 4)
+    np.testing.assert_array_equal(np.isfinite(found), [[False, False, True, True], [True, True, False, False]])
+
+
 def test_nothing_that_is_not_a_number_is_published():
     broken = _model()
     broken.A[0, 0] = math.nan

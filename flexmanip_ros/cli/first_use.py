@@ -55,9 +55,9 @@ class Listener(event.Listener):
 
 
 @contextmanager
-def announced() -> Iterator[None]:
-    """Tell the user on stderr, at most once, that kernels are being compiled."""
-    with event.install_listener('numba:compile', Listener()):
+def announced(say: Callable[[], None] = tell) -> Iterator[None]:
+    """Tell the user, at most once and on stderr where nothing else is said, that kernels are being compiled."""
+    with event.install_listener('numba:compile', Listener(say)):
         yield
 
 

@@ -154,7 +154,9 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         if not self._entities_made:
             self.make_entities()
             self._entities_made = True
-        self.start()
+        from flexmanip_ros.cli import first_use  # it loads numba, which --help does not need
+        with first_use.announced(lambda: self.get_logger().warning(first_use.WORDS)):
+            self.start()
 
     def _activate(self) -> None:
         self.activated()

@@ -14,11 +14,13 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from identifier_harness import CAPTURE, Live, recording
 from joint_states import joint_state
+from numba import njit
 from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from flexmanip_ros import messages
+from flexmanip_ros.cli import first_use
 from flexmanip_ros.cli.suggest import file_text
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import yaml_text
@@ -131,6 +133,14 @@ def test_a_node_logs_its_arm_and_where_it_comes_from(
     monkeypatch.setattr(sys, 'argv', ['capture_trigger', '--ros-args', '--params-file', 'other.yaml'])
     ros.managed(CaptureTrigger(context=ros.context, namespace='three'))
     log('all defaults: other.yaml sets no parameter arm.* of /three/capture_trigger')
+
+
+def test_a_node_that_compiles_kernels_says_so_while_it_does(
+        ros: Ros, log: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(first_use, 'PATIENCE', 1e-4)
+    monkeypatch.setattr(CaptureTrigger, 'start', lambda node: njit(lambda x: x + 1.0)(1.0))
+    ros.managed(CaptureTrigger(context=ros.context))
+    assert log(first_use.WORDS).index(first_use.WORDS) < log('ready: ').index('ready: ')
 
 
 def test_nodes_of_two_arms_have_diagnostics_of_their_own(ros: Ros) -> None:
