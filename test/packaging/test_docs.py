@@ -5,12 +5,15 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import re
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
+from flexmanip_ros.io import outputs
 from flexmanip_ros.parameters import DemoParameters, leaves
 from flexmanip_ros.parameters.document import NODES
+from flexmanip_ros.studies.summary import Summary
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted(str(path.relative_to(ROOT)) for path in (ROOT / 'docs').rglob('*.md'))
@@ -127,6 +130,11 @@ def test_an_option_that_is_named_is_one_of_the_program(program: str, capsys: pyt
         for command in commands(page):
             if re.match(rf'(?:\.venv/bin/)?{program}\b', command):
                 assert set(re.findall(r'(?<!\S)(--[a-z][\w-]*)', command)) <= known, f'{page}: {command}'
+
+
+def test_every_column_and_key_that_identify_bag_writes_is_explained() -> None:
+    written = [*outputs.columns([]), *(field.name for field in fields(Summary) if field.name != 'model_status')]
+    assert [name for name in written if f'`{name}`' not in text_of('docs/recordings.md')] == []
 
 
 @pytest.mark.parametrize('page', ALL)
