@@ -22,11 +22,13 @@ from flexmanip_ros.types import Array, StateSpace, Status
 Complex = NDArray[np.complex128]
 
 AHEAD_S = 0.25
-"""How far ahead predictions are judged [s]; less in the first 1.5 s after an event."""
+"""How far ahead predictions are judged [s]; in the first 0.75 s after an event a third of that time."""
 LAST_S = 1.5
 """Time over which they are judged [s], with that of the first state."""
 INSTANTS = 10
 """From how many instants in the time ahead one prediction each is made."""
+STRETCHES = 6
+"""Stretches in that time, at least, whose frequencies are compared."""
 MOST_ROWS = 4096
 MISSED = 0.5
 """Share of an output's power that predictions may miss."""
@@ -35,7 +37,10 @@ SILENT = 10.0
 FOURTH = 0.6744897501960817 * math.sqrt(70.0)
 """Median of the fourth differences of white noise, in standard deviations."""
 
-
+MEDIAN_SPREAD = 2.9
+"""Relative standard deviation of ``white_noise`` from N samples of white noise, times the root of N."""
+CHANCE = 4.0
+"""Of these deviations by which residuals may exceed the white noise before the model is taken to miss something."""
 OFF, VAGUE = 0.02, 0.01
 """Relative error of a frequency that the last samples may show, and its relative standard deviation."""
 EARLY = 4096
@@ -61,6 +66,14 @@ def white_noise(Y: Array) -> Array:
     return found
 
 
+def free_motion(model: StateSpace, count: int) -> Array:
+    """(count, m, n) C A^k."""
+    free, ahead = model.C[None], model.A
+    while len(free) < count:  # twice as many each time
+        free, ahead = np.concatenate([free, free @ ahead]), ahead @ ahead
+    return free[:count]
+
+
 def missed(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np.bool_] | None = None) -> Array:
     """(m,) share of the power of Y (N, m) that predictions ``horizon`` samples ahead miss.
 
@@ -69,10 +82,7 @@ def missed(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np
     """
     n, m = model.order, model.C.shape[0]
     before = max(horizon, 2 * n)
-    free, ahead = model.C[None], model.A
-    while len(free) < before + horizon:  # C A^k, twice as many each time
-        free, ahead = np.concatenate([free, free @ ahead]), ahead @ ahead
-    free = free[:before + horizon]
+    free = free_motion(model, before + horizon)
     power, white = np.var(Y, axis=0), white_noise(Y)
     unit = 1.0 / np.sqrt(np.where(power > 0.0, power, 1.0))
     free = free * unit[:, None]
@@ -165,37 +175,86 @@ def frequency_errors(model: StateSpace, U: Array, Y: Array, horizon: int, seen: 
     return step, np.sqrt(np.sum(root ** 2, axis=0) * len(scores) / (len(scores) - 1))
 
 
+def unfitted(model: StateSpace, U: Array, Y: Array, seen: NDArray[np.bool_]) -> float:
+    """Share of the amplitude of Y (N, m) that the model leaves beyond white noise, the first state being free.
+
+    In the mean over the outputs that say something; 0 where it may be chance. seen: as in ``missed``.
+    """
+    power, white = np.var(Y, axis=0), white_noise(Y)
+    heard = power > SILENT * white
+    unit = 1.0 / np.sqrt(np.where(power > 0.0, power, 1.0))
+    free = (free_motion(model, len(Y)) * unit[:, None])[seen]
+    left = ((Y - simulate(model, U)) * unit)[seen]
+    if not heard.any() or not np.all(np.isfinite(free)) or not np.all(np.isfinite(left)):
+        return math.inf if heard.any() else 0.0
+    x = np.linalg.lstsq(free.reshape(-1, model.order), left.ravel(), rcond=1e-9)[0]
+    rest = np.mean((left - free @ x) ** 2, axis=0)[heard]
+    noise = (white * unit ** 2)[heard]
+    beyond = rest > (1.0 + CHANCE * MEDIAN_SPREAD / math.sqrt(len(left))) * noise
+    return math.sqrt(float(np.mean(np.where(beyond, rest - noise, 0.0))))
+
+
+def widened(found: Identified, share: float) -> Identified:
+    """Return the model with what errors of its poles explain of a share of the amplitude that it leaves.
+
+    A pole that is off by d [rad a sample] turns or swells the motion by d k in k samples, in the mean over N samples by
+    d N / sqrt(3) (root of the mean square).
+    """
+    A = found.model.A
+    values, right = np.linalg.eig(A)
+    if share == 0.0 or not found.samples > 0.0 or not found.spread.size or not np.linalg.cond(right) < MOST_SKEW:
+        return found
+    left, off = np.linalg.inv(right), math.sqrt(3.0) * share / found.samples
+    more = np.zeros((len(found.spread), 2 * np.count_nonzero(values.imag > 0.0)))
+    for column, k in enumerate(np.flatnonzero(values.imag > 0.0)):
+        turn = 2.0 * off * values[k] * np.outer(right[:, k], left[k])
+        more[:A.size, 2 * column:2 * column + 2] = np.column_stack([(1j * turn).real.ravel(), turn.real.ravel()])
+    return found._replace(spread=np.hstack([found.spread, more]))
+
+
 def judged(found: Identified, rows: Rows, outputs: tuple[str, ...]) -> Identified:
     """Return the model with what its predictions of the last samples are worth; outputs: their names.
 
     INCONSISTENT where they miss too much of the outputs in the mean, or where the last samples show another frequency;
     ORDER_TOO_LOW where they miss one output while the others are predicted; POORLY_EXCITED, at first WARMING_UP, where
-    a frequency is not known well enough. Rates count in the mean alone where there are others: they ring with modes
-    above the order, which displacements hardly show, so that right models of the first modes would be refused.
+    a frequency is not known well enough. Frequencies are judged by displacements alone where there are some: rates ring
+    with modes above the order. A model of one configuration has its deviations widened by what it leaves of the
+    samples, as nothing else tells how far a fit of two periods, or an arm that turns, leads it astray.
     """
     if found.status is not Status.TRACKING:
         return found
-    light = [mode for mode in modes(found) if abs(mode.damping_ratio) < DAMPED][:MOST_MODES]
-    # a model of every configuration has a rule of its own
-    if found.configurations is None and any(mode.frequency_std_hz > VAGUE * mode.frequency_hz for mode in light):
-        return found._replace(status=Status.WARMING_UP if found.samples < EARLY else Status.POORLY_EXCITED)
+    gaps = np.flatnonzero(rows.gap[1:])
+    if gaps.size:  # predictions cannot go over unknown torques
+        rows = rows.between(rows.first + 1 + int(gaps[-1]), rows.until)
+    rates = np.array([name.endswith('/velocity') for name in outputs])
+    chosen = ~rates | rates.all()
+    model = replace(found.model, C=found.model.C[chosen], D=found.model.D[chosen])
+    seen = rows.missing == 0
+    if found.configurations is None:  # that of every configuration has rules of its own
+        last = slice(max(0, len(rows) - round(found.samples)), None)
+        if len(seen[last]) > STRETCHES * model.order:
+            with np.errstate(over='ignore', invalid='ignore'):
+                share = unfitted(model, rows.u[last], rows.y[last][:, chosen], seen[last])
+            if not math.isfinite(share):
+                return found._replace(status=Status.INCONSISTENT)
+            found = widened(found, share)
+        light = [mode for mode in modes(found) if abs(mode.damping_ratio) < DAMPED][:MOST_MODES]
+        if any(mode.frequency_std_hz > VAGUE * mode.frequency_hz for mode in light):
+            return found._replace(status=Status.WARMING_UP if found.samples < EARLY else Status.POORLY_EXCITED)
     dt = found.model.dt
-    horizon = max(2, min(round(AHEAD_S / dt), len(rows) // 6))
-    if 3 * len(rows) < length(dt) or len(rows) < 6 * max(horizon, found.model.order) or rows.gap[1:].any():
+    stretch = max(2, min(round(AHEAD_S / dt), len(rows) // STRETCHES))
+    horizon = max(2, min(round(AHEAD_S / dt), len(rows) // 3))
+    if 3 * len(rows) < length(dt) or len(rows) < STRETCHES * max(stretch, found.model.order):
         return found
     with np.errstate(over='ignore', invalid='ignore'):
-        shares = missed(found.model, rows.u, rows.y, horizon, rows.missing == 0)
+        shares = missed(found.model, rows.u, rows.y, horizon, seen)
     heard = shares[~np.isnan(shares)]
     if heard.size and float(heard.mean()) > MISSED:
         return found._replace(status=Status.INCONSISTENT)
-    rates = np.array([name.endswith('/velocity') for name in outputs])
-    chosen = ~rates | rates.all()
-    alone = shares[~np.isnan(shares) & chosen]
-    if alone.size and float(alone.max()) > MISSED:
+    if heard.size and float(heard.max()) > MISSED:
         return found._replace(status=Status.ORDER_TOO_LOW)
-    model = replace(found.model, C=found.model.C[chosen], D=found.model.D[chosen])
     with np.errstate(over='ignore', invalid='ignore'):
-        error, deviation = frequency_errors(model, rows.u, rows.y[:, chosen], horizon, rows.missing == 0)
+        error, deviation = frequency_errors(model, rows.u, rows.y[:, chosen], stretch, seen)
     if np.any(np.abs(error) - CERTAIN * deviation > OFF):
         return found._replace(status=Status.INCONSISTENT)
     return found

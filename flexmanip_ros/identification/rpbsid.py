@@ -17,7 +17,6 @@ from flexmanip_ros.errors import SignalError
 from flexmanip_ros.identification import decimation, factor, model_output, paper_recursion, recursive_fit
 from flexmanip_ros.identification.factor import FILLED, POWER, PRIOR, USED, WEIGHT, WEIGHT2, Outcomes
 from flexmanip_ros.identification.moments import solve_regressor
-from flexmanip_ros.identification.parameter_varying import roles
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.identification.varying_model import Configurations
 from flexmanip_ros.numerics.background import INLINE, Background
@@ -29,8 +28,6 @@ MODES = {
     'constant': factor.CONSTANT, 'excitation': factor.EXCITATION,
     'innovation': factor.INNOVATION,
 }
-LATEST_VARYING = 3 * recursive_fit.LONGEST // 2
-"""Samples after which a model of one configuration is trusted, where one of every configuration cannot be had."""
 FRESH = 3.0
 """A fit is published while the subspace model rests on at most this many times its samples."""
 
@@ -261,13 +258,10 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> I
             config, refined.varying, dt, model_output.excitation(state.memory[0][:d, :d]), float(state.scalars[POWER]),
             np.zeros(0) if last is None else last.singular_values, float('nan') if last is None else last.condition,
         ).now(state.cursor - refined.seen)
-    # it is followed by a model of every configuration, which starts from displacements alone
-    follows = (refined is not None and refined.batch and refined.total < LATEST_VARYING and roles(config) is not None)
     if refined is not None and refined.recursion and len(refined.recursion.theta.A) == config.order \
             and FRESH * refined.recursion.weight >= state.counts[USED]:
-        published = model_output.from_fit(
+        return model_output.from_fit(
             config, refined.recursion, state.scalars, model_output.excitation(state.memory[0][:d, :d]), dt)
-        return published._replace(status=Status.WARMING_UP) if follows else published
     few = state.counts[USED] <= max(config.past_window, config.order)
     if few or not np.all(np.isfinite(state.memory[0])):
         return None
@@ -281,7 +275,7 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> I
         return None
     found = model_output.publish(
         config, realized, R, scale, state.scalars, state.variance, int(state.counts[USED]), d, dt)
-    early = refined is not None and (follows or state.counts[USED] < recursive_fit.FIRST + recursive_fit.SOONEST
+    early = refined is not None and (state.counts[USED] < recursive_fit.FIRST + recursive_fit.SOONEST
                                      or recursive_fit.is_first_under_way(refined))
     if found is not None and early and found.status is Status.TRACKING:
         return found._replace(status=Status.WARMING_UP)  # a short past is biased, and no fit has been made

@@ -62,7 +62,7 @@ def true_frequencies(plant: PlantParameters, run: simulator.Trajectory, time: fl
 
 def test_a_record_is_needed_before_a_model_is_called_tracking() -> None:
     config = configure(IdentifierParameters, {'payload_method': 'none'})
-    run = simulator.simulate(PlantParameters(), excitation.sequence(ExcitationParameters(), 600), [])
+    run = simulator.simulate(PlantParameters(), excitation.sequence(ExcitationParameters(), 900), [])
     records = [item for item in simulator.records(run) if isinstance(item, JointRecord)]
     said = [(e.stamp_ns, e.model_status) for e in pipeline.run(config, records)]
     assert {status for stamp, status in said if stamp < 0.38e9} == {Status.WARMING_UP}
