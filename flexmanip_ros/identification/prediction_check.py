@@ -217,9 +217,10 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...]) -> Identifie
 
     INCONSISTENT where they miss too much of the outputs in the mean, or where the last samples show another frequency;
     ORDER_TOO_LOW where they miss one output while the others are predicted; POORLY_EXCITED, at first WARMING_UP, where
-    a frequency is not known well enough. Frequencies are judged by displacements alone where there are some: rates ring
-    with modes above the order. A model of one configuration has its deviations widened by what it leaves of the
-    samples, as nothing else tells how far a fit of two periods, or an arm that turns, leads it astray.
+    a frequency is not known well enough. Rates count in the mean alone where there are others: they ring with modes
+    above the order, which displacements hardly show, so that right models of the first modes would be refused.
+    A model of one configuration has its deviations widened by what it leaves of the samples, as nothing else tells how
+    far a fit of two periods, or an arm that turns, leads it astray.
     """
     if found.status is not Status.TRACKING:
         return found
@@ -251,7 +252,7 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...]) -> Identifie
     heard = shares[~np.isnan(shares)]
     if heard.size and float(heard.mean()) > MISSED:
         return found._replace(status=Status.INCONSISTENT)
-    if heard.size and float(heard.max()) > MISSED:
+    if np.any(shares[chosen] > MISSED):
         return found._replace(status=Status.ORDER_TOO_LOW)
     with np.errstate(over='ignore', invalid='ignore'):
         error, deviation = frequency_errors(model, rows.u, rows.y[:, chosen], stretch, seen)

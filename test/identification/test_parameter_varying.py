@@ -278,18 +278,6 @@ def test_two_modes_that_a_fit_of_three_periods_takes_for_one_are_not_tracking() 
         assert (judged.spread is known) == (said is Status.TRACKING)  # white noise widens nothing
 
 
-def test_a_rate_that_is_not_predicted_says_that_the_order_is_too_low() -> None:
-    u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
-    model, y = swinging((5.6, 6.1), u)
-    ringing = np.sin(2.0 * np.pi * 50.0 * 1e-3 * np.arange(len(u)) ** 1.01)[:, None]
-    wide = replace(model, C=np.vstack([model.C, np.eye(4)[1:2]]), D=np.zeros((3, 2)), K=np.zeros((4, 3)))
-    slow = validation.simulate(wide, u)[:, 2:]
-    found = Identified(wide, np.zeros((52, 1)), np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING)
-    for share, said in ((0.1, Status.TRACKING), (2.0, Status.ORDER_TOO_LOW)):
-        rows = log_of(u, np.hstack([y, slow + share * np.std(slow) * ringing])).rows(0, len(u))
-        assert prediction_check.judged(found, rows, ('a/position', 'b/position', 'a/velocity')).status is said
-
-
 def test_a_frequency_that_is_not_known_to_one_per_cent_is_not_tracking() -> None:
     u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
     model, y = swinging((5.6, 6.1), u)
