@@ -316,9 +316,9 @@ def bias_jacobian(
 
 
 @inner
-def solve_columns(L: Array, X: Array) -> None:
-    """Overwrite X (n, m) with -M^-1 X, L from ``equations_of_motion.factor``."""
-    n, m = X.shape
+def solve_columns(L: Array, X: Array, m: int) -> None:
+    """Overwrite the first m columns of X (n, >= m) with -M^-1 X, L from ``equations_of_motion.factor``."""
+    n = X.shape[0]
     for r in range(n):
         for p in range(r):
             x = L[r, p]
@@ -413,6 +413,6 @@ def acceleration_jacobian(
     elastic_jacobian(arm, q, dq, work)
     torque_jacobian(arm, q, qd, work, dq)
     damping_jacobian(arm, work, dqd)
-    solve_columns(work.M, dq)
-    solve_columns(work.M, dqd)
+    solve_columns(work.M, dq, q.size)
+    solve_columns(work.M, dqd, q.size)
     return True

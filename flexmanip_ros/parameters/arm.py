@@ -57,6 +57,14 @@ class ArmParameters:
         (1.0, 1.0), 'measured over true bend of each link', low=0.1, high=10.0, size=2, per_link=True)
     bend_offset: tuple[float, ...] = parameter(
         (0.0, 0.0), 'measured bend of each link when it is straight', unit='m', size=2, per_link=True)
+    torque_delay: float = parameter(
+        0.0, 'dead time between the effort in a message and the torque of all joints; sensors that are late by as much '
+        'show the same', unit='s', low=0.0, high=0.2)
+    torque_lag: tuple[float, ...] = parameter(
+        (0.0, 0.0), 'time constant of the first-order lag with which the torque of each joint follows its effort',
+        unit='s', low=0.0, high=0.1, size=2, per_link=True)
+    bend_delay: float = parameter(
+        0.0, 'time by which the bends in a message are older than the angles in it', unit='s', low=-0.02, high=0.02)
     gravity: tuple[float, ...] = parameter(
         (0.0, 0.0), 'gravity along x and y; (0, -9.81): the arm moves in a vertical plane', unit='m/s^2', size=2)
     base_mass: float = parameter(
@@ -178,6 +186,9 @@ class PlantParameters:
         check_all(self)
         for group in (self, self.sensors, self.actuators):
             fit_links(group, len(self.arm.link_length))
+        if self.arm.bend_delay < 0.0:
+            raise ParameterError(f"parameter 'arm.bend_delay' is {self.arm.bend_delay} s",
+                                 'a simulated arm shows bends late or in time: give 0 or more')
         if self.sensors.stamp_jitter * self.rate > 0.15:  # three deviations stay below half an interval
             raise ParameterError(
                 f"parameter 'sensors.stamp_jitter' is {self.sensors.stamp_jitter} s, so that stamps change places",

@@ -14,7 +14,7 @@ FIELDS = ('position', 'velocity', 'effort')
 
 
 LEARNABLE = ('stiffness', 'damping', 'viscous_friction', 'coulomb_friction', 'rotor_inertia', 'torque_gain',
-             'bend_gain', 'bend_offset', 'mode_stiffness')
+             'bend_gain', 'bend_offset', 'mode_stiffness', 'torque_delay', 'torque_lag', 'bend_delay')
 """What the empty arm can teach."""
 
 

@@ -16,14 +16,16 @@ NAMES = {
     Kind.STIFFNESS: 'link{}_bending_stiffness', Kind.DAMPING: 'link{}_damping_ratio',
     Kind.VISCOUS: 'joint{}_viscous_friction', Kind.COULOMB: 'joint{}_coulomb_friction',
     Kind.ROTOR: 'joint{}_rotor_inertia', Kind.TORQUE_GAIN: 'joint{}_torque_gain', Kind.BEND_GAIN: 'link{}_bend_gain',
-    Kind.BEND_OFFSET: 'link{}_bend_offset'}
+    Kind.BEND_OFFSET: 'link{}_bend_offset', Kind.TORQUE_DELAY: 'torque_delay', Kind.TORQUE_LAG: 'joint{}_torque_lag',
+    Kind.BEND_DELAY: 'bend_delay'}
 """Published name of a parameter of a link or joint, counted from 1."""
 FIELDS = {
     Kind.STIFFNESS: 'bending_stiffness', Kind.VISCOUS: 'joint_viscous_friction', Kind.COULOMB: 'joint_coulomb_friction',
     Kind.ROTOR: 'rotor_inertia', Kind.TORQUE_GAIN: 'torque_gain', Kind.BEND_GAIN: 'bend_gain',
-    Kind.BEND_OFFSET: 'bend_offset'}
+    Kind.BEND_OFFSET: 'bend_offset', Kind.TORQUE_DELAY: 'torque_delay', Kind.TORQUE_LAG: 'torque_lag',
+    Kind.BEND_DELAY: 'bend_delay'}
 """The parameter arm.* that takes it."""
-POSITIVE = (Kind.VISCOUS, Kind.COULOMB, Kind.ROTOR)
+POSITIVE = (Kind.VISCOUS, Kind.COULOMB, Kind.ROTOR, Kind.TORQUE_DELAY, Kind.TORQUE_LAG)
 """Kinds that no parameter can give below zero."""
 
 
@@ -35,12 +37,19 @@ def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple
     if state is None or state.model is None or state.memory is None:
         return ()
     model, m = state.model, state.memory
-    first = 2 * model.motion.arm.stiffness.size
     found = []
+    x, S = m.x[model.payload:].copy(), m.S[model.payload:].copy()
+    late = model.motion.kind == Kind.TORQUE_LAG
+    mirrored = late & (x < 0.0)
+    if mirrored.any():  # what the filter means by a lag below zero, see ``late_torque``
+        delay = model.motion.kind == Kind.TORQUE_DELAY
+        x[delay] += 2.0 * x[mirrored].sum() / late.sum()
+        S[delay] += 2.0 * S[mirrored].sum(axis=0) / late.sum()
+        x[mirrored] *= -1.0
     for c, (kind, link) in enumerate(zip(map(Kind, model.motion.kind), model.motion.link.tolist(), strict=True)):
         if kind not in NAMES or not model.prior[c]:
             continue
-        value, std = float(m.x[first + c]), float(np.linalg.norm(m.S[first + c])) or float(model.prior[c])
+        value, std = float(x[c]), float(np.linalg.norm(S[c])) or float(model.prior[c])
         if kind is Kind.STIFFNESS:
             value = config.arm.bending_stiffness[link] * float(np.exp(value))
             std *= value
@@ -62,12 +71,13 @@ def as_parameters(config: IdentifierParameters, found: Sequence[ArmParameter]) -
     values: dict[str, Any] = {}
     for kind, field in FIELDS.items():
         given = getattr(config.arm, field)
-        here = [by_name.get(NAMES[kind].format(link + 1)) for link in range(len(given))]
+        each = given if isinstance(given, tuple) else (given,)
+        here = [by_name.get(NAMES[kind].format(link + 1)) for link in range(len(each))]
         if any(here):
             least = 0.0 if kind in POSITIVE else -np.inf
-            values[f'arm.{field}'] = tuple(
-                before if one is None else max(float(f'{one.value:.6g}'), least)
-                for one, before in zip(here, given, strict=True))
+            new = tuple(before if one is None else max(float(f'{one.value:.6g}'), least)
+                        for one, before in zip(here, each, strict=True))
+            values[f'arm.{field}'] = new if isinstance(given, tuple) else new[0]
     ratios = [one for one in found if one.name.endswith('_damping_ratio')]
     if ratios:
         weights = np.array([one.std for one in ratios]) ** -2.0

@@ -147,7 +147,9 @@ def _watch(
         fresh = init(config)
         return replace(fresh, filter=fresh.filter._replace(cursor=cursor)), None
     last = rows.between(cursor - 1, cursor)
-    filtered = filtered._replace(memory=m, cursor=cursor, last_ns=int(last.stamp_ns[0]), effort=last.u[0].copy())
+    filtered = filtered._replace(
+        memory=m, cursor=cursor, last_ns=int(last.stamp_ns[0]), efforts=structured.latest(
+            filtered.sensors, last.u, table[:abs(taken), 1:1 + last.u.shape[1]]))
     state = replace(state, filter=filtered, glr=glr)
     if glr.clock[kernel.ALARMED] <= confirm:
         return state, None

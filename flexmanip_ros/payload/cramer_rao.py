@@ -177,14 +177,17 @@ def _gathered(
     measured = np.asarray(noise_std)[[*model.kept, *range(len(config.outputs), len(noise_std))]]
     n, columns = model.motion.arm.stiffness.size, S.shape[1]
     seen = sensors(config, model, dt, np.zeros(x.size))
+    rows = np.full((seen.reach, 1 + efforts.shape[1]), dt)
+    padded = np.vstack([np.tile(efforts[0], (seen.reach - 1, 1)), efforts])
     information, F = np.zeros((columns, columns)), np.zeros((len(measured), columns))
-    for k, effort in enumerate(efforts):
+    for k in range(len(efforts)):
         yield k, information
         for i, deviation in enumerate(measured):
-            observe(seen, i, n, x, S, F[i])
+            observe(seen, i, n, x, S, F[i], model.motion.k[0])
             F[i] /= deviation
         information += F.T @ F
-        if not predict(model.motion, x, S, columns, effort, dt, 0):
+        rows[:, 1:] = padded[k:k + seen.reach]
+        if not predict(model.motion, x, S, columns, rows, dt, 0):
             raise ModelError('the arm diverges under these torques', 'use smaller torques')
     yield len(efforts), information
 

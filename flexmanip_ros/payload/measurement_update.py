@@ -58,6 +58,10 @@ class MeasurementModel(NamedTuple):
     """(m,) which state is the logarithm of the sensor's gain; -1: none."""
     offset: NDArray[np.int64]
     """(m,) which state is its offset; -1: none."""
+    delay: NDArray[np.int64]
+    """(m,) which state is its delay; -1: none."""
+    reach: int
+    """Efforts that a torque depends on."""
     block: int
     """Samples in a block: a tenth of the slowest vibration."""
     diffusion: Array
@@ -73,10 +77,39 @@ class MeasurementModel(NamedTuple):
 
 
 @inner
-def observe(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Array) -> float:
-    """Return what sensor i should read and fill f (nx,) with the spread of that, S' times its derivative."""
+def look_back(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Array, qdd: Array) -> float:
+    """Return how far a late sensor is behind, by Taylor's series to second order, and add that to f."""
+    row = S[sensors.delay[i]]
+    delay: float = x[sensors.delay[i]]
+    opened = delay != 0.0
+    for c in range(f.size):
+        opened |= row[c] != 0.0
+    if not opened:
+        return 0.0
+    rate: float = 0.0
+    bend: float = 0.0
+    for j in range(n):
+        h = sensors.H[i, j]
+        if h != 0.0:
+            rate += h * x[n + j]
+            bend += h * qdd[j]
+            for c in range(f.size):
+                f[c] -= delay * h * S[n + j, c]
+    for c in range(f.size):
+        f[c] += (delay * bend - rate) * row[c]
+    return delay * (0.5 * delay * bend - rate)
+
+
+@inner
+def observe(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Array, qdd: Array) -> float:
+    """Return what sensor i should read and fill f (nx,) with the spread of that, S' times its derivative.
+
+    qdd: (n,) accelerations, of which a late sensor takes note.
+    """
     predicted = project(x, S, sensors.H[i], n if sensors.rate[i] else 0, f)
     gain, offset = sensors.gain[i], sensors.offset[i]
+    if sensors.delay[i] >= 0:
+        predicted += look_back(sensors, i, n, x, S, f, qdd)
     if gain >= 0:
         factor = np.exp(x[gain])
         predicted *= factor
@@ -90,14 +123,17 @@ def observe(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Ar
 
 
 @inner
-def measure(sensors: MeasurementModel, m: FilterState, y: Array) -> None:
-    """Update the filter with one sample and gather what its innovations say of noise and payload."""
+def measure(sensors: MeasurementModel, m: FilterState, y: Array, qdd: Array) -> None:
+    """Update the filter with one sample and gather what its innovations say of noise and payload.
+
+    qdd: (n,) accelerations.
+    """
     x, S, f = m.x, m.S, sensors.f[:m.counts[USED]]
     n = sensors.H.shape[1]
     payload = 2 * n
     for i in range(y.size):
         r = m.noise[i, EFFECTIVE]
-        e = y[i] - observe(sensors, i, n, x, S, f)
+        e = y[i] - observe(sensors, i, n, x, S, f, qdd)
         spread = dot(f, f)
         variance = spread + r
         square = e * e / variance

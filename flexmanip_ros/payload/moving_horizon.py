@@ -97,8 +97,11 @@ CALM_SAMPLES = 1000
 """For so many samples, several periods of the slowest vibration."""
 SLACK = 1.0
 """By so much may the cost rise: less than the estimate can tell."""
-LEAST_DAMPING = 1e-3
-"""Damping of Levenberg and Marquardt with which a rejected step is taken again."""
+LEVENBERG = 1.0
+"""Damping with which a rejected step is taken again after a capture: as much as the arrival cost. What is held lies
+along a narrow valley that bends, and damping in proportion to the information hardly lets a step go along it."""
+MARQUARDT = 1e-3
+"""The same for an empty arm, in proportion to the information: its priors are rough."""
 REJECTIONS = 8
 """How often a step is shortened that raises the cost."""
 
@@ -126,19 +129,21 @@ def begin_iteration(m: FilterState) -> None:
 def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array) -> bool:
     """Take one sample since the event into the iteration: N += f f' / r, g += f e / r. False: the step was too long.
 
-    table: (N, 1 + L + m), its first row is the first sample after the event. The cost is Huber's.
+    table: (N, 1 + L + m), the rows before the event that a late torque needs, then the first sample after it. The cost
+    is Huber's.
     """
-    sample = table[m.counts[ITERATED]]
+    k = m.counts[ITERATED] + sensors.reach - 1
+    sample = table[k]
     n, nx, used = sensors.H.shape[1], m.x.size, m.counts[USED]
     links, f = motion.effort.size, sensors.f[:used]
-    if not predict(motion, m.xr, m.Sr, used, sample[1:1 + links], sample[0], m.counts[HALVED]):
+    if not predict(motion, m.xr, m.Sr, used, table[k + 1 - sensors.reach:k + 1], sensors.period, m.counts[HALVED]):
         return False
     measured = sample[1 + links] == sample[1 + links]
     if measured:
         m.counts[MEASURED] += 1
     for i in range(m.noise.shape[0] if measured else 0):
         r = m.noise[i, EFFECTIVE]
-        e = sample[1 + links + i] - observe(sensors, i, n, m.xr, m.Sr, f)
+        e = sample[1 + links + i] - observe(sensors, i, n, m.xr, m.Sr, f, motion.k[0])
         weight = 1.0 / r
         m.score[COST] += e * e * weight
         m.noise[i, FIT] += e * e
@@ -165,11 +170,11 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
     fits = m.score[COST] < FITS * (nx + m.noise.shape[0] * m.counts[MEASURED])
     enough = CONVERGED * m.counts[ITERATED]
     # two steps may undo each other for ever where the valley bends
-    still = (m.counts[BEFORE] == m.counts[ITERATED] and m.score[LAMBDA] <= LEAST_DAMPING
+    still = (m.counts[BEFORE] == m.counts[ITERATED] and m.score[LAMBDA] <= least_damping(m)
              and m.score[COST_BEFORE] - m.score[COST] < enough)
     m.counts[BEFORE] = m.counts[ITERATED]
     m.score[COST_BEFORE] = m.score[COST]
-    m.score[LAMBDA] = m.score[LAMBDA] / 8.0 if m.score[LAMBDA] > LEAST_DAMPING and not fits else 0.0
+    m.score[LAMBDA] = m.score[LAMBDA] / 8.0 if m.score[LAMBDA] > least_damping(m) and not fits else 0.0
     m.counts[REJECTED] = 0
     m.counts[ITERATING] = 0
     if not damped_step(motion, sensors, m):
@@ -201,6 +206,12 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
 
 
 @inner
+def least_damping(m: FilterState) -> float:
+    """Return the damping that is as good as none."""
+    return LEVENBERG if m.counts[HELD] == 1 else MARQUARDT
+
+
+@inner
 def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
     """Set xi to the accepted one and a step of Levenberg and Marquardt, m.g; the payload stays possible."""
     nx = m.xi.size
@@ -209,7 +220,7 @@ def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
         m.g[i] = m.gradient[i]
         for c in range(i + 1):
             L[i, c] = m.normal[i, c]
-        L[i, i] += m.score[LAMBDA] * (1.0 + L[i, i])
+        L[i, i] += m.score[LAMBDA] * (1.0 if m.counts[HELD] == 1 else 1.0 + L[i, i])
     if not factor_information(L):
         return False
     forward(L, m.g)
@@ -236,7 +247,7 @@ def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
 def reject_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
     """Take a shorter step from the accepted xi, nearer to the gradient, and begin the iteration again."""
     m.counts[REJECTED] += 1
-    m.score[LAMBDA] = max(8.0 * m.score[LAMBDA], LEAST_DAMPING)
+    m.score[LAMBDA] = max(8.0 * m.score[LAMBDA], least_damping(m))
     if m.counts[REJECTED] > REJECTIONS:  # a valley that bends: go on from here
         m.score[COST_BEFORE] = 1e300
     if not damped_step(motion, sensors, m):
@@ -255,6 +266,10 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
     if stored + 1 < FIRST_ITERATION:
         return True
     if stored + 1 == HORIZON:
+        if m.counts[HELD] == 1 and m.score[SHIFT] >= AT_REST:  # what was linearized on the way tells too much
+            for i in range(m.x.size):
+                for c in range(m.x.size):
+                    m.S[i, c] *= np.sqrt(1.0 + m.score[SHIFT] * m.score[SHIFT])
         return not fails(m)
     for _ in range(ROWS):
         if m.counts[ITERATING] == 0:
@@ -360,13 +375,14 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     table: (N, 1 + L + m), see ``capture_detection_kernel.advance``.
     """
     links = motion.effort.size
-    duration, effort, y = table[k, 0], table[k, 1:1 + links], table[k, 1 + links:]
-    if not predict(motion, m.x, m.S, m.counts[USED], effort, duration, m.counts[HALVED]):
+    duration, y = table[k, 0], table[k, 1 + links:]
+    rows = table[k + 1 - sensors.reach:k + 1]
+    if not predict(motion, m.x, m.S, m.counts[USED], rows, sensors.period, m.counts[HALVED]):
         return False
     control_step(motion, m, duration)
     came = y[0] == y[0]
     if came:
-        measure(sensors, m, y)
+        measure(sensors, m, y, motion.k[0])
         confine(motion, m.x[m.x.size - motion.kind.size:])
         if not abs(m.x[2 * sensors.H.shape[1]]) < 1e9:
             return False

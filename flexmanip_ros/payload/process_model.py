@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, acceleration, factor, net_torques, solve
 from flexmanip_ros.arm.jacobian import acceleration_jacobian, damping_jacobian, solve_columns
+from flexmanip_ros.arm.late_torque import late_torque
 from flexmanip_ros.numerics.compiled import inlined, inner, kernel, merged
 from flexmanip_ros.types import Array
 
@@ -71,11 +72,17 @@ class Kind(IntEnum):
     """Measured bend of a straight link [m]."""
     MODE = 12
     """Logarithm of the stiffness of a mode beyond the first over what its link's stiffness gives; number link k + j."""
+    TORQUE_DELAY = 13
+    """Dead time from the reported efforts to the torques of all joints [s]."""
+    TORQUE_LAG = 14
+    """Time constant from the effort of a joint to its torque [s]."""
+    BEND_DELAY = 15
+    """Age of all bends in a sample beyond that of the angles [s]."""
 
 
 # for the compiled functions, to which an enumeration is no constant
 (MASS, FIRST_X, FIRST_Y, INERTIA, STIFFNESS, DAMPING, VISCOUS, COULOMB, ROTOR, TORQUE_GAIN, BEND_GAIN, BEND_OFFSET,
- MODE) = (int(kind) for kind in Kind)
+ MODE, TORQUE_DELAY, TORQUE_LAG, BEND_DELAY) = (int(kind) for kind in Kind)
 
 
 class ProcessModel(NamedTuple):
@@ -114,6 +121,12 @@ class ProcessModel(NamedTuple):
     """(L,) torques."""
     gain: Array
     """(L,) torque over reported effort."""
+    late: Array
+    """(L, 2) dead time and lag of the torques [s]."""
+    slope: Array
+    """(L, 2) derivatives of the torques by these."""
+    opened: NDArray[np.int64]
+    """(1 + np,) how many entries of p are not taken as known, then which these are."""
     p: Array
     """(np,) scratch."""
     a: Array
@@ -122,7 +135,7 @@ class ProcessModel(NamedTuple):
     dqd: Array
     dp: Array
     G: Array
-    """(n, np) derivative of the accelerations by p."""
+    """(n, np) derivative of the accelerations by the entries of p that are not taken as known, in this order."""
     X: Array
     Y: Array
 
@@ -164,6 +177,11 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
             motion.gain[i] = np.exp(value)
         elif kind == MODE:
             arm.stiffness[links + i] *= np.exp(value)
+        elif kind == TORQUE_DELAY:
+            for joint in range(links):
+                motion.late[joint, 0] = value
+        elif kind == TORQUE_LAG:
+            motion.late[i, 1] = value
 
 
 @inner
@@ -227,8 +245,8 @@ def linearize_frozen(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> b
             for c in range(n):
                 motion.dp[r, p] += motion.Mp[p, r, c] * qdd[c]
     damping_jacobian(motion.arm, motion.work, motion.dqd)
-    solve_columns(motion.work.M, motion.dq)
-    solve_columns(motion.work.M, motion.dqd)
+    solve_columns(motion.work.M, motion.dq, n)
+    solve_columns(motion.work.M, motion.dqd, n)
     return True
 
 
@@ -242,11 +260,12 @@ def linearize(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
             motion.arm, motion.payload, q, qd, motion.effort, qdd, motion.dq, motion.dqd, motion.dp, motion.work):
         return False
     n = q.size
-    arm, G, dp, net = motion.arm, motion.G, motion.dp, motion.work.net
+    arm, dp, net = motion.arm, motion.dp, motion.work.net
     k, links = arm.kappa, arm.length.size
+    G, opened = motion.G, motion.opened[0]
     # G first holds the derivative of M qdd + E + D qd + dV/dq - B tau
-    for c in range(motion.kind.size):
-        kind, i = motion.kind[c], motion.link[c]
+    for c in range(opened):
+        kind, i = motion.kind[motion.opened[1 + c]], motion.link[motion.opened[1 + c]]
         o = links + i * k
         for r in range(n):
             G[r, c] = 0.0
@@ -267,6 +286,10 @@ def linearize(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
                 turn += arm.joint[i, r] * qdd[r]
             for r in range(n):
                 G[r, c] = arm.joint[i, r] * turn
+        elif kind == TORQUE_DELAY:
+            for joint in range(links):
+                for r in range(n):
+                    G[r, c] -= motion.slope[joint, 0] * motion.work.B[r, joint]
         else:
             force = 0.0
             if kind == VISCOUS:
@@ -275,10 +298,12 @@ def linearize(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
                 force = np.tanh(net[1, i] / STICTION_RATE)
             elif kind == TORQUE_GAIN:
                 force = -motion.effort[i]
+            elif kind == TORQUE_LAG:
+                force = -motion.slope[i, 1]
             if force != 0.0:
                 for r in range(n):
                     G[r, c] = force * motion.work.B[r, i]
-    solve_columns(motion.work.M, G)
+    solve_columns(motion.work.M, G, opened)
     return True
 
 
@@ -306,18 +331,40 @@ def terms(angle: float, error: float) -> int:
     return k
 
 
-@kernel
-def predict(motion: ProcessModel, x: Array, S: Array, used: int, reported: Array, duration: float, halved: int) -> bool:
-    """Carry x and S over a time [s] with the torque held; False when numbers left the finite range.
+@inner
+def note_opened(motion: ProcessModel, S: Array, used: int) -> None:
+    """Write into motion which entries of p are not taken as known: their rows of S are not zero."""
+    count, first = 0, S.shape[0] - motion.kind.size
+    for p in range(motion.kind.size):
+        for c in range(used):
+            if S[first + p, c] != 0.0:
+                count += 1
+                motion.opened[count] = p
+                break
+    motion.opened[0] = count
 
-    used: number of columns of S, the first ones, that are not zero; halved: how often the longest step is halved.
+
+@kernel
+def predict(
+    motion: ProcessModel, x: Array, S: Array, used: int, rows: Array, period: float, halved: int,
+) -> bool:
+    """Carry x and S over a time with the torque held; False when numbers left the finite range.
+
+    used: number of columns of S, the first ones, that are not zero; rows: (P, >= 1 + L) that time [s] and the effort
+    held meanwhile [N m], after the rows before it that the torque depends on too; period: their sample time [s];
+    halved: how often the longest step is halved.
     """
+    duration = rows[rows.shape[0] - 1, 0]
     if duration <= 0.0:
         return True
     n = motion.arm.stiffness.size
     set_parameters(motion, x)
+    note_opened(motion, S, used)
     for i in range(motion.effort.size):
-        motion.effort[i] = motion.gain[i] * reported[i]
+        late, slope = motion.late[i], motion.slope[i]
+        motion.effort[i] = motion.gain[i] * late_torque(rows, 1 + i, late[0], late[1], period, slope)
+        slope[0] *= motion.gain[i]
+        slope[1] *= motion.gain[i]
     left, fine = duration, 0.5 ** halved
     while left > 0.0:
         if not linearize(motion, x[:n], x[n:2 * n], motion.k[0]):
@@ -440,11 +487,12 @@ def spread(motion: ProcessModel, S: Array, used: int, h: float, count: int) -> N
                     Y[n + i, c] += a * X[j, c] + b * X[n + j, c]
         if order == 1:
             for i in range(n):
-                for p in range(motion.G.shape[1]):
+                for p in range(motion.opened[0]):
                     g = motion.G[i, p]
                     if g != 0.0:
+                        row = 2 * n + motion.opened[1 + p]
                         for c in range(used):
-                            Y[n + i, c] += g * S[2 * n + p, c]
+                            Y[n + i, c] += g * S[row, c]
         weight *= h / order
         for i in range(2 * n):
             for c in range(used):

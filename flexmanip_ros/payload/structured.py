@@ -18,7 +18,7 @@ from flexmanip_ros.payload.capture_detection_kernel import filtered
 from flexmanip_ros.payload.interval import inertia_error, judge
 from flexmanip_ros.payload.measurement_update import MeasurementModel
 from flexmanip_ros.payload.moving_horizon import STARTS
-from flexmanip_ros.payload.process_model import predict
+from flexmanip_ros.payload.process_model import Kind, predict
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload
@@ -47,8 +47,8 @@ class StructuredState(NamedTuple):
     horizon: Horizon | None = None
     """Where the moving horizon begins."""
     last_ns: int = 0
-    effort: Array | None = None
-    """(2,) torque held since then."""
+    efforts: Array | None = None
+    """(P, L) effort held since then, and those of the samples before, newest last [N m]."""
     missing: int = 0
     """How many rows in a row were missing up to now."""
     peak: Array = np.empty(0)
@@ -57,6 +57,8 @@ class StructuredState(NamedTuple):
     """How often numbers left the finite range."""
     refits: int = 0
     """How often the empty arm's fit was begun again."""
+    white: Array = np.empty(0)
+    """(m,) variance of each measurement's white noise, as far as it was known then."""
 
 
 class Horizon(NamedTuple):
@@ -66,8 +68,8 @@ class Horizon(NamedTuple):
     """Its first row."""
     before_ns: int
     """Stamp of the state from which it starts [ns]."""
-    effort: Array
-    """(2,) torque held from there on [N m]."""
+    efforts: Array
+    """(P, L) effort held from there on, and those of the samples before [N m]."""
 
 
 def init(config: IdentifierParameters) -> StructuredState:
@@ -111,14 +113,14 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     if state.memory is None:
         return state._replace(early=(*state.early, (state.cursor, event)))
     m = mem.copy(state.memory)
-    assert state.effort is not None
+    assert state.efforts is not None
     assert state.sensors is not None
     ahead = max(event.stamp_ns - state.last_ns, 0)
-    predict(state.model.motion, m.x, m.S, m.x.size, state.effort, min(ahead * 1e-9, LONGEST_S),
-            m.counts[mem.HALVED])
+    rows = np.column_stack([np.full(len(state.efforts), min(ahead * 1e-9, LONGEST_S)), state.efforts])
+    predict(state.model.motion, m.x, m.S, m.x.size, rows, state.sensors.period, m.counts[mem.HALVED])
     _change(config, state.model, m, event.kind)
     last_ns = state.last_ns + ahead
-    return state._replace(memory=m, last_ns=last_ns, horizon=Horizon(state.cursor, last_ns, state.effort))
+    return state._replace(memory=m, last_ns=last_ns, horizon=Horizon(state.cursor, last_ns, state.efforts))
 
 
 def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
@@ -148,6 +150,8 @@ def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, kind
         opened[payload, 0] = structured_model.EMPTY_STD * model.motion.scale + 0.3 * before
         m.counts[mem.HELD] = 0
     m.S[:] = structured_model.widen(m.S, np.hstack([columns, opened]))
+    if mem.ENOUGH > m.counts[mem.SEEN] >= UNTAUGHT:  # the variances are still guessed from the first samples
+        structured_model.guess_noise(model, m.noise)
     structured_model.shake(model, m)
     m.noise[:, mem.AT_EVENT] = m.noise[:, mem.EFFECTIVE]
     _set_arrival_cost(model, m)
@@ -238,17 +242,21 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     m.noise[:] = structured_model.noise(model, Y)
     structured_model.first(config, model, m, Y[0])
     structured_model.freeze(config, model, np.mean(rows.angles, axis=0))
-    if not state.refits:  # the simplest arm first; all that may be learned where that does not fit
-        structured_model.take_as_known(model, m)
+    if state.white.size:
+        m.noise[:, mem.WHITE] = state.white
+        structured_model.guess_noise(model, m.noise)
+    # the simplest arm first; then all that may be learned, with late signals and without in turn
+    if state.refits % 2 == 0:
+        structured_model.take_as_known(model, m, Kind.MODE if state.refits else Kind.DAMPING)
     m.S[:] = structured_model.triangular(m.S)
     _set_arrival_cost(model, m)
     m.counts[mem.REFITS] = state.refits
     seen = sensors(config, model, dt, structured_model.diffusion(config, model, m))
     events = state.early
-    first_ns, effort = int(rows.stamp_ns[0]), rows.u[0].copy()
+    first_ns, efforts = int(rows.stamp_ns[0]), latest(seen, rows.u[:1], state.efforts)
     state = state._replace(
-        memory=m, sensors=seen, begin=None, early=(), cursor=rows.first, last_ns=first_ns, effort=effort,
-        horizon=Horizon(rows.first, first_ns, effort))
+        memory=m, sensors=seen, begin=None, early=(), cursor=rows.first, last_ns=first_ns, efforts=efforts,
+        horizon=Horizon(rows.first, first_ns, efforts))
     for row, item in events:
         state = event(config, _part(config, state, rows, row), item)
     return _part(config, state, rows, rows.until)
@@ -265,18 +273,26 @@ def _resume(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
     assert state.model is not None
     fresh = reopen(config, state, measurements(state.model, rows.between(rows.first, rows.first + 1))[0])
     assert fresh.memory is not None
-    last_ns, effort = int(rows.stamp_ns[0]), rows.u[0].copy()
-    return fresh._replace(last_ns=last_ns, effort=effort, horizon=Horizon(rows.first, last_ns, effort))
+    assert state.sensors is not None
+    last_ns, efforts = int(rows.stamp_ns[0]), latest(state.sensors, rows.u[:1])
+    return fresh._replace(last_ns=last_ns, efforts=efforts, horizon=Horizon(rows.first, last_ns, efforts))
+
+
+def latest(sensors: MeasurementModel, efforts: Array, before: Array | None = None) -> Array:
+    """Return the efforts (P, L) that the next torques depend on; before these (N, L) the effort was constant."""
+    efforts = efforts if before is None else np.vstack([before, efforts])
+    missing = max(sensors.reach - len(efforts), 0)
+    return np.vstack([np.tile(efforts[0], (missing, 1)), efforts[len(efforts) + missing - sensors.reach:]])
 
 
 def _bridge(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
     """The torque changed, nobody knows when, while samples were missing: open the state by what that may have done."""
     assert state.model is not None
     assert state.memory is not None
-    assert state.effort is not None
+    assert state.efforts is not None
     assert state.sensors is not None
     m = mem.copy(state.memory)
-    change = (state.missing + 1) * (rows.u[0] - state.effort)
+    change = (state.missing + 1) * (rows.u[0] - state.efforts[-1])
     columns = structured_model.unknown_torque(state.model, m, change, state.missing, state.sensors.period)
     young = bool(m.counts[mem.STORED] < mem.HORIZON)
     if young and m.counts[mem.HELD] and state.missing > state.sensors.block:
@@ -291,7 +307,7 @@ def _bridge(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
     m.S[:] = structured_model.widen(m.S, columns)
     if young:  # the horizon has no process noise
         _begin_horizon(m)
-    return state._replace(memory=m, missing=0, horizon=Horizon(state.cursor, state.last_ns, state.effort))
+    return state._replace(memory=m, missing=0, horizon=Horizon(state.cursor, state.last_ns, state.efforts))
 
 
 UNKNOWN_TORQUE = 0.1
@@ -303,7 +319,7 @@ def _parts(state: StructuredState, rows: Rows) -> list[tuple[bool, Rows]]:
     """Return the rows in pieces, and whether a gap or an unknown change of torque is before the first of each."""
     if not len(rows):
         return []
-    before = state.effort if state.effort is not None else rows.u[0]
+    before = state.efforts[-1] if state.efforts is not None else rows.u[0]
     absent = np.concatenate([[state.missing], rows.missing[:-1]]) * (rows.missing == 0)
     broken = rows.gap
     if absent.any():
@@ -333,8 +349,8 @@ def reopen(
     m.S[2 * n:] = 0.0
     m.S[:] = structured_model.widen(m.S, np.vstack([np.zeros((2 * n, spread.shape[1])), spread]))
     _set_arrival_cost(state.model, m)
-    assert state.effort is not None
-    return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.effort))
+    assert state.efforts is not None
+    return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.efforts))
 
 
 def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
@@ -346,7 +362,9 @@ def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> St
     table, first = input_table(state, rows)
     failed = filtered(state.model.motion, state.sensors, m, table, first) - first
     taken = rows.between(rows.first, min(rows.first + failed + 1, rows.until))
-    after = state._replace(cursor=taken.until, last_ns=int(taken.stamp_ns[-1]), effort=taken.u[-1].copy(),
+    efforts = table[:first + len(taken), 1:1 + rows.u.shape[1]]
+    after = state._replace(cursor=taken.until, last_ns=int(taken.stamp_ns[-1]),
+                           efforts=latest(state.sensors, taken.u[-1:], efforts),
                            missing=int(taken.missing[-1]), peak=_peaks(state, taken)[-1])
     if failed == len(rows):
         return after._replace(memory=m)
@@ -356,27 +374,29 @@ def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> St
 def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
     """Return what the kernel reads, (N, 1 + L + m), and the row of it that belongs to the first of ``rows``.
 
-    Columns: duration since the sample before [s], torques held meanwhile [N m], measurements (NaN: missing). While the
-    horizon is open the table reaches back to its first row.
+    Columns: duration since the sample before [s], efforts held meanwhile [N m], measurements (NaN: missing). While the
+    horizon is open the table reaches back to its first row; before that come the efforts that a late torque needs.
     """
     assert state.model is not None
-    before_ns, effort, horizon = state.last_ns, state.effort, state.horizon
+    before_ns, efforts, horizon = state.last_ns, state.efforts, state.horizon
     begin = first_needed(state)
     if begin < rows.first:
         assert horizon is not None
-        before_ns, effort = horizon.before_ns, horizon.effort
+        before_ns, efforts = horizon.before_ns, horizon.efforts
     reach = rows.since(begin)
-    assert effort is not None
+    assert efforts is not None
     stamps, y = reach.stamp_ns, measurements(state.model, reach)
-    links = effort.size
-    table = np.empty((len(y), 1 + links + y.shape[1]))
-    table[0, 0], table[0, 1:1 + links] = stamps[0] - before_ns, effort
+    before, links = len(efforts) - 1, efforts.shape[1]
+    whole = np.zeros((before + len(y), 1 + links + y.shape[1]))
+    whole[:before + 1, 1:1 + links] = efforts
+    table = whole[before:]
+    table[0, 0] = stamps[0] - before_ns
     table[1:, 0], table[1:, 1:1 + links] = stamps[1:] - stamps[:-1], reach.u[:-1]
     np.maximum(table[:, 0], 0.0, out=table[:, 0])
     table[:, 0] *= 1e-9
     table[:, 1 + links:] = y
     table[reach.missing > 0, 1 + links:] = np.nan
-    return table, rows.first - begin
+    return whole, before + rows.first - begin
 
 
 def _restart(config: IdentifierParameters, state: StructuredState, m: mem.FilterState, last: Rows) -> StructuredState:
@@ -387,7 +407,7 @@ def _restart(config: IdentifierParameters, state: StructuredState, m: mem.Filter
     """
     assert state.model is not None
     assert state.memory is not None
-    assert state.effort is not None
+    assert state.efforts is not None
     model = state.model
     refits = int(m.counts[mem.REFITS])
     unfit = refits > state.memory.counts[mem.REFITS]
@@ -414,8 +434,11 @@ def _restart(config: IdentifierParameters, state: StructuredState, m: mem.Filter
         for column in (mem.EFFECTIVE, mem.POWER, mem.SLOW):  # what did not fit was taken for noise
             m.noise[:, column] = m.noise[:, mem.AT_EVENT]
         _set_arrival_cost(model, m)
-        return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.effort))
-    fresh = init(config)._replace(restarts=state.restarts + (not unfit), cursor=state.cursor, refits=refits)
+        return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.efforts))
+    fresh = init(config)._replace(restarts=state.restarts + (not unfit), cursor=state.cursor, refits=refits,
+                                  efforts=state.efforts)
+    if unfit and m.counts[mem.SEEN] >= UNTAUGHT:
+        fresh = fresh._replace(white=m.noise[:, mem.WHITE].copy())
     if m.counts[mem.HELD]:
         grasped = CaptureEvent(state.last_ns, EventKind.CAPTURE)
         fresh = fresh._replace(early=((state.cursor, grasped),))

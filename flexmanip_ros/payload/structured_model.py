@@ -11,6 +11,7 @@ import numpy as np
 import scipy
 
 from flexmanip_ros.arm.capture import tip_jacobian
+from flexmanip_ros.arm.late_torque import efforts_needed
 from flexmanip_ros.arm.linearization import mass_matrix
 from flexmanip_ros.arm.manipulator import Manipulator, manipulator, modal, workspace
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
@@ -169,7 +170,8 @@ def pinned_frequencies(arm: ArmParameters) -> tuple[float, ...]:
 LEARNED = {
     'stiffness': Kind.STIFFNESS, 'damping': Kind.DAMPING, 'viscous_friction': Kind.VISCOUS,
     'coulomb_friction': Kind.COULOMB, 'rotor_inertia': Kind.ROTOR, 'torque_gain': Kind.TORQUE_GAIN,
-    'bend_gain': Kind.BEND_GAIN, 'bend_offset': Kind.BEND_OFFSET, 'mode_stiffness': Kind.MODE}
+    'bend_gain': Kind.BEND_GAIN, 'bend_offset': Kind.BEND_OFFSET, 'mode_stiffness': Kind.MODE,
+    'torque_delay': Kind.TORQUE_DELAY, 'torque_lag': Kind.TORQUE_LAG, 'bend_delay': Kind.BEND_DELAY}
 """What ``payload.learn`` may name."""
 
 
@@ -180,15 +182,17 @@ def learned(config: IdentifierParameters) -> tuple[tuple[Kind, int], ...]:
     bends = {role.link for role in known.outputs if role.quantity in (Quantity.BEND, Quantity.BEND_RATE)} \
         if known else set()
     entries = [(kind, 0) for kind in body]
-    given = {name for name, neutral in (('torque_gain', 1.0), ('bend_gain', 1.0), ('bend_offset', 0.0))
-             if any(value != neutral for value in getattr(config.arm, name))}
+    given = {name for name, neutral in (('torque_gain', 1.0), ('bend_gain', 1.0), ('bend_offset', 0.0),
+                                        ('torque_delay', 0.0), ('torque_lag', 0.0), ('bend_delay', 0.0))
+             if np.any(np.array(getattr(config.arm, name)) != neutral)}
     for name in (*config.payload.learn, *sorted(given.difference(config.payload.learn))):
         kind = LEARNED[name]
         if kind is Kind.MODE:  # static shapes are no modes
             k = config.arm.modes if config.arm.shape_functions == 'sines' else 0
             entries += [(kind, i * k + j) for i in range(len(config.arm.link_length)) for j in range(1, k)]
             continue
-        for i in range(len(config.arm.link_length)):
+        alike = kind in (Kind.TORQUE_DELAY, Kind.BEND_DELAY)  # one for all joints, one for all bends
+        for i in range(1 if alike else len(config.arm.link_length)):
             if kind not in (Kind.BEND_GAIN, Kind.BEND_OFFSET) or i in bends:
                 entries.append((kind, i))
     return tuple(entries)
@@ -213,7 +217,8 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         M0=np.zeros((n, n)), Mp=np.zeros((4, n, n)), stiffness=nominal.stiffness, damping=unit, rotary=nominal.rotary,
         scale=lightest, least=_least(nominal, lightest),
         least_rotor=_least_rotor(nominal), substeps=STEP_ANGLE / fastest, payload=np.zeros(4),
-        effort=np.zeros(links), gain=np.ones(links), p=np.zeros(size), a=np.zeros(n), k=np.zeros((8, n)),
+        effort=np.zeros(links), gain=np.ones(links), late=np.zeros((links, 2)), slope=np.zeros((links, 2)),
+        opened=np.array([size, *range(size)]), p=np.zeros(size), a=np.zeros(n), k=np.zeros((8, n)),
         dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)), G=np.zeros((n, size)), X=np.zeros((2 * n, nx)),
         Y=np.zeros((2 * n, nx)))
 
@@ -224,18 +229,28 @@ def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Ar
     links, count = len(config.arm.link_length), len(model.roles)
     H = np.empty((count, output.shape[1]))
     rate = np.zeros(count, dtype=np.bool_)
-    gain, offset = np.full(count, -1), np.full(count, -1)
+    gain, offset, delay = (np.full(count, -1) for _ in range(3))
     for i, role in enumerate(model.roles):
         bends = role.quantity in (Quantity.BEND, Quantity.BEND_RATE)
         H[i] = output[role.link + links * bends]
         rate[i] = role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE)
         if bends:
             gain[i] = _state(model.motion, Kind.BEND_GAIN, role.link)
-            offset[i] = -1 if rate[i] else _state(model.motion, Kind.BEND_OFFSET, role.link)
+            if not rate[i]:
+                offset[i] = _state(model.motion, Kind.BEND_OFFSET, role.link)
+                delay[i] = _state(model.motion, Kind.BEND_DELAY, 0)
     nx = diffusion.size
     block = max(2, round(0.1 / (model.slowest * dt)))
-    return MeasurementModel(H=H, period=dt, rate=rate, gain=gain, offset=offset, block=block, diffusion=diffusion,
+    return MeasurementModel(H=H, period=dt, rate=rate, gain=gain, offset=offset, delay=delay,
+                            reach=torque_reach(model, dt), block=block, diffusion=diffusion,
                             deviation=np.zeros(nx), f=np.zeros(nx), L=np.zeros((nx, nx)), W=np.zeros((nx, 2 * nx)))
+
+
+def torque_reach(model: Model, dt: float) -> int:
+    """Return how many efforts, one a sample time dt [s], the torques may depend on: those of the prior, at most."""
+    latest = {kind: float(np.max((model.given + 3.0 * model.prior)[model.motion.kind == kind], initial=0.0))
+              for kind in (Kind.TORQUE_DELAY, Kind.TORQUE_LAG)}
+    return min(efforts_needed(latest[Kind.TORQUE_DELAY], latest[Kind.TORQUE_LAG], dt), MOST_EFFORTS)
 
 
 def _state(motion: ProcessModel, kind: Kind, link: int) -> int:
@@ -269,6 +284,10 @@ COULOMB_STD = 0.005
 """Of a Coulomb friction: the deceleration [rad/s^2] that it alone would give that inertia."""
 GAIN_STD = 0.03
 """Of the logarithm of the gains of torques and bends: calibrated to a few percent."""
+LATE_STD = 2e-3
+"""Of delays and lags [s]: of a few samples of a bus, and of drives."""
+MOST_EFFORTS = 1000
+"""Efforts that a torque depends on at most; what was before them, is taken for constant."""
 OFFSET_STD = 1e-3
 """Of the offset of a bend, over the length of its link."""
 BASE_RATE_STD = 0.05
@@ -291,7 +310,8 @@ def priors(config: IdentifierParameters, motion: ProcessModel) -> Array:
     """Return the prior standard deviation (np,) of each entry of p; of the body, as an empty arm has it."""
     J, L = inertias(motion.arm), np.array(config.arm.link_length)
     alike = {Kind.MASS: EMPTY_STD * motion.scale, Kind.STIFFNESS: config.payload.stiffness_std,
-             Kind.DAMPING: config.payload.damping_std, Kind.TORQUE_GAIN: GAIN_STD, Kind.BEND_GAIN: GAIN_STD}
+             Kind.DAMPING: config.payload.damping_std, Kind.TORQUE_GAIN: GAIN_STD, Kind.BEND_GAIN: GAIN_STD,
+             Kind.TORQUE_DELAY: LATE_STD, Kind.TORQUE_LAG: LATE_STD, Kind.BEND_DELAY: LATE_STD}
     by_joint = {Kind.VISCOUS: VISCOUS_STD * J, Kind.COULOMB: COULOMB_STD * J, Kind.ROTOR: ROTOR_STD * J,
                 Kind.BEND_OFFSET: OFFSET_STD * L}
     # shear, rotary inertia and coarse elements all move a mode the farther the higher it is, as j^2 or faster
@@ -307,7 +327,8 @@ def _given(arm: ArmParameters, motion: ProcessModel) -> Array:
     values: dict[Kind, Any] = {
         Kind.DAMPING: (arm.damping_ratio,) * len(arm.link_length), Kind.VISCOUS: arm.joint_viscous_friction,
         Kind.COULOMB: arm.joint_coulomb_friction, Kind.TORQUE_GAIN: np.log(arm.torque_gain),
-        Kind.BEND_GAIN: np.log(arm.bend_gain), Kind.BEND_OFFSET: arm.bend_offset}
+        Kind.BEND_GAIN: np.log(arm.bend_gain), Kind.BEND_OFFSET: arm.bend_offset,
+        Kind.TORQUE_DELAY: (arm.torque_delay,), Kind.TORQUE_LAG: arm.torque_lag, Kind.BEND_DELAY: (arm.bend_delay,)}
     return np.array([values[kind][link] if kind in values else 0.0
                      for kind, link in zip(map(Kind, motion.kind), motion.link, strict=True)])
 
@@ -342,13 +363,18 @@ def noise(model: Model, Y: Array) -> Array:
     differences = np.diff(Y, n=4, axis=0)
     white = (1.4826 * np.median(np.abs(differences), axis=0)) ** 2 / 70
     rows = np.zeros((len(model.roles), 10))
-    for i, role in enumerate(model.roles):
-        rate = role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE)
-        rows[i, mem.FLOOR] = FLOORS[role.quantity] ** 2
-        rows[i, mem.WHITE] = max(white[i], rows[i, mem.FLOOR])
-        rows[i, mem.POWER] = rows[i, mem.WHITE] * (RATE_NOISE if rate else 2.0)
-        rows[i, mem.SLOW] = rows[i, mem.EFFECTIVE] = rows[i, mem.AT_EVENT] = rows[i, mem.POWER]
+    rows[:, mem.FLOOR] = [FLOORS[role.quantity] ** 2 for role in model.roles]
+    rows[:, mem.WHITE] = np.maximum(white, rows[:, mem.FLOOR])
+    guess_noise(model, rows)
     return rows
+
+
+def guess_noise(model: Model, rows: Array) -> None:
+    """Let the variance of every sensor be twice its white noise, of rates more: they show the modes left out."""
+    rates = [role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE) for role in model.roles]
+    guess = np.maximum(rows[:, mem.WHITE], rows[:, mem.FLOOR]) * np.where(rates, RATE_NOISE, 2.0)
+    for column in (mem.POWER, mem.SLOW, mem.EFFECTIVE, mem.AT_EVENT):
+        rows[:, column] = guess
 
 
 def first(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Array) -> None:
@@ -379,11 +405,11 @@ def first(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Arr
     m.S[:] = np.diag(std)
 
 
-def take_as_known(model: Model, m: mem.FilterState) -> None:
-    """Take friction, rotors, gains and offsets as given: an unknown object hides them. Modes are never exact."""
+def take_as_known(model: Model, m: mem.FilterState, beyond: Kind = Kind.DAMPING) -> None:
+    """Take what p holds beyond a kind as given: an unknown object hides it. Modes are never exact."""
     n = model.motion.arm.stiffness.size
     for c, kind in enumerate(model.motion.kind):
-        if kind > Kind.DAMPING and kind != Kind.MODE:
+        if kind > beyond and kind != Kind.MODE:
             m.x[2 * n + c] = model.given[c]
             m.S[2 * n + c] = 0.0
 

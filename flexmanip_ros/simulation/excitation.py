@@ -47,7 +47,7 @@ def plant_of(config: ExcitationParameters) -> PlantParameters:
     """Return the plant the design is made for: noise-free, chord angles seen, stepped coarsely."""
     plant = PlantParameters(
         rate=config.rate, initial_angles=config.initial_angles, payload_mass=config.payload_mass,
-        noise='none', arm=replace(config.arm, angle_convention='chord', effort_delay=0))
+        noise='none', arm=replace(config.arm, angle_convention='chord', effort_delay=0, bend_delay=0.0))
     steps = models.substeps(manipulator(plant.arm), plant)
     return replace(plant, substeps=-(-steps // COARSER))
 
@@ -105,7 +105,7 @@ def expected_std(config: ExcitationParameters) -> dict[float, float]:
     Cramer-Rao bound with the payload and the whole state after the capture unknown and the arm known; all
     signals measured with white noise at snr_db; capture half way through design_time.
     """
-    plant = replace(plant_of(config), arm=config.arm)
+    plant = replace(plant_of(config), arm=replace(config.arm, bend_delay=0.0))
     efforts = sequence(config, round(config.design_time * config.rate))
     half = len(efforts) // 2
     start = simulator.init(plant)

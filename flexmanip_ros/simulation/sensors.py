@@ -62,6 +62,29 @@ def gauge(config: PlantParameters, position: Array, velocity: Array, state: Arra
             values[:, links:] = bends
 
 
+def bends_needed(config: PlantParameters) -> int:
+    """Return of how many samples before the bends are read."""
+    return int(config.arm.bend_delay * config.rate) + 1 if config.arm.bend_delay else 0
+
+
+def late_bends(config: PlantParameters, position: Array, velocity: Array, past: Array) -> Array:
+    """Let the bends come late, in place, by cubics between samples.
+
+    past: (K, 2 L) deflections and rates of the last samples; returns those for the next call.
+    """
+    if not len(past):
+        return past
+    links, count = position.shape[1] // 2, len(position)
+    whole = np.vstack([past, np.hstack([position[:, links:], velocity[:, links:]])])
+    old, new = whole[:count], whole[1:count + 1]
+    a, b, va, vb = old[:, :links], new[:, :links], old[:, links:] / config.rate, new[:, links:] / config.rate
+    t = len(past) - config.arm.bend_delay * config.rate
+    position[:, links:] = (a * (2 * t - 3) * t * t + a + va * ((t - 2) * t + 1) * t
+                           + b * (3 - 2 * t) * t * t + vb * (t - 1) * t * t)
+    velocity[:, links:] = config.rate * (6 * t * (t - 1) * (a - b) + va * ((3 * t - 4) * t + 1) + vb * (3 * t - 2) * t)
+    return whole[count:]
+
+
 def misread(config: PlantParameters, position: Array, velocity: Array) -> None:
     """Let the bend sensors read with their gain and offset, in place."""
     links = position.shape[1] // 2

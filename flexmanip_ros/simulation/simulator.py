@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.arm.capture import Body, free_object, rates_after
+from flexmanip_ros.arm.late_torque import efforts_needed, late_torques
 from flexmanip_ros.errors import ModelError, SignalError
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, SensorParameters
 from flexmanip_ros.simulation import models, sensors, waveforms
@@ -49,6 +50,10 @@ class PlantState:
     """Which block that is."""
     gauges: Array
     """(2, L) low-pass state of the deflections and of their rates."""
+    bends: Array
+    """(K, 2 L) deflections and their rates of the last samples, where they are measured late."""
+    efforts: Array
+    """(P - 1, L) efforts of the drives that still act, where torques are late."""
     commands: Array
     """(command_delay, L) torques on their way to the drives."""
     reported: Array
@@ -80,6 +85,8 @@ def init(config: PlantParameters, start_ns: int = 0, noise_std: Array | None = N
         model=model, start_ns=start_ns, index=0, x=model.rest(), payload=np.zeros(4),
         noise_std=_levels(config) if noise_std is None else np.array(noise_std, dtype=np.float64),
         noise_block=sensors.block(config.seed, 0), noise_number=0, gauges=np.zeros((2, links)),
+        bends=np.zeros((sensors.bends_needed(config), 2 * links)),
+        efforts=np.zeros((_efforts_needed(config) - 1, links)),
         commands=np.zeros((config.actuators.command_delay, links)),
         reported=np.zeros((config.arm.effort_delay, links)))
 
@@ -194,16 +201,26 @@ def _advance(
     reported = np.concatenate([state.reported, applied])
     x, gauges = state.x.copy(), state.gauges.copy()
     position, velocity = (np.empty((count, 2 * efforts.shape[1])) for _ in range(2))
-    good = state.model.advance(x, state.payload, applied * np.array(config.arm.torque_gain), position, velocity)
+    efforts = np.concatenate([state.efforts, applied])
+    torques = applied.copy()
+    if len(state.efforts):
+        late_torques(efforts, config.arm.torque_delay, np.array(config.arm.torque_lag), 1.0 / config.rate, np.zeros(2),
+                     torques)
+    good = state.model.advance(x, state.payload, torques * np.array(config.arm.torque_gain), position, velocity)
     if good < count:
         raise ModelError(
             f'the simulation diverged {(state.index + good) / config.rate:.3f} s after its start',
             'lower the torque, raise the stiffness or the rate, or reset the plant')
     sensors.gauge(config, position, velocity, gauges)
+    bends = sensors.late_bends(config, position, velocity, state.bends)
     sensors.misread(config, position, velocity)
-    after = replace(state, index=state.index + count, x=x, gauges=gauges,
+    after = replace(state, index=state.index + count, x=x, gauges=gauges, bends=bends, efforts=efforts[count:],
                     commands=queue[count:], reported=reported[count:])
     return after, position, velocity, reported[:count]
+
+
+def _efforts_needed(config: PlantParameters) -> int:
+    return efforts_needed(config.arm.torque_delay, max(config.arm.torque_lag), 1.0 / config.rate)
 
 
 def _take(config: PlantParameters, state: PlantState, body: Body) -> PlantState:

@@ -115,7 +115,6 @@ def test_the_estimator_knows_the_body_while_the_controller_holds_the_arm(caught:
     assert found.inertia[5] == pytest.approx(PLANT.payload_inertia, rel=0.05)
 
 
-@pytest.mark.xfail(reason='the interval is too narrow here, see docs/lab/payload.md, "A body under the controller"')
 def test_the_mass_is_inside_its_interval_while_the_controller_holds_the_arm(caught: Caught) -> None:
     assert caught.payload.lower < PLANT.payload_mass < caught.payload.upper
 

@@ -13,7 +13,7 @@ import pytest
 from flexmanip_ros.io import outputs
 from flexmanip_ros.parameters import DemoParameters, leaves
 from flexmanip_ros.parameters.document import NODES
-from flexmanip_ros.studies.summary import Summary
+from flexmanip_ros.studies.results import Summary
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted(str(path.relative_to(ROOT)) for path in (ROOT / 'docs').rglob('*.md'))

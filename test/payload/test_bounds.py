@@ -55,13 +55,14 @@ def test_unknown_structure_with_the_known_coupling():
 
 
 def test_the_moving_arm_tells_more_with_more_samples_and_more_torque():
-    settings = config()
+    settings = config()  # friction, gains and delays are what their priors say before the arm has moved for long
+    settings = replace(settings, payload=replace(settings.payload, learn=('stiffness', 'damping')))
     noise = np.array([2e-5, 2e-5, 7e-4, 7e-4, 1e-4, 1e-4])
     efforts = excitation.sequence(ExcitationParameters(), 600)
     weak, strong = (cramer_rao.nonlinear(settings, THETA, 20.0, scale * efforts, noise, 1e-3, (200, 400, 600))
                     for scale in (1.0, 2.0))
     assert np.all(np.diff(weak) < 0.0)
-    assert strong == pytest.approx(weak / 2, rel=0.35)
+    assert strong == pytest.approx(weak / 2, rel=0.1)
     assert 0.01 < weak[-1] < 1.0
 
 

@@ -56,8 +56,8 @@ def fine(arm, x: np.ndarray, n: int, duration: float, steps: int) -> np.ndarray:
 
 def error(arm, x: np.ndarray, exact: np.ndarray, n: int, duration: float, h: float) -> float:
     state, spread = x.copy(), np.zeros((x.size, x.size))
-    reported = TORQUE / arm.gain
-    assert process_model.predict(arm._replace(substeps=h), state, spread, 0, reported, duration, 0)
+    rows = np.array([[duration, *(TORQUE / arm.gain)]])
+    assert process_model.predict(arm._replace(substeps=h), state, spread, 0, rows, duration, 0)
     return float(np.abs(state[:n] - exact[:n]).max())
 
 

@@ -22,7 +22,8 @@ CLEAN = PlantParameters(noise='none', arm=ArmParameters(modes=1))
 WAVES = excitation.sequence(ExcitationParameters(), 3000)
 REFERENCE = simulator.simulate(CLEAN, WAVES)
 FAULTY = replace(
-    CLEAN, noise='std', arm=ArmParameters(modes=1, effort_delay=1),
+    CLEAN, noise='std',
+    arm=ArmParameters(modes=1, effort_delay=1, torque_delay=1.5e-3, torque_lag=(2e-3, 5e-3), bend_delay=1.3e-3),
     sensors=SensorParameters(encoder_resolution=1e-3, bend_resolution=1e-4, bias=(0.1,) * 8,
                              strain_cutoff=30.0, stamp_jitter=1e-4, drop_probability=0.1),
     actuators=ActuatorParameters(torque_limit=(8.0, 0.0), command_delay=2))
