@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.numerics.compiled import inlined, inner, kernel
+from flexmanip_ros.numerics.compiled import inner, kernel
 
 if TYPE_CHECKING:
     from flexmanip_ros.arm.manipulator import Manipulator, Workspace
@@ -182,7 +182,7 @@ def assemble(
         assemble_payload(arm, payload, q, qd, M, E, work)
 
 
-@inlined
+@inner
 def eliminate_translation(M: Array, E: Array, work: Workspace) -> None:
     """Leave out the translation of a floating base, which keeps the momentum: Schur complement of its mass."""
     mass = work.F[2]
@@ -193,7 +193,7 @@ def eliminate_translation(M: Array, E: Array, work: Workspace) -> None:
             M[r, t] -= x * work.P[0, t] + y * work.P[1, t]
 
 
-@inlined
+@inner
 def elastic(arm: Manipulator, q: Array, work: Workspace) -> None:
     """Fill work.elastic (n,) with dV/dq and, link by link, work.tangent (k, k) with the derivative of V4's part.
 
@@ -266,7 +266,7 @@ def solve(L: Array, x: Array) -> None:
         x[r] = y * L[r, r]
 
 
-@kernel
+@inner
 def hold(L: Array, held: Array, qdd: Array, columns: Array) -> None:
     """Change qdd (n,) by constraint forces so that held qdd = 0.
 
@@ -298,7 +298,7 @@ def hold(L: Array, held: Array, qdd: Array, columns: Array) -> None:
             qdd[c] -= second * columns[1, c]
 
 
-@inlined
+@inner
 def net_torques(B: Array, arm: Manipulator, qd: Array, effort: Array, net: Array) -> None:
     """Fill net (3, L): torques less friction, rates of the joints, derivative of the friction by them; B (n, L)."""
     for i in range(arm.length.size):
@@ -311,7 +311,7 @@ def net_torques(B: Array, arm: Manipulator, qd: Array, effort: Array, net: Array
         net[2, i] = arm.viscous[i] + arm.coulomb[i] * (1.0 - share * share) / STICTION_RATE
 
 
-@inlined
+@inner
 def torque_matrix(arm: Manipulator, q: Array, B: Array) -> None:
     """Fill B (n, L), generalized forces of unit torques at q.
 
@@ -337,6 +337,22 @@ def torque_matrix(arm: Manipulator, q: Array, B: Array) -> None:
                 B[o + j, i + 1] *= 1.0 + 0.5 * tip * tip
 
 
+@inner
+def balance(arm: Manipulator, q: Array, qd: Array, effort: Array, qdd: Array, work: Workspace) -> bool:
+    """Fill qdd (n,) from work.M and work.E. Leaves the factor of M in work.M, and work.elastic, B and net."""
+    elastic(arm, q, work)
+    if not factor(work.M):
+        return False
+    torque_matrix(arm, q, work.B)
+    net_torques(work.B, arm, qd, effort, work.net)
+    for r in range(q.size):
+        qdd[r] = -work.E[r] - work.elastic[r] - arm.damping[r] * qd[r]
+        for i in range(arm.length.size):
+            qdd[r] += work.B[r, i] * work.net[0, i]
+    solve(work.M, qdd)
+    return True
+
+
 @kernel
 def acceleration(
     arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array, qdd: Array, work: Workspace,
@@ -349,14 +365,4 @@ def acceleration(
     assemble(arm, payload, q, qd, work.M, work.E, work)
     if arm.floating:
         eliminate_translation(work.M, work.E, work)
-    elastic(arm, q, work)
-    if not factor(work.M):
-        return False
-    torque_matrix(arm, q, work.B)
-    net_torques(work.B, arm, qd, effort, work.net)
-    for r in range(q.size):
-        qdd[r] = -work.E[r] - work.elastic[r] - arm.damping[r] * qd[r]
-        for i in range(arm.length.size):
-            qdd[r] += work.B[r, i] * work.net[0, i]
-    solve(work.M, qdd)
-    return True
+    return balance(arm, q, qd, effort, qdd, work)

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.arm.equations_of_motion import acceleration, assemble
-from flexmanip_ros.numerics.compiled import inlined, inner, kernel, merged
+from flexmanip_ros.numerics.compiled import inner
 
 if TYPE_CHECKING:
     from flexmanip_ros.arm.manipulator import Manipulator, Workspace
@@ -253,7 +252,7 @@ def link_jacobian(
     work.F[1] += s * fe + c * fn
 
 
-@kernel
+@inner
 def force_jacobian(
     arm: Manipulator, payload: Array, q: Array, qd: Array, qdd: Array, left: Array, right: Array, dp: Array,
     work: Workspace,
@@ -305,16 +304,6 @@ def force_jacobian(
                 right[r, t] -= a * work.Fv[0, t] + b * work.Fv[1, t]
 
 
-@kernel
-def bias_jacobian(
-    arm: Manipulator, payload: Array, q: Array, qd: Array, qdd: Array,
-    left: Array, right: Array, work: Workspace,
-) -> None:
-    """Fill d(M qdd + E)/dq and dE/dqd, each (n, n), qdd held."""
-    assemble(arm, payload, q, qd, work.M, work.E, work)
-    force_jacobian(arm, payload, q, qd, qdd, left, right, work.parameters, work)
-
-
 @inner
 def solve_columns(L: Array, X: Array, m: int) -> None:
     """Overwrite the first m columns of X (n, >= m) with -M^-1 X, L from ``equations_of_motion.factor``."""
@@ -340,7 +329,7 @@ def solve_columns(L: Array, X: Array, m: int) -> None:
             X[r, c] = -X[r, c]
 
 
-@inlined
+@inner
 def torque_jacobian(arm: Manipulator, q: Array, qd: Array, work: Workspace, dq: Array) -> None:
     """Subtract the derivative of B(q) tau by q from dq (n, n), tau the torques less friction."""
     k = arm.kappa
@@ -368,7 +357,7 @@ def torque_jacobian(arm: Manipulator, q: Array, qd: Array, work: Workspace, dq: 
                     dq[r, o + t] += work.B[r, joint] * net[2, joint] * turned * rate
 
 
-@inlined
+@inner
 def elastic_jacobian(arm: Manipulator, q: Array, dq: Array, work: Workspace) -> None:
     """Add the derivative of ``equations_of_motion.elastic`` by q to dq (n, n)."""
     k = arm.kappa
@@ -383,7 +372,7 @@ def elastic_jacobian(arm: Manipulator, q: Array, dq: Array, work: Workspace) -> 
                     dq[o + j, o + t] += work.tangent[i, j, t]
 
 
-@inlined
+@inner
 def damping_jacobian(arm: Manipulator, work: Workspace, dqd: Array) -> None:
     """Add damping and the derivative of the friction to dqd (n, n); right after ``acceleration``."""
     for r in range(dqd.shape[0]):
@@ -397,22 +386,15 @@ def damping_jacobian(arm: Manipulator, work: Workspace, dqd: Array) -> None:
                         dqd[r, t] += force * work.B[t, i]
 
 
-@merged
-def acceleration_jacobian(
-    arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array,
-    qdd: Array, dq: Array, dqd: Array, dp: Array, work: Workspace,
-) -> bool:
-    """Fill qdd (n,), dqdd/dq, dqdd/dqd (n, n), and dp (n, 4): derivative of M qdd + E by the inertial parameters.
+@inner
+def complete_jacobian(arm: Manipulator, q: Array, qd: Array, dq: Array, dqd: Array, work: Workspace) -> None:
+    """Turn ``force_jacobian`` into the derivatives of the accelerations, dqdd/dq and dqdd/dqd (n, n).
 
-    False when M is not positive definite. M's Cholesky factor stays in work.M: for any parameter on which the forces f
-    (n,) of the equations depend, dqdd = M^-1 df.
+    Right after ``acceleration``, whose factor of M it reads in work.M: for any parameter on which the forces f (n,) of
+    the equations depend, dqdd = M^-1 df.
     """
-    if not acceleration(arm, payload, q, qd, effort, qdd, work):
-        return False
-    force_jacobian(arm, payload, q, qd, qdd, dq, dqd, dp, work)
     elastic_jacobian(arm, q, dq, work)
     torque_jacobian(arm, q, qd, work, dq)
     damping_jacobian(arm, work, dqd)
     solve_columns(work.M, dq, q.size)
     solve_columns(work.M, dqd, q.size)
-    return True

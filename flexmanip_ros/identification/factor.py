@@ -88,7 +88,8 @@ def remember(new: Array, mean: Array, scalars: Array, counts: Array, p: int) -> 
     The means start at the first sample: a signal that stands still has no variation, whatever its level.
     """
     if counts[SEEN] - counts[REJECTED] == 1:
-        mean[0] = new
+        for i in range(new.shape[0]):  # a slice would compile for seconds
+            mean[0, i] = new[i]
     rate = 1.0 / (20.0 * p)
     energy = 0.0
     for i in range(new.shape[0]):

@@ -46,10 +46,10 @@ def sway(U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, turns: Arra
                 total = after[i]
                 for j in range(n):
                     total += w * turns[g, i, j] * x[j]
-                after[i] = total
-            X[g] = after
+                X[g, i] = total
         following(U[t], A, B, silent, x, nothing, after)
-        x[:] = after
+        for i in range(n):
+            x[i] = after[i]
 
 
 SURPRISE = 4.0

@@ -136,7 +136,8 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
     sample = table[k]
     n, nx, used = sensors.H.shape[1], m.x.size, m.counts[USED]
     links, f = motion.effort.size, sensors.f[:used]
-    if not predict(motion, m.xr, m.Sr, used, table[k + 1 - sensors.reach:k + 1], sensors.period, m.counts[HALVED]):
+    rows = table[k + 1 - sensors.reach:k + 1]
+    if not predict(motion, m.xr, m.Sr, used, rows, sensors.period, sample[0], m.counts[HALVED]):
         return False
     measured = sample[1 + links] == sample[1 + links]
     if measured:
@@ -377,7 +378,7 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     links = motion.effort.size
     duration, y = table[k, 0], table[k, 1 + links:]
     rows = table[k + 1 - sensors.reach:k + 1]
-    if not predict(motion, m.x, m.S, m.counts[USED], rows, sensors.period, m.counts[HALVED]):
+    if not predict(motion, m.x, m.S, m.counts[USED], rows, sensors.period, duration, m.counts[HALVED]):
         return False
     control_step(motion, m, duration)
     came = y[0] == y[0]

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, acceleration, factor, net_torques, solve
-from flexmanip_ros.arm.jacobian import acceleration_jacobian, damping_jacobian, solve_columns
+from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, assemble, balance, eliminate_translation
+from flexmanip_ros.arm.jacobian import complete_jacobian, force_jacobian, solve_columns
 from flexmanip_ros.arm.late_torque import late_torque
 from flexmanip_ros.numerics.compiled import inlined, inner, kernel, merged
 from flexmanip_ros.types import Array
@@ -196,69 +196,54 @@ def confine(motion: ProcessModel, p: Array) -> None:
             p[c] = max(p[c], motion.least_rotor[motion.link[c]])
 
 
-@merged
-def accelerate(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
-    """Fill qdd (n,) under motion.effort; leaves the factor of M in work.M."""
-    if motion.frozen:
-        return accelerate_frozen(motion, q, qd, qdd)
-    return acceleration(motion.arm, motion.payload, q, qd, motion.effort, qdd, motion.work)
-
-
 @inner
-def accelerate_frozen(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
-    """The same for a mass matrix that stays."""
-    arm, work = motion.arm, motion.work
-    n = q.size
-    for r in range(n):
+def constant_mass(motion: ProcessModel) -> None:
+    """Fill work.M with a mass matrix that stays, and work.E with zero."""
+    M = motion.work.M
+    for r in range(M.shape[0]):
+        motion.work.E[r] = 0.0
         for c in range(r + 1):
-            work.M[r, c] = motion.M0[r, c] + arm.rotary[r, c] - motion.rotary[r, c]
+            M[r, c] = motion.M0[r, c] + motion.arm.rotary[r, c] - motion.rotary[r, c]
             for p in range(4):
-                work.M[r, c] += motion.payload[p] * motion.Mp[p, r, c]
-    if not factor(work.M):
-        return False
-    for r in range(n):
-        for i in range(arm.length.size):
-            work.B[r, i] = arm.torque[r, i]
-    net_torques(work.B, arm, qd, motion.effort, work.net)
-    for r in range(n):
-        work.elastic[r] = arm.stiffness[r] * q[r]
-        qdd[r] = -work.elastic[r] - arm.damping[r] * qd[r]
-        for i in range(arm.length.size):
-            qdd[r] += arm.torque[r, i] * work.net[0, i]
-    solve(work.M, qdd)
-    return True
-
-
-@inner
-def linearize_frozen(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
-    """The same as ``acceleration_jacobian`` for a mass matrix that stays."""
-    if not accelerate_frozen(motion, q, qd, qdd):
-        return False
-    n = q.size
-    for r in range(n):
-        for c in range(n):
-            motion.dq[r, c] = 0.0
-            motion.dqd[r, c] = 0.0
-        motion.dq[r, r] = motion.arm.stiffness[r]
-        for p in range(4):
-            motion.dp[r, p] = 0.0
-            for c in range(n):
-                motion.dp[r, p] += motion.Mp[p, r, c] * qdd[c]
-    damping_jacobian(motion.arm, motion.work, motion.dqd)
-    solve_columns(motion.work.M, motion.dq, n)
-    solve_columns(motion.work.M, motion.dqd, n)
-    return True
+                M[r, c] += motion.payload[p] * motion.Mp[p, r, c]
 
 
 @kernel
+def accelerate(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
+    """Fill qdd (n,) under motion.effort; leaves the factor of M in work.M."""
+    arm, work = motion.arm, motion.work
+    if motion.frozen:
+        constant_mass(motion)
+    else:
+        assemble(arm, motion.payload, q, qd, work.M, work.E, work)
+        if arm.floating:
+            eliminate_translation(work.M, work.E, work)
+    return balance(arm, q, qd, motion.effort, qdd, work)
+
+
+@inner
+def constant_mass_jacobian(motion: ProcessModel, qdd: Array) -> None:
+    """The same as ``force_jacobian`` for a mass matrix that stays."""
+    for r in range(qdd.size):
+        for c in range(qdd.size):
+            motion.dq[r, c] = 0.0
+            motion.dqd[r, c] = 0.0
+        for p in range(4):
+            motion.dp[r, p] = 0.0
+            for c in range(qdd.size):
+                motion.dp[r, p] += motion.Mp[p, r, c] * qdd[c]
+
+
+@merged
 def linearize(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
     """Fill qdd under motion.effort and its derivatives: motion.dq, motion.dqd (n, n), motion.G by p."""
-    if motion.frozen:
-        if not linearize_frozen(motion, q, qd, qdd):
-            return False
-    elif not acceleration_jacobian(
-            motion.arm, motion.payload, q, qd, motion.effort, qdd, motion.dq, motion.dqd, motion.dp, motion.work):
+    if not accelerate(motion, q, qd, qdd):
         return False
+    if motion.frozen:
+        constant_mass_jacobian(motion, qdd)
+    else:
+        force_jacobian(motion.arm, motion.payload, q, qd, qdd, motion.dq, motion.dqd, motion.dp, motion.work)
+    complete_jacobian(motion.arm, q, qd, motion.dq, motion.dqd, motion.work)
     n = q.size
     arm, dp, net = motion.arm, motion.dp, motion.work.net
     k, links = arm.kappa, arm.length.size
@@ -346,17 +331,14 @@ def note_opened(motion: ProcessModel, S: Array, used: int) -> None:
 
 @kernel
 def predict(
-    motion: ProcessModel, x: Array, S: Array, used: int, rows: Array, period: float, halved: int,
+    motion: ProcessModel, x: Array, S: Array, used: int, rows: Array, period: float, duration: float, halved: int,
 ) -> bool:
-    """Carry x and S over a time with the torque held; False when numbers left the finite range.
+    """Carry x and S over a time [s] with the torque held; False when numbers left the finite range.
 
-    used: number of columns of S, the first ones, that are not zero; rows: (P, >= 1 + L) that time [s] and the effort
-    held meanwhile [N m], after the rows before it that the torque depends on too; period: their sample time [s];
-    halved: how often the longest step is halved.
+    used: number of columns of S, the first ones, that are not zero; rows: (P, >= 1 + L) columns 1 to L of the last one
+    are the efforts held meanwhile [N m], those before it are what the torque depends on too; period: their sample time
+    [s]; halved: how often the longest step is halved. A time of zero only linearizes at x: motion.k[0], dq, dqd and G.
     """
-    duration = rows[rows.shape[0] - 1, 0]
-    if duration <= 0.0:
-        return True
     n = motion.arm.stiffness.size
     set_parameters(motion, x)
     note_opened(motion, S, used)
@@ -366,28 +348,31 @@ def predict(
         slope[0] *= motion.gain[i]
         slope[1] *= motion.gain[i]
     left, fine = duration, 0.5 ** halved
-    while left > 0.0:
+    done, steps, h, turn = 0.0, 1.0, 0.0, 0.0
+    while True:
         if not linearize(motion, x[:n], x[n:2 * n], motion.k[0]):
             return False
-        stiff = 0.0
-        for r in range(n):
-            stiff -= motion.dqd[r, r]
-        longest = min(motion.substeps * slower(motion, left), STIFF_STEP / max(stiff, 1e-9))
-        steps = np.ceil(left / longest - 1e-9)
-        if not steps < MOST_STEPS:
+        if left <= 0.0:
+            return True
+        if done == 0.0:
+            stiff = 0.0
+            for r in range(n):
+                stiff -= motion.dqd[r, r]
+            longest = min(motion.substeps * slower(motion, left), STIFF_STEP / max(stiff, 1e-9))
+            steps = np.ceil(left / longest - 1e-9)
+            if not steps < MOST_STEPS:
+                return False
+            h = left / max(steps, 1.0)
+            turn = max(STEP_ANGLE / motion.substeps, stiff)
+            spread(motion, S, used, h, terms(turn * h, SPREAD_ERROR))  # it weighs: the begin's linearization will do
+        if not exponential_step(motion, x, h * fine, terms(turn * h * fine, MOTION_ERROR)):
             return False
-        h = left / max(steps, 1.0)
-        turn = max(STEP_ANGLE / motion.substeps, stiff)
-        spread(motion, S, used, h, terms(turn * h, SPREAD_ERROR))  # it weighs: the linearization at the begin will do
-        parts = 0
-        while parts * fine < 1.0:
-            if parts and not linearize(motion, x[:n], x[n:2 * n], motion.k[0]):
-                return False
-            if not exponential_step(motion, x, h * fine, terms(turn * h * fine, MOTION_ERROR)):
-                return False
-            parts += 1
-        left = left - h if steps > 1.0 else 0.0
-    return True
+        done += fine
+        if done >= 1.0:
+            done = 0.0
+            left = left - h if steps > 1.0 else 0.0
+            if left <= 0.0:
+                return True
 
 
 @inner

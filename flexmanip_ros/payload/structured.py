@@ -116,8 +116,9 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     assert state.efforts is not None
     assert state.sensors is not None
     ahead = max(event.stamp_ns - state.last_ns, 0)
-    rows = np.column_stack([np.full(len(state.efforts), min(ahead * 1e-9, LONGEST_S)), state.efforts])
-    predict(state.model.motion, m.x, m.S, m.x.size, rows, state.sensors.period, m.counts[mem.HALVED])
+    rows = np.pad(state.efforts, ((0, 0), (1, 0)))
+    predict(state.model.motion, m.x, m.S, m.x.size, rows, state.sensors.period, min(ahead * 1e-9, LONGEST_S),
+            m.counts[mem.HALVED])
     _change(config, state.model, m, event.kind)
     last_ns = state.last_ns + ahead
     return state._replace(memory=m, last_ns=last_ns, horizon=Horizon(state.cursor, last_ns, state.efforts))

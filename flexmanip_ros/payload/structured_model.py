@@ -17,7 +17,7 @@ from flexmanip_ros.arm.manipulator import Manipulator, manipulator, modal, works
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.measurement_update import MeasurementModel
-from flexmanip_ros.payload.process_model import STEP_ANGLE, Kind, ProcessModel, linearize, set_parameters
+from flexmanip_ros.payload.process_model import STEP_ANGLE, Kind, ProcessModel, predict, set_parameters
 from flexmanip_ros.types import Array
 
 
@@ -208,12 +208,15 @@ def motion(config: IdentifierParameters) -> ProcessModel:
     unit = manipulator(replace(config.arm, damping_ratio=0.5)).damping / 0.5
     arm = nominal._replace(**{name: getattr(nominal, name).copy() for name in (
         'stiffness', 'damping', 'viscous', 'coulomb', 'rotary')})
+    frozen = config.payload.dynamics == 'linear'
+    if frozen:  # no forces of higher order than the displacements
+        arm = arm._replace(along=np.zeros_like(arm.along))
     lightest = config.arm.tip_mass + config.arm.linear_density[-1] * config.arm.link_length[-1] / 3
     fastest = max(np.sqrt(nominal.stiffness[modal(config.arm, nominal.kappa, i)] * 2 / (rho * L)).max()
                   for i, (rho, L) in enumerate(zip(config.arm.linear_density, config.arm.link_length, strict=True)))
     return ProcessModel(
         arm=arm, work=workspace(nominal), kind=np.array([kind for kind, _ in kinds], dtype=np.int64),
-        link=np.array([link for _, link in kinds], dtype=np.int64), frozen=config.payload.dynamics == 'linear',
+        link=np.array([link for _, link in kinds], dtype=np.int64), frozen=frozen,
         M0=np.zeros((n, n)), Mp=np.zeros((4, n, n)), stiffness=nominal.stiffness, damping=unit, rotary=nominal.rotary,
         scale=lightest, least=_least(nominal, lightest),
         least_rotor=_least_rotor(nominal), substeps=STEP_ANGLE / fastest, payload=np.zeros(4),
@@ -483,9 +486,7 @@ def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, 
     """
     motion = model.motion
     n = motion.arm.stiffness.size
-    set_parameters(motion, m.x)
-    motion.effort[:] = 0.0
-    linearize(motion, m.x[:n], m.x[n:2 * n], motion.k[0])
+    predict(motion, m.x, m.S, 0, np.zeros((1, 1 + change.size)), dt, 0.0, 0)
     flow = np.zeros((2 * n + change.size, 2 * n + change.size))
     flow[:n, n:2 * n], flow[n:2 * n, :n], flow[n:2 * n, n:2 * n] = np.eye(n), motion.dq, motion.dqd
     M = motion.M0 + np.tensordot(motion.payload, motion.Mp, 1) if motion.frozen \

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexmanip_ros.arm.equations_of_motion import acceleration, hold
-from flexmanip_ros.numerics.compiled import kernel
+from flexmanip_ros.numerics.compiled import kernel, merged
 
 if TYPE_CHECKING:
     from flexmanip_ros.arm.manipulator import Manipulator, Workspace
@@ -17,7 +17,7 @@ LIMIT = 1e6
 """A coordinate or rate beyond this has diverged."""
 
 
-@kernel
+@merged
 def runge_kutta(
     arm: Manipulator, payload: Array, held: Array, x: Array, effort: Array, h: float, steps: int,
     scratch: Array, work: Workspace,

@@ -38,11 +38,18 @@ def bent(arm, n: int) -> np.ndarray:
     return x
 
 
+def linearize(arm, x: np.ndarray) -> np.ndarray:
+    """The accelerations; their derivatives stand in the arm."""
+    rows = np.array([[0.0, *(TORQUE / arm.gain)]])
+    assert process_model.predict(arm, x, np.eye(x.size), x.size, rows, 1e-3, 0.0, 0)
+    return arm.k[0].copy()
+
+
 def fine(arm, x: np.ndarray, n: int, duration: float, steps: int) -> np.ndarray:
     """Runge and Kutta with steps so small that they count as exact."""
     def slope(state):
         qdd = np.zeros(n)
-        assert process_model.linearize(arm, state[:n].copy(), state[n:].copy(), qdd)
+        assert process_model.accelerate(arm, state[:n].copy(), state[n:].copy(), qdd)
         return np.concatenate([state[n:], qdd])
 
     state, h = x[:2 * n].copy(), duration / steps
@@ -56,8 +63,8 @@ def fine(arm, x: np.ndarray, n: int, duration: float, steps: int) -> np.ndarray:
 
 def error(arm, x: np.ndarray, exact: np.ndarray, n: int, duration: float, h: float) -> float:
     state, spread = x.copy(), np.zeros((x.size, x.size))
-    rows = np.array([[duration, *(TORQUE / arm.gain)]])
-    assert process_model.predict(arm._replace(substeps=h), state, spread, 0, rows, duration, 0)
+    rows = np.array([[0.0, *(TORQUE / arm.gain)]])
+    assert process_model.predict(arm._replace(substeps=h), state, spread, 0, rows, duration, duration, 0)
     return float(np.abs(state[:n] - exact[:n]).max())
 
 
@@ -75,15 +82,13 @@ def test_a_step_of_one_sample_is_exact_to_a_hundredth_of_the_sensors_and_of_thir
 def test_the_linearisation_is_the_derivative_of_the_motion(arm):
     n = arm.arm.stiffness.size
     x = bent(arm, n)
-    qdd, low, high = np.zeros(n), np.zeros(n), np.zeros(n)
-    assert process_model.linearize(arm, x[:n].copy(), x[n:2 * n].copy(), qdd)
+    linearize(arm, x)
     dq, dqd = arm.dq.copy(), arm.dqd.copy()
     for i in range(2 * n):
-        up, down = x[:2 * n].copy(), x[:2 * n].copy()
+        up, down = x.copy(), x.copy()
         up[i] += 1e-6
         down[i] -= 1e-6
-        process_model.linearize(arm, up[:n].copy(), up[n:].copy(), high)
-        process_model.linearize(arm, down[:n].copy(), down[n:].copy(), low)
+        high, low = linearize(arm, up), linearize(arm, down)
         given = dq[:, i] if i < n else dqd[:, i - n]
         np.testing.assert_allclose((high - low) / 2e-6, given, rtol=1e-4, atol=1e-6 * np.abs(given).max())
 
@@ -91,8 +96,8 @@ def test_the_linearisation_is_the_derivative_of_the_motion(arm):
 def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(arm):
     n = arm.arm.stiffness.size
     x = bent(arm, n)
-    qdd, low, high = np.zeros(n), np.zeros(n), np.zeros(n)
-    assert process_model.linearize(arm, x[:n].copy(), x[n:2 * n].copy(), qdd)
+    low, high = np.zeros(n), np.zeros(n)
+    linearize(arm, x)
     G = arm.G.copy()
     for c in range(G.shape[1]):
         up, down = x.copy(), x.copy()
@@ -101,5 +106,5 @@ def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(arm):
         for state, acceleration in ((up, high), (down, low)):
             process_model.set_parameters(arm, state)
             arm.effort[:] = arm.gain * TORQUE / np.exp(0.03)
-            process_model.linearize(arm, x[:n].copy(), x[n:2 * n].copy(), acceleration)
+            process_model.accelerate(arm, x[:n].copy(), x[n:2 * n].copy(), acceleration)
         np.testing.assert_allclose((high - low) / 2e-5, G[:, c], rtol=1e-4, atol=1e-5 * np.abs(G[:, c]).max() + 1e-9)

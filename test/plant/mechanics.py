@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flexmanip_ros.arm.equations_of_motion import acceleration, assemble, elastic, eliminate_translation, torque_matrix
-from flexmanip_ros.arm.jacobian import bias_jacobian
+from flexmanip_ros.arm.jacobian import force_jacobian
 from flexmanip_ros.arm.linearization import mass_matrix
 from flexmanip_ros.arm.manipulator import Manipulator, workspace
 from flexmanip_ros.types import Array
@@ -23,7 +23,8 @@ def bias(arm: Manipulator, payload: Array, q: Array, qd: Array) -> Array:
 def coriolis_matrix(arm: Manipulator, payload: Array, q: Array, qd: Array) -> Array:
     """Return C(q, qd) of the Christoffel symbols, (n, n): E = C qd and dM/dt - 2 C is skew; C = dE/dqd / 2."""
     work = workspace(arm)
-    bias_jacobian(arm, payload, q, qd, np.zeros_like(q), work.left, work.right, work)
+    assemble(arm, payload, q, qd, work.M, work.E, work)
+    force_jacobian(arm, payload, q, qd, np.zeros_like(q), work.left, work.right, work.parameters, work)
     return work.right / 2
 
 

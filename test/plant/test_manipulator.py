@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from flexmanip_ros.arm import linearization
 from flexmanip_ros.arm import manipulator as m
-from flexmanip_ros.arm.jacobian import acceleration_jacobian
+from flexmanip_ros.arm.equations_of_motion import acceleration
+from flexmanip_ros.arm.jacobian import complete_jacobian, force_jacobian
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
@@ -87,7 +88,10 @@ def test_derivatives_of_the_acceleration(shortening: bool, kappa: int, payload: 
     n = q.size
     tau, qdd = np.array([3.0, -2.0]), np.empty(n)
     dq, dqd, dp = np.empty((n, n)), np.empty((n, n)), np.empty((n, 4))
-    assert acceleration_jacobian(arm, payload, q, qd, tau, qdd, dq, dqd, dp, m.workspace(arm))
+    work = m.workspace(arm)
+    assert acceleration(arm, payload, q, qd, tau, qdd, work)
+    force_jacobian(arm, payload, q, qd, qdd, dq, dqd, dp, work)
+    complete_jacobian(arm, q, qd, dq, dqd, work)
     assert np.array_equal(qdd, mechanics.accelerations(arm, payload, q, qd, tau))
 
     expected = {
