@@ -16,7 +16,16 @@ from numpy.typing import NDArray
 from flexmanip_ros.arm.equations_of_motion import solve
 from flexmanip_ros.numerics.compiled import inner, kernel
 from flexmanip_ros.numerics.square_root import factor_information, forward
-from flexmanip_ros.payload.filter_state import AGAIN, BEFORE, EFFECTIVE, HORIZON, REJECTED, STORED, USED
+from flexmanip_ros.payload.filter_state import (
+    AGAIN,
+    BEFORE,
+    EFFECTIVE,
+    HALVED,
+    HORIZON,
+    REJECTED,
+    STORED,
+    USED,
+)
 from flexmanip_ros.payload.moving_horizon import take
 from flexmanip_ros.payload.process_model import SERIES, predict
 from flexmanip_ros.types import Array
@@ -246,8 +255,9 @@ def advance(
             continue
         clock = glr.clock
         if clock[SINCE_TRACES] == 0:
+            # linearizes there; literal numbers would compile it once more
             rows = table[k + 1 - sensors.reach:k + 1]
-            predict(motion, m.x, m.S, m.counts[USED], rows, sensors.period, 0.0, 0)
+            predict(motion, m.x, m.S, m.counts[USED], rows, sensors.period, 0.0, m.counts[HALVED])
             traces(motion, sensors, m, glr, prior, dt)
         clock[SINCE_TRACES] = (clock[SINCE_TRACES] + 1) % REFRESH
         update_glr(m, glr, scratch)

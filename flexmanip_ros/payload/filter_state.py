@@ -41,8 +41,8 @@ class FilterState(NamedTuple):
     counts: NDArray[np.int64]
     """(22,) counters; USED: number of columns of S and S0, the first ones, that are not zero; IN_A_ROW: samples since
     the last one that was missing; MEASURED: samples of this iteration that were not; TRIED: iterations that did
-    not fit, over the same samples; HALVED: how often the longest step of the motion is; CALM: samples since a
-    longer one was too long."""
+    not fit, over the same samples; HALVED: how fine a step of the motion is; CALM: samples since a coarser one
+    was too coarse."""
     score: Array
     """(11,) MOVE: sum of the payload's updates in this batch, VARIANCE: the variance they should have; SHIFT: by how
     many standard deviations the last iteration moved the payload, DOUBT: root of the sum of the squares of that step

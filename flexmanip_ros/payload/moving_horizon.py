@@ -90,9 +90,9 @@ MOST_REFITS = 4
 STRAY, STRAY_EVERY = 3.0, 500
 """Power over white noise of every sensor with which the filter is begun again; samples between two looks."""
 HALVINGS = 3
-"""How often a step is halved: its correction is of third order, so 512 times smaller then."""
+"""How often a step is made finer, first by its order."""
 DOUBLED = 0.1
-"""Correction, over what is allowed, with which a step of twice the length would be allowed: it is of third order."""
+"""Correction, over what is allowed, with which a coarser step would be allowed: it is of third order."""
 CALM_SAMPLES = 1000
 """For so many samples, several periods of the slowest vibration."""
 SLACK = 1.0
@@ -338,8 +338,8 @@ def strays(sensors: MeasurementModel, m: FilterState) -> bool:
 
 @inner
 def control_step(motion: ProcessModel, m: FilterState, duration: float) -> None:
-    """Halve the longest step where its correction is too large, double it where it has long been small enough."""
-    size = correction(motion, duration)
+    """Make the step finer where its correction is too large, coarser where it has long been small enough."""
+    size = correction(motion, duration, m.counts[HALVED])
     m.counts[CALM] += 1
     if size > 1.0 and m.counts[HALVED] < HALVINGS:
         m.counts[HALVED] += 1

@@ -30,9 +30,12 @@ MOTION_ERROR = 1e-8
 """Share of the fastest mode that the motion's exponential leaves out in a step."""
 SPREAD_ERROR = 1e-4
 """Of the spread's: it weighs, and need not be exact."""
-STEP_ERROR = 2e-8
-"""Correction of a step, positions and rates times the sample time, over the length of link 1, beyond which the
-following ones are halved. Steps that change from sample to sample let the energy of a vibration drift."""
+STEP_ERRORS = 1e-7, 1e-6
+"""Correction of a step of fourth and of fifth order, positions and rates times the sample time, over the length of
+link 1, beyond which the following ones are finer: a sample is then off by 4e-9. Steps that change from sample to
+sample let the energy of a vibration drift."""
+LATER = 0.9
+"""Where in a step of fifth order the motion is looked at a second time."""
 MOST_TERMS = 30
 """Terms of an exponential at most: more than ``STEP_ANGLE`` needs."""
 STIFF_STEP = 2.0
@@ -331,13 +334,14 @@ def note_opened(motion: ProcessModel, S: Array, used: int) -> None:
 
 @kernel
 def predict(
-    motion: ProcessModel, x: Array, S: Array, used: int, rows: Array, period: float, duration: float, halved: int,
+    motion: ProcessModel, x: Array, S: Array, used: int, rows: Array, period: float, duration: float, fineness: int,
 ) -> bool:
     """Carry x and S over a time [s] with the torque held; False when numbers left the finite range.
 
     used: number of columns of S, the first ones, that are not zero; rows: (P, >= 1 + L) columns 1 to L of the last one
     are the efforts held meanwhile [N m], those before it are what the torque depends on too; period: their sample time
-    [s]; halved: how often the longest step is halved. A time of zero only linearizes at x: motion.k[0], dq, dqd and G.
+    [s]; fineness: 0 steps of fourth order, 1 of fifth, 2 half as long, 3 a quarter. A time of zero only linearizes at
+    x: motion.k[0], dq, dqd and G.
     """
     n = motion.arm.stiffness.size
     set_parameters(motion, x)
@@ -347,7 +351,7 @@ def predict(
         motion.effort[i] = motion.gain[i] * late_torque(rows, 1 + i, late[0], late[1], period, slope)
         slope[0] *= motion.gain[i]
         slope[1] *= motion.gain[i]
-    left, fine = duration, 0.5 ** halved
+    left, fine = duration, 0.5 ** max(fineness - 1, 0)
     done, steps, h, turn = 0.0, 1.0, 0.0, 0.0
     while True:
         if not linearize(motion, x[:n], x[n:2 * n], motion.k[0]):
@@ -365,7 +369,7 @@ def predict(
             h = left / max(steps, 1.0)
             turn = max(STEP_ANGLE / motion.substeps, stiff)
             spread(motion, S, used, h, terms(turn * h, SPREAD_ERROR))  # it weighs: the begin's linearization will do
-        if not exponential_step(motion, x, h * fine, terms(turn * h * fine, MOTION_ERROR)):
+        if not exponential_step(motion, x, h * fine, terms(turn * h * fine, MOTION_ERROR), fineness > 0):
             return False
         done += fine
         if done >= 1.0:
@@ -376,8 +380,8 @@ def predict(
 
 
 @inner
-def correction(motion: ProcessModel, duration: float) -> float:
-    """What the linearization missed in the last step, over ``STEP_ERROR``; duration: of a sample [s].
+def correction(motion: ProcessModel, duration: float, fineness: int) -> float:
+    """What the linearization missed in the last step, over ``STEP_ERRORS``; duration: of a sample [s].
 
     Where Coulomb friction may change its sign it is 0: a shorter step does not straighten that bend of the motion.
     """
@@ -385,70 +389,110 @@ def correction(motion: ProcessModel, duration: float) -> float:
     if not motion.frozen and slower(motion, duration) == 1.0:
         for i in range(motion.k.shape[1]):
             largest = max(largest, abs(motion.k[1, i]), duration * abs(motion.k[2, i]))
-    allowed: float = STEP_ERROR * motion.arm.length[0]
+    allowed: float = STEP_ERRORS[min(fineness, 1)] * motion.arm.length[0]
     return largest / allowed
 
 
 @merged
-def exponential_step(motion: ProcessModel, x: Array, h: float, count: int) -> bool:
+def exponential_step(motion: ProcessModel, x: Array, h: float, count: int, fifth: bool) -> bool:
     """Advance x by h, exactly where the motion is linear; right after ``linearize`` at x. count: terms of the series.
 
-    Exponential Rosenbrock method of third order: x1 = x + h phi_1(h F) f(x), then x1 + 2 h phi_3(h F) of what
-    f(x1) - f(x) misses of F (x1 - x). The vibration turns too far in one sample for a step of Runge and
-    Kutta: their damping of the fastest mode read as 0.3 % of payload.
+    Exponential Rosenbrock methods: X = x + c h phi_1(c h F) f(x), and D is what f(X) - f(x) misses of F (X - x). Of
+    fourth order with one X (exprb42, Luan, Applied Numerical Mathematics 112, 2017), of fifth with two (exprb53s3, Luan
+    and Ostermann, Journal of Computational and Applied Mathematics 255, 2014). The vibration turns too far in one
+    sample for a step of Runge and Kutta: their damping of the fastest mode read as 0.3 % of payload.
     """
     n = motion.arm.stiffness.size
-    q, qd = x[:n], x[n:2 * n]
-    total, term = motion.k[1:3], motion.k[4:6]
+    corrected, first, term, second = motion.k[1:3], motion.k[3], motion.k[4:6], motion.k[6]
+    sums, moved, later, whole = motion.k[7:13], motion.k[13:15], motion.k[15:17], motion.k[17:19]
+    c = 0.5 if fifth else 0.75
     for i in range(n):
-        term[0, i] = qd[i]
+        term[0, i] = x[n + i]
         term[1, i] = motion.k[0, i]
-    series(motion, h, 1, h, count)
-    for i in range(n):
-        x[i] += total[0, i]
-        x[n + i] += total[1, i]
+    series(motion, h, 1, count, c)
+    for part in range(2):
+        for i in range(n):
+            moved[part, i] = c * h * sums[part, i]
+            later[part, i] = LATER * h * sums[2 + part, i]
+            whole[part, i] = h * sums[4 + part, i]
     if not motion.frozen:
-        if not accelerate(motion, q, qd, motion.k[3]):
+        if not miss(motion, x, moved, first):
             return False
         for i in range(n):
-            missed = motion.k[3, i] - motion.k[0, i]
-            for j in range(n):
-                missed -= motion.dq[i, j] * total[0, j] + motion.dqd[i, j] * total[1, j]
             term[0, i] = 0.0
-            term[1, i] = missed / 6.0
-        series(motion, h, 3, 2.0 * h, max(count - 2, 1))
-        for i in range(n):
-            x[i] += total[0, i]
-            x[n + i] += total[1, i]
+            term[1, i] = first[i] / 6.0
+        series(motion, h, 3, max(count - 2, 1), c)
+        for part in range(2):
+            for i in range(n):
+                corrected[part, i] = 2.0 / (c * c) * h * sums[4 + part, i]
+                later[part, i] += h * (27.0 / 25.0 * sums[part, i] + 729.0 / 125.0 * sums[2 + part, i])
+        if fifth:
+            if not miss(motion, x, later, second):
+                return False
+            for i in range(n):  # phi_3(z) a + phi_4(z) b = a / 6 + phi_4(z) (z a + b)
+                whole[1, i] += h * (3.0 * first[i] - 125.0 / 243.0 * second[i])
+                term[0, i] = h * (18.0 * first[i] - 250.0 / 81.0 * second[i]) / 24.0
+                term[1, i] = (500.0 / 27.0 * second[i] - 60.0 * first[i]) / 24.0
+            for i in range(n):
+                for j in range(n):
+                    term[1, i] += motion.dqd[i, j] * term[0, j]
+            series(motion, h, 4, max(count - 3, 1), c)
+        for part in range(2):
+            for i in range(n):
+                whole[part, i] += h * sums[4 + part, i] if fifth else corrected[part, i]
     largest = 0.0
-    for i in range(2 * n):
-        largest += abs(x[i])
+    for part in range(2):
+        for i in range(n):
+            x[part * n + i] += whole[part, i]
+            largest += abs(x[part * n + i])
     return largest < 1e6
 
 
-@inner
-def series(motion: ProcessModel, h: float, first: int, scale: float, count: int) -> None:
-    """Fill total with scale x phi_first(h F) v, F the linearisation, phi_l(z) = sum of z^j / (j + l)!.
-
-    v / first! stands in rows 4, 5 of motion.k (positions, rates) and is used up; total: rows 1, 2.
-    """
-    n = motion.arm.stiffness.size
-    total, term, following = motion.k[1:3], motion.k[4:6], motion.k[6:8]
+@merged
+def miss(motion: ProcessModel, x: Array, moved: Array, missed: Array) -> bool:
+    """Fill missed (n,) with what the linearization at x misses of the acceleration at x + moved (2, n)."""
+    n = missed.size
+    place = motion.k[7:9]
     for part in range(2):
         for i in range(n):
-            total[part, i] = scale * term[part, i]
+            place[part, i] = x[part * n + i] + moved[part, i]
+    if not accelerate(motion, place[0], place[1], missed):
+        return False
+    for i in range(n):
+        missed[i] -= motion.k[0, i]
+        for j in range(n):
+            missed[i] -= motion.dq[i, j] * moved[0, j] + motion.dqd[i, j] * moved[1, j]
+    return True
+
+
+@inner
+def series(motion: ProcessModel, h: float, first: int, count: int, c: float) -> None:
+    """Fill rows 7 to 12 of motion.k with phi_first(z) v at z = c h F, LATER h F and h F, F the linearization.
+
+    phi_l(z) = sum of z^j / (j + l)!; v / first! stands in rows 4, 5 (positions, rates) and is used up.
+    """
+    n = motion.arm.stiffness.size
+    term, following, sums = motion.k[4:6], motion.k[6], motion.k[7:13]
+    for row in range(6):
+        for i in range(n):
+            sums[row, i] = term[row % 2, i]
+    near, far = 1.0, 1.0
     for order in range(first + 1, first + count):
         weight = h / order
+        near *= c
+        far *= LATER
         for i in range(n):
             value = 0.0
             for j in range(n):
                 value += motion.dq[i, j] * term[0, j] + motion.dqd[i, j] * term[1, j]
-            following[0, i] = weight * term[1, i]
-            following[1, i] = weight * value
-        for part in range(2):
-            for i in range(n):
-                term[part, i] = following[part, i]
-                total[part, i] += scale * following[part, i]
+            following[i] = weight * value
+        for i in range(n):
+            term[0, i] = weight * term[1, i]
+            term[1, i] = following[i]
+            for part in range(2):
+                sums[part, i] += near * term[part, i]
+                sums[2 + part, i] += far * term[part, i]
+                sums[4 + part, i] += term[part, i]
 
 
 @inner

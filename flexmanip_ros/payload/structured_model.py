@@ -221,7 +221,7 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         scale=lightest, least=_least(nominal, lightest),
         least_rotor=_least_rotor(nominal), substeps=STEP_ANGLE / fastest, payload=np.zeros(4),
         effort=np.zeros(links), gain=np.ones(links), late=np.zeros((links, 2)), slope=np.zeros((links, 2)),
-        opened=np.array([size, *range(size)]), p=np.zeros(size), a=np.zeros(n), k=np.zeros((8, n)),
+        opened=np.array([size, *range(size)]), p=np.zeros(size), a=np.zeros(n), k=np.zeros((19, n)),
         dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)), G=np.zeros((n, size)), X=np.zeros((2 * n, nx)),
         Y=np.zeros((2 * n, nx)))
 

@@ -61,22 +61,23 @@ def fine(arm, x: np.ndarray, n: int, duration: float, steps: int) -> np.ndarray:
     return state
 
 
-def error(arm, x: np.ndarray, exact: np.ndarray, n: int, duration: float, h: float) -> float:
+def error(arm, x: np.ndarray, exact: np.ndarray, n: int, duration: float, h: float, fineness: int) -> float:
     state, spread = x.copy(), np.zeros((x.size, x.size))
     rows = np.array([[0.0, *(TORQUE / arm.gain)]])
-    assert process_model.predict(arm._replace(substeps=h), state, spread, 0, rows, duration, duration, 0)
+    assert process_model.predict(arm._replace(substeps=h), state, spread, 0, rows, duration, duration, fineness)
     return float(np.abs(state[:n] - exact[:n]).max())
 
 
-def test_a_step_of_one_sample_is_exact_to_a_hundredth_of_the_sensors_and_of_third_order(arm):
+def test_a_step_of_one_sample_is_exact_to_a_hundredth_of_the_sensors_and_of_fourth_or_fifth_order(arm):
     n = arm.arm.stiffness.size
     x = bent(arm, n)
     x[2 * n:][arm.kind == Kind.COULOMB] = 0.0  # it has no third derivative to speak of
     process_model.set_parameters(arm, x)
     exact = fine(arm, x, n, 0.02, 4000)
-    coarse, halved = (error(arm, x, exact, n, 0.02, h) for h in (1e-4, 5e-5))
-    assert coarse < 1e-7  # of bends of 5e-3 m
-    assert halved < coarse / 6
+    for fineness, order in ((0, 4), (1, 5)):
+        coarse, halved = (error(arm, x, exact, n, 0.02, h, fineness) for h in (2e-4, 1e-4))
+        assert coarse < 1e-8  # of bends of 5e-3 m
+        assert halved < coarse / 2 ** order
 
 
 def test_the_linearisation_is_the_derivative_of_the_motion(arm):
