@@ -307,7 +307,7 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
     """
     arguments = list(sys.argv if argv is None else argv)
     try:
-        rclpy_workarounds.interrupt_on_signals()
+        rclpy_workarounds.interrupt_on_signals(again=True)
         try:
             parser(name, about, cls).parse_args(remove_ros_args(arguments)[1:])
             rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
@@ -315,6 +315,7 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
             return reject(name, rclpy_workarounds.first_line(error))
         return _spin(make, name)
     except KeyboardInterrupt:
+        rclpy_workarounds.ignore_signals()
         return 0
 
 
@@ -325,7 +326,7 @@ def _spin(make: Callable[[], FlexmanipNode[Any]], name: str) -> int:
     try:
         node = make()
         executor = rclpy_workarounds.make_executor()
-        caught = rclpy_workarounds.interrupt_on_signals()
+        caught = rclpy_workarounds.interrupt_on_signals(again=True)
         executor.add_node(node)
         started = node.autostart()
         if not started and not caught:

@@ -9,7 +9,9 @@ import faulthandler
 import gc
 import inspect
 import math
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -25,6 +27,8 @@ from rclpy.subscription import Subscription
 
 POLL_S = 0.1
 """Longest wait inside the executor, hence the longest delay of a signal on an idle node."""
+AGAIN_S = 1.0
+"""Time after which a signal is repeated that has not ended the process yet."""
 LONGEST_END_S = 10.0
 """Longest time in which a process leaves the middleware; it takes some tenths of a second."""
 
@@ -42,11 +46,12 @@ def make_executor(context: Context | None = None) -> Executor:
     return EventsExecutor(context=context)
 
 
-def interrupt_on_signals() -> list[int]:
+def interrupt_on_signals(*, again: bool = False) -> list[int]:
     """Let SIGINT and SIGTERM raise KeyboardInterrupt; call it again after an executor was made.
 
     Return a list that holds the signals which have come: an exception in a callback from C, such as those with which
-    numba loads a kernel, is printed and lost.
+    numba loads a kernel, is printed and lost. again: the signal then comes again, every ``AGAIN_S`` until signals are
+    ignored. Without that a node whose kernels are being compiled ends a minute later.
 
     rclpy's own handlers end the context before a node can send its last message, such as zero torque. With
     ``SignalHandlerOptions.NO`` SIGTERM ends the process at once, and the events executor sets handlers of its own.
@@ -55,6 +60,10 @@ def interrupt_on_signals() -> list[int]:
 
     def interrupt(number: int, frame: object) -> None:
         caught.append(number)
+        if again:
+            repeat = threading.Timer(AGAIN_S, os.kill, (os.getpid(), number))
+            repeat.daemon = True
+            repeat.start()
         raise KeyboardInterrupt
 
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -93,7 +102,7 @@ def shutdown() -> Iterator[None]:
     detected"). Fast DDS can also wait without end where a participant is destroyed just as another leaves
     (https://github.com/eProsima/Fast-DDS/issues/6193): after ``LONGEST_END_S`` the process ends with exit code 1.
     """
-    _ignore_signals()
+    ignore_signals()
     faulthandler.dump_traceback_later(LONGEST_END_S, exit=True)
     try:
         yield
@@ -101,10 +110,11 @@ def shutdown() -> Iterator[None]:
         rclpy.try_shutdown()
         gc.collect()
         faulthandler.cancel_dump_traceback_later()
-        _ignore_signals()  # the executor that went gave the signals their default actions back
+        ignore_signals()  # the executor that went gave the signals their default actions back
 
 
-def _ignore_signals() -> None:
+def ignore_signals() -> None:
+    """Let SIGINT and SIGTERM pass: the process is ending."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
 

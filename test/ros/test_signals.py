@@ -72,3 +72,17 @@ def test_a_signal_while_a_node_starts_ends_it_as_any_other(moment: str) -> None:
              'sys.exit(node.main([]))')
     ended = subprocess.run([sys.executable, '-c', begin], text=True, capture_output=True, timeout=60.0)
     assert (ended.returncode, ended.stderr) == (0, '')
+
+
+def test_a_signal_that_a_callback_from_c_loses_ends_a_node_that_compiles_for_long() -> None:
+    begin = ('import contextlib, os, signal, sys, time, flexmanip_ros.ros.nodes.excitation as node\n'
+             'def start(self):\n'
+             '    with contextlib.suppress(KeyboardInterrupt):\n'
+             '        os.kill(os.getpid(), signal.SIGINT)\n'
+             '        time.sleep(1000.0)\n'
+             '    time.sleep(1000.0)\n'
+             'node.Excitation.start = start\n'
+             'sys.exit(node.main([]))')
+    ended = subprocess.run([sys.executable, '-c', begin], text=True, capture_output=True, timeout=100.0)
+    assert ended.returncode == 0
+    assert 'Traceback' not in ended.stderr
