@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -80,19 +79,6 @@ def payload() -> None:
 PARTS: dict[str, Callable[[], None]] = {'payload': payload, 'simulator and identifier': simulator_and_identifier}
 
 
-def drop_stale(package: Path) -> int:
-    """Delete compiled functions older than any kernel's source; return how many.
-
-    numba looks at the file of a function alone, not at those of the functions it calls.
-    """
-    newest = max(path.stat().st_mtime_ns for path in package.rglob('*.py')
-                 if '@kernel' in (text := path.read_text(encoding='utf-8')) or '@inlined' in text or '@merged' in text)
-    stale = [path for path in package.rglob('__pycache__/*.nb[ic]') if path.stat().st_mtime_ns < newest]
-    for path in stale:
-        path.unlink(missing_ok=True)
-    return len(stale)
-
-
 def main(argv: list[str] | None = None) -> int:
     """Compile all parts side by side, or the one that is named. A part that fails is compiled at its first use."""
     begin = time.perf_counter()
@@ -101,10 +87,6 @@ def main(argv: list[str] | None = None) -> int:
         PARTS[named[0]]()
         print(f'  compiled: {named[0]} ({time.perf_counter() - begin:.0f} s)', flush=True)
         return 0
-    try:
-        drop_stale(Path(__file__).parents[1])
-    except OSError as problem:  # the folder is read-only, and so are its compiled functions
-        print(f'compiled functions are left as they are: {problem}', file=sys.stderr)
     print(f'compiling {len(PARTS)} parts side by side, about a minute the first time: {", ".join(PARTS)}', flush=True)
     running = {name: subprocess.Popen([sys.executable, '-m', 'flexmanip_ros.cli.warm_up', name]) for name in PARTS}
     for name, process in running.items():

@@ -1,8 +1,14 @@
-"""How the inner functions are compiled (numba): no fast-math, so that every machine gets the same bits."""
+"""How the inner functions are compiled (numba): no fast-math, so that every machine gets the same bits.
+
+They are kept on disk from the first use on; what an update of the sources made stale is deleted at the next import.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 from numba import njit
@@ -57,3 +63,24 @@ _OPTIONS: dict[str, Any] = {'nogil': True, '_nrt': False, 'no_cfunc_wrapper': Tr
 def _compiled(function: Function, **more: Any) -> Function:
     compiled: Function = njit(cache=True, **_OPTIONS, **more)(function)
     return compiled
+
+
+COMPILED = re.compile(r'^@(kernel|inlined|inner|merged)$', re.MULTILINE)
+
+
+def drop_stale(package: Path) -> int:
+    """Delete compiled functions older than the newest source of any; return how many.
+
+    numba looks at the file of a function alone, not at those of the functions it calls: after an update one kernel in
+    two would be the old one, and numbers wrong. Raises OSError where the folder is read-only.
+    """
+    newest = max(path.stat().st_mtime_ns for path in package.rglob('*.py')
+                 if COMPILED.search(path.read_text(encoding='utf-8')))
+    stale = [path for path in package.rglob('__pycache__/*.nb[ic]') if path.stat().st_mtime_ns < newest]
+    for path in stale:
+        path.unlink(missing_ok=True)
+    return len(stale)
+
+
+with contextlib.suppress(OSError):  # numba keeps those of a read-only folder elsewhere
+    drop_stale(Path(__file__).parents[1])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from flexmanip_ros.cli.warm_up import drop_stale
+from flexmanip_ros.numerics.compiled import drop_stale
 
 
 def test_caches_older_than_a_kernel_are_dropped(tmp_path: Path) -> None:
