@@ -74,9 +74,12 @@ def drop_stale(package: Path) -> int:
     numba looks at the file of a function alone, not at those of the functions it calls: after an update one kernel in
     two would be the old one, and numbers wrong. Raises OSError where the folder is read-only.
     """
-    newest = max(path.stat().st_mtime_ns for path in package.rglob('*.py')
-                 if COMPILED.search(path.read_text(encoding='utf-8')))
-    stale = [path for path in package.rglob('__pycache__/*.nb[ic]') if path.stat().st_mtime_ns < newest]
+    compiled = {path: path.stat().st_mtime_ns for path in package.rglob('__pycache__/*.nb[ic]')}
+    oldest = min(compiled.values(), default=0)
+    sources = ((path, path.stat().st_mtime_ns) for path in package.rglob('*.py'))
+    newest = max((age for path, age in sources if compiled and age > oldest  # most imports read no file
+                  and COMPILED.search(path.read_text(encoding='utf-8'))), default=0)
+    stale = [path for path, age in compiled.items() if age < newest]
     for path in stale:
         path.unlink(missing_ok=True)
     return len(stale)

@@ -22,7 +22,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
 # Elements of ``counts``.
 (HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN, BEFORE,
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
- HALVED, CALM) = range(22)
+ FINENESS, CALM) = range(22)
 # Elements of ``score``.
 MOVE, VARIANCE, SHIFT, DOUBT, DRIFT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA = range(11)
 
@@ -41,7 +41,7 @@ class FilterState(NamedTuple):
     counts: NDArray[np.int64]
     """(22,) counters; USED: number of columns of S and S0, the first ones, that are not zero; IN_A_ROW: samples since
     the last one that was missing; MEASURED: samples of this iteration that were not; TRIED: iterations that did
-    not fit, over the same samples; HALVED: how fine a step of the motion is; CALM: samples since a coarser one
+    not fit, over the same samples; FINENESS: how fine a step of the motion is; CALM: samples since a coarser one
     was too coarse."""
     score: Array
     """(11,) MOVE: sum of the payload's updates in this batch, VARIANCE: the variance they should have; SHIFT: by how

@@ -24,9 +24,9 @@ from flexmanip_ros.payload.filter_state import (
     DOUBT,
     EFFECTIVE,
     ENOUGH,
+    FINENESS,
     FIT,
     FLOOR,
-    HALVED,
     HELD,
     HORIZON,
     IN_A_ROW,
@@ -89,10 +89,10 @@ MOST_REFITS = 4
 """How often a fit is begun again after an event: an arm that is another one never fits."""
 STRAY, STRAY_EVERY = 3.0, 500
 """Power over white noise of every sensor with which the filter is begun again; samples between two looks."""
-HALVINGS = 3
-"""How often a step is made finer, first by its order."""
-DOUBLED = 0.1
-"""Correction, over what is allowed, with which a coarser step would be allowed: it is of third order."""
+FINEST = 3
+"""Of the steps, see ``process_model.predict``."""
+COARSER = 0.1
+"""Correction, over what is allowed, below which a coarser step is tried."""
 CALM_SAMPLES = 1000
 """For so many samples, several periods of the slowest vibration."""
 SLACK = 1.0
@@ -137,7 +137,7 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
     n, nx, used = sensors.H.shape[1], m.x.size, m.counts[USED]
     links, f = motion.effort.size, sensors.f[:used]
     rows = table[k + 1 - sensors.reach:k + 1]
-    if not predict(motion, m.xr, m.Sr, used, rows, sensors.period, sample[0], m.counts[HALVED]):
+    if not predict(motion, m.xr, m.Sr, used, rows, sensors.period, sample[0], m.counts[FINENESS]):
         return False
     measured = sample[1 + links] == sample[1 + links]
     if measured:
@@ -208,7 +208,7 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
 
 @inner
 def least_damping(m: FilterState) -> float:
-    """Return the damping that is as good as none."""
+    """Return the damping with which a rejected step is taken again first; one below it becomes zero."""
     return LEVENBERG if m.counts[HELD] == 1 else MARQUARDT
 
 
@@ -268,9 +268,10 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
         return True
     if stored + 1 == HORIZON:
         if m.counts[HELD] == 1 and m.score[SHIFT] >= AT_REST:  # what was linearized on the way tells too much
+            wider = np.sqrt(1.0 + m.score[SHIFT] * m.score[SHIFT])
             for i in range(m.x.size):
                 for c in range(m.x.size):
-                    m.S[i, c] *= np.sqrt(1.0 + m.score[SHIFT] * m.score[SHIFT])
+                    m.S[i, c] *= wider
         return not fails(m)
     for _ in range(ROWS):
         if m.counts[ITERATING] == 0:
@@ -339,15 +340,15 @@ def strays(sensors: MeasurementModel, m: FilterState) -> bool:
 @inner
 def control_step(motion: ProcessModel, m: FilterState, duration: float) -> None:
     """Make the step finer where its correction is too large, coarser where it has long been small enough."""
-    size = correction(motion, duration, m.counts[HALVED])
+    size = correction(motion, duration, m.counts[FINENESS])
     m.counts[CALM] += 1
-    if size > 1.0 and m.counts[HALVED] < HALVINGS:
-        m.counts[HALVED] += 1
+    if size > 1.0 and m.counts[FINENESS] < FINEST:
+        m.counts[FINENESS] += 1
         m.counts[CALM] = 0
-    elif size > DOUBLED or m.counts[HALVED] == 0:
+    elif size > COARSER or m.counts[FINENESS] == 0:
         m.counts[CALM] = 0
     elif m.counts[CALM] >= CALM_SAMPLES:
-        m.counts[HALVED] -= 1
+        m.counts[FINENESS] -= 1
         m.counts[CALM] = 0
 
 
@@ -378,7 +379,7 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     links = motion.effort.size
     duration, y = table[k, 0], table[k, 1 + links:]
     rows = table[k + 1 - sensors.reach:k + 1]
-    if not predict(motion, m.x, m.S, m.counts[USED], rows, sensors.period, duration, m.counts[HALVED]):
+    if not predict(motion, m.x, m.S, m.counts[USED], rows, sensors.period, duration, m.counts[FINENESS]):
         return False
     control_step(motion, m, duration)
     came = y[0] == y[0]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, assemble, balance, eliminate_translation
+from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, acceleration, balance
 from flexmanip_ros.arm.jacobian import complete_jacobian, force_jacobian, solve_columns
 from flexmanip_ros.arm.late_torque import late_torque
 from flexmanip_ros.numerics.compiled import inlined, inner, kernel, merged
@@ -214,14 +214,10 @@ def constant_mass(motion: ProcessModel) -> None:
 @kernel
 def accelerate(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
     """Fill qdd (n,) under motion.effort; leaves the factor of M in work.M."""
-    arm, work = motion.arm, motion.work
-    if motion.frozen:
-        constant_mass(motion)
-    else:
-        assemble(arm, motion.payload, q, qd, work.M, work.E, work)
-        if arm.floating:
-            eliminate_translation(work.M, work.E, work)
-    return balance(arm, q, qd, motion.effort, qdd, work)
+    if not motion.frozen:
+        return acceleration(motion.arm, motion.payload, q, qd, motion.effort, qdd, motion.work)
+    constant_mass(motion)
+    return balance(motion.arm, q, qd, motion.effort, qdd, motion.work)
 
 
 @inner
@@ -352,7 +348,7 @@ def predict(
         slope[0] *= motion.gain[i]
         slope[1] *= motion.gain[i]
     left, fine = duration, 0.5 ** max(fineness - 1, 0)
-    done, steps, h, turn, smooth = 0.0, 1.0, 0.0, 0.0, True
+    done, steps, h, turn, pace = 0.0, 1.0, 0.0, 0.0, 1.0
     while True:
         if not linearize(motion, x[:n], x[n:2 * n], motion.k[0]):
             return False
@@ -362,15 +358,15 @@ def predict(
             stiff = 0.0
             for r in range(n):
                 stiff -= motion.dqd[r, r]
-            longest = min(motion.substeps * slower(motion, left), STIFF_STEP / max(stiff, 1e-9))
-            smooth = slower(motion, left) == 1.0
+            pace = slower(motion, left)
+            longest = min(motion.substeps * pace, STIFF_STEP / max(stiff, 1e-9))
             steps = np.ceil(left / longest - 1e-9)
             if not steps < MOST_STEPS:
                 return False
             h = left / max(steps, 1.0)
             turn = max(STEP_ANGLE / motion.substeps, stiff)
             spread(motion, S, used, h, terms(turn * h, SPREAD_ERROR))  # it weighs: the begin's linearization will do
-        order = min(fineness, 1) if smooth else -1
+        order = min(fineness, 1) if pace == 1.0 else -1
         if not exponential_step(motion, x, h * fine, terms(turn * h * fine, MOTION_ERROR), order):
             return False
         done += fine

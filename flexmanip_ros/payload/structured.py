@@ -118,7 +118,7 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     ahead = max(event.stamp_ns - state.last_ns, 0)
     rows = np.pad(state.efforts, ((0, 0), (1, 0)))
     predict(state.model.motion, m.x, m.S, m.x.size, rows, state.sensors.period, min(ahead * 1e-9, LONGEST_S),
-            m.counts[mem.HALVED])
+            m.counts[mem.FINENESS])
     _change(config, state.model, m, event.kind)
     last_ns = state.last_ns + ahead
     return state._replace(memory=m, last_ns=last_ns, horizon=Horizon(state.cursor, last_ns, state.efforts))
@@ -281,9 +281,12 @@ def _resume(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
 
 def latest(sensors: MeasurementModel, efforts: Array, before: Array | None = None) -> Array:
     """Return the efforts (P, L) that the next torques depend on; before these (N, L) the effort was constant."""
-    efforts = efforts if before is None else np.vstack([before, efforts])
-    missing = max(sensors.reach - len(efforts), 0)
-    return np.vstack([np.tile(efforts[0], (missing, 1)), efforts[len(efforts) + missing - sensors.reach:]])
+    if before is not None:
+        efforts = np.vstack([before[-sensors.reach:], efforts])
+    missing = sensors.reach - len(efforts)
+    if missing > 0:
+        return np.vstack([np.tile(efforts[0], (missing, 1)), efforts])
+    return efforts[-missing:].copy()
 
 
 def _bridge(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
