@@ -49,7 +49,7 @@ from flexmanip_ros.payload.filter_state import (
     WHITE,
 )
 from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, misfit, observe
-from flexmanip_ros.payload.process_model import INERTIA, confine, correction, predict
+from flexmanip_ros.payload.process_model import DAMPING, INERTIA, confine, correction, predict
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -214,9 +214,12 @@ def least_damping(m: FilterState) -> float:
 
 @inner
 def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
-    """Set xi to the accepted one and a step of Levenberg and Marquardt, m.g; the payload stays possible."""
+    """Set xi to the accepted one and a step of Levenberg and Marquardt, m.g; payload and damping stay possible.
+
+    A damping below zero: the least of the quadratic cost among the steps that leave it zero (``keep_passive``).
+    """
     nx = m.xi.size
-    L, p = sensors.L, motion.p
+    L, f, p = sensors.L, sensors.f, motion.p
     for i in range(nx):
         m.g[i] = m.gradient[i]
         for c in range(i + 1):
@@ -229,6 +232,18 @@ def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
     for i in range(nx):
         m.xi[i] = m.accepted[i] + m.g[i]
     first = nx - p.size
+    for turn in range(2 * p.size):  # twice each: what one moves may violate another
+        c = turn % p.size
+        below = m.x0[first + c] + dot(m.S0[first + c], m.xi)
+        if motion.kind[c] == DAMPING and below < 0.0:
+            for i in range(nx):
+                f[i] = m.S0[first + c, i]
+            forward(L, f)
+            square = dot(f, f)
+            backward(L, f)
+            for i in range(nx if square > 0.0 else 0):
+                m.xi[i] -= below / square * f[i]
+                m.g[i] -= below / square * f[i]
     for c in range(p.size):
         p[c] = m.x0[first + c] + dot(m.S0[first + c], m.xi)
     confine(motion, p)
@@ -370,6 +385,21 @@ def diffuse(sensors: MeasurementModel, m: FilterState, duration: float) -> None:
     m.score[NOW] = 0.0
 
 
+@inner
+def keep_passive(motion: ProcessModel, m: FilterState) -> None:
+    """Condition the state on dampings of zero where they are below: the fast modes of such an arm explode.
+
+    Projection of the estimate (Simon and Chia 2002): to the nearest possible state, measured by the covariance.
+    """
+    first = m.x.size - motion.kind.size
+    for c in range(motion.kind.size):
+        i = first + c
+        below = m.x[i]
+        square = dot(m.S[i], m.S[i]) if motion.kind[c] == DAMPING and below < 0.0 else 0.0
+        for r in range(m.x.size if square > 0.0 else 0):
+            m.x[r] -= below / square * dot(m.S[r], m.S[i])
+
+
 @merged
 def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array, k: int) -> bool:
     """Take the sample in row k of the table; False when numbers left the finite range.
@@ -385,6 +415,7 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     came = y[0] == y[0]
     if came:
         measure(sensors, m, y, motion.k[0])
+        keep_passive(motion, m)
         confine(motion, m.x[m.x.size - motion.kind.size:])
         if not abs(m.x[2 * sensors.H.shape[1]]) < 1e9:
             return False

@@ -189,7 +189,7 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
 
 @inner
 def confine(motion: ProcessModel, p: Array) -> None:
-    """Move p (np,) to what a payload can be: mass and inertia high enough for a positive mass matrix."""
+    """Move p (np,) to what can be: mass and inertia high enough for a positive mass matrix, dampings not negative."""
     p[MASS] = max(p[MASS], 0.5 * motion.least[0])
     if p.size > INERTIA and motion.kind[INERTIA] == INERTIA:
         moment = p[FIRST_X] * p[FIRST_X] + p[FIRST_Y] * p[FIRST_Y]
@@ -197,6 +197,8 @@ def confine(motion: ProcessModel, p: Array) -> None:
     for c in range(p.size):
         if motion.kind[c] == ROTOR:
             p[c] = max(p[c], motion.least_rotor[motion.link[c]])
+        elif motion.kind[c] == DAMPING:
+            p[c] = max(p[c], 0.0)
 
 
 @inner
