@@ -49,7 +49,7 @@ from flexmanip_ros.payload.filter_state import (
     WHITE,
 )
 from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, misfit, observe
-from flexmanip_ros.payload.process_model import DAMPING, INERTIA, confine, correction, predict
+from flexmanip_ros.payload.process_model import INERTIA, confine, correction, lower_bound, predict
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -214,9 +214,10 @@ def least_damping(m: FilterState) -> float:
 
 @inner
 def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
-    """Set xi to the accepted one and a step of Levenberg and Marquardt, m.g; payload and damping stay possible.
+    """Set xi to the accepted one and a step of Levenberg and Marquardt, m.g; what p holds stays possible.
 
-    A damping below zero: the least of the quadratic cost among the steps that leave it zero (``keep_passive``).
+    What would fall below its bound ends on it, and the rest follows: the least quadratic cost on that constraint
+    (projection of Simon and Chia, 2002). Inertia, whose bound bends, is moved alone.
     """
     nx = m.xi.size
     L, f, p = sensors.L, sensors.f, motion.p
@@ -234,8 +235,8 @@ def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
     first = nx - p.size
     for turn in range(2 * p.size):  # twice each: what one moves may violate another
         c = turn % p.size
-        below = m.x0[first + c] + dot(m.S0[first + c], m.xi)
-        if motion.kind[c] == DAMPING and below < 0.0:
+        below = m.x0[first + c] + dot(m.S0[first + c], m.xi) - lower_bound(motion, c)
+        if below < 0.0:
             for i in range(nx):
                 f[i] = m.S0[first + c, i]
             forward(L, f)
@@ -312,9 +313,8 @@ def misfits(motion: ProcessModel, m: FilterState) -> bool:
     most = MOST_REFITS - 1
     if m.counts[HELD] == 1:
         most = STARTS if motion.kind.size > INERTIA and motion.kind[INERTIA] == INERTIA else 0
-    if m.counts[REFITS] >= most or m.counts[ITERATED] < TELLS:
-        return False
-    if m.counts[AGAIN] == 1 and m.counts[TRIED] < TRIALS:
+    early = m.counts[TRIED] < TRIALS if m.counts[AGAIN] == 1 else m.counts[ITERATED] < TELLS
+    if m.counts[REFITS] >= most or early:
         return False
     expected = m.xi.size + m.noise.shape[0] * m.counts[MEASURED]
     failed = bool(m.score[COST_BEFORE] > UNFIT * expected)
@@ -385,21 +385,6 @@ def diffuse(sensors: MeasurementModel, m: FilterState, duration: float) -> None:
     m.score[NOW] = 0.0
 
 
-@inner
-def keep_passive(motion: ProcessModel, m: FilterState) -> None:
-    """Condition the state on dampings of zero where they are below: the fast modes of such an arm explode.
-
-    Projection of the estimate (Simon and Chia 2002): to the nearest possible state, measured by the covariance.
-    """
-    first = m.x.size - motion.kind.size
-    for c in range(motion.kind.size):
-        i = first + c
-        below = m.x[i]
-        square = dot(m.S[i], m.S[i]) if motion.kind[c] == DAMPING and below < 0.0 else 0.0
-        for r in range(m.x.size if square > 0.0 else 0):
-            m.x[r] -= below / square * dot(m.S[r], m.S[i])
-
-
 @merged
 def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array, k: int) -> bool:
     """Take the sample in row k of the table; False when numbers left the finite range.
@@ -415,7 +400,6 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     came = y[0] == y[0]
     if came:
         measure(sensors, m, y, motion.k[0])
-        keep_passive(motion, m)
         confine(motion, m.x[m.x.size - motion.kind.size:])
         if not abs(m.x[2 * sensors.H.shape[1]]) < 1e9:
             return False

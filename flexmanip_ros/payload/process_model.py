@@ -188,17 +188,27 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
 
 
 @inner
+def lower_bound(motion: ProcessModel, c: int) -> float:
+    """Return the least that entry c of p can be: the mass matrix is positive, and no damping is below zero."""
+    kind = motion.kind[c]
+    low: float = -np.inf
+    if kind == MASS:
+        low = 0.5 * motion.least[0]
+    elif kind == ROTOR:
+        low = motion.least_rotor[motion.link[c]]
+    elif kind == DAMPING:
+        low = 0.0
+    return low
+
+
+@inner
 def confine(motion: ProcessModel, p: Array) -> None:
-    """Move p (np,) to what can be: mass and inertia high enough for a positive mass matrix, dampings not negative."""
-    p[MASS] = max(p[MASS], 0.5 * motion.least[0])
+    """Move p (np,) to what can be, see ``lower_bound``; inertia follows from mass and first moments."""
+    for c in range(p.size):
+        p[c] = max(p[c], lower_bound(motion, c))
     if p.size > INERTIA and motion.kind[INERTIA] == INERTIA:
         moment = p[FIRST_X] * p[FIRST_X] + p[FIRST_Y] * p[FIRST_Y]
         p[INERTIA] = max(p[INERTIA], motion.least[1] + moment / (p[MASS] - motion.least[0]))
-    for c in range(p.size):
-        if motion.kind[c] == ROTOR:
-            p[c] = max(p[c], motion.least_rotor[motion.link[c]])
-        elif motion.kind[c] == DAMPING:
-            p[c] = max(p[c], 0.0)
 
 
 @inner

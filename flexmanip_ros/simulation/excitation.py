@@ -9,16 +9,13 @@ import numpy as np
 from scipy.linalg import qr
 from scipy.optimize import brentq
 
-from flexmanip_ros.arm.manipulator import manipulator
 from flexmanip_ros.errors import ModelError, ParameterError
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters
-from flexmanip_ros.simulation import models, sensors, simulator, waveforms
+from flexmanip_ros.simulation import sensors, simulator, waveforms
 from flexmanip_ros.types import Array
 
 TIMES = (0.25, 1.0, 3.0)
 """Seconds after the capture for which the accuracy is told."""
-COARSER = 5
-"""Integration steps are this much longer than the plant's: half a radian of the fastest mode."""
 CLOSE = 0.02
 """The fitted motion ends within this share below the allowed angle."""
 BEYOND = 10.0
@@ -44,12 +41,10 @@ def amplitude(config: ExcitationParameters) -> tuple[float, ...]:
 
 
 def plant_of(config: ExcitationParameters) -> PlantParameters:
-    """Return the plant the design is made for: noise-free, chord angles seen, stepped coarsely."""
-    plant = PlantParameters(
+    """Return the plant the design is made for: noise-free, chord angles seen."""
+    return PlantParameters(
         rate=config.rate, initial_angles=config.initial_angles, payload_mass=config.payload_mass,
         noise='none', arm=replace(config.arm, angle_convention='chord', effort_delay=0, bend_delay=0.0))
-    steps = models.substeps(manipulator(plant.arm), plant)
-    return replace(plant, substeps=-(-steps // COARSER))
 
 
 @lru_cache(maxsize=16)

@@ -1,53 +1,80 @@
-"""Compiled time stepping: the nonlinear arm by Runge-Kutta of fourth order, linear plants exactly."""
+"""Compiled time stepping: the nonlinear arm by methods of Runge and Kutta, linear plants exactly."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.integrate import DOP853
 
 from flexmanip_ros.arm.equations_of_motion import acceleration, hold
 from flexmanip_ros.numerics.compiled import kernel, merged
+from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
     from flexmanip_ros.arm.manipulator import Manipulator, Workspace
-    from flexmanip_ros.types import Array
 
 LIMIT = 1e6
 """A coordinate or rate beyond this has diverged."""
 
 
+class Method(NamedTuple):
+    """An explicit method of Runge and Kutta."""
+
+    stages: Array
+    """(s, s) its Butcher tableau."""
+    weights: Array
+    """(s,) of the slopes."""
+    angle: float
+    """Largest angle [rad] the fastest mode may turn in a step: its phase and its size are then good to 4e-6."""
+    decay: float
+    """Largest step over the shortest time constant of what decays."""
+    stable: float
+    """Largest step times the fastest pole that is stable."""
+
+
+SMOOTH = Method(np.ascontiguousarray(DOP853.A), np.ascontiguousarray(DOP853.B), angle=1.5, decay=2.5, stable=5.9)
+"""Of eighth order (Dormand and Prince): a third of the evaluations."""
+ROUGH = Method(np.diag([0.5, 0.5, 1.0], -1), np.array([1.0, 2.0, 2.0, 1.0]) / 6.0, angle=0.15, decay=1.0, stable=2.6)
+"""Of fourth order, where Coulomb friction changes its sign: more does not follow it any better."""
+
+
 @merged
 def runge_kutta(
     arm: Manipulator, payload: Array, held: Array, x: Array, effort: Array, h: float, steps: int,
-    scratch: Array, work: Workspace,
+    stages: Array, weights: Array, scratch: Array, work: Workspace,
 ) -> bool:
     """Advance x = [q; qd] (2n,) by steps of h seconds under a held torque; False when it diverged.
 
-    held: (0 or 2, n) combinations of q that stay; scratch: (6, 2n), trial state and the four slopes.
+    held: (0 or 2, n) combinations of q that stay; stages, weights: see ``Method``; scratch: (s + 1, 2n), the slopes and
+    the trial state.
     """
     size = x.size
     n = size // 2
-    trial = scratch[0]
+    count = weights.size
+    trial = scratch[count]
     for _ in range(steps):
-        for stage in range(4):
-            slope = scratch[1 + stage]
-            if stage == 0:
-                for r in range(size):
-                    trial[r] = x[r]
-            else:
-                before = scratch[stage]
-                reach = h if stage == 3 else 0.5 * h
-                for r in range(size):
-                    trial[r] = x[r] + reach * before[r]
+        for stage in range(count):
+            for r in range(size):
+                trial[r] = x[r]
+            for before in range(stage):
+                weight = h * stages[stage, before]
+                if weight != 0.0:
+                    for r in range(size):
+                        trial[r] += weight * scratch[before, r]
+            slope = scratch[stage]
             for r in range(n):
                 slope[r] = trial[n + r]
             if not acceleration(arm, payload, trial[:n], trial[n:size], effort, slope[n:size], work):
                 return False
             if held.shape[0]:
                 hold(work.M, held, slope[n:size], work.held)
+        for stage in range(count):
+            weight = h * weights[stage]
+            if weight != 0.0:
+                for r in range(size):
+                    x[r] += weight * scratch[stage, r]
         for r in range(size):
-            x[r] += h / 6.0 * (scratch[1, r] + 2.0 * (scratch[2, r] + scratch[3, r]) + scratch[4, r])
             if not abs(x[r]) < LIMIT:
                 return False
     return True
@@ -56,11 +83,12 @@ def runge_kutta(
 @kernel
 def run_nonlinear(
     arm: Manipulator, payload: Array, held: Array, x: Array, efforts: Array, dt: float, steps: int,
-    position: Array, velocity: Array, scratch: Array, work: Workspace,
+    stages: Array, weights: Array, position: Array, velocity: Array, scratch: Array, work: Workspace,
 ) -> int:
     """Record each sample, then integrate to the next under its torque; return how many samples are good.
 
-    x (2n,) is advanced in place. efforts: (N, L); position, velocity: (N, 2 L) filled; scratch: (6, 2n).
+    x (2n,) is advanced in place. efforts: (N, L); position, velocity: (N, 2 L) filled; scratch: see
+    ``runge_kutta``.
     """
     n = x.size // 2
     count: int = efforts.shape[0]
@@ -72,7 +100,7 @@ def run_nonlinear(
                 rate += arm.output[r, c] * x[n + c]
             position[k, r] = place
             velocity[k, r] = rate
-        if not runge_kutta(arm, payload, held, x, efforts[k], dt / steps, steps, scratch, work):
+        if not runge_kutta(arm, payload, held, x, efforts[k], dt / steps, steps, stages, weights, scratch, work):
             return k
     return count
 
@@ -84,7 +112,7 @@ def run_linear(
 ) -> int:
     """Record and step x = [dq; dq'] by x = A x + B u; outputs rest + C dq and C dq'. See run_nonlinear.
 
-    A: (2n, 2n), B: (2n, L), C: (2 L, n), rest: (2 L,), scratch: (6, 2n).
+    A: (2n, 2n), B: (2n, L), C: (2 L, n), rest: (2 L,), scratch: (1, 2n).
     """
     size = x.size
     n = size // 2
@@ -109,8 +137,3 @@ def run_linear(
             if not abs(x[r]) < LIMIT:
                 return k
     return count
-
-
-def scratch(size: int) -> Array:
-    """Scratch rows for a state of the given size 2n."""
-    return np.zeros((6, size))

@@ -24,13 +24,9 @@ from flexmanip_ros.arm.linearization import discretize
 from flexmanip_ros.arm.manipulator import Manipulator, manipulator, workspace
 from flexmanip_ros.errors import ModelError, ParameterError
 from flexmanip_ros.parameters import ArmParameters, PlantParameters
-from flexmanip_ros.simulation.integration import run_linear, run_nonlinear, scratch
+from flexmanip_ros.simulation.integration import ROUGH, SMOOTH, Method, run_linear, run_nonlinear
 from flexmanip_ros.types import Array
 
-STEP_ANGLE = 0.15
-"""Largest angle [rad] the fastest mode turns in one integration step: its phase is then good to 4e-6."""
-STABLE_ANGLE = 2.6
-"""Runge-Kutta of fourth order is stable up to 2.78."""
 MOST_SUBSTEPS = 1000
 
 
@@ -47,8 +43,9 @@ class NonlinearModel:
         self._angles = config.initial_angles
         self._dt = 1.0 / config.rate
         self._steps = substeps(self.arm, config)
+        self._method = method(self.arm)
         self._work = workspace(self.arm)
-        self._scratch = scratch(2 * n)
+        self._scratch = np.zeros((len(self._method.weights) + 1, 2 * n))
 
     def rest(self) -> Array:
         """State at rest: chords at the initial angles, no bending."""
@@ -58,8 +55,8 @@ class NonlinearModel:
 
     def advance(self, x: Array, payload: Array, efforts: Array, position: Array, velocity: Array) -> int:
         """Record efforts.shape[0] samples and advance x in place; return how many are good."""
-        return run_nonlinear(self.arm, payload, self.held, x, efforts, self._dt, self._steps, position, velocity,
-                             self._scratch, self._work)
+        return run_nonlinear(self.arm, payload, self.held, x, efforts, self._dt, self._steps, self._method.stages,
+                             self._method.weights, position, velocity, self._scratch, self._work)
 
     def mass_matrix(self, x: Array, payload: Array) -> Array:
         """M at the state, (n, n)."""
@@ -96,7 +93,7 @@ class LinearModel:
         self.rest_output = rest_output
         self._dt = dt
         self._tip, self._turn = tip, turn
-        self._scratch = scratch(2 * M0.shape[0])
+        self._scratch = np.zeros((1, 2 * M0.shape[0]))
         self._steps: dict[bytes, tuple[Array, Array]] = {}
 
     def rest(self) -> Array:
@@ -161,6 +158,11 @@ def build(config: PlantParameters) -> Model:
     return model
 
 
+def method(arm: Manipulator) -> Method:
+    """Return how the motion is integrated."""
+    return ROUGH if arm.coulomb.any() else SMOOTH
+
+
 def substeps(arm: Manipulator, config: PlantParameters) -> int:
     """Integration steps a sample for the fastest mode of the empty arm, in any configuration.
 
@@ -169,14 +171,15 @@ def substeps(arm: Manipulator, config: PlantParameters) -> int:
     fastest = max(_fastest(arm, spread, 0.0) for spread in (0.0, np.pi / 2, np.pi)) / config.rate
     # where a joint sticks, its friction is a stiff damper, and stability is enough
     stiffest = max(_fastest(arm, spread, 1.0) for spread in (0.0, np.pi / 2, np.pi)) / config.rate
+    by = method(arm)
     if config.substeps:
-        if stiffest / config.substeps > STABLE_ANGLE:
+        if stiffest / config.substeps > by.stable:
             raise ParameterError(
                 f"parameter 'substeps' is {config.substeps}: the fastest mode turns "
                 f'{stiffest / config.substeps:.1f} rad a step and the integration is unstable',
-                f'give at least {int(np.ceil(stiffest / STABLE_ANGLE))}, or 0 for automatic')
+                f'give at least {int(np.ceil(stiffest / by.stable))}, or 0 for automatic')
         return config.substeps
-    steps = max(int(np.ceil(fastest / STEP_ANGLE)), int(np.ceil(stiffest)), 1)
+    steps = max(int(np.ceil(fastest / by.angle)), int(np.ceil(stiffest / by.decay)), 1)
     if steps > MOST_SUBSTEPS:
         raise ParameterError(
             f"parameter 'rate' is {config.rate} Hz but the fastest mode needs {steps} steps a sample",
