@@ -282,28 +282,31 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
     m.counts[STORED] = stored + 1
     if stored + 1 < FIRST_ITERATION:
         return True
-    if stored + 1 == HORIZON:
+    last = stored + 1 == HORIZON
+    # a fit that has come but lags behind the filter is carried to the newest row at once
+    behind = last and m.counts[AGAIN] == 0 and 0 < m.counts[BEFORE] < m.counts[STORED]
+    for _ in range(HORIZON if behind else 0 if last else ROWS):
+        if m.counts[ITERATING] == 0:
+            before = m.counts[BEFORE]
+            more = max(before // GROWTH, 1) if m.score[SHIFT] < AT_REST and not behind else 1
+            if m.counts[AGAIN] == 0 and m.counts[STORED] < before + more:
+                break
+            begin_iteration(m)
+        until = m.counts[BEFORE]
+        if m.counts[AGAIN] == 0:
+            until = m.counts[STORED] if behind else min(m.counts[STORED], until + until // 2 + FIRST_ITERATION)
+        if not iterate_sample(motion, sensors, m, table):
+            if m.counts[BEFORE] == 0 or not reject_step(motion, sensors, m):
+                return False
+        elif m.counts[ITERATED] == until and (not finish_iteration(motion, sensors, m) or misfits(motion, m)):
+            return False
+    if last:
         if m.counts[HELD] == 1 and m.score[SHIFT] >= AT_REST:  # what was linearized on the way tells too much
             wider = np.sqrt(1.0 + m.score[SHIFT] * m.score[SHIFT])
             for i in range(m.x.size):
                 for c in range(m.x.size):
                     m.S[i, c] *= wider
         return not fails(m)
-    for _ in range(ROWS):
-        if m.counts[ITERATING] == 0:
-            before = m.counts[BEFORE]
-            more = max(before // GROWTH, 1) if m.score[SHIFT] < AT_REST else 1
-            if m.counts[AGAIN] == 0 and m.counts[STORED] < before + more:
-                break
-            begin_iteration(m)
-        until = m.counts[BEFORE]
-        if m.counts[AGAIN] == 0:
-            until = min(m.counts[STORED], until + until // 2 + FIRST_ITERATION)
-        if not iterate_sample(motion, sensors, m, table):
-            if m.counts[BEFORE] == 0 or not reject_step(motion, sensors, m):
-                return False
-        elif m.counts[ITERATED] == until and (not finish_iteration(motion, sensors, m) or misfits(motion, m)):
-            return False
     return True
 
 
