@@ -134,6 +134,7 @@ def catch_up(state: State, background: Background = INLINE, group: int = 1) -> t
         state, model = _take_model(state, background)
         state, estimate = _estimate(state, background)
         estimates += [*model, *estimate]
+        state = _without_old_rows(state)
     if state.log.end - _running(state)[2].cursor >= group:
         state = _advance(state, state.log.end, background)
     if state.pending is not None and state.log.end > state.pending.due:
@@ -291,8 +292,12 @@ def _running(state: State) -> tuple[IdentifierParameters, EventReplay[PayloadEst
 
 
 def _advance(state: State, until: int, background: Background) -> State:
-    """Let both estimators take the rows up to ``until``; drop rows that neither reads again."""
-    state = _advance_identifier(_advance_payload(state, until, background), until, background)
+    """Let both estimators take the rows up to ``until``."""
+    return _without_old_rows(_advance_identifier(_advance_payload(state, until, background), until, background))
+
+
+def _without_old_rows(state: State) -> State:
+    """Drop the rows that neither estimator reads again."""
     _, payload, identifier = _running(state)
     needed = min(event_replay.first_needed(payload), event_replay.first_needed(identifier),
                  identifier.cursor - prediction_check.length(state.clock.dt))
@@ -326,6 +331,8 @@ def _due_rows(state: State) -> list[int]:
     config, payload, _ = _running(state)
     cursor = payload.cursor
     rows = state.log.rows(cursor, state.log.end)
+    if not len(rows) or _instant(state, int(rows.stamp_ns[-1]), config.publish_rate) <= state.published:
+        return []  # most messages end here
     measured = np.flatnonzero(rows.missing == 0)
     stamps = rows.stamp_ns[measured]
     instants = ((stamps - state.first_ns) * config.publish_rate * 1e-9 + ROUNDING).astype(np.int64)

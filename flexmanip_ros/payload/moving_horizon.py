@@ -285,7 +285,10 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
     last = stored + 1 == HORIZON
     # a fit that has come but lags behind the filter is carried to the newest row at once
     behind = last and m.counts[AGAIN] == 0 and 0 < m.counts[BEFORE] < m.counts[STORED]
-    for _ in range(HORIZON if behind else 0 if last else ROWS):
+    budget = ROWS
+    if last:
+        budget = HORIZON if behind else 0
+    for _ in range(budget):
         if m.counts[ITERATING] == 0:
             before = m.counts[BEFORE]
             more = max(before // GROWTH, 1) if m.score[SHIFT] < AT_REST and not behind else 1
@@ -293,8 +296,10 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
                 break
             begin_iteration(m)
         until = m.counts[BEFORE]
-        if m.counts[AGAIN] == 0:
-            until = m.counts[STORED] if behind else min(m.counts[STORED], until + until // 2 + FIRST_ITERATION)
+        if behind:
+            until = m.counts[STORED]
+        elif m.counts[AGAIN] == 0:
+            until = min(m.counts[STORED], until + until // 2 + FIRST_ITERATION)
         if not iterate_sample(motion, sensors, m, table):
             if m.counts[BEFORE] == 0 or not reject_step(motion, sensors, m):
                 return False

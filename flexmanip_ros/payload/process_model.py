@@ -378,8 +378,8 @@ def predict(
             h = left / max(steps, 1.0)
             turn = max(STEP_ANGLE / motion.substeps, stiff)
             spread(motion, S, used, h, terms(turn * h, SPREAD_ERROR))  # it weighs: the begin's linearization will do
-        order = min(fineness, 1) if pace == 1.0 else -1
-        if not exponential_step(motion, x, h * fine, terms(turn * h * fine, MOTION_ERROR), order):
+        fifth = fineness > 0 and pace == 1.0
+        if not exponential_step(motion, x, h * fine, terms(turn * h * fine, MOTION_ERROR), fifth):
             return False
         done += fine
         if done >= 1.0:
@@ -404,23 +404,21 @@ def correction(motion: ProcessModel, duration: float, fineness: int) -> float:
 
 
 @merged
-def exponential_step(motion: ProcessModel, x: Array, h: float, count: int, order: int) -> bool:
+def exponential_step(motion: ProcessModel, x: Array, h: float, count: int, fifth: bool) -> bool:
     """Advance x by h, exactly where the motion is linear; right after ``linearize`` at x.
 
-    count: terms of the series; order: 0 fourth, 1 fifth, -1 third, where Coulomb friction may change its sign: the
-    weights of D grow with the order, and multiply what no polynomial follows.
+    count: terms of the series; fifth: order of the step, else fourth. Not where Coulomb friction may change its sign:
+    the weights of D are larger in the fifth order, and multiply what no polynomial follows.
 
     Exponential Rosenbrock methods: X = x + c h phi_1(c h F) f(x), and D is what f(X) - f(x) misses of F (X - x). Of
-    third order with c = 1, of fourth with 3/4 (exprb42, Luan, Applied Numerical Mathematics 112, 2017), of fifth with
-    two X (exprb53s3, Luan and Ostermann, Journal of Computational and Applied Mathematics 255, 2014). The vibration
-    turns too far in one sample for a step of Runge and Kutta: their damping of the fastest mode read as 0.3 % of the
-    payload.
+    fourth order with c = 3/4 (exprb42, Luan, Applied Numerical Mathematics 112, 2017), of fifth with two X (exprb53s3,
+    Luan and Ostermann, Journal of Computational and Applied Mathematics 255, 2014). The vibration turns too far in one
+    sample for a step of Runge and Kutta: their damping of the fastest mode read as 0.3 % of the payload.
     """
     n = motion.arm.stiffness.size
     corrected, first, term, second = motion.k[1:3], motion.k[3], motion.k[4:6], motion.k[6]
     sums, moved, later, whole = motion.k[7:13], motion.k[13:15], motion.k[15:17], motion.k[17:19]
-    fifth = order == 1
-    c = 0.5 if fifth else 1.0 if order < 0 else 0.75
+    c = 0.5 if fifth else 0.75
     for i in range(n):
         term[0, i] = x[n + i]
         term[1, i] = motion.k[0, i]

@@ -168,18 +168,15 @@ def substeps(arm: Manipulator, config: PlantParameters) -> int:
 
     Raises ParameterError naming the field when the steps asked for are unstable, or none suffice.
     """
-    fastest = max(_fastest(arm, spread, 0.0) for spread in (0.0, np.pi / 2, np.pi)) / config.rate
-    # where a joint sticks, its friction is a stiff damper, and stability is enough
-    stiffest = max(_fastest(arm, spread, 1.0) for spread in (0.0, np.pi / 2, np.pi)) / config.rate
-    by = method(arm)
+    by, least = method(arm), fewest_substeps(arm, config)
     if config.substeps:
-        if stiffest / config.substeps > by.stable:
+        if config.substeps < least:
             raise ParameterError(
-                f"parameter 'substeps' is {config.substeps}: the fastest mode turns "
-                f'{stiffest / config.substeps:.1f} rad a step and the integration is unstable',
-                f'give at least {int(np.ceil(stiffest / by.stable))}, or 0 for automatic')
+                f"parameter 'substeps' is {config.substeps}, and the integration is unstable",
+                f'give at least {least}, or 0 for automatic')
         return config.substeps
-    steps = max(int(np.ceil(fastest / by.angle)), int(np.ceil(stiffest / by.decay)), 1)
+    steps = max(int(np.ceil(_fastest(arm, 0.0) / config.rate / by.angle)),
+                int(np.ceil(_fastest(arm, 1.0) / config.rate / by.decay)), 1)
     if steps > MOST_SUBSTEPS:
         raise ParameterError(
             f"parameter 'rate' is {config.rate} Hz but the fastest mode needs {steps} steps a sample",
@@ -187,16 +184,24 @@ def substeps(arm: Manipulator, config: PlantParameters) -> int:
     return steps
 
 
-def _fastest(arm: Manipulator, spread: float, sticking: float) -> float:
-    """Largest pole magnitude [rad/s] with chord 2 at an angle from chord 1; sticking: share of the joints' friction."""
+def fewest_substeps(arm: Manipulator, config: PlantParameters) -> int:
+    """Integration steps a sample that are just stable; where a joint sticks, its friction is a stiff damper."""
+    return int(np.ceil(_fastest(arm, 1.0) / config.rate / method(arm).stable))
+
+
+def _fastest(arm: Manipulator, sticking: float) -> float:
+    """Largest pole magnitude [rad/s] in any configuration; sticking: share of the joints' friction."""
     n, links = arm.torque.shape
-    q = np.zeros(n)
-    q[links - 1] = spread
     friction = arm.viscous + sticking * arm.coulomb / STICTION_RATE
     D = np.diag(arm.damping) + (arm.torque * friction) @ arm.torque.T
-    M = linearization.mass_matrix(arm, np.zeros(4), q)
-    A, _ = linearization.first_order(M, np.diag(arm.stiffness), D, np.zeros((n, 0)))
-    return float(np.max(np.abs(eigvals(A))))
+    largest = 0.0
+    for spread in (0.0, np.pi / 2, np.pi):
+        q = np.zeros(n)
+        q[links - 1] = spread
+        M = linearization.mass_matrix(arm, np.zeros(4), q)
+        A, _ = linearization.first_order(M, np.diag(arm.stiffness), D, np.zeros((n, 0)))
+        largest = max(largest, float(np.max(np.abs(eigvals(A)))))
+    return largest
 
 
 def linear_model(config: PlantParameters) -> LinearModel:

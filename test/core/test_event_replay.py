@@ -128,6 +128,11 @@ def test_memory_stays_constant() -> None:
     assert len(state.payload.snapshots) <= 4
 
 
+def test_a_replay_drops_the_rows_that_nobody_reads_again() -> None:
+    kept = [state.log.end - state.log.start for state, _ in pipeline.replay(CONFIG, records(6000))]
+    assert max(kept) <= 4000  # as above, and a message that is taken at once
+
+
 def test_a_looped_recording_gives_the_same_estimates_again() -> None:
     config = configure(IdentifierParameters, {'payload_method': 'none', 'max_time_jump': 0.1})
     items = with_event(records(300), 200.0, 150)

@@ -36,16 +36,10 @@ def test_a_delay_or_lag_that_was_learned_costs_less_than_one_percent_of_the_payl
     empty, found = read(GIVEN, record(6.0, (event(3.0),), outputs=BENDS, arm=arm, seed=seed))
     assert found.status is Status.TRACKING
     assert found.mass == pytest.approx(20.0, rel=0.01)
+    assert found.lower < 20.0 < found.upper
     learned = {one.name: one.value for one in taught(GIVEN, empty)}
     late = learned['torque_delay'] + learned['joint1_torque_lag']
     assert late == pytest.approx(arm.torque_delay + arm.torque_lag[0], abs=3e-4)
-
-
-@pytest.mark.xfail(reason='the interval is too narrow here, see docs/lab/payload.md, "Late signals"')
-@pytest.mark.parametrize(('arm', 'seed'), [(DELAY, 0), (LAG, 3)])
-def test_the_mass_is_inside_its_interval_where_a_delay_or_lag_was_learned(arm: ArmParameters, seed: int) -> None:
-    _, found = read(GIVEN, record(6.0, (event(3.0),), outputs=BENDS, arm=arm, seed=seed))
-    assert found.lower < 20.0 < found.upper
 
 
 def test_a_delay_that_may_not_be_learned_is_not_trusted() -> None:

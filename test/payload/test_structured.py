@@ -148,9 +148,10 @@ def test_an_undamped_arm_is_not_lost_to_a_damping_below_zero(seed, share):
     noise = share * np.array([1.4e-3, 2.9e-3, 7.8e-5, 1.4e-4, 4.1e-2, 4.6e-2, 3.5e-3, 5.5e-3])
     arm, capture = ArmParameters(), event(3.0)
     samples = record(4.5, (capture,), noise='std', noise_std=tuple(noise), arm=arm, seed=seed)
-    before = structured.advance(config(arm), structured.init(config(arm)), samples.between(samples.first, 3000))
-    assert structured.estimate(config(arm), before).std < 0.1
-    found = structured.estimate(config(arm), run(config(arm), samples, (capture,)))
+    state = structured.advance(config(arm), structured.init(config(arm)), samples.between(samples.first, 3000))
+    assert structured.estimate(config(arm), state).std < 0.1
+    state = structured.advance(config(arm), structured.event(config(arm), state, capture), samples.since(3000))
+    found = structured.estimate(config(arm), state)
     assert found.status is Status.TRACKING
     assert abs(found.mass - 20.0) < 3.0 * found.std < 0.3
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +27,24 @@ def test_the_arm_turns_just_less_than_allowed(shape: str, angle: float) -> None:
     assert 0.96 * angle < turned <= angle
     assert np.array_equal(excitation.sequence(config, 100), excitation.sequence(fitted, 100))
     assert np.array_equal(excitation.torque(config, 7), excitation.sequence(config, 8)[7])
+
+
+@pytest.mark.parametrize('own', [
+    {'joint_coulomb_friction': (0.2, 0.05)}, {'base_mass': 200.0, 'base_inertia': 50.0},
+    {'link_length': (1.0,), 'linear_density': (2.0,), 'bending_stiffness': (400.0,)}])
+def test_arms_with_friction_a_base_or_one_link_turn_just_less_than_allowed(own: dict[str, Any]) -> None:
+    arm = replace(CONFIG.arm, **own)
+    links = len(arm.link_length)
+    config = replace(CONFIG, allowed_angle=0.1, arm=arm, amplitude=CONFIG.amplitude[:links],
+                     offset=CONFIG.offset[:links], initial_angles=CONFIG.initial_angles[:links])
+    fitted = replace(config, allowed_angle=0.0, amplitude=excitation.amplitude(config))
+    turned = excitation.motion(fitted, replace(excitation.plant_of(config), substeps=0))
+    assert 0.95 * 0.1 < turned <= 1.005 * 0.1
+
+
+def test_an_arm_that_falls_is_refused_by_name() -> None:
+    with pytest.raises(ParameterError, match='gravity'):
+        excitation.amplitude(replace(CONFIG, allowed_angle=0.1, arm=replace(CONFIG.arm, gravity=(0.0, -9.81))))
 
 
 def test_an_allowed_angle_needs_a_torque() -> None:
