@@ -26,7 +26,7 @@ from flexmanip_ros.samples.sampling import Clock, Counters
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord
 
 GROUP = 16
-"""Rows that a live node leaves pending at most. A group costs less than its rows one by one, and at 1 kHz takes
+"""Messages that a live node leaves pending at most. A group costs less than its rows one by one, and at 1 kHz takes
 0.4 ms, which delays a sample less than the 3 ms that an estimate may take."""
 RESULT_DELAY_S = 0.005
 """Time from the row that a model is asked for at to the row at which it is taken [s]. Reading it takes 1 to 3 ms."""
@@ -79,11 +79,19 @@ class State(NamedTuple):
     """Number of the last second from the first stamp on in which an estimate carried the arm's parameters."""
     pending: PendingModel | None = None
     model: ModelEstimate | None = None
+    held: tuple[JointRecord, ...] = ()
+    """Regular messages that wait to be taken together, see ``step``."""
 
     @property
     def counters(self) -> Counters:
-        """What became of the messages."""
-        return self.clock.counters
+        """What became of the messages; those that wait are sure to be accepted."""
+        counters, more = self.clock.counters, len(self.held)
+        return counters._replace(received=counters.received + more, accepted=counters.accepted + more)
+
+    @property
+    def last_ns(self) -> int | None:
+        """Stamp of the latest message that was accepted [ns]."""
+        return self.held[-1].stamp_ns if self.held else self.clock.last_ns
 
     def stamp_of(self, kind: EventKind) -> int | None:
         """Return the stamp of the latest event of a kind [ns], None when there was none."""
@@ -100,11 +108,36 @@ def step(config: IdentifierParameters, state: State, item: Item, background: Bac
     """Take a message, a block of messages or an event; return the estimates that are due with it.
 
     An estimate with a new payload comes at once (``payload_is_new``); where its model is read, the model follows
-    in an estimate of the same stamp (``model_is_new``). Rows wait until an estimate is due, or ``group`` of them.
+    in an estimate of the same stamp (``model_is_new``). Messages wait until an estimate is due, or ``group`` of them.
     Raises ParameterError when the configuration does not fit the signals that the messages carry.
     """
+    if isinstance(item, JointRecord) and _may_wait(state, item, group):
+        return state._replace(held=(*state.held, item)), ()
+    state, estimates = take_held(config, state, background, group)
     if isinstance(item, CaptureEvent):
-        return _insert(state, item, background), ()
+        return _insert(state, item, background), estimates
+    state, more = _take(config, state, item, background, group)
+    return state, (*estimates, *more)
+
+
+def _may_wait(state: State, record: JointRecord, group: int) -> bool:
+    """Whether a message is as regular as those that wait, no estimate is due with it, and they are not enough."""
+    return (state.payload is not None and state.config is not None and len(state.held) + 1 < group
+            and _instant(state, record.stamp_ns, state.config.publish_rate) <= state.published
+            and sampling.follows(state.config, state.clock, state.held, record))
+
+
+def take_held(config: IdentifierParameters, state: State, background: Background = INLINE, group: int = 1
+              ) -> tuple[State, tuple[Estimate, ...]]:
+    """Take the messages that wait."""
+    if not state.held:
+        return state, ()
+    return _take(config, state._replace(held=()), JointBlock.of(*state.held), background, group)
+
+
+def _take(config: IdentifierParameters, state: State, item: JointRecord | JointBlock, background: Background,
+          group: int) -> tuple[State, tuple[Estimate, ...]]:
+    """Take messages at once."""
     estimates: list[Estimate] = []
     taken, count = 0, len(item.stamp_ns) if isinstance(item, JointBlock) else 1
     while taken < count:
@@ -203,11 +236,12 @@ def finish(config: IdentifierParameters, state: State, background: Background = 
     """No message follows: take every row, and the model under way."""
     if state.config is None:
         return state, ()
+    state, held = take_held(config, state, background)
     sampled = sampling.flush(config, state.clock, state.log)
     state = _sampled(config, state, sampled, state.first_ns, background)
     state, estimates = catch_up(state, background)
     state, model = _take_model(state, background)
-    return state, (*estimates, *model)
+    return state, (*held, *estimates, *model)
 
 
 def current(state: State) -> Estimate | None:
@@ -217,6 +251,7 @@ def current(state: State) -> Estimate | None:
     """
     if state.payload is None or state.config is None:
         return None
+    state, _ = take_held(state.config, state)
     state, _ = _take_model(_advance(state, state.log.end, INLINE), INLINE)
     config, payload, identifier = _running(state)
     if payload.cursor == 0:
@@ -245,6 +280,7 @@ def reconfigure(config: IdentifierParameters, state: State, background: Backgrou
     if before is None:
         return state
     if state.payload is not None:  # the samples before the change are estimated with the parameters before it
+        state, _ = take_held(before, state, background)
         state = _advance(state, state.log.end, background)
     state = state._replace(config=replace(config, outputs=before.outputs))
     if state.published < 0 or state.payload is None:

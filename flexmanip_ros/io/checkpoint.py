@@ -28,8 +28,8 @@ from flexmanip_ros import pipeline
 from flexmanip_ros.errors import CheckpointError
 from flexmanip_ros.parameters import IdentifierParameters, flatten, leaves
 
-NAME, FORMAT = b'flexmanip_ros checkpoint ', b'4\n'
-"""The format changes with the place of a class that a state holds."""
+NAME, FORMAT = b'flexmanip_ros checkpoint ', b'5\n'
+"""The format changes with what a state holds, and with the place of a class."""
 CHECKSUM = hashlib.sha256().digest_size
 PACKAGE = 'flexmanip_ros.'
 _NUMBERS = 'biuf'

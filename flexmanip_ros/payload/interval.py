@@ -40,9 +40,12 @@ UNKNOWN_POWER = 4.0
 """Beyond this most of the residuals is no noise: the fit may stand in any minimum, and the object weigh anything. After
 a fit that was given up, so it is beyond ``POWER_LIMIT``."""
 WIDENING_LIMIT = 4.0
-"""Factor on the standard deviation, the model error apart, beyond which the model does not fit."""
+"""Square root of what the payload moves over its variance, and of the misfit, beyond which the model does not fit."""
 FREE_BIAS = 2.0
 """Standard deviations that an empty arm may seem to hold without a doubt of the model."""
+MOST_BIAS = 3.0
+"""Standard deviations, the error of the inertia in them, beyond which it is not the arm that was told or learned
+(chance: 1 in 370). What it catches then is not read right either."""
 SETTLED = 1000
 """Samples after which a restart is forgotten."""
 
@@ -65,10 +68,9 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     if fitting:  # the next step may be as long as the last one
         drift = max(drift, 1.0 + float(m.score[SHIFT]) ** 2)
     restless = math.sqrt(drift * max(1.0, consistency / POWER_LIMIT))
-    widening, doubt = (restless * max(1.0, abs(float(m.score[bias])) / FREE_BIAS)
-                       for bias in (mem.EMPTY_ARM_BIAS, mem.EXCESS_BIAS))
+    widening = restless * max(1.0, abs(float(m.score[mem.EMPTY_ARM_BIAS])) / FREE_BIAS)
     status = Status.TRACKING
-    if consistency > POWER_LIMIT or doubt > WIDENING_LIMIT:
+    if consistency > POWER_LIMIT or restless > WIDENING_LIMIT or abs(m.score[mem.EXCESS_BIAS]) > MOST_BIAS:
         status = Status.INCONSISTENT
     if m.counts[mem.SINCE_EVENT] < FEW:
         status = Status.WARMING_UP
@@ -146,10 +148,10 @@ def empty(seeming: float, std: float, considered: float, consistency: float, sta
     """
     if status in (Status.INCONSISTENT, Status.DIVERGED):
         return Payload(0.0, math.inf, 0.0, math.inf, consistency, status)
-    if abs(seeming) > 3.0 * std:
+    if abs(seeming) > MOST_BIAS * std:
         std = math.hypot(std, considered)
     upper = max(seeming, 0.0) + QUANTILE * std
-    if abs(seeming) > 3.0 * std and status is Status.TRACKING:
+    if abs(seeming) > MOST_BIAS * std and status is Status.TRACKING:
         return Payload(0.0, math.inf, 0.0, math.inf, consistency, Status.INCONSISTENT)
     return Payload(0.0, std, 0.0, upper, consistency, status)
 

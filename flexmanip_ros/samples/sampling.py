@@ -7,8 +7,9 @@ After more than ``max_gap`` the next row is marked with ``gap`` instead; so it i
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import NamedTuple
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -150,6 +151,31 @@ def push_block(config: IdentifierParameters, clock: Clock, log: SampleLog, block
     return Sampled(clock, log), regular
 
 
+def follows(config: IdentifierParameters, clock: Clock, held: Sequence[JointRecord], record: JointRecord) -> bool:
+    """Whether ``push`` is sure to accept a message after those held: layout, stamp and values are regular."""
+    channels, before = clock.channels, clock.last_ns
+    if (channels is None or before is None or clock.interval_count == 0 or clock.jump_candidate is not None
+            or channels.names != record.names or _fault(channels, record) is not None):
+        return False
+    last = held[-1].stamp_ns if held else before
+    arrays = record[2:]
+    if held and any(a.shape != b.shape for a, b in zip(arrays, held[0][2:], strict=True)):
+        return False
+    interval = record.stamp_ns - last
+    total, count = clock.interval_sum_ns + last - before, clock.interval_count + len(held)
+    return bool(_is_on_time(config, interval, total, count) and interval * 1e-9 <= config.max_time_jump
+                and math.isfinite(sum(sum(values.tolist()) for values in arrays)))
+
+
+def _is_on_time(config: IdentifierParameters, interval: Any, total: Any, count: Any) -> Any:
+    """Whether intervals [ns] agree with the mean of those before, whose sum is ``total``; numbers or arrays.
+
+    Compared in whole nanoseconds times count: the same stamps give the same verdict on any machine.
+    """
+    return ((interval * count < config.gap_factor * total)
+            & (interval * count > (2.0 - config.gap_factor) * total))
+
+
 def _regular(config: IdentifierParameters, clock: Clock, block: JointBlock, first: int) -> int:
     """Return how many messages, from ``first`` on, are regular by their stamps and layout."""
     channels = clock.channels
@@ -161,10 +187,7 @@ def _regular(config: IdentifierParameters, clock: Clock, block: JointBlock, firs
     intervals = np.diff(stamps, prepend=np.int64(clock.last_ns))
     sums = clock.interval_sum_ns + np.concatenate([[0], np.cumsum(intervals[:-1])])
     counts = clock.interval_count + np.arange(len(stamps))
-    # the same comparison of whole nanoseconds as ``_next``; a far jump is irregular too
-    regular = ((intervals * counts < config.gap_factor * sums)
-               & (intervals * counts > (2.0 - config.gap_factor) * sums)
-               & (intervals * 1e-9 <= config.max_time_jump))
+    regular = _is_on_time(config, intervals, sums, counts) & (intervals * 1e-9 <= config.max_time_jump)  # no far jump
     return len(stamps) if regular.all() else int(np.argmin(regular))
 
 
@@ -304,9 +327,7 @@ def _next(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sampl
     if clock.last_ns is not None:
         interval = raw.stamp_ns - clock.last_ns
         total, count = clock.interval_sum_ns, clock.interval_count
-        # compared in whole nanoseconds times count: the same stamps give the same verdict on any machine
-        gap = not (interval * count < config.gap_factor * total
-                   and interval * count > (2.0 - config.gap_factor) * total)
+        gap = not _is_on_time(config, interval, total, count)
         if gap:
             absent = _absent(config, clock, raw)
             log = _filled(log, clock, raw, absent, config.arm.effort_delay) if absent else log.without_waiting()

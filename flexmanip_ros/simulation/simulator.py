@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from flexmanip_ros.simulation import models, sensors, waveforms
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointRecord
 
 
+@lru_cache
 def joint_names(links: int) -> tuple[str, ...]:
     """Return the names in a message: joints, then bends."""
     return (*(f'joint{i + 1}' for i in range(links)), *(f'link{i + 1}_bend' for i in range(links)))

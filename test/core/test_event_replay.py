@@ -128,6 +128,18 @@ def test_memory_stays_constant() -> None:
     assert len(state.payload.snapshots) <= 4
 
 
+def test_messages_that_wait_for_an_estimate_are_counted_and_taken_by_the_next_unusual_one() -> None:
+    state, _ = step_through(records(209))
+    assert len(state.held) == 8  # row 200 was due at 50 Hz
+    assert state.counters.accepted == 209
+    taken, _ = pipeline.take_held(CONFIG, state)
+    assert taken.counters == state.counters
+    assert taken.log.end == state.log.end + 8
+    repeated, _ = pipeline.step(CONFIG, state, records(209)[-1])
+    assert repeated.counters.repeated_stamp == 1
+    assert not repeated.held
+
+
 def test_a_replay_drops_the_rows_that_nobody_reads_again() -> None:
     kept = [state.log.end - state.log.start for state, _ in pipeline.replay(CONFIG, records(6000))]
     assert max(kept) <= 4000  # as above, and a message that is taken at once
