@@ -111,20 +111,17 @@ def step(config: IdentifierParameters, state: State, item: Item, background: Bac
     in an estimate of the same stamp (``model_is_new``). Messages wait until an estimate is due, or ``group`` of them.
     Raises ParameterError when the configuration does not fit the signals that the messages carry.
     """
-    if isinstance(item, JointRecord) and _may_wait(state, item, group):
-        return state._replace(held=(*state.held, item)), ()
+    given = state.config
+    if (isinstance(item, JointRecord) and given is not None and state.payload is not None
+            and sampling.follows(given, state.clock, state.held, item)):
+        state = state._replace(held=(*state.held, item))
+        is_due = _instant(state, item.stamp_ns, given.publish_rate) > state.published
+        return take_held(config, state, background, group) if is_due or len(state.held) >= group else (state, ())
     state, estimates = take_held(config, state, background, group)
     if isinstance(item, CaptureEvent):
         return _insert(state, item, background), estimates
     state, more = _take(config, state, item, background, group)
     return state, (*estimates, *more)
-
-
-def _may_wait(state: State, record: JointRecord, group: int) -> bool:
-    """Whether a message is as regular as those that wait, no estimate is due with it, and they are not enough."""
-    return (state.payload is not None and state.config is not None and len(state.held) + 1 < group
-            and _instant(state, record.stamp_ns, state.config.publish_rate) <= state.published
-            and sampling.follows(state.config, state.clock, state.held, record))
 
 
 def take_held(config: IdentifierParameters, state: State, background: Background = INLINE, group: int = 1
@@ -224,7 +221,11 @@ def _steps(config: IdentifierParameters, state: State, items: Iterable[Item], ba
            ) -> Iterator[tuple[State, tuple[Estimate, ...]]]:
     """Yield state and estimates after each message of a recording, and after its end."""
     for item in items:
-        state, found = step(config, state, item, background, HOPELESS)
+        found: tuple[Estimate, ...] = ()
+        if isinstance(item, CaptureEvent):
+            state = _insert(state, item, background)
+        else:
+            state, found = _take(config, state, item, background, HOPELESS)
         yield state, found
         if state.counters.accepted == 0 and state.counters.received >= HOPELESS:
             break
