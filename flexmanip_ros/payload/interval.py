@@ -40,12 +40,12 @@ UNKNOWN_POWER = 4.0
 """Beyond this most of the residuals is no noise: the fit may stand in any minimum, and the object weigh anything. After
 a fit that was given up, so it is beyond ``POWER_LIMIT``."""
 WIDENING_LIMIT = 4.0
-"""Square root of what the payload moves over its variance, and of the misfit, beyond which the model does not fit."""
+"""Factor by which the payload's moves and the misfit widen its deviation, beyond which the model does not fit."""
 FREE_BIAS = 2.0
 """Standard deviations that an empty arm may seem to hold without a doubt of the model."""
 MOST_BIAS = 3.0
-"""Standard deviations, the error of the inertia in them, beyond which it is not the arm that was told or learned
-(chance: 1 in 370). What it catches then is not read right either."""
+"""Standard deviations that an arm may seem to hold while it is empty, the error of its inertia allowed for. Beyond them
+(by chance 1 in 370) it is not the arm that was told or learned, and what it catches is not read right either."""
 SETTLED = 1000
 """Samples after which a restart is forgotten."""
 

@@ -167,7 +167,7 @@ def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterSta
         if square > 0.0:
             if m.counts[mem.SINCE_EVENT] > mem.ENOUGH:
                 m.score[mem.EMPTY_ARM_BIAS] = m.x[payload] / np.sqrt(square)
-            if m.counts[mem.SINCE_EVENT] > mem.ENOUGH or m.counts[mem.REFITS]:  # what was begun again is in doubt early
+            if m.counts[mem.SINCE_EVENT] > mem.ENOUGH or m.counts[mem.REFITS]:  # a fit begun again is doubted sooner
                 considered = inertia_error(config, model, 0.0)
                 m.score[mem.EXCESS_BIAS] = m.x[payload] / np.hypot(np.sqrt(square), considered)
             gain = m.S @ f / square

@@ -153,9 +153,8 @@ def push_block(config: IdentifierParameters, clock: Clock, log: SampleLog, block
 
 def follows(config: IdentifierParameters, clock: Clock, held: Sequence[JointRecord], record: JointRecord) -> bool:
     """Whether ``push`` is sure to accept a message after those held: layout, stamp and values are regular."""
-    channels, before = clock.channels, clock.last_ns
-    if (channels is None or before is None or clock.interval_count == 0 or clock.jump_candidate is not None
-            or channels.names != record.names or _fault(channels, record) is not None):
+    before = clock.last_ns
+    if before is None or not _is_expected(clock, record):
         return False
     last = held[-1].stamp_ns if held else before
     arrays = record[2:]
@@ -165,6 +164,13 @@ def follows(config: IdentifierParameters, clock: Clock, held: Sequence[JointReco
     total, count = clock.interval_sum_ns + last - before, clock.interval_count + len(held)
     return bool(_is_on_time(config, interval, total, count) and interval * 1e-9 <= config.max_time_jump
                 and math.isfinite(sum(sum(values.tolist()) for values in arrays)))
+
+
+def _is_expected(clock: Clock, message: JointRecord | JointBlock) -> bool:
+    """Whether the sample time is known, no stamp is in doubt, and messages have the layout of the last one."""
+    channels = clock.channels
+    return (channels is not None and clock.interval_count > 0 and clock.jump_candidate is None
+            and channels.names == message.names and _fault(channels, message) is None)
 
 
 def _is_on_time(config: IdentifierParameters, interval: Any, total: Any, count: Any) -> Any:
@@ -178,9 +184,7 @@ def _is_on_time(config: IdentifierParameters, interval: Any, total: Any, count: 
 
 def _regular(config: IdentifierParameters, clock: Clock, block: JointBlock, first: int) -> int:
     """Return how many messages, from ``first`` on, are regular by their stamps and layout."""
-    channels = clock.channels
-    if (channels is None or clock.interval_count == 0 or clock.jump_candidate is not None
-            or channels.names != block.names or _fault(channels, block) is not None):
+    if not _is_expected(clock, block):
         return 0
     assert clock.last_ns is not None
     stamps = block.stamp_ns[first:]

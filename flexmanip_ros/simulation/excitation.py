@@ -68,7 +68,7 @@ def fitted_amplitude(config: ExcitationParameters) -> tuple[float, ...]:
         raise ParameterError("parameter 'allowed_angle' is set but the torque is zero",
                              'choose a shape and amplitudes whose ratio you want')
     target = (1.0 - CLOSE / 2) * config.allowed_angle
-    if motion(replace(plain, shape='zero'), plant) > target:
+    if any((*config.offset, *config.arm.gravity)) and motion(replace(plain, shape='zero'), plant) > target:
         raise ParameterError("'offset' and 'arm.gravity' alone turn the arm beyond 'allowed_angle'",
                              'lower the offset; an arm that falls needs a controller')
 

@@ -168,13 +168,14 @@ def substeps(arm: Manipulator, config: PlantParameters) -> int:
 
     Raises ParameterError naming the field when the steps asked for are unstable, or none suffice.
     """
-    by, least = method(arm), fewest_substeps(arm, config)
     if config.substeps:
+        least = fewest_substeps(arm, config)
         if config.substeps < least:
             raise ParameterError(
                 f"parameter 'substeps' is {config.substeps}, and the integration is unstable",
                 f'give at least {least}, or 0 for automatic')
         return config.substeps
+    by = method(arm)
     steps = max(int(np.ceil(_fastest(arm, 0.0) / config.rate / by.angle)),
                 int(np.ceil(_fastest(arm, 1.0) / config.rate / by.decay)), 1)
     if steps > MOST_SUBSTEPS:

@@ -88,7 +88,7 @@ def late_bends(config: PlantParameters, position: Array, velocity: Array, past: 
 def misread(config: PlantParameters, position: Array, velocity: Array) -> None:
     """Let the bend sensors read with their gain and offset, in place."""
     if not any(config.arm.bend_offset) and all(gain == 1.0 for gain in config.arm.bend_gain):
-        return  # 75 us of a sample of a live plant go for arithmetic that changes nothing, here and below
+        return  # arithmetic that changes nothing, here and below, costs a live plant 65 us a sample
     links = position.shape[1] // 2
     gain = np.array(config.arm.bend_gain)
     position[:, links:] = gain * position[:, links:] + np.array(config.arm.bend_offset)

@@ -140,9 +140,24 @@ def test_messages_that_wait_for_an_estimate_are_counted_and_taken_by_the_next_un
     assert not repeated.held
 
 
+@pytest.mark.parametrize('changed', range(204, 221, 4))  # a model is asked for at row 200
+def test_a_change_of_parameters_loses_no_model_that_is_under_way(changed: int) -> None:
+    items = records(400)
+    _, plain = step_through(items)
+    state, found = pipeline.init(), []
+    for k, item in enumerate(items):
+        if k == changed:
+            state = pipeline.reconfigure(CONFIG, state)
+        state, ready = pipeline.step(CONFIG, state, item)
+        found.extend(ready)
+    models = [{estimate.stamp_ns for estimate in some if estimate.model_is_new} for some in (plain, found)]
+    assert models[0]
+    assert models[0] <= models[1]
+
+
 def test_a_replay_drops_the_rows_that_nobody_reads_again() -> None:
     kept = [state.log.end - state.log.start for state, _ in pipeline.replay(CONFIG, records(6000))]
-    assert max(kept) <= 4000  # as above, and a message that is taken at once
+    assert max(kept) <= 4000  # a fit sees 2048 rows, and some wait for the next estimate
 
 
 def test_a_looped_recording_gives_the_same_estimates_again() -> None:

@@ -220,7 +220,6 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         try:
             self.state, estimates = pipeline.step(self.config, self.state, item, self._background)
         except FlexmanipError as error:
-            self.state = self.state._replace(held=())
             self._reject('configuration', str(error))
             return
         self._publish(estimates)
