@@ -158,8 +158,9 @@ def test_a_test_that_needs_an_extra_is_skipped_without_it(tmp_path: Path) -> Non
     assert 'scikit-fem, which is not installed' in done.stdout
 
 
-def test_every_import_is_locked() -> None:
-    lock = requirements('runtime.txt')
+@pytest.mark.parametrize('locked', ['runtime.txt', 'jazzy.txt'])
+def test_every_import_is_locked(locked: str) -> None:
+    lock = requirements(locked)
     for name, files in third_party().items():
         if name in ('launch', 'launch_ros', 'ament_index_python'):
             continue  # not on PyPI: launch files run on a full ROS installation
@@ -167,7 +168,7 @@ def test_every_import_is_locked() -> None:
         assert re.search(rf'^{pypi}==', lock, re.MULTILINE), f'{sorted(files)} import {name}: not locked'
 
 
-@pytest.mark.parametrize('name', ['runtime.txt', 'development.txt', 'benchmark.txt'])
+@pytest.mark.parametrize('name', ['runtime.txt', 'development.txt', 'benchmark.txt', 'jazzy.txt'])
 def test_locks_pin_every_version_with_hashes_and_name_no_host(name: str) -> None:
     lock = requirements(name)
     entries = re.split(r'\n(?=\S)', lock)
