@@ -1,4 +1,4 @@
-"""JointState and Header straight from their CDR bytes.
+"""JointState and Header straight from their CDR bytes, and JointState to them.
 
 The messages of one publisher share one layout: names and array lengths, and with them every byte offset, stay the
 same. So the messages of a recording are decoded many at a time as rows of one numpy table, after a check that their
@@ -75,6 +75,14 @@ def joint_record(raw: bytes, layout: Layout | None) -> tuple[JointRecord, Layout
         seconds * 1_000_000_000 + nanoseconds, layout.names, np.frombuffer(raw, '<f8', a, at_a) if a else _EMPTY,
         np.frombuffer(raw, '<f8', b, at_b) if b else _EMPTY,
         np.frombuffer(raw, '<f8', c, at_c) if c else _EMPTY), layout
+
+
+def refilled(message: bytearray, layout: Layout, record: JointRecord) -> bytes:
+    """Return a message of this layout with the stamp and the numbers of a record of the same names and lengths."""
+    STAMP.pack_into(message, START, *divmod(record.stamp_ns, 1_000_000_000))
+    for start, values in zip(layout.starts, record[2:], strict=True):
+        message[start:start + values.nbytes] = values.tobytes()
+    return bytes(message)
 
 
 _EMPTY = np.empty(0)

@@ -10,7 +10,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import InertiaStamped
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header, MultiArrayDimension
 
@@ -52,6 +52,43 @@ class JointStateReader:
         except (cdr.CdrError, UnicodeDecodeError, struct.error):
             return _decoded(raw)
         return record
+
+
+class JointStateWriter:
+    """JointState to bytes, which a publisher sends as they are: a third of the cost.
+
+    The names and lengths of the last message stay; stamp and numbers are written over its own.
+    """
+
+    def __init__(self) -> None:
+        self._message = bytearray()
+        self._layout: cdr.Layout | None = None
+
+    def __call__(self, record: JointRecord) -> bytes:
+        """Return the message."""
+        layout, counts = self._layout, tuple(map(len, record[2:]))
+        is_alike = layout is not None and layout.names == record.names and layout.counts == counts
+        if layout is not None and is_alike and FIRST_NS <= record.stamp_ns <= LAST_NS:
+            return cdr.refilled(self._message, layout, record)
+        raw: bytes = serialize_message(joint_state(record))
+        self._message, self._layout = bytearray(raw), cdr.joint_record(raw, None)[1]
+        return raw
+
+
+class NumbersWriter:
+    """Float64MultiArray without labels to bytes, likewise: all but the numbers at its end stays."""
+
+    def __init__(self) -> None:
+        self._head = b''
+        self._size = -1
+
+    def __call__(self, values: Array) -> bytes:
+        """Return the message with values (N,)."""
+        data = np.ascontiguousarray(values, dtype=np.float64).tobytes()
+        if len(data) != self._size:
+            raw: bytes = serialize_message(Float64MultiArray(data=doubles(values)))
+            self._head, self._size = raw[:len(raw) - len(data)], len(data)
+        return self._head + data
 
 
 def _decoded(raw: bytes) -> JointRecord:

@@ -115,7 +115,7 @@ def expected_std(config: ExcitationParameters) -> dict[float, float]:
     half = len(efforts) // 2
     start = simulator.init(plant)
     x, before = _run(start, start.x, start.payload, efforts[:half])
-    state = simulator.attach(plant, replace(start, x=x))
+    state = simulator.attach(plant, start._replace(x=x))
     later = efforts[half:]
     step = 1e-4 * max(config.payload_mass, 1.0)
     payload = state.payload.copy()

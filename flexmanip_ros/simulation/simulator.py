@@ -8,7 +8,7 @@ event's instant is the first after the jump; an event between two stamps acts at
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -32,13 +32,12 @@ REHEARSAL_TIME = 6.0
 """Seconds of the rehearsal that finds the signal levels, with the capture half way (the paper's run)."""
 
 
-@dataclass(frozen=True, eq=False)
-class PlantState:
+class PlantState(NamedTuple):
     """The arm between two samples. Never written to; ``model`` holds constants and scratch only."""
 
     model: models.Model
     start_ns: int
-    index: int
+    sample: int
     """Number of the next sample."""
     x: Array
     """(2n,) coordinates and rates."""
@@ -84,7 +83,7 @@ def init(config: PlantParameters, start_ns: int = 0, noise_std: Array | None = N
     model = models.build(config)
     links = len(config.arm.link_length)
     return PlantState(
-        model=model, start_ns=start_ns, index=0, x=model.rest(), payload=np.zeros(4),
+        model=model, start_ns=start_ns, sample=0, x=model.rest(), payload=np.zeros(4),
         noise_std=_levels(config) if noise_std is None else np.array(noise_std, dtype=np.float64),
         noise_block=sensors.block(config.seed, 0), noise_number=0, gauges=np.zeros((2, links)),
         bends=np.zeros((sensors.bends_needed(config), 2 * links)),
@@ -95,7 +94,7 @@ def init(config: PlantParameters, start_ns: int = 0, noise_std: Array | None = N
 
 def stamp(config: PlantParameters, state: PlantState) -> int:
     """Stamp [ns] of the next sample."""
-    return state.start_ns + round(state.index * 1e9 / config.rate)
+    return state.start_ns + round(state.sample * 1e9 / config.rate)
 
 
 def step(
@@ -108,10 +107,10 @@ def step(
     """
     efforts = _checked(config, np.asarray(efforts, dtype=np.float64).reshape(1, -1))
     now = stamp(config, state)
-    number = state.index // sensors.BLOCK
+    number = state.sample // sensors.BLOCK
     if number != state.noise_number:
-        state = replace(state, noise_block=sensors.block(config.seed, number), noise_number=number)
-    drawn = state.noise_block[state.index % sensors.BLOCK][None]
+        state = state._replace(noise_block=sensors.block(config.seed, number), noise_number=number)
+    drawn = state.noise_block[state.sample % sensors.BLOCK][None]
     state, position, velocity, effort = _advance(config, state, efforts)
     if not sensors.arrives(config, drawn)[0]:
         return state, None
@@ -129,16 +128,16 @@ def attach(config: PlantParameters, state: PlantState) -> PlantState:
     """
     if state.taking is not None:
         state = _take(config, state, state.taking.part(state.taking_left))
-        state = replace(state, taking=None, taking_left=0)
+        state = state._replace(taking=None, taking_left=0)
     parts = max(round(config.gripper_ramp * config.rate), 1)
     if parts == 1:
         return _take(config, state, free_object(config))
-    return replace(state, taking=free_object(config).part(1.0 / parts), taking_left=parts)
+    return state._replace(taking=free_object(config).part(1.0 / parts), taking_left=parts)
 
 
 def release(config: PlantParameters, state: PlantState) -> PlantState:
     """Let go of all that is held: the arm keeps its rates and the object those of the tip."""
-    return replace(state, payload=np.zeros(4), taking=None, taking_left=0)
+    return state._replace(payload=np.zeros(4), taking=None, taking_left=0)
 
 
 def simulate(
@@ -196,7 +195,7 @@ def _advance(
     if state.taking is not None:
         state = _take(config, state, state.taking)
         left = state.taking_left - 1
-        state = replace(state, taking_left=left, taking=state.taking if left else None)
+        state = state._replace(taking_left=left, taking=state.taking if left else None)
     count = len(efforts)
     queue = np.concatenate([state.commands, sensors.saturated(config, efforts)])
     applied = np.ascontiguousarray(queue[:count])
@@ -211,12 +210,12 @@ def _advance(
     good = state.model.advance(x, state.payload, torques * np.array(config.arm.torque_gain), position, velocity)
     if good < count:
         raise ModelError(
-            f'the simulation diverged {(state.index + good) / config.rate:.3f} s after its start',
+            f'the simulation diverged {(state.sample + good) / config.rate:.3f} s after its start',
             'lower the torque, raise the stiffness or the rate, or reset the plant')
     sensors.gauge(config, position, velocity, gauges)
     bends = sensors.late_bends(config, position, velocity, state.bends)
     sensors.misread(config, position, velocity)
-    after = replace(state, index=state.index + count, x=x, gauges=gauges, bends=bends, efforts=efforts[count:],
+    after = state._replace(sample=state.sample + count, x=x, gauges=gauges, bends=bends, efforts=efforts[count:],
                     commands=queue[count:], reported=reported[count:])
     return after, position, velocity, reported[:count]
 
@@ -232,7 +231,7 @@ def _take(config: PlantParameters, state: PlantState, body: Body) -> PlantState:
         x[n:] = rates_after(
             model.mass_matrix(x, state.payload), model.body_jacobian(x, state.payload, body.com), x[n:], body,
             model.floating_mass(state.payload), model.held)
-    return replace(state, x=x, payload=state.payload + body.payload)
+    return state._replace(x=x, payload=state.payload + body.payload)
 
 
 def _levels(config: PlantParameters) -> Array:
@@ -253,6 +252,6 @@ def _checked(config: PlantParameters, efforts: Array) -> Array:
     links = len(config.arm.link_length)
     if efforts.ndim != 2 or efforts.shape[1] != links:
         raise SignalError(f'the efforts have shape {efforts.shape}', f'give one torque for each of {links} joints')
-    if not np.all(np.isfinite(efforts)):
+    if not np.isfinite(efforts).all():
         raise SignalError('an effort is not finite', 'look at the controller that sent it')
     return efforts

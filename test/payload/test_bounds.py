@@ -89,7 +89,7 @@ def measured(start, arm, plant, torque):
         assert state.model.advance(x, state.payload, applied, position, velocity) == len(applied)
         sensors.misread(plant, position, velocity)
         rows.append(position)
-        state = simulator.attach(plant, replace(state, x=x))
+        state = simulator.attach(plant, state._replace(x=x))
         x = state.x.copy()
     return np.vstack(rows)[:, [2, 3, 0, 1]]
 

@@ -80,7 +80,7 @@ def test_the_tip_jacobian_is_the_derivative_of_the_tip() -> None:
     for c in range(half):
         step = np.zeros(state.x.size)
         step[c] = 1e-6
-        ahead, behind = (position_of(replace(state, x=state.x + s * step), com) for s in (1, -1))
+        ahead, behind = (position_of(state._replace(x=state.x + s * step), com) for s in (1, -1))
         assert J[:2, c] == pytest.approx((ahead - behind) / 2e-6, abs=1e-8)
 
 
