@@ -21,44 +21,41 @@ def vaf(y: Array, yhat: Array) -> Array:
     return np.maximum(score, 0.0)
 
 
-@njit(cache=True)
-def _run(
-    A: Array, B: Array, C: Array, D: Array, K: Array, U: Array, Y: Array, x: Array,
-) -> tuple[Array, Array]:
-    out = np.zeros((U.shape[0], C.shape[0]))
-    for k in range(U.shape[0]):
-        out[k] = C @ x + D @ U[k]
-        x = A @ x + B @ U[k] + K @ (Y[k] - out[k])
-    return out, x
+@njit(cache=True, nogil=True)
+def _run(A: Array, V: Array, X: Array) -> None:
+    """Fill X (N + 1, n), whose first row is given, by x+ = A x + v with V (N, n)."""
+    for k in range(V.shape[0]):
+        for i in range(A.shape[0]):
+            value = V[k, i]
+            for j in range(A.shape[1]):
+                value += A[i, j] * X[k, j]
+            X[k + 1, i] = value
 
 
-def _filter(model: StateSpace, U: Array, Y: Array, x: Array) -> Array:
-    A, B, C, D, K = (np.ascontiguousarray(a) for a in (model.A, model.B, model.C, model.D, model.K))
-    return _run(A, B, C, D, K, np.ascontiguousarray(U), np.ascontiguousarray(Y), x)[0]
+def _states(model: StateSpace, U: Array, Y: Array | None, x0: Array | None) -> Array:
+    """States (N + 1, n) from x0 on; with outputs Y (N, m) those of the innovation form (eqs. 22-23)."""
+    A, V = model.A, U @ model.B.T
+    if Y is not None:
+        A, V = A - model.K @ model.C, V + (Y - U @ model.D.T) @ model.K.T
+    X = np.zeros((len(U) + 1, model.order))
+    X[0] = 0.0 if x0 is None else x0
+    _run(np.ascontiguousarray(A), V, X)
+    return X
+
+
+def _outputs(model: StateSpace, U: Array, X: Array) -> Array:
+    found: Array = X[:-1] @ model.C.T + U @ model.D.T
+    return found
 
 
 def simulate(model: StateSpace, U: Array, x0: Array | None = None) -> Array:
     """Outputs (N, m) for inputs U (N, r) from state x0 (n,) (zero by default); no measured output is used."""
-    m, n = model.C.shape
-    x = np.zeros(n) if x0 is None else np.array(x0, dtype=float)
-    blind = StateSpace(model.A, model.B, model.C, model.D, np.zeros((n, m)), model.dt)
-    return _filter(blind, U, np.zeros((U.shape[0], m)), x)
+    return _outputs(model, U, _states(model, U, None, x0))
 
 
 def predict(model: StateSpace, U: Array, Y: Array, x0: Array | None = None) -> Array:
-    """One-step predictions (N, m) of outputs Y (N, m) by the innovation form (eqs. 22-23)."""
-    x = np.zeros(model.order) if x0 is None else np.array(x0, dtype=float)
-    return _filter(model, U, Y, x)
-
-
-@njit(cache=True)
-def _states(A: Array, B: Array, C: Array, D: Array, K: Array, U: Array, Y: Array, x: Array) -> Array:
-    out = np.zeros((U.shape[0] + 1, A.shape[0]))
-    for k in range(U.shape[0]):
-        out[k] = x
-        x = A @ x + B @ U[k] + K @ (Y[k] - C @ x - D @ U[k])
-    out[U.shape[0]] = x
-    return out
+    """One-step predictions (N, m) of outputs Y (N, m) by the innovation form."""
+    return _outputs(model, U, _states(model, U, Y, x0))
 
 
 def predict_ahead(model: StateSpace, U: Array, Y: Array, steps: int, x0: Array | None = None) -> Array:
@@ -66,14 +63,10 @@ def predict_ahead(model: StateSpace, U: Array, Y: Array, steps: int, x0: Array |
 
     Row k predicts Y[k + steps - 1] from the state that the outputs before k give, and from all inputs U (N, r).
     """
-    m, n = model.C.shape
-    count = U.shape[0] - steps + 1
+    m, count = model.C.shape[0], U.shape[0] - steps + 1
     if count < 1:
         return np.zeros((0, m))
-    x = np.zeros(n) if x0 is None else np.array(x0, dtype=float)
-    A, B, C, D, K, inputs, outputs = (
-        np.ascontiguousarray(a) for a in (model.A, model.B, model.C, model.D, model.K, U, Y))
-    X = _states(A, B, C, D, K, inputs, outputs, x)[:count]
+    X = _states(model, U, Y, x0)[:count]
     response = markov(model, steps)
     ahead = X @ (model.C @ np.linalg.matrix_power(model.A, steps - 1)).T
     for o in range(m):
