@@ -216,17 +216,20 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def _step(self, item: JointRecord | CaptureEvent) -> None:
         """Take one step of the pipeline and publish; a message that cannot be used is counted and logged."""
-        before = self.state.counters
+        before = self.state.clock.counters  # messages that wait change none of these
         try:
             self.state, estimates = pipeline.step(self.config, self.state, item, self._background)
         except FlexmanipError as error:
             self._reject('configuration', str(error))
             return
         self._publish(estimates)
-        if self.state.counters.dropped > before.dropped and self.state.clock.rejection is not None:
-            rejection = self.state.clock.rejection
-            self.log_throttled(rejection.reason, f'message dropped: {rejection.problem}; {rejection.remedy}')
-        if self.state.counters.resets > before.resets:
+        clock = self.state.clock
+        if clock.counters is before:
+            return
+        if clock.counters.dropped > before.dropped and clock.rejection is not None:
+            self.log_throttled(
+                clock.rejection.reason, f'message dropped: {clock.rejection.problem}; {clock.rejection.remedy}')
+        if clock.counters.resets > before.resets:
             self.get_logger().warning('the stamps jumped or their rate changed: everything identified is forgotten')
 
     def _publish(self, estimates: tuple[Estimate, ...]) -> None:
