@@ -183,10 +183,6 @@ class Workspace(NamedTuple):
     """(3, L) torques less friction, rates of the joints, and derivative of the friction by them."""
     held: Array
     """(2, n) scratch of the constraints."""
-    parameters: Array
-    """(n, 4) derivative of the forces by the payload's inertial parameters."""
-    left: Array
-    right: Array
 
 
 def workspace(arm: Manipulator) -> Workspace:
@@ -198,8 +194,7 @@ def workspace(arm: Manipulator) -> Workspace:
         block=np.zeros((k + 1, k + 1)), elastic=np.zeros(n), tangent=np.zeros((links, k, k)),
         A=np.zeros((links + 1, 2)), Aq=np.zeros((links + 1, 2, n)), Av=np.zeros((links + 1, 2, n)),
         Fq=np.zeros((2, n)), Fv=np.zeros((2, n)), frame=np.zeros((4, n)), B=np.zeros((n, links)),
-        net=np.zeros((3, links)),
-        held=np.zeros((2, n)), parameters=np.zeros((n, 4)), left=np.zeros((n, n)), right=np.zeros((n, n)))
+        net=np.zeros((3, links)), held=np.zeros((2, n)))
 
 
 def payload_array(mass: float = 0.0, inertia: float = 0.0, com: tuple[float, float] = (0.0, 0.0)) -> Array:

@@ -192,12 +192,6 @@ REAL = 1e-9
 """A pole whose angle [rad per sample] is below this does not oscillate."""
 
 
-def poles(A: Array) -> tuple[Array, Array, Array]:
-    """Eigenvalues (n,), right (n, n) and left (n, n) eigenvectors with left' right = I."""
-    values, right = np.linalg.eig(A)
-    return values, right, np.linalg.inv(right).conj().T
-
-
 def modes(identified: Identified) -> tuple[Mode, ...]:
     """Oscillations of the identified model, rising frequency; deviations to first order (nan: unknown)."""
     A, dt = identified.model.A, identified.model.dt

@@ -88,7 +88,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
     # What a subclass fills in.
 
     def make_entities(self) -> None:
-        """Create publishers, subscriptions, services and timers; called once, at the first configure."""
+        """Create publishers, subscriptions, services and timers; called once, after the first ``start``."""
 
     def start(self) -> None:
         """Build the state, compile what must be compiled. A FlexmanipError rejects the configuration."""
@@ -151,12 +151,12 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         arm = arm_line(self)
         if arm:
             self.get_logger().info(arm)
-        if not self._entities_made:
-            self.make_entities()
-            self._entities_made = True
         from flexmanip_ros.cli import first_use  # it loads numba, which --help does not need
         with first_use.announced(lambda: self.get_logger().warning(first_use.WORDS)):
             self.start()
+        if not self._entities_made:  # last: what comes while kernels are loaded would fill the queues, and be lost
+            self.make_entities()
+            self._entities_made = True
 
     def _activate(self) -> None:
         self.activated()

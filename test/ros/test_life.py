@@ -16,6 +16,7 @@ from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
 
 from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.nodes import rpbsid_identifier
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.nodes.excitation import Excitation
 from flexmanip_ros.ros.nodes.live_view import LiveView
@@ -76,3 +77,17 @@ def test_two_nodes_of_one_name_say_so(ros: Ros) -> None:
     first, second = (ros.managed(CaptureTrigger(context=ros.context)) for _ in range(2))
     ros.wait(lambda: sum('another node' in message.status[0].message for message in heard) > 1)
     assert (first.active, second.active) == (True, True)
+
+
+def test_a_node_listens_once_it_is_ready_to(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What came while kernels were loaded would be a backlog, and what did not fit into the queue a gap."""
+    node = RpbsidIdentifier(context=ros.context, overrides=overrides(payload_method='none'))
+
+    def heard() -> list[str]:
+        return [entity.topic_name for entity in node.subscriptions if entity.msg_type is JointState]
+
+    before: list[str] = []
+    monkeypatch.setattr(rpbsid_identifier, 'warm_up', lambda config: before.extend(heard()))
+    ros.managed(node)
+    assert not before
+    assert heard() == ['/joint_states']
