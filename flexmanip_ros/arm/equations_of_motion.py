@@ -36,6 +36,7 @@ def assemble_link(
     re, rn = c * a[0] + s * a[1], c * a[1] - s * a[0]
     Je, Jn, Se, Sn, own = work.own[0], work.own[1], work.own[2], work.own[3], work.own[4]
     block = work.block
+    bent, bending, G, phi, shortened = q[o:o + k], qd[o:o + k], arm.G[i], arm.phi[i], arm.tip_shortening[i]
     for r in range(k + 1):
         Se[r], Sn[r], own[r] = 0.0, 0.0, 0.0
         for t in range(k + 1):
@@ -47,15 +48,15 @@ def assemble_link(
         for j in range(k):
             g, h = 0.0, 0.0
             for t in range(k):
-                g += arm.G[i, p, j, t] * q[o + t]
-                h += arm.G[i, p, j, t] * qd[o + t]
-            x -= 0.5 * g * q[o + j]
-            xd -= g * qd[o + j]
-            xdd -= h * qd[o + j]
-            y += arm.phi[i, p, j] * q[o + j]
-            yd += arm.phi[i, p, j] * qd[o + j]
+                g += G[p, j, t] * bent[t]
+                h += G[p, j, t] * bending[t]
+            x -= 0.5 * g * bent[j]
+            xd -= g * bending[j]
+            xdd -= h * bending[j]
+            y += phi[p, j] * bent[j]
+            yd += phi[p, j] * bending[j]
             Je[1 + j] = -g
-            Jn[1 + j] = arm.phi[i, p, j]
+            Jn[1 + j] = phi[p, j]
         Je[0] = -y
         Jn[0] = x
         Ae = m * (xdd - 2.0 * yd * w - x * w * w + re)
@@ -100,11 +101,11 @@ def assemble_link(
     for j in range(k):
         g, h = 0.0, 0.0
         for t in range(k):
-            g += arm.tip_shortening[i, j, t] * q[o + t]
-            h += arm.tip_shortening[i, j, t] * qd[o + t]
-        x -= 0.5 * g * q[o + j]
-        xd -= g * qd[o + j]
-        xdd -= h * qd[o + j]
+            g += shortened[j, t] * bent[t]
+            h += shortened[j, t] * bending[t]
+        x -= 0.5 * g * bent[j]
+        xd -= g * bending[j]
+        xdd -= h * bending[j]
         tip[0, o + j] -= c * g
         tip[1, o + j] -= s * g
     tip[0, i] -= s * x
@@ -195,7 +196,7 @@ def eliminate_translation(M: Array, E: Array, work: Workspace) -> None:
 
 @inner
 def elastic(arm: Manipulator, q: Array, work: Workspace) -> None:
-    """Fill work.elastic (n,) with dV/dq and, link by link, work.tangent (k, k) with the derivative of V4's part.
+    """Fill work.elastic (n,) with dV/dq.
 
     V = K q^2 / 2 + V4, V4 the integral of EI w''^2 w'^2 / 2: the curvature of an inextensible beam is
     w'' (1 + w'^2 / 2). EI is read back from arm.stiffness, so that an estimated one counts.
@@ -207,27 +208,18 @@ def elastic(arm: Manipulator, q: Array, work: Workspace) -> None:
     for i in range(links):
         o = links + i * k
         EI = arm.stiffness[o] / arm.unit_stiffness[o]
-        for j in range(k):
-            for t in range(k):
-                work.tangent[i, j, t] = 0.0
+        bent, force, curvature, slopes = q[o:o + k], work.elastic[o:o + k], arm.curvature[i], arm.slope[i]
         for p in range(arm.along.shape[1]):
             weight = EI * arm.along[i, p]
             if weight == 0.0:
                 continue
             bend, slope = 0.0, 0.0
             for j in range(k):
-                bend += arm.curvature[i, p, j] * q[o + j]
-                slope += arm.slope[i, p, j] * q[o + j]
+                bend += curvature[p, j] * bent[j]
+                slope += slopes[p, j] * bent[j]
             for j in range(k):
-                K, s = weight * arm.curvature[i, p, j], weight * arm.slope[i, p, j]
-                work.elastic[o + j] += bend * slope * (slope * K + bend * s)
-                first = slope * slope * K + 2.0 * bend * slope * s
-                second = 2.0 * bend * slope * K + bend * bend * s
-                for t in range(j + 1):
-                    work.tangent[i, j, t] += first * arm.curvature[i, p, t] + second * arm.slope[i, p, t]
-        for j in range(k):
-            for t in range(j):
-                work.tangent[i, t, j] = work.tangent[i, j, t]
+                K, s = weight * curvature[p, j], weight * slopes[p, j]
+                force[j] += bend * slope * (slope * K + bend * s)
 
 
 @inner
@@ -235,18 +227,20 @@ def factor(M: Array) -> bool:
     """Overwrite the lower triangle of M with its Cholesky factor, diagonal inverted; False if indefinite."""
     n = M.shape[0]
     for j in range(n):
-        d = M[j, j]
+        done = M[j]
+        d = done[j]
         for p in range(j):
-            d -= M[j, p] * M[j, p]
+            d -= done[p] * done[p]
         if not d > 0.0:
             return False
         inverse = 1.0 / np.sqrt(d)
-        M[j, j] = inverse
+        done[j] = inverse
         for r in range(j + 1, n):
-            x = M[r, j]
+            row = M[r]
+            x = row[j]
             for p in range(j):
-                x -= M[r, p] * M[j, p]
-            M[r, j] = x * inverse
+                x -= row[p] * done[p]
+            row[j] = x * inverse
     return True
 
 

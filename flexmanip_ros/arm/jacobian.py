@@ -30,15 +30,16 @@ def move_station(arm: Manipulator, i: int, q: Array, qd: Array, qdd: Array, work
             Aq[side, r] = work.Aq[i, side, r]
             Av[side, r] = work.Av[i, side, r]
     x, xd, xdd = arm.length[i], 0.0, 0.0
+    bent, bending, bent_faster = q[o:o + k], qd[o:o + k], qdd[o:o + k]
     for j in range(k):
         g, h, gdd = 0.0, 0.0, 0.0
         for t in range(k):
-            g += arm.tip_shortening[i, j, t] * q[o + t]
-            h += arm.tip_shortening[i, j, t] * qd[o + t]
-            gdd += arm.tip_shortening[i, j, t] * qdd[o + t]
-        x -= 0.5 * g * q[o + j]
-        xd -= g * qd[o + j]
-        xdd -= h * qd[o + j] + g * qdd[o + j]
+            g += arm.tip_shortening[i, j, t] * bent[t]
+            h += arm.tip_shortening[i, j, t] * bending[t]
+            gdd += arm.tip_shortening[i, j, t] * bent_faster[t]
+        x -= 0.5 * g * bent[j]
+        xd -= g * bending[j]
+        xdd -= h * bending[j] + g * bent_faster[j]
         e, f = -gdd + g * w * w, -2.0 * h * w - g * wd
         Aq[0, o + j] += c * e - s * f
         Aq[1, o + j] += s * e + c * f
@@ -166,6 +167,8 @@ def link_jacobian(
     g, Se, Sn = work.own[0], work.own[2], work.own[3]
     eq, nq, ev, nv = work.own[4], work.own[5], work.own[6], work.own[7]
     feq, fnq, fev, fnv = work.own[8], work.own[9], work.own[10], work.own[11]
+    bent, bending, bent_faster = q[o:o + k], qd[o:o + k], qdd[o:o + k]
+    shortening, phi, turned, turning = arm.G[i], arm.phi[i], left[i, o:o + k], right[i, o:o + k]
     for r in range(k + 1):
         Se[r], Sn[r] = 0.0, 0.0
         feq[r], fnq[r], fev[r], fnv[r] = 0.0, 0.0, 0.0, 0.0
@@ -176,16 +179,16 @@ def link_jacobian(
         for j in range(k):
             G, h, gdd = 0.0, 0.0, 0.0
             for t in range(k):
-                G += arm.G[i, p, j, t] * q[o + t]
-                h += arm.G[i, p, j, t] * qd[o + t]
-                gdd += arm.G[i, p, j, t] * qdd[o + t]
-            shape = arm.phi[i, p, j]
-            x -= 0.5 * G * q[o + j]
-            xd -= G * qd[o + j]
-            xdd -= h * qd[o + j] + G * qdd[o + j]
-            y += shape * q[o + j]
-            yd += shape * qd[o + j]
-            ydd += shape * qdd[o + j]
+                G += shortening[p, j, t] * bent[t]
+                h += shortening[p, j, t] * bending[t]
+                gdd += shortening[p, j, t] * bent_faster[t]
+            shape = phi[p, j]
+            x -= 0.5 * G * bent[j]
+            xd -= G * bending[j]
+            xdd -= h * bending[j] + G * bent_faster[j]
+            y += shape * bent[j]
+            yd += shape * bending[j]
+            ydd += shape * bent_faster[j]
             g[1 + j] = G
             eq[1 + j] = m * (-gdd - shape * wd + G * w * w)
             nq[1 + j] = m * (-2.0 * h * w - G * wd - shape * w * w)
@@ -204,23 +207,24 @@ def link_jacobian(
         Sn[0] += m * x
         for t in range(k):
             Se[1 + t] -= m * g[1 + t]
-            Sn[1 + t] += m * arm.phi[i, p, t]
+            Sn[1 + t] += m * phi[p, t]
         right[i, i] += x * nv[0] - y * ev[0]
         fev[0] += ev[0]
         fnv[0] += nv[0]
-        for t in range(1, k + 1):
-            feq[t] += eq[t]
-            fnq[t] += nq[t]
-            fev[t] += ev[t]
-            fnv[t] += nv[t]
-            left[i, o + t - 1] += x * nq[t] - y * eq[t] - arm.phi[i, p, t - 1] * Ae - g[t] * An
-            right[i, o + t - 1] += x * nv[t] - y * ev[t]
-            right[o + t - 1, i] += arm.phi[i, p, t - 1] * nv[0] - g[t] * ev[0]
+        for t in range(k):
+            feq[1 + t] += eq[1 + t]
+            fnq[1 + t] += nq[1 + t]
+            fev[1 + t] += ev[1 + t]
+            fnv[1 + t] += nv[1 + t]
+            turned[t] += x * nq[1 + t] - y * eq[1 + t] - phi[p, t] * Ae - g[1 + t] * An
+            turning[t] += x * nv[1 + t] - y * ev[1 + t]
+            right[o + t, i] += phi[p, t] * nv[0] - g[1 + t] * ev[0]
         for j in range(k):
-            shape, G = arm.phi[i, p, j], g[1 + j]
+            shape, G = phi[p, j], g[1 + j]
+            by_q, by_v = left[o + j, o:o + k], right[o + j, o:o + k]
             for t in range(k):
-                left[o + j, o + t] += shape * nq[1 + t] - G * eq[1 + t] - arm.G[i, p, j, t] * Ae
-                right[o + j, o + t] += shape * nv[1 + t] - G * ev[1 + t]
+                by_q[t] += shape * nq[1 + t] - G * eq[1 + t] - shortening[p, j, t] * Ae
+                by_v[t] += shape * nv[1 + t] - G * ev[1 + t]
     # the root's acceleration, in the frame, moves all points alike
     for r in range(n):
         e = c * Aq[0, r] + s * Aq[1, r]
@@ -364,12 +368,30 @@ def elastic_jacobian(arm: Manipulator, q: Array, dq: Array, work: Workspace) -> 
     links = arm.length.size
     for r in range(q.size):
         dq[r, r] += arm.stiffness[r]
-    if arm.along[0, 0] != 0.0:
-        for i in range(links):
-            o = links + i * k
+    for i in range(links):
+        o = links + i * k
+        EI = arm.stiffness[o] / arm.unit_stiffness[o]
+        bent, tangent, curvature, slopes = q[o:o + k], work.tangent, arm.curvature[i], arm.slope[i]
+        for j in range(k):
+            for t in range(k):
+                tangent[j, t] = 0.0
+        for p in range(arm.along.shape[1]):
+            weight = EI * arm.along[i, p]
+            if weight == 0.0:
+                continue
+            bend, slope = 0.0, 0.0
             for j in range(k):
-                for t in range(k):
-                    dq[o + j, o + t] += work.tangent[i, j, t]
+                bend += curvature[p, j] * bent[j]
+                slope += slopes[p, j] * bent[j]
+            for j in range(k):
+                K, s = weight * curvature[p, j], weight * slopes[p, j]
+                first = slope * slope * K + 2.0 * bend * slope * s
+                second = 2.0 * bend * slope * K + bend * bend * s
+                for t in range(j + 1):
+                    tangent[j, t] += first * curvature[p, t] + second * slopes[p, t]
+        for j in range(k):
+            for t in range(k):
+                dq[o + j, o + t] += tangent[max(j, t), min(j, t)]
 
 
 @inner

@@ -165,7 +165,7 @@ class Workspace(NamedTuple):
     """(k + 1, k + 1) scratch of one link."""
     elastic: Array
     tangent: Array
-    """(L, k, k) derivative of the elastic forces of fourth order."""
+    """(k, k) scratch: derivative of a link's elastic forces of fourth order."""
     A: Array
     """(L + 1, 2) accelerations of the stations."""
     Aq: Array
@@ -191,7 +191,7 @@ def workspace(arm: Manipulator) -> Workspace:
     return Workspace(
         M=np.zeros((n, n)), E=np.zeros(n), J=np.zeros((links + 1, 2, n)), a=np.zeros((links + 1, 2)),
         P=np.zeros((2, n)), F=np.zeros(3), first=np.zeros((links, 2, n)), own=np.zeros((12, k + 1)),
-        block=np.zeros((k + 1, k + 1)), elastic=np.zeros(n), tangent=np.zeros((links, k, k)),
+        block=np.zeros((k + 1, k + 1)), elastic=np.zeros(n), tangent=np.zeros((k, k)),
         A=np.zeros((links + 1, 2)), Aq=np.zeros((links + 1, 2, n)), Av=np.zeros((links + 1, 2, n)),
         Fq=np.zeros((2, n)), Fv=np.zeros((2, n)), frame=np.zeros((4, n)), B=np.zeros((n, links)),
         net=np.zeros((3, links)), held=np.zeros((2, n)))

@@ -43,6 +43,8 @@ def absorb_measurement(x: Array, S: Array, f: Array, e: float, r: float, varianc
     gamma = 1.0 / (1.0 + np.sqrt(r / variance))
     for i in range(x.size):
         gain = dot(f, S[i]) / variance
+        if gain == 0.0:  # taken as known
+            continue
         x[i] += gain * e
         gain *= gamma
         for c in range(f.size):

@@ -420,6 +420,9 @@ def exponential_step(motion: ProcessModel, x: Array, h: float, count: int, fifth
     sums, moved, later, whole = motion.k[7:13], motion.k[13:15], motion.k[15:17], motion.k[17:19]
     c = 0.5 if fifth else 0.75
     for i in range(n):
+        for j in range(n):  # by columns, which ``series`` reads in a row
+            motion.X[j, i], motion.Y[j, i] = motion.dq[i, j], motion.dqd[i, j]
+    for i in range(n):
         term[0, i] = x[n + i]
         term[1, i] = motion.k[0, i]
     series(motion, h, 1, count, c)
@@ -482,7 +485,8 @@ def miss(motion: ProcessModel, x: Array, moved: Array, missed: Array) -> bool:
 def series(motion: ProcessModel, h: float, first: int, count: int, c: float) -> None:
     """Fill rows 7 to 12 of motion.k with phi_first(z) v at z = c h F, LATER h F and h F, F the linearization.
 
-    phi_l(z) = sum of z^j / (j + l)!; v / first! stands in rows 4, 5 (positions, rates) and is used up.
+    phi_l(z) = sum of z^j / (j + l)!; v / first! stands in rows 4, 5 (positions, rates) and is used up. The columns of
+    motion.dq and dqd are the rows of motion.X and Y.
     """
     n = motion.arm.stiffness.size
     term, following, sums = motion.k[4:6], motion.k[6], motion.k[7:13]
@@ -495,14 +499,16 @@ def series(motion: ProcessModel, h: float, first: int, count: int, c: float) -> 
         near *= c
         far *= LATER
         for i in range(n):
-            value = 0.0
-            for j in range(n):
-                value += motion.dq[i, j] * term[0, j] + motion.dqd[i, j] * term[1, j]
-            following[i] = weight * value
+            following[i] = 0.0
+        for j in range(n):
+            place, rate, by_place, by_rate = term[0, j], term[1, j], motion.X[j], motion.Y[j]
+            for i in range(n):
+                following[i] += by_place[i] * place + by_rate[i] * rate
         for i in range(n):
             term[0, i] = weight * term[1, i]
-            term[1, i] = following[i]
-            for part in range(2):
+            term[1, i] = weight * following[i]
+        for part in range(2):
+            for i in range(n):
                 sums[part, i] += near * term[part, i]
                 sums[2 + part, i] += far * term[part, i]
                 sums[4 + part, i] += term[part, i]

@@ -24,8 +24,9 @@ def coriolis_matrix(arm: Manipulator, payload: Array, q: Array, qd: Array) -> Ar
     """Return C(q, qd) of the Christoffel symbols, (n, n): E = C qd and dM/dt - 2 C is skew; C = dE/dqd / 2."""
     work = workspace(arm)
     assemble(arm, payload, q, qd, work.M, work.E, work)
-    force_jacobian(arm, payload, q, qd, np.zeros_like(q), work.left, work.right, work.parameters, work)
-    return work.right / 2
+    left, right = np.zeros((2, q.size, q.size))
+    force_jacobian(arm, payload, q, qd, np.zeros_like(q), left, right, np.zeros((q.size, 4)), work)
+    return right / 2
 
 
 def torque_at(arm: Manipulator, q: Array) -> Array:
