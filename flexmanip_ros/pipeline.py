@@ -297,7 +297,8 @@ def reconfigure(config: IdentifierParameters, state: State, background: Backgrou
         return state
     last = _instant(state, state.payload.last_ns, config.publish_rate)
     model = state.model._replace(instant=-1) if state.model is not None else None  # to be read again
-    return state._replace(published=last, model=model)
+    pending = state.pending._replace(instant=-1) if state.pending is not None else None
+    return state._replace(published=last, model=model, pending=pending)
 
 
 def _sampled(config: IdentifierParameters, state: State, sampled: sampling.Sampled, stamp_ns: int,

@@ -112,12 +112,12 @@ def identify(request: Request, progress: Report | None = None) -> Result:
                 err.problem, f"{err.remedy}, or let 'identify_bag {request.bag} --suggest FILE.yaml' choose") from err
         except KeyboardInterrupt:
             messages.fault, interrupted = BagError('interrupted', 'the messages until then are reported'), True
+        if interrupted and state.counters.accepted == 0:
+            raise KeyboardInterrupt
+        if messages.fault is not None and state.counters.accepted == 0:  # an output that was there stays
+            raise messages.fault
         if isinstance(output, TableOutput):
             output.start_ns = messages.first_ns
-    if interrupted and state.counters.accepted == 0:
-        raise KeyboardInterrupt
-    if messages.fault is not None and state.counters.accepted == 0:
-        raise messages.fault
     progress.phase('fitting the last samples')
     last = pipeline.current(state)
     summary = summarize(state, last, time.perf_counter() - started)

@@ -126,7 +126,8 @@ def _recording(source: str, topics: bag.Topics, until_s: float | None, progress:
                 found.events.append(item.stamp_ns)
                 continue
             first = found.blocks[0].stamp_ns[0] if found.blocks else item.stamp_ns[0]
-            used = item.stamp_ns < first + (1e18 if until_s is None else round(until_s * 1e9))
+            used = np.full(len(item.stamp_ns), True) if until_s is None else (
+                item.stamp_ns < first + round(until_s * 1e9))
             if used.any():
                 found.blocks.append(item if used.all() else item.part(used))
     except BagError:
@@ -227,4 +228,4 @@ def _collect(config: IdentifierParameters, recording: _Recording) -> tuple[Signa
     borders = [0, *borders, len(whole.stamp_ns)]
     a, b = max(pairwise(borders), key=lambda pair: pair[1] - pair[0])
     return replace(whole, stamp_ns=whole.stamp_ns[a:b], u=whole.u[a:b], y=whole.y[a:b], angles=whole.angles[a:b],
-                   gap=whole.gap[a:b]), clock.dt
+                   gap=whole.gap[a:b], missing=whole.missing[a:b]), clock.dt

@@ -8,6 +8,7 @@ file sqlite itself returns the rows before the first missing page.
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import struct
 import sys
@@ -240,13 +241,15 @@ class _Recording:
         if path.is_dir() and not (path / 'metadata.yaml').is_file() and not self._files():
             raise BagError(f"directory '{path}' is not a bag: metadata.yaml and recording are missing",
                            'give the directory that ros2 bag record made')
-        if any(file.stat().st_size == 0 for file in self._files()):
+        if not any(file.stat().st_size for file in self._files()):
             raise BagError(f"bag '{path}' is empty", 'record again; the recorder was stopped before it wrote')
 
     def _files(self) -> list[Path]:
         if self.path.is_file():
             return [self.path]
-        return sorted(file for file in self.path.iterdir() if file.suffix in ('.mcap', '.db3'))
+        found = (file for file in self.path.iterdir() if file.suffix in ('.mcap', '.db3'))
+        return sorted(found, key=lambda file: [  # of a split recording 10 comes after 9
+            (part.isdigit(), int(part) if part.isdigit() else 0, part) for part in re.split(r'(\d+)', file.name)])
 
     def messages(self) -> Generator[tuple[str, bytes]]:
         """Yield topic and bytes of the messages on the chosen topics: what the library reads, then what is left."""

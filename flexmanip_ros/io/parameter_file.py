@@ -12,10 +12,12 @@ import yaml
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import ArmParameters, PlantParameters, configure
+from flexmanip_ros.parameters.document import NODES, package_names
+from flexmanip_ros.parameters.field import leaves
 
 Config = TypeVar('Config')
-STANDARD = re.compile(r'^(use_sim_time|start_type_description_service|qos_overrides\..*)$')
-"""Parameters that every ROS node has and that have no meaning offline."""
+STANDARD = re.compile(r'^(use_sim_time|start_type_description_service|autostart|qos_overrides\..*)$')
+"""Parameters that every node has and that have no meaning offline."""
 LARGEST_FILE = 1 << 20
 """Size of a file above which it is rejected [bytes]; a parameter file is a page of text."""
 
@@ -62,8 +64,8 @@ def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, An
     """Return the parameters a file gives to ``node``, nested groups flattened with dots.
 
     Sections named ``/**``, ``node``, ``/ns/node`` or with wildcards apply, later ones win; sections of other
-    nodes are left alone. A file without any section for ``node`` is an error unless ``optional``. Raises
-    ParameterError naming the file.
+    nodes are left alone, and so are their parameters in a section for every node. An empty file gives no values; one
+    without any section for ``node`` is an error unless ``optional``. Raises ParameterError naming the file.
     """
     where = f"parameter file '{path}'"
     try:
@@ -90,7 +92,8 @@ def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, An
     values: dict[str, Any] = {}
     for name in chosen:
         flat = _flatten(sections[name], '', where)
-        values.update((key, value) for key, value in flat.items() if not STANDARD.match(key))
+        foreign = package_names() - {leaf.name for leaf in leaves(NODES[node])} if name.endswith('*') else ()
+        values.update((key, value) for key, value in flat.items() if not STANDARD.match(key) and key not in foreign)
     return values
 
 

@@ -24,6 +24,13 @@ NODES: Mapping[str, type] = {
     'live_view': ViewParameters,
 }
 """Each node and the class that declares its parameters."""
+
+
+def package_names() -> frozenset[str]:
+    """Return the names of all nodes' parameters: a section for every node (``/**``) may serve several."""
+    return frozenset(leaf.name for cls in NODES.values() for leaf in leaves(cls))
+
+
 WIDTH = 100
 """Characters in a line of a comment or of --help."""
 

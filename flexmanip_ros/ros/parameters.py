@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import Leaf, check, configure, flatten, leaves
-from flexmanip_ros.parameters.document import NODES, limits
+from flexmanip_ros.parameters.document import limits, package_names
 from flexmanip_ros.parameters.field import LINKS
 from flexmanip_ros.ros.rclpy_workarounds import declare, parameter_overrides
 
@@ -122,16 +122,11 @@ def _given_type(node: Node, leaf: Leaf) -> str:
 def _reject_unknown(node: Node, known: dict[str, Leaf]) -> None:
     """Raise ParameterError for an override that no node of this package declares, such as a misspelt name."""
     for name in parameter_overrides(node):
-        if name in known or name.startswith(_ROS_OWN) or name in _package_names():
+        if name in known or name.startswith(_ROS_OWN) or name in package_names():
             continue
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f'see ros2 param list /{node.get_name()} or --help'
         raise ParameterError(f"unknown parameter '{name}'", hint)
-
-
-def _package_names() -> frozenset[str]:
-    """Names of all nodes' parameters: a file under /** may serve several nodes."""
-    return frozenset(leaf.name for cls in NODES.values() for leaf in leaves(cls))
 
 
 def arm_line(node: Any) -> str:

@@ -206,7 +206,8 @@ class Rows:
     def missing(self) -> NDArray[np.int64]:
         """(N,) 0: the row was measured; k: it is the k-th of a few rows in a row whose message never came.
 
-        Its values are interpolated between the messages around it. No estimator takes its outputs for measured.
+        Its values are interpolated between the messages around it. No estimator takes its outputs for measured, but
+        that a row made of several (decimation) counts as measured where half of them were.
         """
         return self._column('missing', np.int64)
 
@@ -250,11 +251,11 @@ class Signals:
 
 
 def log_of(u: Array, y: Array, angles: Array | None = None, stamp_ns: NDArray[np.int64] | None = None,
-           gap: NDArray[np.bool_] | None = None) -> SampleLog:
-    """Return a log of whole arrays: u (N, r), y (N, m), angles (N, a), stamp_ns (N,), gap (N,)."""
+           gap: NDArray[np.bool_] | None = None, missing: NDArray[np.int64] | None = None) -> SampleLog:
+    """Return a log of whole arrays: u (N, r), y (N, m), angles (N, a), stamp_ns (N,), gap (N,), missing (N,)."""
     u, y = np.atleast_2d(u), np.atleast_2d(y)
     count = len(y)
     angles = np.zeros((count, 0)) if angles is None else angles
     log = SampleLog(Width(u.shape[1], y.shape[1], angles.shape[1]))
     return log.append(np.zeros(count, dtype=np.int64) if stamp_ns is None else stamp_ns, u, y, angles,
-                      np.zeros(count, dtype=np.bool_) if gap is None else gap)
+                      np.zeros(count, dtype=np.bool_) if gap is None else gap, missing=missing)

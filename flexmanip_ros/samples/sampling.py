@@ -353,8 +353,8 @@ def _absent(config: IdentifierParameters, clock: Clock, raw: Sample) -> int:
     """Return how many samples never came before ``raw``; 0 where too many, or where it came too early."""
     assert clock.last_ns is not None
     interval = raw.stamp_ns - clock.last_ns
-    if clock.latest is None or interval * 1e-9 > config.max_gap:
-        return 0
+    if clock.latest is None or not clock.interval_sum_ns or interval * 1e-9 > config.max_gap:
+        return 0  # after a single sample the sample time is not known either
     # whole numbers: the same on any machine
     count = (2 * interval * clock.interval_count + clock.interval_sum_ns) // (2 * clock.interval_sum_ns) - 1
     return count if 0 < count <= MOST_MISSING else 0

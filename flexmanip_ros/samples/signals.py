@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
+from flexmanip_ros.parameters.field import of_links
 from flexmanip_ros.types import Array, JointBlock, JointRecord, Sample
-
-_SHRINKABLE = IdentifierParameters().outputs
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ def resolve(
     if fault is not None:
         return fault
     wanted = config.outputs if outputs is None else outputs
-    if outputs is None and config.outputs == _SHRINKABLE:
+    if outputs is None and _is_default('outputs', config):
         kept = (name for name in wanted if not _is_unfilled(name, record))
         wanted = tuple(kept) or wanted
     groups: list[tuple[tuple[str, int], ...]] = []
@@ -72,7 +71,13 @@ def joints(config: IdentifierParameters | TriggerParameters) -> tuple[str, ...]:
 
 def reads_angles(config: IdentifierParameters) -> bool:
     """Whether the angles are read: for a payload, or where they are named (the default ones are of one arm)."""
-    return bool(config.angles) and (config.payload_method != 'none' or config.angles != IdentifierParameters.angles)
+    return bool(config.angles) and (config.payload_method != 'none' or not _is_default('angles', config))
+
+
+def _is_default(group: str, config: IdentifierParameters) -> bool:
+    """Whether the signals of a group are those that an arm of so many links has where none are named."""
+    default = getattr(IdentifierParameters, group)
+    return getattr(config, group) in (default, of_links(default, len(config.arm.link_length)))
 
 
 def relative_angle(config: IdentifierParameters, angles: Array) -> Array:

@@ -84,6 +84,7 @@ def score(model: StateSpace | None, signals: Signals, start_s: float, *, factor:
     r = signals.u.shape[1]
     U, Y = kept[:, :r], kept[:, r:]
     u, y = U[split:], Y[split:]
+    told = signals.missing[before:after][rows] <= _tolerated(factor)  # what was interpolated is not scored
     steps = max(1, round(horizon_s / model.dt)) + lag
     x0 = validation.state_at_end(model, U[:split], Y[:split])
     with np.errstate(all='ignore'):  # an unstable model overflows and scores 0
@@ -91,11 +92,12 @@ def score(model: StateSpace | None, signals: Signals, start_s: float, *, factor:
         filtered = validation.state_at_end(_predictor(model), kept[:split], Y[:split])
         predicted = validation.predict(model, u, y, filtered)
         ahead = validation.predict_ahead(model, u, y, steps, filtered)
-    target = measured[rows[split + steps - 1:]]
-    horizon = validation.vaf(target, ahead) if len(target) > 1 else np.full(y.shape[1], np.nan)
+    target, later, told = measured[rows[split + steps - 1:]], told[split + steps - 1:], told[split:]
+    horizon = validation.vaf(target[later], ahead[later]) if np.count_nonzero(later) > 1 else np.full(
+        y.shape[1], np.nan)
     return Scores(
-        validation.vaf(y, simulated), validation.vaf(y, predicted), horizon, time[before:after][rows[split:]], y,
-        simulated, predicted, after < time.size)
+        validation.vaf(y[told], simulated[told]), validation.vaf(y[told], predicted[told]), horizon,
+        time[before:after][rows[split:]], y, simulated, predicted, after < time.size)
 
 
 def _predictor(model: StateSpace) -> StateSpace:
@@ -154,11 +156,12 @@ def _stretch(config: IdentifierParameters, signals: Signals, a: int, b: int, dt:
     noise = 'sensor' if config.refinement == 'output_error' else 'any'
     config = replace(config, estimator='factor', forgetting='innovation', forgetting_factor=(1.0,) * 3,
                      refinement='none', state_basis='fixed' if config.state_basis == 'fixed' else 'singular')
-    log = log_of(u, y, stamp_ns=signals.stamp_ns[a:b], gap=gap)
+    missing = signals.missing[a:b]
+    log = log_of(u, y, stamp_ns=signals.stamp_ns[a:b], gap=gap, missing=missing)
     found, method = None, 'none'
     try:
         state = rpbsid.advance(config, rpbsid.init(config), log.rows(0, b - a))
-        found = _fit(config, state, _longest(config, u, y, gap), noise, b - a, dt)
+        found = _fit(config, state, _longest(config, u, y, gap, missing), noise, b - a, dt)
         method = 'maximum likelihood'
         if found is None:
             found, method = rpbsid.identified(config, state, dt), 'subspace'
@@ -170,11 +173,25 @@ def _stretch(config: IdentifierParameters, signals: Signals, a: int, b: int, dt:
     return Smoothed(start_s, end_s, b - a, method, found.status, modes(found))
 
 
-def _longest(config: IdentifierParameters, u: Array, y: Array, gap: NDArray[np.bool_]) -> Array:
-    """Return inputs and outputs (N, r + m) of the longest part without a gap, as the identifier sees them."""
+def _longest(config: IdentifierParameters, u: Array, y: Array, gap: NDArray[np.bool_], missing: NDArray[np.int64]
+             ) -> Array:
+    """Return inputs and outputs (N, r + m) of the longest part without a gap, as the identifier sees them.
+
+    Outputs that were not measured are NaN, and no fit counts them.
+    """
     borders = [0, *(k for k in np.flatnonzero(gap).tolist() if k), len(u)]
     a, b = max(pairwise(borders), key=lambda part: part[1] - part[0])
-    return decimation.whole(np.hstack([u[a:b], y[a:b]]), config.decimation)[0]
+    samples, rows = decimation.whole(np.hstack([u[a:b], y[a:b]]), config.decimation)
+    absent = missing[a:b][rows] > _tolerated(config.decimation)
+    if absent.any():
+        samples = samples.copy()
+        samples[absent, u.shape[1]:] = np.nan
+    return samples
+
+
+def _tolerated(factor: int) -> int:
+    """Return how many interpolated samples a filtered one may follow and still count as measured."""
+    return factor // 2 if factor > 1 else 0
 
 
 def _fit(config: IdentifierParameters, state: rpbsid.RpbsidState, samples: Array, noise: str, count: int, dt: float

@@ -181,3 +181,14 @@ def test_a_seed_that_is_none_is_rejected_before_the_runs(capsys, program):
         program.main([*(['scenario.yaml'] if program is monte_carlo else []), '--first-seed=-5'])
     assert ended.value.code == 2
     assert "'-5' is not a whole number" in capsys.readouterr().err
+
+
+def test_a_recording_that_is_not_there_leaves_the_last_results(capsys, tmp_path):
+    table = tmp_path / 'estimates.csv'
+    table.write_text('the last results\n', encoding='utf-8')
+    assert main([str(tmp_path / 'typo'), '--output', str(table), PLAIN]) == 2
+    assert 'does not exist' in capsys.readouterr().err
+    assert table.read_text(encoding='utf-8') == 'the last results\n'
+    folder = tmp_path / 'out'
+    assert main([str(tmp_path / 'typo'), '--output', str(folder), PLAIN]) == 2
+    assert not folder.exists()

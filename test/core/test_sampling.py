@@ -169,3 +169,21 @@ def test_stamps_of_zero_are_explained() -> None:
     state, _, _ = drive([record(k)._replace(stamp_ns=0) for k in range(10)])
     assert state.rejection is not None
     assert 'stamps do not advance' in state.rejection.problem
+
+
+def test_a_single_sample_before_a_pause_teaches_no_sample_time() -> None:
+    config = IdentifierParameters()
+    first, *later = [record(k) for k in (0, *range(1000, 1100))]
+    clock, log, _ = sampling.flush(config, *sampling.push(config, sampling.Clock(), sampling.EMPTY, first)[:2])
+    for item in later:
+        clock, log, _ = sampling.push(config, clock, log, item)
+    assert clock.dt == 1e-3
+    assert clock.counters.received == 101
+
+
+def test_the_default_signals_of_one_link_shrink_to_those_that_come() -> None:
+    config = configure(IdentifierParameters, {
+        'arm.link_length': [1.0], 'inputs': ['joint1/effort'], 'payload_method': 'none', 'order': 2})
+    clock, samples, _ = drive([record(k, ('joint1', 'link1_bend'), velocity=[]) for k in range(30)], config)
+    assert clock.outputs == ('link1_bend/position',)
+    assert len(samples) == 30

@@ -146,3 +146,19 @@ def test_a_foreign_database_is_rejected(tmp_path):
         database.execute('CREATE TABLE cats (name TEXT)')
     database.close()
     assert 'cannot be read' in good_part(tmp_path / 'other.db3')[1]
+
+
+def test_a_recording_that_was_split_and_not_finished_is_read_in_the_order_of_its_numbers(tmp_path):
+    split = tmp_path / 'split'
+    split.mkdir()
+    for part in range(12):
+        with BagWriter(tmp_path / f'part{part}') as writer:
+            for k in range(100 * part, 100 * part + 100):
+                writer.write('/joint_states', START + k * 1_000_000, joint_state_record(k))
+        storage_file(tmp_path / f'part{part}').rename(split / f'split_{part}.mcap')
+    (split / 'split_12.mcap').write_bytes(b'')
+    messages, line = good_part(split)
+    stamps = [item.stamp_ns for item in messages if isinstance(item, JointRecord)]
+    assert len(stamps) == 1200
+    assert stamps == sorted(stamps)
+    assert '1200 messages' in line

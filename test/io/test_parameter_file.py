@@ -101,3 +101,10 @@ def test_whatever_is_in_the_file_only_our_error_comes_out(tmp_path, content):
     path.write_bytes(content)
     with suppress(ParameterError):
         load(IdentifierParameters, NODE, path)
+
+
+def test_a_section_for_every_node_may_hold_what_only_another_one_has(tmp_path):
+    path = _file(tmp_path, '/**: {ros__parameters: {payload_mass: 20.0, autostart: false, order: 6}}')
+    assert read(path, NODE) == {'order': 6}
+    with pytest.raises(ParameterError, match='payload_mas'):
+        load(IdentifierParameters, NODE, _file(tmp_path, '/**: {ros__parameters: {payload_mas: 20.0}}'))

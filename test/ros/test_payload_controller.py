@@ -140,3 +140,14 @@ def test_the_arm_is_brought_to_a_new_setpoint_live(ros: Ros) -> None:
     # 2 to 13 s on an idle machine: the loop runs by the wall's clock, and late torques ring the arm
     ros.wait(lambda: np.abs(np.array(heard[-1].position[:2]) - goal).max() < 0.01, timeout=60.0)
     assert plant.dropped_commands == 0
+
+
+def test_a_parameter_that_is_no_setpoint_moves_nothing(ros: Ros) -> None:
+    node = start(ros, readers=0, setpoint=[0.5, 0.3])
+    before = node.state
+    for name, value in (('max_payload', 30.0), ('setpoint', [0.5, 0.3])):
+        (result,) = node.set_parameters([Parameter(name, value=value)])
+        assert result.successful
+        assert node.state is before
+    node.set_parameters([Parameter('setpoint', value=[0.0, 0.0])])
+    assert node.state is not before

@@ -6,6 +6,7 @@ from geometry_msgs.msg import InertiaStamped
 from identifier_harness import CAPTURE, Live, recording, replayed
 from rclpy.parameter import Parameter
 from ros_harness import Ros
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
 from std_srvs.srv import Trigger
 
@@ -181,3 +182,32 @@ def test_the_publishing_rate_changes_while_it_runs(ros: Ros) -> None:
     (result,) = live.node.set_parameters([Parameter('order', value=6)])
     assert not result.successful
     assert live.node.config.publish_rate == 250.0
+
+
+def test_what_comes_while_the_node_is_not_active_is_no_loss(ros: Ros) -> None:
+    live = Live(ros, payload_method='none')
+    heard = ros.listen(JointState, 'joint_states', qos.sensor_output())
+    ros.wait(lambda: live.joint_states.get_subscription_count() == 2)
+    samples = recording(300)
+    live.send(*samples[:100])
+    live.finish()
+    for record in samples[100:200]:
+        live.joint_states.publish(conversions.joint_state(record))
+    ros.wait(lambda: len(heard) == 200)
+    live.node.trigger_activate()
+    live.send(*samples[200:])
+    assert live.node.losses.lost == 0
+
+
+@pytest.mark.parametrize('changed', range(300, 320, 5))
+def test_a_slower_rate_of_models_begins_at_once(ros: Ros, changed: int) -> None:
+    live = Live(ros, payload_method='none', model_rate=50.0)
+    samples = recording(700)
+    live.send(*samples[:changed])
+    live.node.set_parameters([Parameter('model_rate', value=1.0)])
+    before = len(live.said[messages.MODEL])
+    live.send(*samples[changed:])
+    live.finish()
+    ros.wait(lambda: len(live.said[messages.MODEL]) > before)
+    assert live.node.state.model is not None
+    assert live.node.state.model.instant <= 1

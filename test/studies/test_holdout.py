@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from flexmanip_ros.errors import ModelError, ParameterError
+from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.samples.sample_log import Signals
-from flexmanip_ros.studies.whole_recording import score
+from flexmanip_ros.studies.whole_recording import score, smooth
 from flexmanip_ros.types import StateSpace
 
 DT = 0.01
@@ -104,3 +107,29 @@ def test_nothing_to_score_is_said(start):
 def test_a_missing_model_is_said():
     with pytest.raises(ModelError, match='no model'):
         score(None, _signals(), 4.0)
+
+
+def test_what_never_came_is_not_scored():
+    signals = _signals(noise=0.3)
+    absent = np.zeros(800, dtype=np.int64)
+    absent[450:780:7] = 1
+    y = signals.y.copy()
+    y[absent > 0] = 1e6
+    plain = score(_system(), signals, 4.0).simulation
+    found = score(_system(), replace(signals, y=y, missing=absent), 4.0).simulation
+    assert found == pytest.approx(plain, abs=1.0)
+
+
+def test_what_never_came_moves_no_fit_of_the_whole_recording():
+    config = configure(IdentifierParameters, {
+        'payload_method': 'none', 'inputs': ['a/effort'], 'outputs': ['a/position'], 'order': 2})
+    signals = _signals(noise=0.05, count=3000)
+    absent = np.zeros(3000, dtype=np.int64)
+    absent[100:2900:9] = 1
+    found = {}
+    for wrong in (1e-3, 1.0):
+        y = signals.y.copy()
+        y[absent > 0] += wrong
+        (found[wrong],) = smooth(config, replace(signals, y=y, missing=absent), [], DT)
+    assert found[1.0].method == 'maximum likelihood'
+    assert found[1.0].modes[0].frequency_hz == pytest.approx(found[1e-3].modes[0].frequency_hz, rel=1e-3)

@@ -96,7 +96,7 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
             if stamp is None:
                 return
             if self._first_ns is None or stamp < self._first_ns:
-                self._first_ns, self._last = stamp, -1
+                self._first_ns, self._last = stamp, 0
             self._instant(round((stamp - self._first_ns) * 1e-9 * self.config.rate) + 1)
 
     def _instant(self, latest: int) -> None:

@@ -57,6 +57,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._arrived = np.inf
         self._meter = Meter()
         self._reader = JointStateReader()
+        self._setpoint = self.config.setpoint
         self._names: tuple[str, ...] = ()
         self._places: list[int] = []
 
@@ -93,7 +94,10 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
 
     def configuration_changed(self, config: ControllerParameters) -> None:
         """Go to a new setpoint."""
-        if self.state is not None and (self.state.setpoint is not None or any(config.setpoint)):
+        if config.setpoint == self._setpoint:
+            return
+        self._setpoint = config.setpoint
+        if self.state is not None:
             self.state = controller.goto(self.state, np.asarray(config.setpoint))
 
     def _on_joint_states(self, raw: bytes) -> None:

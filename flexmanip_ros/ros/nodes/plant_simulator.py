@@ -187,6 +187,8 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             response.success, response.message = False, f'{NAME} is not active'
             return response
         if self._grid.begun:
+            if self._fault:  # what passed since then is not made up
+                self.samples = max(self.samples, self._grid.latest() + 1)
             self._restart()
         response.success, response.message = True, 'the arm is at its start, at rest and empty'
         return response

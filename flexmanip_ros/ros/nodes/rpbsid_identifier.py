@@ -187,10 +187,10 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def _on_joint_states(self, raw: bytes, info: object) -> None:
         """Convert, take one step, publish."""
+        self.losses.note(sequence_number(info))  # of what comes while the node is not active nothing is lost
         if not self.active:
             return
         with self.meter:
-            self.losses.note(sequence_number(info))
             try:
                 record = self._reader(raw)
             except SignalError as error:
@@ -304,7 +304,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         payload, since_ns = estimate.payload, self.state.stamp_of(EventKind.CAPTURE)
         if payload is None:
             return
-        if (payload.status is Status.TRACKING and math.isfinite(payload.std)
+        came = since_ns is None or estimate.stamp_ns >= since_ns  # an event may be announced before its stamp
+        if (payload.status is Status.TRACKING and math.isfinite(payload.std) and came
                 and ('payload' not in self._logged or self._logged['payload'] != since_ns)):
             self._logged['payload'] = since_ns
             log.info(f'payload {payload.mass:.4g} kg, 95 % interval {payload.lower:.4g} to {payload.upper:.4g} kg')
