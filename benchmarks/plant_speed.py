@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +49,7 @@ def with_scipy(config: PlantParameters, efforts: np.ndarray) -> np.ndarray:
     changes = np.flatnonzero(np.any(np.diff(efforts, axis=0) != 0, axis=1)) + 1
     for last in [*sorted({*changes.tolist(), SAMPLES // 2}), SAMPLES]:
         if first == SAMPLES // 2:
-            carried = simulator.attach(config, replace(simulator.init(config), x=x))
+            carried = simulator.attach(config, simulator.init(config)._replace(x=x))
             x, payload = carried.x, carried.payload
         torque = efforts[first]
 

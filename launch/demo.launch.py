@@ -20,7 +20,7 @@ ARGUMENTS = (
     ('payload_mass', '20.0', 'mass of the object [kg]'),
     ('capture_time', '3.0', 'capture this long after the first sample [s]; negative: never'),
     ('release_time', '-1.0', 'release this long after the first sample [s]; negative: never'),
-    ('payload_method', 'structured', 'none | block | structured'),
+    ('payload_method', 'structured', 'none | block | frequency | structured'),
     ('view', 'false', 'show the run live in a browser on this machine (node live_view)'),
     ('view_port', '8765', 'port of that page; 0: any that is free'),
     ('namespace', '', 'namespace of all nodes'),

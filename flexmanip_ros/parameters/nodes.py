@@ -55,7 +55,8 @@ class ControllerParameters:
         0.2, 'largest trusted half width of the 95 % interval, as a fraction of tip mass plus payload', low=0.0,
         high=10.0, live=True)
     max_consistency: float = parameter(
-        4.0, 'largest trusted residual power of an estimate (1: noise alone)', low=0.0, live=True)
+        2.0, 'largest trusted consistency: residual power of an estimate (1: noise alone; INCONSISTENT above 2)',
+        low=0.0, live=True)
     payload_rate: float = parameter(
         100.0, 'largest rate at which the scheduled payload follows a trusted estimate', unit='kg/s', low=0.01,
         high=1e6, live=True)
@@ -103,7 +104,8 @@ class AdapterParameters:
     max_std: float = parameter(
         0.2, 'standard deviation below which every payload is sent', unit='kg', low=1e-6, high=1e3, live=True)
     max_consistency: float = parameter(
-        4.0, 'largest trusted residual power of an estimate (1: noise alone)', low=0.0, live=True)
+        2.0, 'largest trusted consistency: residual power of an estimate (1: noise alone; INCONSISTENT above 2)',
+        low=0.0, live=True)
     max_payload: float = parameter(100.0, 'largest payload that is sent', unit='kg', low=0.0, live=True)
     settle_time: float = parameter(
         0.3, 'time for which a payload must have been trusted before it is sent', unit='s', low=0.0, high=60.0,

@@ -180,7 +180,7 @@ def test_an_arm_under_gravity_stays_where_it_is_and_sags_where_the_controller_kn
 
     def falls(told: ArmParameters) -> float:
         config, body = ControllerParameters(arm=told), simulator.attach(plant, simulator.init(plant))
-        body = replace(body, x=np.append(rest, np.zeros(8)))
+        body = body._replace(x=np.append(rest, np.zeros(8)))
         control, torque = controller.init(config)._replace(payload=held, trusted=held), holding
         angles = []
         for _ in range(600):
