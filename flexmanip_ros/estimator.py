@@ -108,18 +108,17 @@ class ModelRequest:
 
     config: IdentifierParameters
     identifier: ModelEstimator
-    estimator: PayloadEstimator
     stamp_ns: int
     dt: float
     payload: Payload | None
-    rows: Rows | None = None
+    rows: Rows
     """The latest samples, on which the model is judged."""
 
     def solve(self) -> Estimate:
         """Return the estimate with model and modes."""
         config, identifier, payload = self.config, self.identifier, self.payload
         found, without = _identified(config, identifier.rpbsid, self.dt)
-        if found is not None and self.rows is not None and config.decimation == 1:
+        if found is not None and config.decimation == 1:
             found = prediction_check.judged(found, self.rows, config.outputs)
         if config.payload_method == 'block' and found is not None:
             payload = block_extraction.estimate(config, found, identifier.angles, identifier.configuration_range)

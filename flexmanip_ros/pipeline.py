@@ -1,4 +1,4 @@
-"""The one way through the house: messages in, estimates out.
+"""Joint states and events in, estimates out.
 
 A message becomes a row of the sample log. Two estimators, payload and identifier, are cursors into that log and take
 its rows in groups. The live node calls ``step`` for each message, a replay ``run`` for a recording: the same messages
@@ -31,9 +31,11 @@ takes 1.3 ms, which delays a sample less than the 3 ms that an estimate may take
 RESULT_DELAY_S = 0.005
 """Time from the row that a model is asked for at to the row at which it is taken [s]. Reading it takes 1 to 3 ms."""
 ARM_RATE = 1.0
-"""How often an estimate carries what the arm taught [Hz]: it changes slowly."""
+"""Rate at which estimates carry the arm parameters that were learned [Hz]: they change slowly."""
 HOPELESS = 2000
 """Messages without a single usable one after which a replay gives up."""
+REPLAY_GROUP = 2000
+"""Rows that a replay takes at once at least: what Python adds to a row is then below a microsecond."""
 ROUNDING = 1e-6
 """Share of an instant by which a stamp may fall short of it, for stamps that are rounded to nanoseconds."""
 
@@ -87,11 +89,6 @@ class State(NamedTuple):
         """What became of the messages; those that wait are sure to be accepted."""
         counters, more = self.clock.counters, len(self.held)
         return counters._replace(received=counters.received + more, accepted=counters.accepted + more)
-
-    @property
-    def last_ns(self) -> int | None:
-        """Stamp of the latest message that was accepted [ns]."""
-        return self.held[-1].stamp_ns if self.held else self.clock.last_ns
 
     def stamp_of(self, kind: EventKind) -> int | None:
         """Return the stamp of the latest event of a kind [ns], None when there was none."""
@@ -160,7 +157,7 @@ def _take(config: IdentifierParameters, state: State, item: JointRecord | JointB
 
 
 def catch_up(state: State, background: Background = INLINE, group: int = 1) -> tuple[State, list[Estimate]]:
-    """Let the estimators take the rows of the log: the pipeline's table of contents.
+    """Let the estimators take the rows of the log.
 
     The payload's takes the rows up to each instant of ``publish_rate``, and the estimate due there is made. Where that
     needs a new model, the identifier takes the same rows. Last the rows left over, if they are ``group`` or more.
@@ -234,7 +231,7 @@ def _steps(config: IdentifierParameters, state: State, items: Iterable[Item], ba
         if isinstance(item, CaptureEvent):
             state = _insert(state, item, background)
         else:
-            state, found = _take(config, state, item, background, HOPELESS)
+            state, found = _take(config, state, item, background, REPLAY_GROUP)
         yield state, found
         if state.counters.accepted == 0 and state.counters.received >= HOPELESS:
             break
@@ -267,7 +264,7 @@ def current(state: State) -> Estimate | None:
     if payload.cursor == 0:
         return None
     model = identifier.estimator._replace(rpbsid=rpbsid.finish(config, identifier.estimator.rpbsid))
-    request = estimator.ModelRequest(config, model, payload.estimator, payload.last_ns, state.clock.dt, None,
+    request = estimator.ModelRequest(config, model, payload.last_ns, state.clock.dt, None,
                                      _latest(state, payload.cursor))
     estimate = request.solve()
     held = estimator.payload(config, payload.estimator)
@@ -352,7 +349,7 @@ def _without_old_rows(state: State) -> State:
 
 
 def _latest(state: State, until: int) -> Rows:
-    """Return the rows before ``until`` on which a model is judged: of the last second, since the last event."""
+    """Return the rows before ``until`` on which a model is judged: the last 1.5 s, since the last event."""
     first = max(state.log.start, until - prediction_check.length(state.clock.dt))
     first = min(state.log.row_at(_running(state)[1].estimator.since_ns, first), until)
     return state.log.rows(first, until)
@@ -410,7 +407,7 @@ def _estimate(state: State, background: Background) -> tuple[State, list[Estimat
     if last is not None and last.since_ns == since_ns and not young and instant <= last.instant:
         return state, [estimator.with_model_of(config, stamp_ns, last.estimate, payload)._replace(arm_parameters=arm)]
     state = _advance_identifier(state, now.cursor, background)
-    request = estimator.ModelRequest(config, _running(state)[2].estimator, now.estimator, stamp_ns, state.clock.dt,
+    request = estimator.ModelRequest(config, _running(state)[2].estimator, stamp_ns, state.clock.dt,
                                      payload, _latest(state, now.cursor))
     background.start(request)
     due = now.cursor - 1 + int(np.ceil(RESULT_DELAY_S / max(state.clock.dt, 1e-9)))

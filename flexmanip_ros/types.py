@@ -80,15 +80,13 @@ class Sample(NamedTuple):
     """One instant of the configured signals, in JointState units.
 
     u: (r,) inputs held from ``stamp_ns`` on [N m]; y: (m,) outputs [m, m/s, rad, ...];
-    angles: (2,) measured configuration [rad], or (0,) when none is configured;
-    gap: the sample before this one is missing, so no regressor may reach back over it.
+    angles: (2,) measured configuration [rad], or (0,) when none is configured.
     """
 
     stamp_ns: int
     u: Array
     y: Array
     angles: Array
-    gap: bool = False
 
 
 class Status(Enum):

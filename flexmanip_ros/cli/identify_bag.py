@@ -12,6 +12,7 @@ from flexmanip_ros.cli import console
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import help_text
+from flexmanip_ros.types import QUANTILE
 
 if TYPE_CHECKING:
     from flexmanip_ros.cli.replay import Result
@@ -123,7 +124,7 @@ def describe(result: Result) -> list[str]:
 
     rows = result_rows(result.summary, result.config, result.modes, result.events)
     for part in result.summary.smoothed or ():
-        told = ', '.join(f'{mode.frequency_hz:.4f} +- {1.96 * mode.frequency_std_hz:.2g} Hz' for mode in part.modes)
+        told = ', '.join(f'{mode.frequency_hz:.4f} +- {QUANTILE * mode.frequency_std_hz:.2g} Hz' for mode in part.modes)
         rows.append(('smoothed', f'{part.start_s:.3f} to {part.end_s:.3f} s, {part.method}: {told or "no mode"}'))
     return [f'{name:12s} {words}' for name, words in (*rows, *(('written', place) for place in result.written))]
 

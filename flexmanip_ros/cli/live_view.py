@@ -29,7 +29,8 @@ EPILOG = """without a recording, as a node (ROS must run):
   live_view --ros-args -p port:=8765
   subscribes to joint_states, capture_event, capture_detected and rpbsid_identifier/status; only listens.
 
-exit status: 0 when it is interrupted (Ctrl-C); 2 on bad input or arguments, with one line on stderr.
+exit status: 0 when it is interrupted (Ctrl-C), 130 before the page is there; 2 on bad input or arguments, with one
+line on stderr.
 
 parameters of the node:
 """

@@ -26,7 +26,7 @@ AHEAD_S = 0.25
 LAST_S = 1.5
 """Time over which they are judged [s], with that of the first state."""
 INSTANTS = 10
-"""From how many instants in the time ahead one prediction each is made."""
+"""Predictions start every ``horizon / INSTANTS`` samples."""
 STRETCHES = 6
 """Stretches in that time, at least, whose frequencies are compared."""
 MOST_ROWS = 4096
@@ -35,7 +35,7 @@ MISSED = 0.5
 SILENT = 10.0
 """Power of an output, in units of its white noise, below which it says nothing."""
 FOURTH = 0.6744897501960817 * math.sqrt(70.0)
-"""Median of the fourth differences of white noise, in standard deviations."""
+"""Median of the absolute fourth differences of white noise, in standard deviations."""
 
 MEDIAN_SPREAD = 2.9
 """Relative standard deviation of ``white_noise`` from N samples of white noise, times the root of N."""

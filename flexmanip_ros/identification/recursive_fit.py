@@ -114,7 +114,7 @@ def start(row: int, before: Recursion | None = None, varying_before: Varying | N
 
 
 def restart(refined: Refined) -> Refined:
-    """Begin again: the plant has changed, and yet is another of its kind."""
+    """Begin a new stretch after an event; the fit so far is where the next one starts."""
     return start(refined.end, refined.recursion or refined.before, refined.varying or refined.varying_before)
 
 
@@ -258,13 +258,13 @@ def break_window(refined: Refined) -> Refined:
 MEMORY = 1_000_000.0
 """Samples after which parameters may have drifted by their own standard deviation."""
 NOISE_BLOCKS, DRIFT_BLOCKS, TREND_BLOCKS = 16, 4, 8
-"""Blocks over which the noise is remembered, how fast the parameters move, and where they go."""
+"""Blocks over which the covariance of the innovations, the drift and the mean step of the parameters are averaged."""
 SURPRISE = 4.0
 """Standard deviations beyond which a block says that the parameters have gone elsewhere."""
 AGE = 1.25
 """Blocks from the middle of one to when its result is read, in the mean."""
 CHANCE = 2.0
-"""Standard deviations that are left to chance before anything is taken to swell or to move."""
+"""Excess, in standard deviations, below which larger residuals or a trend of the parameters are left to chance."""
 LARGEST_DRIFT = 1.4
 """Logarithm of the largest factor on a variance from one block."""
 

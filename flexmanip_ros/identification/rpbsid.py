@@ -2,7 +2,7 @@
 
 Two estimators behind one interface. ``factor`` (default) carries one triangular factor of the moments of
 [z; u; y] and solves the whole method when a model is asked for (``moments``); ``paper`` runs the three
-recursive least squares of the paper at every sample (``paper_kernel``). Memory is constant and the cost
+recursive least squares of the paper at every sample (``paper_recursion``). Memory is constant and the cost
 per sample bounded in both; decompositions happen only in ``identified``.
 """
 
@@ -36,7 +36,7 @@ class RpbsidState(NamedTuple):
     """All the identifier remembers; nothing grows.
 
     z: (p (r + m),) past window, scaled; scale: (r + m,); mean: (2, r + m) slow means and peaks;
-    variance: (m,) of the innovations, scaled; scalars, counts: see ``memory_kernel``;
+    variance: (m,) of the innovations, scaled; scalars, counts: see ``factor``;
     memory: the arrays of the estimator, in the order its kernel takes them; refined: the prediction-error
     fit, None where it is off; decimator: the anti-alias filter, None where every sample is used; decimated: the
     log of filtered samples, where it is used; cursor: row of the sample log that is taken next.

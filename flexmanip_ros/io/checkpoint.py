@@ -28,7 +28,7 @@ from flexmanip_ros import pipeline
 from flexmanip_ros.errors import CheckpointError
 from flexmanip_ros.parameters import IdentifierParameters, flatten, leaves
 
-NAME, FORMAT = b'flexmanip_ros checkpoint ', b'5\n'
+NAME, FORMAT = b'flexmanip_ros checkpoint ', b'6\n'
 """The format changes with what a state holds, and with the place of a class."""
 CHECKSUM = hashlib.sha256().digest_size
 PACKAGE = 'flexmanip_ros.'
@@ -172,7 +172,7 @@ class Saved(NamedTuple):
 class CheckpointWriter:
     """Writes the identifier's state to ``checkpoint_file`` every ``checkpoint_period``, on a thread.
 
-    A state never changes after it was made, so the thread can write it while samples go on.
+    The rows that a state shows are never written again, so the thread can write it while samples go on.
     """
 
     def __init__(self, config: IdentifierParameters) -> None:

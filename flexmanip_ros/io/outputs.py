@@ -85,7 +85,7 @@ def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
 def columns(estimates: Sequence[Estimate], start_ns: int | None = None) -> dict[str, Any]:
     """Return arrays with one row an estimate.
 
-    stamp_ns (T,), time_s (T,) from ``start_ns`` (default: the first estimate), status (T,), frequency_hz,
+    stamp_ns (T,), time_s (T,) from ``start_ns`` (default: the first estimate), status, model_status (T,), frequency_hz,
     damping_ratio and their _std (T, k), payload_mass_kg, payload_std_kg, payload_lower_kg, payload_upper_kg,
     consistency, excitation, condition, innovation_power (T,). Values that an estimate does not have are NaN.
     """

@@ -22,7 +22,7 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.whole_recording import Scores, Smoothed, Sweep
-from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointRecord, Status
+from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, JointRecord, Status
 from flexmanip_ros.view.screen import COLOURS, EVENT_COLOUR, MODES_APART, PAYLOAD_COLOUR, STATUS_LOOKS
 
 LINES: tuple[Any, ...] = ('-', (0, (4, 1.2)), (0, (1.2, 1)), (0, (6, 1.2, 1.2, 1.2)))
@@ -129,7 +129,7 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int, truth: Se
 
 def _band(ax: Any, x: Array, frequency: Array, std: Array, k: int) -> None:
     """Draw the frequency of mode k over x with its 95 % band."""
-    colour, spread = COLOURS[k % len(COLOURS)], 1.96 * std
+    colour, spread = COLOURS[k % len(COLOURS)], QUANTILE * std
     ax.fill_between(x, frequency - spread, frequency + spread, color=colour, alpha=0.2, linewidth=0)
     ax.plot(x, frequency, color=colour, linestyle=LINES[k % len(LINES)], linewidth=1.4,
             label=f'mode {k + 1}, 95 % band')
@@ -336,7 +336,7 @@ def frequency_figure(made: Run) -> Figure:
     _estimates(axes, made, with_payload=False)
     for part in made.smoothed:
         for mode in part.modes:
-            wide = 1.96 * mode.frequency_std_hz
+            wide = QUANTILE * mode.frequency_std_hz
             axes[0].fill_between([part.start_s, part.end_s], mode.frequency_hz - wide, mode.frequency_hz + wide,
                                  color=SMOOTHED_COLOUR, alpha=0.25, linewidth=0.0)
             axes[0].plot([part.start_s, part.end_s], [mode.frequency_hz] * 2, color=SMOOTHED_COLOUR, linewidth=1.0,

@@ -21,7 +21,7 @@ from flexmanip_ros.parameters.field import leaves
 from flexmanip_ros.studies.results import Score, Summary, result_rows, score, status_text
 from flexmanip_ros.studies.trial import Row
 from flexmanip_ros.studies.whole_recording import Scores, Smoothed, Sweep
-from flexmanip_ros.types import Array, Mode, StateSpace, Status
+from flexmanip_ros.types import QUANTILE, Array, Mode, StateSpace, Status
 from flexmanip_ros.view import screen
 
 STYLE = """
@@ -174,7 +174,7 @@ def _answer(config: IdentifierParameters, summary: Summary, modes: Sequence[Mode
     found = [mode for mode in modes if np.isfinite(mode.frequency_hz)]
     if found:
         shown = [f'{mode.frequency_hz:.4g}'
-                 + (f' &plusmn; {1.96 * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else '')
+                 + (f' &plusmn; {QUANTILE * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else '')
                  + f' Hz (damping ratio {mode.damping_ratio:.3g})' for mode in found]
         parts.append(f'<p>Modes (95 %): {", ".join(shown)}.</p>')
     return ''.join(parts)
@@ -193,7 +193,7 @@ def _result(config: IdentifierParameters, summary: Summary, modes: Sequence[Mode
 def _smoothed(parts: Sequence[Smoothed]) -> str:
     """Return the models of whole stretches as a table, those of the grey bands; empty without any."""
     rows = [(f'{part.start_s:.3f} to {part.end_s:.3f} s', part.method, f'{mode.frequency_hz:.4f} Hz',
-             f'{1.96 * mode.frequency_std_hz:.2g} Hz', f'{mode.damping_ratio:.4f}')
+             f'{QUANTILE * mode.frequency_std_hz:.2g} Hz', f'{mode.damping_ratio:.4f}')
             for part in parts for mode in part.modes]
     note = '<p class="note">Grey: the model of each stretch from all of its samples.</p>'
     return note + table(['stretch', 'method', 'frequency', '95 % +-', 'damping ratio'], rows) if rows else ''

@@ -26,12 +26,10 @@ from flexmanip_ros.payload.filter_state import (
 )
 from flexmanip_ros.payload.measurement_update import MeasurementModel, misfit
 from flexmanip_ros.payload.structured_model import Model
-from flexmanip_ros.types import Array, Payload, Status
+from flexmanip_ros.types import QUANTILE, Array, Payload, Status
 
-QUANTILE = 1.959963984540054
-"""Of the normal distribution, for 95 %."""
 UNKNOWN_STD = 0.3
-"""A payload is not known whose relative standard deviation is larger: it keeps that of its prior."""
+"""Relative standard deviation above which the payload counts as unknown: its own is then at least that of the prior."""
 FEW = 50
 """Samples after an event before anything is claimed."""
 POWER_LIMIT = 2.0
@@ -57,7 +55,7 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     if model is None:
         return Payload(0.0, math.inf, 0.0, math.inf, 1.0, Status.UNOBSERVABLE)
     if m is None or sensors is None:
-        begun = Status.DIVERGED if restarts else Status.WARMING_UP  # it may fall over at every sample
+        begun = Status.DIVERGED if restarts else Status.WARMING_UP  # the filter may diverge again with every sample
         return Payload(0.0, math.inf, 0.0, math.inf, 1.0, begun)
     state = model.payload
     held = bool(m.counts[mem.HELD])
@@ -89,7 +87,7 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         body, spread = point_or_body(body, spread, structured_model.body_mean(config, model),
                                      structured_model.body_std(config, model))
     mass, std = max(float(body[0]), 0.0), math.sqrt(spread[0, 0])
-    # a linearization tells too much of what moves hardly, or where the payload was not known at which it was made
+    # a linearization is too sure of a payload that is hardly excited, or was not known where it was made
     if std > UNKNOWN_STD * mass or (fitting and m.score[DOUBT] > UNKNOWN_STD):
         std = max(std, float(structured_model.body_std(config, model)[0]))
         status = Status.POORLY_EXCITED if status is Status.TRACKING else status

@@ -49,7 +49,15 @@ from flexmanip_ros.payload.filter_state import (
     WHITE,
 )
 from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, misfit, observe
-from flexmanip_ros.payload.process_model import INERTIA, confine, correction, lower_bound, predict
+from flexmanip_ros.payload.process_model import (
+    DAMPING,
+    INERTIA,
+    confine,
+    correction,
+    keep_inertia,
+    lower_bound,
+    predict,
+)
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -66,9 +74,9 @@ FIRST_ITERATION = 8
 ROWS = 8
 """Rows that are read again for each new sample."""
 GROWTH = 4
-"""A fit that has come is repeated with a quarter more samples: fewer add little to what it is linearized at."""
+"""A converged fit is repeated once the horizon has a quarter more samples: fewer hardly move it."""
 AT_REST = 0.5
-"""A fit has come whose last step moved the payload by less than this share of its deviation."""
+"""A fit has converged when its last step moved the payload by less than this share of its standard deviation."""
 CONVERGED = 0.02
 """A step that lowers the cost by less, for each sample, has converged: the horizon may grow."""
 FITS = 1.5
@@ -76,11 +84,11 @@ FITS = 1.5
 LOST = 1e4
 """A trajectory that costs more, for each measurement, says nothing of the arm."""
 TRUSTED = 2.0
-"""Standard deviations that the filter is moved by a step of the moving-horizon estimation."""
+"""Standard deviations by which a step of the moving-horizon estimation moves the filter's state at most."""
 TELLS = 50
 """Samples whose cost tells a fit from none: the cost of white noise varies by 0.1 of itself."""
 UNFIT = 2.0
-"""Times the cost of white noise: more is no fit."""
+"""A fit is rejected whose cost is more than this times what white noise costs."""
 TRIALS = 10
 """Iterations over the same samples after which a fit is not expected to come: those that come take three to nine."""
 STARTS = 2
@@ -96,12 +104,14 @@ COARSER = 0.1
 CALM_SAMPLES = 1000
 """For so many samples, several periods of the slowest vibration."""
 SLACK = 1.0
-"""By so much may the cost rise: less than the estimate can tell."""
+"""A step is accepted though it raises the cost, by so much at most: less than the estimate can tell."""
 LEVENBERG = 1.0
 """Damping with which a rejected step is taken again after a capture: as much as the arrival cost. What is held lies
 along a narrow valley that bends, and damping in proportion to the information hardly lets a step go along it."""
 MARQUARDT = 1e-3
 """The same for an empty arm, in proportion to the information: its priors are rough."""
+CHANCE = 3.0
+"""Standard deviations by which the filter may put a damping ratio below zero: more is no noise."""
 REJECTIONS = 8
 """How often a step is shortened that raises the cost."""
 
@@ -130,7 +140,7 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
     """Take one sample since the event into the iteration: N += f f' / r, g += f e / r. False: the step was too long.
 
     table: (N, 1 + L + m), the rows before the event that a late torque needs, then the first sample after it. The cost
-    is Huber's.
+    is the sum of e^2 / r.
     """
     k = m.counts[ITERATED] + sensors.reach - 1
     sample = table[k]
@@ -376,6 +386,29 @@ def control_step(motion: ProcessModel, m: FilterState, duration: float) -> None:
 
 
 @inner
+def keep_possible(motion: ProcessModel, m: FilterState, chance: float) -> None:
+    """Put an entry of p that is below its bound onto it, and move all other states with it (Simon and Chia, 2002).
+
+    The bound alone would be a ratchet: of each step across it the other states would keep their part. A damping ratio
+    may be ``chance`` standard deviations below zero: of an undamped arm half the noise puts it there, and an estimate
+    that is kept from it is biased.
+    """
+    first = m.x.size - motion.kind.size
+    for c in range(motion.kind.size):
+        row = m.S[first + c]
+        square = dot(row, row)
+        below = lower_bound(motion, c) - m.x[first + c]
+        if motion.kind[c] == DAMPING:
+            below -= chance * np.sqrt(square)
+        if below > 0.0 and square > 0.0:
+            for i in range(m.x.size):
+                m.x[i] += dot(m.S[i], row) / square * below
+        elif below > 0.0:
+            m.x[first + c] += below
+    keep_inertia(motion, m.x[first:])
+
+
+@inner
 def diffuse(sensors: MeasurementModel, m: FilterState, duration: float) -> None:
     """Add the process noise of a while, so that the memory stays finite."""
     m.score[NOW] += duration
@@ -408,7 +441,7 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     came = y[0] == y[0]
     if came:
         measure(sensors, m, y, motion.k[0])
-        confine(motion, m.x[m.x.size - motion.kind.size:])
+        keep_possible(motion, m, CHANCE)
         if not abs(m.x[2 * sensors.H.shape[1]]) < 1e9:
             return False
         m.counts[SINCE_EVENT] += 1

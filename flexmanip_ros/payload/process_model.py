@@ -203,9 +203,15 @@ def lower_bound(motion: ProcessModel, c: int) -> float:
 
 @inner
 def confine(motion: ProcessModel, p: Array) -> None:
-    """Move p (np,) to what can be, see ``lower_bound``; inertia follows from mass and first moments."""
+    """Move p (np,) to what can be, see ``lower_bound``; the inertia last."""
     for c in range(p.size):
         p[c] = max(p[c], lower_bound(motion, c))
+    keep_inertia(motion, p)
+
+
+@inner
+def keep_inertia(motion: ProcessModel, p: Array) -> None:
+    """Move the inertia in p (np,) to the least that mass and first moments leave."""
     if p.size > INERTIA and motion.kind[INERTIA] == INERTIA:
         moment = p[FIRST_X] * p[FIRST_X] + p[FIRST_Y] * p[FIRST_Y]
         p[INERTIA] = max(p[INERTIA], motion.least[1] + moment / (p[MASS] - motion.least[0]))

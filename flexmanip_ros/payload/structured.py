@@ -17,7 +17,7 @@ from flexmanip_ros.payload import structured_model
 from flexmanip_ros.payload.capture_detection_kernel import filtered
 from flexmanip_ros.payload.interval import inertia_error, judge
 from flexmanip_ros.payload.measurement_update import MeasurementModel
-from flexmanip_ros.payload.moving_horizon import STARTS
+from flexmanip_ros.payload.moving_horizon import STARTS, keep_possible
 from flexmanip_ros.payload.process_model import Kind, predict
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.samples.sample_log import Rows
@@ -179,7 +179,7 @@ def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterSta
 
 def _set_arrival_cost(model: Model, m: mem.FilterState) -> None:
     """An event: the present state is the arrival cost, and what was gathered of its consistency is void."""
-    _begin_horizon(m)
+    _begin_horizon(model, m)
     for counter in (mem.SINCE_EVENT, mem.BATCHES):
         m.counts[counter] = 0
     m.counts[mem.BLOCKS] = min(m.counts[mem.BLOCKS], 40)
@@ -217,8 +217,9 @@ def _open_body(config: IdentifierParameters, model: Model, m: mem.FilterState) -
     _refit(m)
 
 
-def _begin_horizon(m: mem.FilterState) -> None:
+def _begin_horizon(model: Model, m: mem.FilterState) -> None:
     """Begin a new moving horizon here: the present state is its arrival cost."""
+    keep_possible(model.motion, m, 0.0)  # over a whole horizon a damping ratio below zero explodes
     m.x0[:], m.S0[:] = m.x, m.S
     m.counts[mem.STORED] = 0
     _refit(m)
@@ -311,7 +312,7 @@ def _bridge(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
         columns = np.hstack([columns, opened])
     m.S[:] = structured_model.widen(m.S, columns)
     if young:  # the horizon has no process noise
-        _begin_horizon(m)
+        _begin_horizon(state.model, m)
     return state._replace(memory=m, missing=0, horizon=Horizon(state.cursor, state.last_ns, state.efforts))
 
 
@@ -407,8 +408,9 @@ def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
 def _restart(config: IdentifierParameters, state: StructuredState, m: mem.FilterState, last: Rows) -> StructuredState:
     """Begin again after the last row, at which numbers left the finite range or a fit failed, with memory m.
 
-    The first fit is that of the simplest arm and of a point; the next ones learn all that they may, and a body. What is
-    held begins with its prior, and the arm with what was learned before the event, or as given if that fails at once.
+    The first fit estimates few parameters of the arm and a point mass; later ones all of ``payload.learn``, and a rigid
+    body. The object begins with its prior; the arm with what was learned before the event, or as given if that fails at
+    once.
     """
     assert state.model is not None
     assert state.memory is not None

@@ -43,7 +43,7 @@ from flexmanip_ros.ros import rclpy_workarounds
 from flexmanip_ros.ros.composition import Composition, foreign_arm
 from flexmanip_ros.ros.node import BAD_INPUT, reject
 from flexmanip_ros.studies.results import status_text
-from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, Payload, Status
+from flexmanip_ros.types import QUANTILE, CaptureEvent, Estimate, JointRecord, Payload, Status
 
 START_TIMEOUT_S = 20.0
 END_TIMEOUT_S = 15.0
@@ -400,7 +400,7 @@ def _table(config: DemoParameters, estimates: Sequence[Estimate], items: Sequenc
     after = [e for e in estimates if e.modes and capture_ns is not None and e.stamp_ns >= capture_ns]
     for words, found, known in (('before', before, truth.before), ('after', after, truth.after)):
         for k, mode in enumerate(found[-1].modes[:len(known)] if found else ()):
-            band = 1.96 * mode.frequency_std_hz
+            band = QUANTILE * mode.frequency_std_hz
             low, high = mode.frequency_hz - band, mode.frequency_hz + band
             table.add_row(f'frequency {k + 1} {words} [Hz]', f'{mode.frequency_hz:.3f}',
                           f'{low:.3f} .. {high:.3f}' if np.isfinite(band) else '-', f'{known[k]:.3f}')

@@ -124,7 +124,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         return self._transition(self._deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forget the state; the next configure builds a new one."""
+        """Keep all as it is; the next configure builds a new state."""
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:

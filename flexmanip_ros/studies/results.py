@@ -22,7 +22,7 @@ from flexmanip_ros.payload import cramer_rao
 from flexmanip_ros.payload.structured_model import chords, unobservable_reason
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.whole_recording import Smoothed
-from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, Mode, Payload, Status
+from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, Mode, Payload, Status
 
 ADVICE: Mapping[Status, str] = {
     Status.WARMING_UP: 'record for longer, while the arm moves',
@@ -116,7 +116,7 @@ def result_rows(summary: Summary, config: IdentifierParameters, modes: Sequence[
     if summary.model_status not in (summary.status, Status.TRACKING.name):
         found.append(('model', f'{summary.model_status}: {status_text(Status[summary.model_status])}'))
     for k, mode in enumerate(modes):
-        spread = f' +- {1.96 * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else ''
+        spread = f' +- {QUANTILE * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else ''
         found.append((f'mode {k + 1}',
                       f'{mode.frequency_hz:.4f}{spread} Hz, damping ratio {mode.damping_ratio:.4f}'))
     if summary.payload_ci95_kg is not None:

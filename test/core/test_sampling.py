@@ -1,11 +1,24 @@
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
 from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.samples import sampling
-from flexmanip_ros.types import JointRecord, Sample
+from flexmanip_ros.types import JointRecord
+
+
+class Seen(NamedTuple):
+    """A sample that was measured, and whether a gap is before it."""
+
+    stamp_ns: int
+    u: np.ndarray
+    y: np.ndarray
+    angles: np.ndarray
+    gap: bool
+
 
 NAMES = ('joint1', 'joint2', 'link1_bend', 'link2_bend')
 DT = 1_000_000
@@ -20,7 +33,7 @@ def record(k: float, names: tuple[str, ...] = NAMES, **arrays: object) -> JointR
 
 
 def drive(records: list[JointRecord], config: IdentifierParameters | None = None
-          ) -> tuple[sampling.Clock, list[Sample], int]:
+          ) -> tuple[sampling.Clock, list[Seen], int]:
     config = config or IdentifierParameters()
     clock, log, resets = sampling.Clock(), sampling.EMPTY, 0
     for item in records:
@@ -28,7 +41,7 @@ def drive(records: list[JointRecord], config: IdentifierParameters | None = None
         resets += reset
     clock, log, reset = sampling.flush(config, clock, log)
     rows = log.rows(0, log.end)
-    samples = [Sample(int(rows.stamp_ns[k]), rows.u[k], rows.y[k], rows.angles[k], bool(rows.gap[k]))
+    samples = [Seen(int(rows.stamp_ns[k]), rows.u[k], rows.y[k], rows.angles[k], bool(rows.gap[k]))
                for k in np.flatnonzero(rows.missing == 0)]
     return clock, samples, resets + reset
 

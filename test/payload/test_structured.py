@@ -288,3 +288,13 @@ def test_no_samples_are_a_table_without_rows() -> None:
     assert model is not None
     rows = log_of(np.zeros((0, 2)), np.zeros((0, 4)), np.zeros((0, 2))).rows(0, 0)
     assert structured.measurements(model, rows).shape == (0, len(model.roles))
+
+
+def test_an_undamped_arm_is_known_without_bias():
+    """Its damping ratio is at its bound: an estimate that may not fall below zero errs, and the mass with it."""
+    capture, deviations = event(2.0), []
+    for seed in range(4):
+        found = structured.estimate(config(), run(config(), record(6.5, (capture,), seed=seed), (capture,)))
+        assert found.status is Status.TRACKING
+        deviations.append((found.mass - 20.0) / found.std)
+    assert abs(np.mean(deviations)) < 3.0 / np.sqrt(len(deviations))
