@@ -195,6 +195,16 @@ def eliminate_translation(M: Array, E: Array, work: Workspace) -> None:
 
 
 @inner
+def bending(curvature: Array, slopes: Array, bent: Array) -> tuple[float, float]:
+    """Return curvature w'' and slope w' of a link where its shapes have phi'' and phi' (k,); bent: eta (k,)."""
+    bend, slope = 0.0, 0.0
+    for j in range(bent.size):
+        bend += curvature[j] * bent[j]
+        slope += slopes[j] * bent[j]
+    return bend, slope
+
+
+@inner
 def elastic(arm: Manipulator, q: Array, work: Workspace) -> None:
     """Fill work.elastic (n,) with dV/dq.
 
@@ -213,10 +223,7 @@ def elastic(arm: Manipulator, q: Array, work: Workspace) -> None:
             weight = EI * arm.along[i, p]
             if weight == 0.0:
                 continue
-            bend, slope = 0.0, 0.0
-            for j in range(k):
-                bend += curvature[p, j] * bent[j]
-                slope += slopes[p, j] * bent[j]
+            bend, slope = bending(curvature[p], slopes[p], bent)
             for j in range(k):
                 K, s = weight * curvature[p, j], weight * slopes[p, j]
                 force[j] += bend * slope * (slope * K + bend * s)

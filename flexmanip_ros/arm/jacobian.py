@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from flexmanip_ros.arm.equations_of_motion import bending
 from flexmanip_ros.numerics.compiled import inner
 
 if TYPE_CHECKING:
@@ -379,10 +380,7 @@ def elastic_jacobian(arm: Manipulator, q: Array, dq: Array, work: Workspace) -> 
             weight = EI * arm.along[i, p]
             if weight == 0.0:
                 continue
-            bend, slope = 0.0, 0.0
-            for j in range(k):
-                bend += curvature[p, j] * bent[j]
-                slope += slopes[p, j] * bent[j]
+            bend, slope = bending(curvature[p], slopes[p], bent)
             for j in range(k):
                 K, s = weight * curvature[p, j], weight * slopes[p, j]
                 first = slope * slope * K + 2.0 * bend * slope * s
