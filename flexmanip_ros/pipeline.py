@@ -376,7 +376,7 @@ def _due_rows(state: State) -> list[int]:
     cursor = payload.cursor
     rows = state.log.rows(cursor, state.log.end)
     if not len(rows) or _instant(state, int(rows.stamp_ns[-1]), config.publish_rate) <= state.published:
-        return []  # so it is after most messages that come one by one
+        return []  # no instant was passed, as after most messages that come one by one
     measured = np.flatnonzero(rows.missing == 0)
     stamps = rows.stamp_ns[measured]
     instants = ((stamps - state.first_ns) * config.publish_rate * 1e-9 + ROUNDING).astype(np.int64)

@@ -36,7 +36,7 @@ def assemble_link(
     re, rn = c * a[0] + s * a[1], c * a[1] - s * a[0]
     Je, Jn, Se, Sn, own = work.own[0], work.own[1], work.own[2], work.own[3], work.own[4]
     block = work.block
-    bent, bending, G, phi, shortened = q[o:o + k], qd[o:o + k], arm.G[i], arm.phi[i], arm.tip_shortening[i]
+    eta, etad, G, phi, shortened = q[o:o + k], qd[o:o + k], arm.G[i], arm.phi[i], arm.tip_shortening[i]
     for r in range(k + 1):
         Se[r], Sn[r], own[r] = 0.0, 0.0, 0.0
         for t in range(k + 1):
@@ -48,13 +48,13 @@ def assemble_link(
         for j in range(k):
             g, h = 0.0, 0.0
             for t in range(k):
-                g += G[p, j, t] * bent[t]
-                h += G[p, j, t] * bending[t]
-            x -= 0.5 * g * bent[j]
-            xd -= g * bending[j]
-            xdd -= h * bending[j]
-            y += phi[p, j] * bent[j]
-            yd += phi[p, j] * bending[j]
+                g += G[p, j, t] * eta[t]
+                h += G[p, j, t] * etad[t]
+            x -= 0.5 * g * eta[j]
+            xd -= g * etad[j]
+            xdd -= h * etad[j]
+            y += phi[p, j] * eta[j]
+            yd += phi[p, j] * etad[j]
             Je[1 + j] = -g
             Jn[1 + j] = phi[p, j]
         Je[0] = -y
@@ -101,11 +101,11 @@ def assemble_link(
     for j in range(k):
         g, h = 0.0, 0.0
         for t in range(k):
-            g += shortened[j, t] * bent[t]
-            h += shortened[j, t] * bending[t]
-        x -= 0.5 * g * bent[j]
-        xd -= g * bending[j]
-        xdd -= h * bending[j]
+            g += shortened[j, t] * eta[t]
+            h += shortened[j, t] * etad[t]
+        x -= 0.5 * g * eta[j]
+        xd -= g * etad[j]
+        xdd -= h * etad[j]
         tip[0, o + j] -= c * g
         tip[1, o + j] -= s * g
     tip[0, i] -= s * x
@@ -195,12 +195,12 @@ def eliminate_translation(M: Array, E: Array, work: Workspace) -> None:
 
 
 @inner
-def bending(curvature: Array, slopes: Array, bent: Array) -> tuple[float, float]:
-    """Return curvature w'' and slope w' of a link where its shapes have phi'' and phi' (k,); bent: eta (k,)."""
+def curvature_and_slope(curvature: Array, slopes: Array, eta: Array) -> tuple[float, float]:
+    """Return curvature w'' and slope w' of a link where its shapes have phi'' and phi' (k,); eta: (k,)."""
     bend, slope = 0.0, 0.0
-    for j in range(bent.size):
-        bend += curvature[j] * bent[j]
-        slope += slopes[j] * bent[j]
+    for j in range(eta.size):
+        bend += curvature[j] * eta[j]
+        slope += slopes[j] * eta[j]
     return bend, slope
 
 
@@ -218,12 +218,12 @@ def elastic(arm: Manipulator, q: Array, work: Workspace) -> None:
     for i in range(links):
         o = links + i * k
         EI = arm.stiffness[o] / arm.unit_stiffness[o]
-        bent, force, curvature, slopes = q[o:o + k], work.elastic[o:o + k], arm.curvature[i], arm.slope[i]
+        eta, force, curvature, slopes = q[o:o + k], work.elastic[o:o + k], arm.curvature[i], arm.slope[i]
         for p in range(arm.along.shape[1]):
             weight = EI * arm.along[i, p]
             if weight == 0.0:
                 continue
-            bend, slope = bending(curvature[p], slopes[p], bent)
+            bend, slope = curvature_and_slope(curvature[p], slopes[p], eta)
             for j in range(k):
                 K, s = weight * curvature[p, j], weight * slopes[p, j]
                 force[j] += bend * slope * (slope * K + bend * s)

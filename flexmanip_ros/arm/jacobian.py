@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.arm.equations_of_motion import bending
+from flexmanip_ros.arm.equations_of_motion import curvature_and_slope
 from flexmanip_ros.numerics.compiled import inner
 
 if TYPE_CHECKING:
@@ -31,16 +31,16 @@ def move_station(arm: Manipulator, i: int, q: Array, qd: Array, qdd: Array, work
             Aq[side, r] = work.Aq[i, side, r]
             Av[side, r] = work.Av[i, side, r]
     x, xd, xdd = arm.length[i], 0.0, 0.0
-    bent, bending, bent_faster = q[o:o + k], qd[o:o + k], qdd[o:o + k]
+    eta, etad, etadd = q[o:o + k], qd[o:o + k], qdd[o:o + k]
     for j in range(k):
         g, h, gdd = 0.0, 0.0, 0.0
         for t in range(k):
-            g += arm.tip_shortening[i, j, t] * bent[t]
-            h += arm.tip_shortening[i, j, t] * bending[t]
-            gdd += arm.tip_shortening[i, j, t] * bent_faster[t]
-        x -= 0.5 * g * bent[j]
-        xd -= g * bending[j]
-        xdd -= h * bending[j] + g * bent_faster[j]
+            g += arm.tip_shortening[i, j, t] * eta[t]
+            h += arm.tip_shortening[i, j, t] * etad[t]
+            gdd += arm.tip_shortening[i, j, t] * etadd[t]
+        x -= 0.5 * g * eta[j]
+        xd -= g * etad[j]
+        xdd -= h * etad[j] + g * etadd[j]
         e, f = -gdd + g * w * w, -2.0 * h * w - g * wd
         Aq[0, o + j] += c * e - s * f
         Aq[1, o + j] += s * e + c * f
@@ -168,7 +168,7 @@ def link_jacobian(
     g, Se, Sn = work.own[0], work.own[2], work.own[3]
     eq, nq, ev, nv = work.own[4], work.own[5], work.own[6], work.own[7]
     feq, fnq, fev, fnv = work.own[8], work.own[9], work.own[10], work.own[11]
-    bent, bending, bent_faster = q[o:o + k], qd[o:o + k], qdd[o:o + k]
+    eta, etad, etadd = q[o:o + k], qd[o:o + k], qdd[o:o + k]
     shortening, phi, turned, turning = arm.G[i], arm.phi[i], left[i, o:o + k], right[i, o:o + k]
     for r in range(k + 1):
         Se[r], Sn[r] = 0.0, 0.0
@@ -180,16 +180,16 @@ def link_jacobian(
         for j in range(k):
             G, h, gdd = 0.0, 0.0, 0.0
             for t in range(k):
-                G += shortening[p, j, t] * bent[t]
-                h += shortening[p, j, t] * bending[t]
-                gdd += shortening[p, j, t] * bent_faster[t]
+                G += shortening[p, j, t] * eta[t]
+                h += shortening[p, j, t] * etad[t]
+                gdd += shortening[p, j, t] * etadd[t]
             shape = phi[p, j]
-            x -= 0.5 * G * bent[j]
-            xd -= G * bending[j]
-            xdd -= h * bending[j] + G * bent_faster[j]
-            y += shape * bent[j]
-            yd += shape * bending[j]
-            ydd += shape * bent_faster[j]
+            x -= 0.5 * G * eta[j]
+            xd -= G * etad[j]
+            xdd -= h * etad[j] + G * etadd[j]
+            y += shape * eta[j]
+            yd += shape * etad[j]
+            ydd += shape * etadd[j]
             g[1 + j] = G
             eq[1 + j] = m * (-gdd - shape * wd + G * w * w)
             nq[1 + j] = m * (-2.0 * h * w - G * wd - shape * w * w)
@@ -372,7 +372,7 @@ def elastic_jacobian(arm: Manipulator, q: Array, dq: Array, work: Workspace) -> 
     for i in range(links):
         o = links + i * k
         EI = arm.stiffness[o] / arm.unit_stiffness[o]
-        bent, tangent, curvature, slopes = q[o:o + k], work.tangent, arm.curvature[i], arm.slope[i]
+        eta, tangent, curvature, slopes = q[o:o + k], work.tangent, arm.curvature[i], arm.slope[i]
         for j in range(k):
             for t in range(k):
                 tangent[j, t] = 0.0
@@ -380,7 +380,7 @@ def elastic_jacobian(arm: Manipulator, q: Array, dq: Array, work: Workspace) -> 
             weight = EI * arm.along[i, p]
             if weight == 0.0:
                 continue
-            bend, slope = bending(curvature[p], slopes[p], bent)
+            bend, slope = curvature_and_slope(curvature[p], slopes[p], eta)
             for j in range(k):
                 K, s = weight * curvature[p, j], weight * slopes[p, j]
                 first = slope * slope * K + 2.0 * bend * slope * s

@@ -3,8 +3,7 @@
 Of a damaged recording every complete message before the fault comes out: the reading libraries reject an mcap file
 whose end is missing, or lose the whole chunk that the fault is in (several seconds at 1 kHz). An mcap file is a
 sequence of records (opcode, length, content; https://mcap.dev/spec); chunks hold such a sequence, compressed. A fault
-inside a compressed chunk costs that chunk. Of a .db3
-file sqlite itself returns the rows before the first missing page.
+inside a compressed chunk costs that chunk. Of a .db3 file sqlite itself returns the rows before the first missing page.
 """
 
 from __future__ import annotations

@@ -25,14 +25,13 @@ NODES: Mapping[str, type] = {
 }
 """Each node and the class that declares its parameters."""
 
+WIDTH = 100
+"""Characters in a line of a comment or of --help."""
+
 
 def package_names() -> frozenset[str]:
     """Return the names of all nodes' parameters: a section for every node (``/**``) may serve several."""
     return frozenset(leaf.name for cls in NODES.values() for leaf in leaves(cls))
-
-
-WIDTH = 100
-"""Characters in a line of a comment or of --help."""
 
 
 def number(value: float) -> str:

@@ -395,9 +395,11 @@ def keep_possible(motion: ProcessModel, m: FilterState, chance: float) -> None:
     """
     first = m.x.size - motion.kind.size
     for c in range(motion.kind.size):
+        below = lower_bound(motion, c) - m.x[first + c]
+        if below <= 0.0:
+            continue
         row = m.S[first + c]
         square = dot(row, row)
-        below = lower_bound(motion, c) - m.x[first + c]
         if motion.kind[c] == DAMPING:
             below -= chance * np.sqrt(square)
         if below > 0.0 and square > 0.0:

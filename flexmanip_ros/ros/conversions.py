@@ -76,7 +76,7 @@ class JointStateWriter:
 
 
 class NumbersWriter:
-    """Float64MultiArray without labels to bytes, likewise: all but the numbers at its end stays."""
+    """Float64MultiArray without labels to bytes: the numbers at its end are new, all before them stays."""
 
     def __init__(self) -> None:
         self._head = b''

@@ -14,6 +14,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.io.parameter_file import STANDARD
 from flexmanip_ros.parameters import Leaf, check, configure, flatten, leaves
 from flexmanip_ros.parameters.document import limits, package_names
 from flexmanip_ros.parameters.field import LINKS
@@ -24,7 +25,6 @@ Config = TypeVar('Config')
 _TYPES = {bool: 'BOOL', int: 'INTEGER', float: 'DOUBLE', str: 'STRING'}
 _EXAMPLE = {bool: 'true or false', int: 'a whole number such as 100',
             float: 'a number with a decimal point such as 100.0', str: 'a text'}
-_ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.', 'autostart')
 _LARGEST = sys.float_info.max
 _LARGEST_INT = 2**63 - 1
 
@@ -122,7 +122,7 @@ def _given_type(node: Node, leaf: Leaf) -> str:
 def _reject_unknown(node: Node, known: dict[str, Leaf]) -> None:
     """Raise ParameterError for an override that no node of this package declares, such as a misspelt name."""
     for name in parameter_overrides(node):
-        if name in known or name.startswith(_ROS_OWN) or name in package_names():
+        if name in known or STANDARD.match(name) or name in package_names():
             continue
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f'see ros2 param list /{node.get_name()} or --help'

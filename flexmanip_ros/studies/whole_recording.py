@@ -84,7 +84,7 @@ def score(model: StateSpace | None, signals: Signals, start_s: float, *, factor:
     r = signals.u.shape[1]
     U, Y = kept[:, :r], kept[:, r:]
     u, y = U[split:], Y[split:]
-    told = signals.missing[before:after][rows] <= _tolerated(factor)  # what was interpolated is not scored
+    seen = signals.missing[before:after][rows] <= factor // 2  # what was interpolated is not scored
     steps = max(1, round(horizon_s / model.dt)) + lag
     x0 = validation.state_at_end(model, U[:split], Y[:split])
     with np.errstate(all='ignore'):  # an unstable model overflows and scores 0
@@ -92,11 +92,12 @@ def score(model: StateSpace | None, signals: Signals, start_s: float, *, factor:
         filtered = validation.state_at_end(_predictor(model), kept[:split], Y[:split])
         predicted = validation.predict(model, u, y, filtered)
         ahead = validation.predict_ahead(model, u, y, steps, filtered)
-    target, later, told = measured[rows[split + steps - 1:]], told[split + steps - 1:], told[split:]
+    target, later = measured[rows[split + steps - 1:]], seen[split + steps - 1:]
     horizon = validation.vaf(target[later], ahead[later]) if np.count_nonzero(later) > 1 else np.full(
         y.shape[1], np.nan)
+    seen = seen[split:]
     return Scores(
-        validation.vaf(y[told], simulated[told]), validation.vaf(y[told], predicted[told]), horizon,
+        validation.vaf(y[seen], simulated[seen]), validation.vaf(y[seen], predicted[seen]), horizon,
         time[before:after][rows[split:]], y, simulated, predicted, after < time.size)
 
 
@@ -182,16 +183,11 @@ def _longest(config: IdentifierParameters, u: Array, y: Array, gap: NDArray[np.b
     borders = [0, *(k for k in np.flatnonzero(gap).tolist() if k), len(u)]
     a, b = max(pairwise(borders), key=lambda part: part[1] - part[0])
     samples, rows = decimation.whole(np.hstack([u[a:b], y[a:b]]), config.decimation)
-    absent = missing[a:b][rows] > _tolerated(config.decimation)
+    absent = missing[a:b][rows] > config.decimation // 2  # as the identifier counts them
     if absent.any():
         samples = samples.copy()
         samples[absent, u.shape[1]:] = np.nan
     return samples
-
-
-def _tolerated(factor: int) -> int:
-    """Return how many interpolated samples a filtered one may follow and still count as measured."""
-    return factor // 2 if factor > 1 else 0
 
 
 def _fit(config: IdentifierParameters, state: rpbsid.RpbsidState, samples: Array, noise: str, count: int, dt: float

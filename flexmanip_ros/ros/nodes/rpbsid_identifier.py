@@ -187,7 +187,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def _on_joint_states(self, raw: bytes, info: object) -> None:
         """Convert, take one step, publish."""
-        self.losses.note(sequence_number(info))  # of what comes while the node is not active nothing is lost
+        self.losses.note(sequence_number(info))  # also while the node is not active: what it ignores is not lost
         if not self.active:
             return
         with self.meter:
