@@ -11,6 +11,7 @@ import numpy as np
 from flexmanip_ros.identification import prediction_check, rpbsid
 from flexmanip_ros.identification.factor import FILLED, REJECTED
 from flexmanip_ros.identification.uncertainty import Identified, modes
+from flexmanip_ros.identification.varying_model import Configurations
 from flexmanip_ros.numerics.background import Background
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, frequency, structured
@@ -118,6 +119,8 @@ class ModelRequest:
         """Return the estimate with model and modes."""
         config, identifier, payload = self.config, self.identifier, self.payload
         found, without = _identified(config, identifier.rpbsid, self.dt)
+        if found is not None and isinstance(found.configurations, Configurations):
+            found = found.configurations.now(self.rows)
         if found is not None and config.decimation == 1:
             found = prediction_check.judged(found, self.rows, config.outputs)
         if config.payload_method == 'block' and found is not None:

@@ -12,12 +12,15 @@ above the modes; blocks of ``BLOCK`` of them update parameters and state togethe
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
+from flexmanip_ros.identification.batch_fit import BLOCK
 from flexmanip_ros.identification.moments import triangle
 from flexmanip_ros.identification.prediction_error import condition
 from flexmanip_ros.identification.varying_kernel import basis, low_pass, simulate_block
@@ -28,10 +31,13 @@ from flexmanip_ros.types import Array
 
 FUNCTIONS = 3
 """Functions of the configuration, see ``varying_kernel.basis``."""
-LONGEST_STEP = 3.0
-"""Largest step of an iteration in units of the prior deviations."""
+MOST_TRIALS, SHORTER = 3, 0.3
+"""Trials for each iteration of a fit at most, and factor on a step that would raise its cost."""
 VARIES, KNOWN = 0.12, 1.0
 """Prior deviations, as shares of the largest entry: of the parts of G and H that vary with c, and of the rest."""
+UNEVEN = 0.03
+"""The same of the parts of G that change as no arm of two links does. Where link 2 points the other way, c and the
+bends of link 2 change sign: G of a link alone is even in c, what couples the links is odd."""
 DIRECT, DAMPED, TURNING, OFFSET, SHARED = 0.05, 0.05, 2.0, 0.3, 1.0
 """Prior deviations of E and F, D, its terms with rates, b and zeta; signals at unit power, time in 1 / shift."""
 WALK = 0.001
@@ -46,6 +52,11 @@ STRIKES = 3
 """Such blocks in a row that end the fit."""
 UNKNOWN = 3.0
 """Standard deviation of a state of which nothing is known, in signals of unit power."""
+SETTLE = 2.0
+"""Periods of the corner frequency after which a filter that began anew is trusted."""
+ITERATIONS = 4
+"""Gauss-Newton iterations of a block at most, while the fit is younger than ``SHARE_BLOCKS``: it moves the parameters
+far. Later ones need one: more made nothing better in three minutes of a wandering arm."""
 AT_REST = np.array([1.0, 0.0, 0.0])
 """Factors on the parts of D when the links stand still."""
 QUALITIES = (1.0 / 0.5411961, 1.0 / 1.3065630)
@@ -65,9 +76,10 @@ class Varying(NamedTuple):
     shift: unit of time [1/s]; scale_u (r,), scale_y (h,): factors on signals; theta: (k,) see ``parts``; x: (2h,);
     root: (k + 2h, k + 2h) S with S S' their covariance; noise: (h, h); averaged over the last blocks, share: (h,) of
     the outputs' amplitude that the prediction of a block misses, and swing: ``Block.swing``; corner [Hz], every: the
-    filter and the samples that it keeps one of; filtered: (4, r + h + 2) its state; dt: sample time [s]; angle, rate:
-    relative angle of the links at the end [rad, rad/s]; blocks: number taken; strikes: bad ones in a row; lost: samples
-    were missing, so filter and state begin anew; gain: (n, m) published K.
+    filter and the samples that it keeps one of; filtered: (4, r + h + 2) its state; dt: sample time [s]; angle:
+    relative angle of the links at the end [rad]; blocks: number taken; strikes: bad ones in a row; lost: samples were
+    missing, so filter and state begin anew; settling: kept samples until the filter that began anew is trusted; gain:
+    (n, m) published K.
     """
 
     shift: float
@@ -84,10 +96,10 @@ class Varying(NamedTuple):
     filtered: Array
     dt: float
     angle: float
-    rate: float
     blocks: int
     strikes: int
     lost: bool
+    settling: int
     gain: Array
 
 
@@ -108,7 +120,6 @@ class Block(NamedTuple):
     by_s: float
     rates: Array
     angle: float
-    rate: float
     swing: float
 
 
@@ -159,12 +170,18 @@ def part(theta: Array, name: str, h: int, r: int) -> Array:
     return theta[where].reshape(shape)
 
 
+def shares(h: int) -> Array:
+    """(FUNCTIONS, h, h) prior deviations of G as shares of its largest entry."""
+    own = np.eye(h, dtype=np.bool_)
+    return np.array([np.where(own, KNOWN, UNEVEN), np.where(own, UNEVEN, VARIES), np.where(own, VARIES, UNEVEN)])
+
+
 def prior(G: Array, H: Array) -> Array:
     """(k,) prior standard deviations around matrices G (h, h), H (h, r) of one configuration."""
     h, r = H.shape
     share = np.array([KNOWN, VARIES, VARIES])
     return np.concatenate([
-        np.repeat(share * np.abs(G).max(), h * h), np.repeat(share * np.abs(H).max(), h * r),
+        np.abs(G).max() * shares(h).ravel(), np.repeat(share * np.abs(H).max(), h * r),
         np.repeat(DIRECT * np.array([1.0, 0.3, 0.3]), h * r), np.full(h * r, DIRECT),
         np.full(h * h, DAMPED), np.full(2 * h * h, TURNING), np.full(h, OFFSET), np.full(1, SHARED)])
 
@@ -242,15 +259,21 @@ def passed(v: Varying, signals: Array, anew: bool) -> tuple[Array, Array, Array]
     return out, second, state
 
 
-def block_of(v: Varying, out: Array, second: Array) -> Block:
-    """Scale filtered signals (N, w) and find the configuration in them.
+def straight(s: Array, Y: Array, angles: Array) -> Array:
+    """(2 + h, a) begin and slope of straight lines in s (N,) through angles (N, a), and what goes with Y (N, h).
 
-    The angles are straight lines and what goes with the displacements: encoders see the slopes of bent links.
+    Encoders see the slopes of bent links: the lines are the angles that straight links would have.
     """
+    found = np.linalg.lstsq(np.column_stack([np.ones(len(s)), s, Y]), angles, rcond=None)[0]
+    return np.asarray(found)
+
+
+def block_of(v: Varying, out: Array, second: Array) -> Block:
+    """Scale filtered signals (N, w) and find the configuration in them, see ``straight``."""
     r, h, n = len(v.scale_u), len(v.scale_y), len(out)
     U, Y = out[:, :r] * v.scale_u, out[:, r:r + h] * v.scale_y
     s = np.asarray((np.arange(n) - 0.5 * (n - 1)) / (0.5 * n), dtype=np.float64)
-    lines = np.linalg.lstsq(np.column_stack([np.ones(n), s, Y - Y.mean(axis=0)]), out[:, r + h:], rcond=None)[0]
+    lines = straight(s, Y, out[:, r + h:])
     half, turns = 0.5 * n * v.every * v.dt, Y @ lines[2:]
     middle, relative, first = float(lines[0, 0]), float(lines[1, 0]) / half, float(lines[1, 1]) / half
     bent = math.sin(middle) / v.shift
@@ -261,11 +284,24 @@ def block_of(v: Varying, out: Array, second: Array) -> Block:
     return Block(
         np.ascontiguousarray(U), slope, V, np.ascontiguousarray(Y), s, v.every * v.dt * v.shift, math.cos(middle),
         -math.sin(middle) * relative * half, np.array([1.0, bent * first, bent * (first + relative)]),
-        middle + relative * half, relative, 2.0 * float(np.var(turns[:, 1]) + np.var(turns.sum(axis=1))))
+        middle + relative * half, 2.0 * float(np.var(turns[:, 1]) + np.var(turns.sum(axis=1))))
 
 
-def _run(v: Varying, block: Block, theta: Array, x: Array, noise: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Information (l, l), gradient (l,), residual moments, derivative of the state at the end, and that state."""
+class Run(NamedTuple):
+    """Simulated samples of a block, by the local parameters and the first state, l of them; see ``simulate_block``.
+
+    N: (l, l) information, g: (l,) gradient, moments: (h, h) sum of the residuals' products, X: (2h, l) derivative of
+    the state at the end, and that state: (2h,).
+    """
+
+    N: Array
+    g: Array
+    moments: Array
+    X: Array
+    end: Array
+
+
+def _run(v: Varying, block: Block, theta: Array, x: Array, noise: Array) -> Run:
     h, r = len(v.scale_y), len(v.scale_u)
     width = 3 * h * h + 2 * h * r + h * (2 * r + 1) + 2 * h
     N, g, moments, X = np.zeros((width, width)), np.zeros(width), np.zeros((h, h)), np.zeros((2 * h, width))
@@ -275,7 +311,13 @@ def _run(v: Varying, block: Block, theta: Array, x: Array, noise: Array) -> tupl
     G, G1, H, H1, D, E = local(theta, h, r, block.c, block.by_s, block.rates)
     simulate_block(block.U, block.slope, block.V, block.Y, block.s, block.dt, G, G1, H, H1, D, E, end, whiten, N, g,
                    moments, X)
-    return N, g, moments / len(block.U), X, end
+    return Run(N, g, moments, X, end)
+
+
+def _first_state(v: Varying, block: Block, noise: Array) -> Array:
+    """(2h,) first state of a block that fits it best, parameters as they are: the output is linear in it."""
+    run, n = _run(v, block, v.theta, np.zeros_like(v.x), noise), len(v.x)
+    return np.asarray(np.linalg.solve(run.N[-n:, -n:] + np.eye(n) / UNKNOWN ** 2, run.g[-n:]))
 
 
 def noise_of(signals: Array, v: Varying) -> Array:
@@ -287,76 +329,155 @@ def noise_of(signals: Array, v: Varying) -> Array:
     return np.diag(np.maximum(white * v.scale_y * inside, 1e-4 * size + 1e-12) ** 2)
 
 
-def updated(v: Varying, block: Block, noise: Array, iterations: int) -> Varying | None:
-    """Update parameters and state by one block; None where the numbers leave the finite range."""
+def updated(v: Varying, blocks: Sequence[Block], noise: Array, iterations: int) -> Varying | None:
+    """Update parameters and state by blocks; None where the numbers leave the finite range.
+
+    The first block begins with the state of v, further ones after gaps, each with an unknown state of its own.
+    """
     h, r, k = len(v.scale_y), len(v.scale_u), len(v.theta)
-    wide = max(1.0, 1.0 / (2.1 * v.corner * v.dt * v.every))  # filtered noise: that many samples say what one says
     root = v.root
     if v.blocks:
-        root = triangle(np.hstack([root, np.diag(walk(v.theta, h, r, np.std(block.Y, axis=0)))]).T).T
-    theta, x, z = v.theta, v.x, np.zeros(k + 2 * h)
-    share, after, moments = v.share, root, noise
-    for i in range(iterations):
-        N, g, moments, _, _ = _run(v, block, theta, x, noise)
-        if not np.all(np.isfinite(N)):
-            return None
-        if i == 0:
-            power = np.maximum(np.var(block.Y, axis=0), np.diag(noise))
-            share = np.sqrt(np.diag(moments) / power)
-        derivative = to_local(theta, h, r, block.c, block.by_s, block.rates)
-        if i == 0:  # what the parameters' own deviations explain of it is no fault of the model
-            own = derivative[:, :k] @ root[:k]
-            share = share / (1.0 + float(np.sum((N @ own) * own)) / block.Y.size) ** 0.25
-        turned = derivative @ root
-        after, step = root.copy(), np.empty(k + 2 * h)
-        condition(turned.T @ N @ turned / wide, after, turned.T @ g / wide - z, step)
-        size = float(np.linalg.norm(step))
-        if not np.isfinite(size):
-            return None
-        z = z + (step * min(1.0, LONGEST_STEP / size) if iterations > 1 and size > 0.0 else step)
-        moved = root @ z
-        theta, x = v.theta + moved[:k], v.x + moved[k:]
-        if size < 0.1:
-            break
-    _, _, moments, X, end = _run(v, block, theta, x, noise)
-    if not np.all(np.isfinite(moments)) or not np.all(np.isfinite(end)):
+        root = triangle(np.hstack([root, np.diag(walk(v.theta, h, r, np.std(blocks[0].Y, axis=0)))]).T).T
+    after_gap = bool(v.blocks) and not v.x.any()
+    fit = _fitted(v, blocks, noise, iterations, root, _first_state(v, blocks[0], noise) if after_gap else v.x)
+    if fit is None:
         return None
-    arrival = X @ to_local(theta, h, r, block.c, block.by_s, block.rates)
-    after[k:] = arrival @ after
+    theta, runs, after, share = fit
+    block, run, Y = blocks[-1], runs[-1], np.vstack([block.Y for block in blocks])
+    moments = np.sum([one.moments for one in runs], axis=0) / len(Y)
+    after[k:] = run.X @ to_local(theta, h, r, block.c, block.by_s, block.rates) @ after
     fresh = max(1.0 / (v.blocks + 1.0), 1.0 / NOISE_BLOCKS)
     known = (1.0 - fresh) * v.noise + fresh * moments if v.blocks else moments
     if not v.blocks:
-        share, strikes = np.sqrt(np.diag(moments) / np.var(block.Y, axis=0)), 0
-    elif not v.x.any():  # after a loss the state was unknown: that was no prediction
+        share, strikes = np.sqrt(np.diag(moments) / np.var(Y, axis=0)), 0
+    elif after_gap:  # the state was unknown: that was no prediction
         share, strikes = v.share, 0
     else:
         strikes = v.strikes + 1 if float(share.max()) > UNPREDICTED else 0
         share = v.share + (share - v.share) * max(1.0 / v.blocks, 1.0 / SHARE_BLOCKS)
-    return v._replace(theta=theta, x=end, root=after, noise=known, share=share, angle=block.angle, rate=block.rate,
+    return v._replace(theta=theta, x=run.end, root=after if len(blocks) == 1 else triangle(after.T).T, noise=known,
+                      share=share, angle=block.angle,
                       swing=v.swing + (block.swing - v.swing) * max(1.0 / (v.blocks + 1.0), 1.0 / SHARE_BLOCKS),
                       blocks=v.blocks + 1, strikes=strikes)
+
+
+def _fitted(v: Varying, blocks: Sequence[Block], noise: Array, iterations: int, root: Array, x: Array
+            ) -> tuple[Array, list[Run], Array, Array] | None:
+    """Return theta, the runs with it, the root of the covariance of theta and the last state, the share of the first.
+
+    Gauss-Newton iterations in units of ``root``, the prior's, from the states that fit best; with more than one a step
+    that raises the cost is shortened (backtracking).
+    """
+    h, r, k, n = len(v.scale_y), len(v.scale_u), len(v.theta), len(v.x)
+    wide = max(1.0, 1.0 / (2.1 * v.corner * v.dt * v.every))  # filtered noise: that many samples say what one says
+    root = scipy.linalg.block_diag(root, *[UNKNOWN * np.eye(n)] * (len(blocks) - 1))
+    base = np.concatenate([v.theta, x, *(_first_state(v, block, noise) for block in blocks[1:])])
+    places = [np.r_[:k, k + j * n:k + j * n + n] for j in range(len(blocks))]
+
+    def runs_at(z: Array) -> tuple[Array, list[Run]]:
+        found = base + root @ z
+        return found[:k], [_run(v, block, found[:k], found[at[k:]], noise)
+                           for block, at in zip(blocks, places, strict=True)]
+
+    share, after, step, i = v.share, root, np.zeros(len(base)), 0
+    best, lowest, z = step, math.inf, step
+    for _ in range(MOST_TRIALS * iterations + 1):
+        theta, runs = runs_at(z)
+        if not all(np.all(np.isfinite(run.N)) and np.all(np.isfinite(run.end)) for run in runs):
+            return None
+        cost = sum(float(np.trace(np.linalg.solve(noise, run.moments))) for run in runs) / wide + float(z @ z)
+        if cost > lowest and iterations > 1:
+            step = SHORTER * step
+            z = best + step
+            continue
+        best, lowest = z, cost
+        if i == iterations:
+            break
+        information, gradient = np.zeros_like(root), np.zeros_like(z)
+        for block, run, at in zip(blocks, runs, places, strict=True):
+            along = to_local(theta, h, r, block.c, block.by_s, block.rates)
+            if i == 0:
+                share = _missed(block, run, noise, along[:, :k] @ root[:k])
+            turned = along @ root[at]
+            information += turned.T @ run.N @ turned
+            gradient += turned.T @ run.g
+        after, step = root.copy(), np.empty_like(z)
+        condition(information / wide, after, gradient / wide - z, step)
+        size = float(np.linalg.norm(step))
+        if not np.isfinite(size):
+            return None
+        if size < 0.1 and i:
+            break
+        z, i = z + step, i + 1
+    if z is not best:
+        theta, runs = runs_at(best)
+    return theta, runs, after[places[-1]], share
+
+
+def _missed(block: Block, run: Run, noise: Array, own: Array) -> Array:
+    """(h,) share of the amplitude of a block that its prediction misses.
+
+    own: derivative of the local parameters along the parameters' deviations. What these explain is no fault of the
+    model.
+    """
+    power = np.maximum(np.var(block.Y, axis=0), np.diag(noise))
+    found = np.sqrt(np.diag(run.moments / len(block.Y)) / power)
+    return np.asarray(found / (1.0 + float(np.sum((run.N @ own) * own)) / block.Y.size) ** 0.25)
 
 
 def advance(config: IdentifierParameters, v: Varying, rows: Rows) -> Varying | None:
     """Take a block of ``BLOCK`` samples; None where the fit has come to its end."""
     role = shown(config)
     assert role is not None
-    signals = signals_of(config, rows, role)
-    # a straight line through more missing samples than that is no motion that the filter lets pass
-    blind = int(rows.missing.max()) * v.dt > 0.25 / v.corner
-    if blind or not np.all(np.isfinite(signals)):
-        return v._replace(lost=True)
+    signals, end = signals_of(config, rows, role), 0
+    for first, last in measured(v, signals, rows.missing):
+        done = taken(lost(v) if first > end else v, signals[first:last])
+        if done is None or done.strikes >= STRIKES:
+            return None
+        v, end = done, last
+    return lost(v) if end < len(rows) else v
+
+
+def measured(v: Varying, signals: Array, missing: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """First row and the row after the last one of each part of signals (N, w) that has no gap. missing: (N,).
+
+    A straight line through more missing samples than the filter lets pass is no motion. A part is a multiple of
+    ``every`` long, so that its last row is one that the filter keeps, and the state stands at its end.
+    """
+    blind = ~np.all(np.isfinite(signals), axis=1)
+    after = np.append(missing[1:], 0)
+    for last in np.flatnonzero((missing > after) & (missing * v.dt > 0.25 / v.corner)):
+        blind[max(last + 1 - missing[last], 0):last + 1] = True
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], blind, [True]]).astype(np.int8))).reshape(-1, 2)
+    return [(int(first + (last - first) % v.every), int(last)) for first, last in edges if last - first >= v.every]
+
+
+def taken(v: Varying, signals: Array) -> Varying | None:
+    """Take a block of samples (N, w) without a gap between them, once the filter has settled."""
     out, second, state = passed(v, signals, v.lost)
+    waiting = settling(v) if v.lost else v.settling
+    if v.lost or waiting:
+        v = reopened(v, max(waiting - len(out), 0))._replace(angle=float(out[-1, -2]))
+        out, second = out[waiting:], second[waiting:]
     v = v._replace(filtered=state)
-    if v.lost:  # the filter settles; the state is unknown
-        k, n = len(v.theta), len(v.x)
-        root = np.zeros_like(v.root)
-        root[:k, :k] = triangle(v.root[:k].T).T
-        root[k:, k:] = UNKNOWN * np.eye(n)
-        block = block_of(v, out, second)
-        return v._replace(lost=False, root=root, x=np.zeros(n), angle=block.angle, rate=block.rate)
-    done = updated(v, block_of(v, out, second), v.noise + 0.05 * noise_of(signals, v), 1)
-    return None if done is None or done.strikes >= STRIKES else done
+    if len(out) < BLOCK // v.every // 4:  # a gap follows, or the filter has just settled
+        return v
+    iterations = ITERATIONS if v.blocks < SHARE_BLOCKS else 1
+    return updated(v, [block_of(v, out, second)], v.noise + 0.05 * noise_of(signals, v), iterations)
+
+
+def reopened(v: Varying, waiting: int) -> Varying:
+    """Forget the state, of which nothing is known after a gap; waiting: see ``Varying.settling``."""
+    k, n = len(v.theta), len(v.x)
+    root = np.zeros_like(v.root)
+    root[:k, :k] = triangle(v.root[:k].T).T
+    root[k:, k:] = UNKNOWN * np.eye(n)
+    return v._replace(lost=False, settling=waiting, root=root, x=np.zeros(n))
+
+
+def settling(v: Varying) -> int:
+    """Return the number of kept samples after which a filter that began anew is trusted."""
+    return math.ceil(SETTLE / (v.corner * v.dt * v.every))
 
 
 def lost(v: Varying) -> Varying:

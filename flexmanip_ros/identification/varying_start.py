@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.batch_fit import BLOCK, Recursion
@@ -14,31 +15,39 @@ from flexmanip_ros.identification.parameter_varying import (
     UNKNOWN,
     Roles,
     Varying,
+    advance,
     block_of,
     local,
+    lost,
+    measured,
     noise_of,
     passed,
     prior,
+    reopened,
     roles,
+    settling,
+    shares,
     signals_of,
     updated,
 )
 from flexmanip_ros.identification.prediction_check import DAMPED
 from flexmanip_ros.identification.realization import known_output_basis, slowest, to_continuous, transform
+from flexmanip_ros.identification.varying_kernel import basis
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Rows
+from flexmanip_ros.samples.signals import relative_angle
 from flexmanip_ros.types import Array, StateSpace
 
 CUTOFF = 2.0
 """Corner of the low-pass filter over the highest frequency of the model."""
 FINE = 18.0
 """Samples kept per period of the corner frequency, at least; between them torques are taken for straight lines."""
-SETTLE = 2.0
-"""Periods of the corner frequency after which a filter that began anew is trusted."""
 WINDOW = 1024
 """Samples of the longest stretch that is fitted at once, as one block."""
 GROWTH = (256, 512, 640, 768, WINDOW)
 """Samples of the stretches that lead there, each started from the one before."""
+FEWEST = 24
+"""Kept samples of a block at least, from which a first fit may begin."""
 ITERATIONS = 8
 LATE = 16.0
 """Times the noise by which the first stretches may miss, as their start may be far off."""
@@ -83,38 +92,42 @@ def start(config: IdentifierParameters, rows: Rows, old: Recursion | None, befor
         return None
     stamps = rows.stamp_ns
     dt = float(stamps[-1] - stamps[0]) * 1e-9 / (len(rows) - 1)
-    h, r = len(role.displacements), len(config.inputs)
+    h, r, c = len(role.displacements), len(config.inputs), math.cos(float(np.mean(relative_angle(config, rows.angles))))
     if before is not None:
-        begun: Varying | None = before._replace(x=np.zeros(2 * h), blocks=0, strikes=0, lost=False)
+        begun: Varying | None = before._replace(x=np.zeros(2 * h), blocks=0, strikes=0, lost=False, settling=0)
     else:
         assert old is not None
-        begun = _from_recursion(old, role, r, dt)
+        begun = _from_recursion(old, role, r, dt, c)
     if begun is None or begun.every < 1 or GROWTH[0] % begun.every:
         return None
     power = np.concatenate([np.mean(rows.u ** 2, axis=0), np.var(rows.y[:, list(role.displacements)], axis=0)])
     if not np.all(power > 0.0) or not np.all(np.isfinite(power)):
         return None
-    G, _, H, _, D, _ = local(begun.theta, h, r, math.cos(begun.angle), 0.0, AT_REST)
+    G, _, H, _, D, _ = local(begun.theta, h, r, c, 0.0, AT_REST)
     unit = 1.0 / np.sqrt(power)
     more_u, more_y = unit[:r] / begun.scale_u, unit[r:] / begun.scale_y
     ratio = more_y[:, None] / more_y
-    theta, root = _around(G * ratio, H * more_y[:, None] / more_u, D * ratio)
+    theta, root = _around(G * ratio, H * more_y[:, None] / more_u, D * ratio, c)
     if before is not None:  # the same arm, with another object
         root[:len(theta), :len(theta)] *= SAME
     return _fit_stretch(
         config, begun._replace(dt=dt, theta=theta, root=root, scale_u=unit[:r], scale_y=unit[r:]), rows, role)
 
 
-def _around(G: Array, H: Array, D: Array) -> tuple[Array, Array]:
-    """Theta of a model that does not vary, and the root of its prior covariance, that of the state included."""
+def _around(G: Array, H: Array, D: Array, c: float) -> tuple[Array, Array]:
+    """Theta of the model that is most likely, by its prior, if it has these matrices at c; and the prior's root.
+
+    The root is that of the covariance of theta and state.
+    """
     h, r = H.shape
-    at_rest = (np.concatenate([X.ravel(), np.zeros(2 * X.size)]) for X in (G, H, D))
-    g, b, d = at_rest
-    theta = np.concatenate([g, b, np.zeros(4 * h * r), d, np.zeros(h), np.full(1, ZETA)])
+    value, variance = basis(c, ZETA)[0][:, None, None], shares(h) ** 2
+    g = variance * value / np.sum(variance * value ** 2, axis=0) * G
+    b, d = (np.concatenate([X.ravel(), np.zeros(2 * X.size)]) for X in (H, D))
+    theta = np.concatenate([g.ravel(), b, np.zeros(4 * h * r), d, np.zeros(h), np.full(1, ZETA)])
     return theta, np.diag(np.concatenate([prior(G, H), np.full(2 * h, UNKNOWN)]))
 
 
-def _from_recursion(old: Recursion, role: Roles, r: int, dt: float) -> Varying | None:
+def _from_recursion(old: Recursion, role: Roles, r: int, dt: float, c: float) -> Varying | None:
     fit, scale = old.theta, old.scale
     found = from_model(StateSpace(fit.A, fit.B, fit.C, fit.D, fit.K, dt), role)
     if found is None:
@@ -128,12 +141,12 @@ def _from_recursion(old: Recursion, role: Roles, r: int, dt: float) -> Varying |
     every = 2 ** max(math.floor(math.log2(1.0 / (dt * corner * FINE))), -1) if corner * dt > 0.0 else 0
     if every < 1:
         return None
-    theta, root = _around(G / shift ** 2, H / shift ** 2, D / shift)
+    theta, root = _around(G / shift ** 2, H / shift ** 2, D / shift, c)
     return Varying(
         shift=shift, scale_u=scale[:r].copy(), scale_y=scale[r:][list(role.displacements)].copy(), theta=theta,
         x=np.zeros(2 * h), root=root, noise=np.zeros((h, h)), share=np.zeros(h), swing=0.0, corner=corner,
-        every=every, filtered=np.zeros((4, r + h + 2)), dt=dt, angle=0.0, rate=0.0, blocks=0, strikes=0, lost=False,
-        gain=np.zeros((0, 0)))
+        every=every, filtered=np.zeros((4, r + h + 2)), dt=dt, angle=0.0, blocks=0, strikes=0, lost=False,
+        settling=0, gain=np.zeros((0, 0)))
 
 
 def _fit_stretch(config: IdentifierParameters, v: Varying, rows: Rows, role: Roles) -> Varying | None:
@@ -141,31 +154,38 @@ def _fit_stretch(config: IdentifierParameters, v: Varying, rows: Rows, role: Rol
     signals = signals_of(config, rows, role)
     if not np.all(np.isfinite(signals)):
         return None
-    out, second, state = passed(v, signals, True)
-    quiet = math.ceil(SETTLE / (v.corner * v.dt * v.every))
+    begun = _fit_at_once(v, signals[:WINDOW], rows.missing[:WINDOW])
+    for row in range(rows.first + WINDOW, rows.until, BLOCK):
+        begun = None if begun is None else advance(config, begun, rows.between(row, min(row + BLOCK, rows.until)))
+    return begun
+
+
+def _fit_at_once(v: Varying, signals: Array, missing: NDArray[np.int64]) -> Varying | None:
+    """Fit growing stretches of signals (N, w), without the gaps between them and what a filter takes to settle."""
+    quiet, begin = settling(v), v
+    parts = [(first, last, *passed(v, signals[first:last], True)) for first, last in measured(v, signals, missing)]
     least = noise_of(signals, v)
-    power = np.diag(np.var(out[quiet:, len(v.scale_u):len(v.scale_u) + len(v.scale_y)] * v.scale_y, axis=0))
-    begin, last = v, 0
-    for count in (length for length in GROWTH if length <= len(rows)):
-        last = count // v.every
-        if last < quiet + 24:
+    inside = slice(len(v.scale_u), len(v.scale_u) + len(v.scale_y))
+    if not any(len(out) >= quiet + FEWEST for _, _, out, *_ in parts):
+        return None
+    power = np.diag(np.var(np.vstack([out[quiet:, inside] for _, _, out, *_ in parts]) * v.scale_y, axis=0))
+    for count in sorted({min(length, len(signals)) for length in GROWTH}):
+        blocks = []
+        for first, last, out, second, _ in parts:
+            end = (min(count, last) - first) // v.every
+            if end >= quiet + FEWEST:
+                blocks.append(block_of(v, out[quiet:end], second[quiet:end]))
+        if not blocks:
             continue
-        block = block_of(v, out[quiet:last], second[quiet:last])
         noise = (LATE if count < WINDOW else 4.0) * least + 1e-4 * power
-        found = updated(begin, block, noise, ITERATIONS)
+        found = updated(begin, blocks, noise, ITERATIONS)
         if found is not None:  # once more, with the noise that it leaves
             begin = begin._replace(theta=found.theta)
-            found = updated(begin, block, 1.5 * found.noise + least, ITERATIONS)
+            found = updated(begin, blocks, 1.5 * found.noise + least, ITERATIONS)
         if found is None:
             return None
         begin, v = begin._replace(theta=found.theta), found
-    if not v.blocks:
-        return None
-    length = BLOCK // v.every
-    for first in range(last, len(out) - length + 1, length):
-        done = updated(v, block_of(v, out[first:first + length], second[first:first + length]),
-                       v.noise + 0.05 * least, 1)
-        if done is None:
-            return None
-        v = done
-    return v._replace(filtered=state)
+    _, last, out, _, state = parts[-1]
+    if len(out) < quiet + FEWEST:  # the filter has not settled since the last gap
+        v = reopened(v, max(quiet - len(out), 0))
+    return v._replace(filtered=state) if last == len(signals) else lost(v)

@@ -290,6 +290,28 @@ def test_a_frequency_that_is_not_known_to_one_per_cent_is_not_tracking() -> None
     assert prediction_check.judged(early, rows, ('a/position', 'b/position')).status is Status.WARMING_UP
 
 
+@pytest.mark.parametrize('seed', [3, 5])
+def test_a_burst_of_lost_samples_each_second_leaves_both_frequencies_known(seed: int) -> None:
+    trajectory, event, chords = record()
+    rng = np.random.default_rng(seed)
+    kept = np.ones(len(trajectory.stamp_ns), dtype=np.bool_)
+    kept[8000:] = False
+    for second in range(8):
+        length = int(rng.integers(10, 101))
+        begin = 1000 * second + int(rng.integers(0, 1000 - length))
+        kept[begin:begin + length] = False
+    thin = trajectory._replace(**{name: getattr(trajectory, name)[kept]
+                                  for name in ('stamp_ns', 'position', 'velocity', 'effort')})
+    estimates, state = identify(thin, event, 1000)
+    run = Run(estimates, state, chords)
+    late = [one for one in estimates if one.stamp_ns > (CAPTURE_S + 1.4) * 1e9]
+    known = [one for one in late if len(one.modes) == 2
+             and all(mode.frequency_std_hz < 0.01 * mode.frequency_hz for mode in one.modes)]
+    assert len(known) >= 0.9 * len(late) > 0
+    for one in known:
+        assert np.all(np.abs([mode.frequency_hz for mode in one.modes] / truth(run, one) - 1.0) < 0.015)
+
+
 def test_missing_samples_cost_no_more_than_the_blocks_they_are_in() -> None:
     trajectory, event, chords = record()
     kept = np.ones(len(trajectory.stamp_ns), dtype=np.bool_)
