@@ -12,6 +12,7 @@ import math
 import os
 import signal
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,6 +24,8 @@ from flexmanip_ros.errors import FlexmanipError, ModelError
 SUCCESS, DEFECT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 LONGEST = 1e9
 """Largest time that is accepted [s]; larger ones overflow a stamp in nanoseconds."""
+AGAIN_S = 0.05
+"""Time after which a signal comes again that came while a kernel was loaded, which takes some milliseconds."""
 TRACEBACK = 'FLEXMANIP_TRACEBACK'
 """Environment variable; where it is set, a defect prints its traceback."""
 
@@ -163,8 +166,19 @@ def run(prog: str, body: Callable[[], int]) -> int:
 
 @contextmanager
 def _signals_as_interrupt() -> Iterator[None]:
-    """Raise KeyboardInterrupt on SIGINT and on SIGTERM, so that both write the results so far."""
+    """Raise KeyboardInterrupt on SIGINT and on SIGTERM, so that both write the results so far.
+
+    While LLVM calls back to load a kernel, an exception is lost, or ends the process: the signal comes again a little
+    later.
+    """
     def interrupt(number: int, frame: FrameType | None) -> None:
+        while frame is not None:
+            if frame.f_globals.get('__name__', '').startswith('llvmlite.'):
+                again = threading.Timer(AGAIN_S, os.kill, (os.getpid(), number))
+                again.daemon = True
+                again.start()
+                return
+            frame = frame.f_back
         raise KeyboardInterrupt
 
     try:

@@ -1,11 +1,20 @@
-"""A program answers --help, and a mistake in its arguments, before it loads anything that takes long to load."""
+"""A program answers --help, and a mistake in its arguments, before it loads anything that takes long to load.
+
+An interrupt while it loads kernels ends it as well.
+"""
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
+import time
+from typing import Any
 
 import pytest
+
+from flexmanip_ros.cli import console
 
 PROGRAMS = ('identify_bag', 'simulate_bag', 'live_view', 'monte_carlo', 'reproduce_paper', 'write_urdf')
 SLOW = ('scipy', 'numba', 'rosbags', 'matplotlib', 'rich', 'rclpy')
@@ -36,3 +45,20 @@ def test_help_loads_none_of_the_slow_libraries(program):
 @pytest.mark.parametrize('program', PROGRAMS)
 def test_a_mistake_in_the_arguments_is_told_before_the_slow_libraries_are_loaded(program):
     assert lines_of(program, '--no-such-option')[-2:] == ['exit 2', 'loaded']
+
+
+def test_an_interrupt_while_llvm_calls_back_comes_once_the_kernel_is_loaded() -> None:
+    callback: dict[str, Any] = {'__name__': 'llvmlite.binding.executionengine', 'interrupt': lambda: os.kill(
+        os.getpid(), signal.SIGINT)}
+    exec('def notify():\n    interrupt()\n    return "to its end"', callback)
+    said = []
+
+    def body() -> int:
+        said.append(callback['notify']())
+        limit = time.monotonic() + 10.0
+        while time.monotonic() < limit:
+            time.sleep(0.01)
+        return console.SUCCESS
+
+    assert console.run('program', body) == console.INTERRUPTED
+    assert said == ['to its end']
