@@ -11,7 +11,6 @@ import numpy as np
 from flexmanip_ros.identification import prediction_check, rpbsid
 from flexmanip_ros.identification.factor import FILLED, REJECTED
 from flexmanip_ros.identification.uncertainty import Identified, modes
-from flexmanip_ros.identification.varying_model import Configurations
 from flexmanip_ros.numerics.background import Background
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, frequency, structured
@@ -118,9 +117,7 @@ class ModelRequest:
     def solve(self) -> Estimate:
         """Return the estimate with model and modes."""
         config, identifier, payload = self.config, self.identifier, self.payload
-        found, without = _identified(config, identifier.rpbsid, self.dt)
-        if found is not None and isinstance(found.configurations, Configurations):
-            found = found.configurations.now(self.rows)
+        found, without = _identified(config, identifier.rpbsid, self.dt, self.rows)
         if found is not None and config.decimation == 1:
             found = prediction_check.judged(found, self.rows, config.outputs)
         if config.payload_method == 'block' and found is not None:
@@ -158,11 +155,11 @@ def _overall(config: IdentifierParameters, model: Status, payload: Payload | Non
     return model
 
 
-def _identified(config: IdentifierParameters, state: rpbsid.RpbsidState, dt: float
+def _identified(config: IdentifierParameters, state: rpbsid.RpbsidState, dt: float, rows: Rows
                 ) -> tuple[Identified | None, Status]:
     """Return the model, and the status while there is none: too few samples, or signals that stand still."""
     try:
-        found = rpbsid.identified(config, state, dt)
+        found = rpbsid.identified(config, state, dt, rows)
     except np.linalg.LinAlgError:  # signals that barely move, or in one direction only
         return None, Status.POORLY_EXCITED
     parameters = config.past_window * (len(config.inputs) + len(config.outputs)) + len(config.inputs)

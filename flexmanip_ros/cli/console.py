@@ -164,22 +164,27 @@ def run(prog: str, body: Callable[[], int]) -> int:
             return DEFECT
 
 
+def is_postponed(number: int, frame: FrameType | None) -> bool:
+    """Return whether a signal came while LLVM calls back to load a kernel; it then comes again ``AGAIN_S`` later.
+
+    An exception in such a callback is printed and lost, or ends the process with SIGSEGV.
+    """
+    while frame is not None:
+        if frame.f_globals.get('__name__', '').startswith('llvmlite.'):
+            again = threading.Timer(AGAIN_S, os.kill, (os.getpid(), number))
+            again.daemon = True
+            again.start()
+            return True
+        frame = frame.f_back
+    return False
+
+
 @contextmanager
 def _signals_as_interrupt() -> Iterator[None]:
-    """Raise KeyboardInterrupt on SIGINT and on SIGTERM, so that both write the results so far.
-
-    While LLVM calls back to load a kernel, an exception is lost, or ends the process: the signal comes again a little
-    later.
-    """
+    """Raise KeyboardInterrupt on SIGINT and on SIGTERM, so that both write the results so far."""
     def interrupt(number: int, frame: FrameType | None) -> None:
-        while frame is not None:
-            if frame.f_globals.get('__name__', '').startswith('llvmlite.'):
-                again = threading.Timer(AGAIN_S, os.kill, (os.getpid(), number))
-                again.daemon = True
-                again.start()
-                return
-            frame = frame.f_back
-        raise KeyboardInterrupt
+        if not is_postponed(number, frame):
+            raise KeyboardInterrupt
 
     try:
         before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}

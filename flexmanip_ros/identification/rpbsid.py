@@ -244,20 +244,22 @@ def restart(config: IdentifierParameters, state: RpbsidState, background: Backgr
     return new
 
 
-def identified(config: IdentifierParameters, state: RpbsidState, dt: float) -> Identified | None:
+def identified(config: IdentifierParameters, state: RpbsidState, dt: float, rows: Rows | None = None
+               ) -> Identified | None:
     """Return the model as of the last sample, or None before there is one. dt: sample time [s].
 
-    With decimation the model steps ``decimation`` sample times.
+    With decimation the model steps ``decimation`` sample times. rows: the latest ones, in which a model of every
+    configuration looks for the present one; without them it is read at that of the latest block.
     """
     dt *= config.decimation
     d = _regressors(config, len(config.inputs), len(config.outputs))
     refined = state.refined
     if refined is not None and refined.varying is not None:
         last = refined.recursion
-        return Configurations(
+        read = Configurations(
             config, refined.varying, dt, model_output.excitation(state.memory[0][:d, :d]), float(state.scalars[POWER]),
-            np.zeros(0) if last is None else last.singular_values, float('nan') if last is None else last.condition,
-        ).with_relative(refined.varying.angle)
+            np.zeros(0) if last is None else last.singular_values, float('nan') if last is None else last.condition)
+        return read.with_relative(refined.varying.angle) if rows is None else read.now(rows)
     if refined is not None and refined.recursion and len(refined.recursion.theta.A) == config.order \
             and FRESH * refined.recursion.weight >= state.counts[USED]:
         return model_output.from_fit(

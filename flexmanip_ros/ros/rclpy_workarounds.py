@@ -14,6 +14,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from types import FrameType
 from typing import Any
 
 import rclpy
@@ -24,6 +25,8 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.subscription import Subscription
+
+from flexmanip_ros.cli.console import is_postponed
 
 POLL_S = 0.1
 """Longest wait inside the executor, hence the longest delay of a signal on an idle node."""
@@ -49,16 +52,18 @@ def make_executor(context: Context | None = None) -> Executor:
 def interrupt_on_signals(*, again: bool = False) -> list[int]:
     """Let SIGINT and SIGTERM raise KeyboardInterrupt; call it again after an executor was made.
 
-    Return a list that holds the signals which have come: an exception in a callback from C, such as those with which
-    numba loads a kernel, is printed and lost. again: the signal then comes again, every ``AGAIN_S`` until signals are
-    ignored. Without that a node whose kernels are being compiled ends a minute later.
+    Return a list that holds the signals which have come: an exception in a callback from C is printed and lost. One
+    that comes while a kernel is loaded waits for that, see ``console.is_postponed``. again: each comes again, every
+    ``AGAIN_S`` until signals are ignored, in case another callback lost it.
 
     rclpy's own handlers end the context before a node can send its last message, such as zero torque. With
     ``SignalHandlerOptions.NO`` SIGTERM ends the process at once, and the events executor sets handlers of its own.
     """
     caught: list[int] = []
 
-    def interrupt(number: int, frame: object) -> None:
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if is_postponed(number, frame):
+            return
         caught.append(number)
         if again:
             repeat = threading.Timer(AGAIN_S, os.kill, (os.getpid(), number))
