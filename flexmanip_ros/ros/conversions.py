@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import struct
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from flexmanip_ros import messages
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.io import cdr
 from flexmanip_ros.messages import Diagnostics, Dimension, Inertia, LabelledArray, Value
-from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointRecord
+from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointBlock, JointRecord
 
 SECOND = 1_000_000_000
 FIRST_NS, LAST_NS = -(1 << 31) * SECOND, (1 << 31) * SECOND - 1
@@ -37,7 +38,7 @@ def time_message(nanoseconds: int) -> Time:
 
 
 class JointStateReader:
-    """JointState from the bytes of a raw subscription, the way a bag is read: a third of the cost."""
+    """JointStates from the bytes of a raw subscription, the way a bag is read: a third of the cost."""
 
     def __init__(self) -> None:
         self._layout: cdr.Layout | None = None
@@ -52,6 +53,21 @@ class JointStateReader:
         except (cdr.CdrError, UnicodeDecodeError, struct.error):
             return _decoded(raw)
         return record
+
+    def blocks(self, raws: list[bytes]) -> Iterator[JointBlock | SignalError]:
+        """Yield the messages in blocks of one layout each; where bytes are no JointState, what is wrong."""
+        while raws:
+            try:
+                block, self._layout = cdr.joint_block(raws, self._layout)
+            except (cdr.CdrError, UnicodeDecodeError):
+                try:
+                    block = JointBlock.of(_decoded(raws[0]))
+                except SignalError as error:
+                    yield error
+                    raws = raws[1:]
+                    continue
+            yield block
+            raws = raws[len(block.stamp_ns):]
 
 
 class JointStateWriter:

@@ -71,12 +71,19 @@ def text(value: Any) -> str:
 
 
 class Meter:
-    """Counts and times the runs of a callback: ``with meter:`` around its body."""
+    """Times the runs of a callback and counts its messages: ``with meter:`` around its body."""
 
     def __init__(self) -> None:
         self._times_ns: list[int] = []
+        self._messages = 0
+        self._taken = 1
         self._entered_ns = 0
         self._window_ns = time.monotonic_ns()
+
+    def of(self, messages: int) -> Meter:
+        """Return the meter for a run that takes so many messages."""
+        self._taken = messages
+        return self
 
     def __enter__(self) -> Meter:
         self._entered_ns = time.perf_counter_ns()
@@ -85,16 +92,19 @@ class Meter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         self._times_ns.append(time.perf_counter_ns() - self._entered_ns)
+        self._messages += self._taken
+        self._taken = 1
 
     def window(self) -> Mapping[str, float]:
-        """Return rate [Hz] and callback time [us] since the last call, and start a new window."""
+        """Return rate of the messages [Hz] and callback time [us] since the last call, and start a new window."""
         now = time.monotonic_ns()
         seconds = max(now - self._window_ns, 1) * 1e-9
         times_us = np.array(self._times_ns, dtype=np.float64) * 1e-3
-        self._times_ns, self._window_ns = [], now
+        messages = self._messages
+        self._times_ns, self._messages, self._window_ns = [], 0, now
         some = times_us.size > 0
         return {
-            'rate_hz': times_us.size / seconds,
+            'rate_hz': messages / seconds,
             'callback_p50_us': float(np.percentile(times_us, 50)) if some else math.nan,
             'callback_p99_us': float(np.percentile(times_us, 99)) if some else math.nan,
             'callback_max_us': float(times_us.max()) if some else math.nan,

@@ -64,6 +64,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         self.events: dict[str, int] = {}
         """Events of the middleware, by topic: missed deadlines, incompatible publishers, ..."""
         self._entities_made = False
+        self._batches: list[rclpy_workarounds.Batches] = []
         self._logged_at: dict[str, float] = {}
         self._waits_for = ''
         try:
@@ -101,7 +102,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         """Begin to work."""
 
     def deactivated(self) -> None:
-        """Cease to work; what was published before stays."""
+        """Cease to work; what was published before stays. ``active`` becomes false after it."""
 
     def configuration_changed(self, config: Config) -> None:
         """Take parameters that were changed while running."""
@@ -165,8 +166,10 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
 
     def _deactivate(self) -> None:
         if self.active:
-            self.active = False
-            self.deactivated()
+            try:
+                self.deactivated()
+            finally:
+                self.active = False
 
     def _transition(self, work: Callable[[], None]) -> TransitionCallbackReturn:
         """Run a part of a transition and log its exception, which rclpy would drop."""
@@ -201,6 +204,20 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         with _qos_errors(topic):
             return self.create_subscription(kind, topic, callback, profile, raw=raw, event_callbacks=watch,
                                             qos_overriding_options=qos.overridable())
+
+    def batches(self, kind: type[Any], topic: str, profile: QoSProfile, *,
+                matched: Callable[[Any], None] | None = None) -> rclpy_workarounds.Batches:
+        """Create a subscription whose serialized messages wait until they are taken, see ``Batches``."""
+        made = rclpy_workarounds.Batches(
+            self, self.subscription(kind, topic, _unused, profile, raw=True, matched=matched))
+        self._batches.append(made)
+        return made
+
+    def destroy_node(self) -> None:
+        """Take along the subscriptions that the executor does not know of."""
+        while self._batches:
+            self._batches.pop().give_back(self)
+        super().destroy_node()
 
     def _count(self, topic: str, what: str, count: int) -> None:
         self.events[f'{topic} {what}'] = count
@@ -250,6 +267,10 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
                 else f'messages arrive: {report.values["rate_hz"]:.0f} a second')
         self._diagnostics.publish(report.message(
             self.get_fully_qualified_name(), self.get_namespace(), self.get_clock().now().to_msg()))
+
+
+def _unused(message: Any) -> None:
+    """Stand where rclpy wants a callback."""
 
 
 @contextmanager

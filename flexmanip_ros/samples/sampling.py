@@ -7,8 +7,7 @@ After more than ``max_gap`` the next row is marked with ``gap`` instead; so it i
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -151,22 +150,7 @@ def push_block(config: IdentifierParameters, clock: Clock, log: SampleLog, block
     return Sampled(clock, log), regular
 
 
-def follows(config: IdentifierParameters, clock: Clock, held: Sequence[JointRecord], record: JointRecord) -> bool:
-    """Whether ``push`` is sure to accept a message after those held: layout, stamp and values are regular."""
-    before = clock.last_ns
-    if before is None or not _is_expected(clock, record):
-        return False
-    last = held[-1].stamp_ns if held else before
-    arrays = record[2:]
-    if held and any(a.shape != b.shape for a, b in zip(arrays, held[0][2:], strict=True)):
-        return False
-    interval = record.stamp_ns - last
-    total, count = clock.interval_sum_ns + last - before, clock.interval_count + len(held)
-    return bool(_is_on_time(config, interval, total, count) and interval * 1e-9 <= config.max_time_jump
-                and math.isfinite(sum(sum(values.tolist()) for values in arrays)))
-
-
-def _is_expected(clock: Clock, message: JointRecord | JointBlock) -> bool:
+def _is_expected(clock: Clock, message: JointBlock) -> bool:
     """Whether the sample time is known, no stamp is in doubt, and messages have the layout of the last one."""
     channels = clock.channels
     return (channels is not None and clock.interval_count > 0 and clock.jump_candidate is None

@@ -128,16 +128,16 @@ def test_memory_stays_constant() -> None:
     assert len(state.payload.snapshots) <= 4
 
 
-def test_messages_that_wait_for_an_estimate_are_counted_and_taken_by_the_next_unusual_one() -> None:
-    state, _ = step_through(records(209))
-    assert len(state.held) == 8  # row 200 was due at 50 Hz
-    assert state.counters.accepted == 209
-    taken, _ = pipeline.take_held(CONFIG, state)
-    assert taken.counters == state.counters
-    assert taken.log.end == state.log.end + 8
-    repeated, _ = pipeline.step(CONFIG, state, records(209)[-1])
-    assert repeated.counters.repeated_stamp == 1
-    assert not repeated.held
+def test_rows_that_wait_for_an_estimate_are_taken_by_the_end_with_the_bits_of_a_replay() -> None:
+    items = records(206)
+    state, some = step_through(items)
+    assert state.identifier is not None
+    assert state.log.end - state.identifier.cursor == 5  # row 200 was due at 50 Hz
+    assert state.counters.accepted == 206
+    state, rest = pipeline.finish(CONFIG, state)
+    assert state.identifier is not None
+    assert state.identifier.cursor == state.log.end
+    assert same([*some, *rest], list(pipeline.run(CONFIG, items)))
 
 
 @pytest.mark.parametrize('changed', range(204, 221, 4))  # a model is asked for at row 200

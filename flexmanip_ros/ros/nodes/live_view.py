@@ -23,14 +23,12 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.io import cdr
 from flexmanip_ros.parameters import ViewParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, capture_event, diagnostics
 from flexmanip_ros.ros.diagnostics import LossCounter, Meter, Report
 from flexmanip_ros.ros.node import FlexmanipNode, run
-from flexmanip_ros.ros.rclpy_workarounds import Batches, sequence_number
-from flexmanip_ros.types import JointBlock
+from flexmanip_ros.ros.rclpy_workarounds import sequence_number
 from flexmanip_ros.view.screen import Screen, Source, encoded, page
 from flexmanip_ros.view.server import BEAT_S, Server
 
@@ -46,16 +44,13 @@ class LiveView(FlexmanipNode[ViewParameters]):
         """There is one while the node is active."""
         self.losses = LossCounter()
         self._meter = Meter()
-        self._layout: cdr.Layout | None = None
         self._reader = JointStateReader()
 
     def make_entities(self) -> None:
         """Subscriptions, and the timer that empties them."""
         self._screen = self._new_screen()
-        self._joint_states = Batches(self, self.subscription(
-            JointState, 'joint_states', _unused, qos.sensor_input(), raw=True, matched=self.losses.matched))
-        self._statuses = Batches(self, self.subscription(
-            DiagnosticArray, f'{self.config.identifier}/status', _unused, qos.sensor_input(), raw=True))
+        self._joint_states = self.batches(JointState, 'joint_states', qos.sensor_input(), matched=self.losses.matched)
+        self._statuses = self.batches(DiagnosticArray, f'{self.config.identifier}/status', qos.sensor_input())
         for topic in ('capture_event', 'capture_detected'):
             self.subscription(Header, topic, self._on_event, qos.latched_input())
         self._timer = self.create_timer(1.0 / self.config.rate, self._update, clock=self._steady)
@@ -83,12 +78,8 @@ class LiveView(FlexmanipNode[ViewParameters]):
             self.server = None
 
     def destroy_node(self) -> None:
-        """Take along what the executor does not know of; a page too, where a signal came while it was made."""
+        """Let every page go, also where a signal came while one was made."""
         self.deactivated()
-        for name in ('_joint_states', '_statuses'):
-            batches = self.__dict__.pop(name, None)
-            if batches is not None:
-                batches.give_back(self)
         super().destroy_node()
 
     def _state(self) -> dict[str, Any]:
@@ -127,28 +118,16 @@ class LiveView(FlexmanipNode[ViewParameters]):
         statuses = [raw for raw, _ in self._statuses.take()]
         if not self.active:
             return
-        while raws:
-            try:
-                block, self._layout = cdr.joint_block(raws, self._layout)
-            except (cdr.CdrError, UnicodeDecodeError):
-                self._take_one(raws.pop(0))
-                continue
-            self._screen.joint_states(block)
-            raws = raws[len(block.stamp_ns):]
+        for block in self._reader.blocks(raws):
+            if isinstance(block, SignalError):
+                self.log_throttled('encoding', f'message dropped: {block}')
+            else:
+                self._screen.joint_states(block)
         for raw in statuses:
             try:
                 self._screen.status(diagnostics(deserialize_message(raw, DiagnosticArray)))
             except (RuntimeError, MemoryError):  # the errors of the middleware
                 self.log_throttled('status', 'a status that is no DiagnosticArray was dropped')
-
-    def _take_one(self, raw: bytes) -> None:
-        """Hand over a message of another encoding."""
-        try:
-            record = self._reader(raw)
-        except SignalError as error:
-            self.log_throttled('encoding', f'message dropped: {error}')
-            return
-        self._screen.joint_states(JointBlock.of(record))
 
     def _on_event(self, message: Header) -> None:
         if not self.active:
@@ -171,10 +150,6 @@ class LiveView(FlexmanipNode[ViewParameters]):
         report.values.update(samples=samples, pages=self.server.pages)
         if report.values['rate_hz'] == 0.0:
             report.silent('joint_states')
-
-
-def _unused(message: Any) -> None:
-    """Stand where rclpy wants a callback."""
 
 
 def main(argv: list[str] | None = None) -> int:
