@@ -178,12 +178,8 @@ def replay(config: IdentifierParameters, items: Iterable[Item], background: Back
     yield last, None
 
 
-def one_a_stamp(estimates: Iterable[Estimate]) -> Iterator[Estimate]:
-    """Yield the estimates of ``step`` as a replay does: payload and model of one stamp in one estimate."""
-    return (estimate for _, estimate in _one_a_stamp((init(), estimate) for estimate in estimates))
-
-
 def _one_a_stamp(estimates: Iterable[tuple[State, Estimate]]) -> Iterator[tuple[State, Estimate]]:
+    """Yield payload and model of one stamp in one estimate."""
     waiting: tuple[State, Estimate] | None = None
     for state, estimate in estimates:
         arm = estimate.arm_parameters

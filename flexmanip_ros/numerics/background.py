@@ -80,6 +80,32 @@ class Threads:
         self._pool.shutdown(cancel_futures=True)
 
 
+class Deferred(Threads):
+    """Begins to solve requests when it is told to: a node does so when an estimate is out, so that none waits for them.
+
+    Python runs one thread at a time: another one waits for its turn, up to 5 ms.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._waiting: list[Request] = []
+
+    def start(self, request: Request) -> None:
+        """Take note of a request."""
+        self._waiting.append(request)
+
+    def begin(self) -> None:
+        """Begin to solve the requests noted."""
+        waiting, self._waiting = self._waiting, []
+        for request in waiting:
+            super().start(request)
+
+    def result(self, request: Request) -> Any:
+        """Return the result of a request."""
+        self.begin()
+        return super().result(request)
+
+
 T = TypeVar('T')
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from estimates import one_a_stamp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -42,7 +43,7 @@ def step_through(items: Sequence[JointRecord | CaptureEvent], config: Identifier
     for item in items:
         state, ready = pipeline.step(config, state, item)
         out.extend(ready)
-    return state, list(pipeline.one_a_stamp(out))
+    return state, one_a_stamp(out)
 
 
 def bits(estimate: Estimate) -> tuple[object, ...]:

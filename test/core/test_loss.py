@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from estimates import one_a_stamp
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm.linearization import frequencies, vibration_model
@@ -142,6 +143,6 @@ def test_blocks_give_the_bits_of_single_messages_with_loss(messages: list[JointR
         state, some = pipeline.step(IdentifierParameters(), state, item, group=1)
         found += some
     state, some = pipeline.finish(IdentifierParameters(), state)
-    one = list(pipeline.one_a_stamp([*found, *some]))
+    one = one_a_stamp([*found, *some])
     assert [(e.stamp_ns, repr(e.payload), repr(e.modes)) for e in alone] == [
         (e.stamp_ns, repr(e.payload), repr(e.modes)) for e in one]

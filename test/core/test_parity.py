@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from estimates import one_a_stamp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -67,7 +68,7 @@ def test_message_by_message_is_the_replay_bit_for_bit(bad: list[tuple[int, str]]
     for item in items:
         state, ready = pipeline.step(CONFIG, state, item)
         live.extend(ready)
-    live = list(pipeline.one_a_stamp(live))
+    live = one_a_stamp(live)
     replayed, last = [], pipeline.init()
     for now, estimate in pipeline.replay(CONFIG, items):
         last = now
@@ -124,7 +125,7 @@ def test_every_fit_after_a_capture_gives_the_same_bits_live_and_replayed() -> No
         for item in items:
             state, ready = pipeline.step(config, state, item)
             live += ready
-        live = list(pipeline.one_a_stamp(live))
+        live = one_a_stamp(live)
         ballast = [np.empty(3 * k + 1) for k in range(50)]  # other places in memory, the same numbers
         replayed = list(pipeline.run(config, items))
         assert [_bits(one) for one in live] == [_bits(one) for one in replayed], len(ballast)

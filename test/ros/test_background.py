@@ -8,10 +8,11 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import pytest
+from estimates import one_a_stamp
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.identification.recursive_fit import FitRequest
-from flexmanip_ros.numerics.background import KEPT, Request, Threads
+from flexmanip_ros.numerics.background import KEPT, Deferred, Request, Threads
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord
@@ -67,7 +68,7 @@ def live(items: Iterable[JointRecord | CaptureEvent], pause: float,
         background.close()
     assert len(background.asked) > 20
     assert any(isinstance(request, FitRequest) for request in background.asked)
-    return list(pipeline.one_a_stamp(estimates))
+    return one_a_stamp(estimates)
 
 
 def said(estimate: Estimate) -> tuple[str, bytes]:
@@ -142,3 +143,15 @@ def test_what_is_asked_for_after_the_end_is_solved_in_place() -> None:
     background.close()
     background.start(request)
     assert background.result(request) == 3
+
+
+def test_deferred_requests_begin_when_told_and_at_the_latest_with_their_result() -> None:
+    background, first, second, third = Deferred(), Sum(1), Sum(2), Sum(3)
+    background.start(first)
+    background.start(second)
+    assert (first.solved, second.solved) == (0, 0)
+    background.begin()
+    background.start(third)
+    assert [background.result(request) for request in (first, second, third)] == [1, 2, 3]
+    assert [request.solved for request in (first, second, third)] == [1, 1, 1]
+    background.close()

@@ -38,7 +38,7 @@ from flexmanip_ros import messages, pipeline
 from flexmanip_ros.errors import CheckpointError, FlexmanipError, SignalError
 from flexmanip_ros.identification import batch_fit, recursive_fit
 from flexmanip_ros.io.checkpoint import CheckpointWriter, too_old
-from flexmanip_ros.numerics.background import Threads
+from flexmanip_ros.numerics.background import Deferred
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.arm_markers import ArmMarkers
@@ -76,6 +76,9 @@ LEAD_S = 0.003
 """Time before an estimate is due at which those before are taken [s]: a few are left then, so it comes soon."""
 SHORTEST_WAIT_S = 0.00025
 """Time after which a message is looked for again that did not come when it was expected [s]."""
+DRIFT_NS = 20_000
+"""What the delay of a message may grow by from one look to the next [ns]: that one was late says nothing of the next, and
+clocks drift by less (0.1 ms a second)."""
 
 WARM_UP_EVENT = 40
 """Samples before the event of the warm-up: more than are needed to learn the sample time."""
@@ -132,7 +135,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self.losses = LossCounter()
         self.meter = Meter()
         self._reader = JointStateReader()
-        self._background = Threads()
+        self._background = Deferred()
         self._checkpoints: CheckpointWriter | None = None
         self._resumed = False
         self._logged: dict[str, object] = {}
@@ -142,7 +145,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self._arrived_ns = np.zeros(0)
         """When each of the latest messages arrived, on the system clock."""
         self._lag_ns: int | None = None
-        """How much later than its stamp the quickest of them arrived, whatever clock the stamp is of."""
+        """How much later than its stamp the quickest one arrived of late, whatever clock the stamp is of."""
 
     def make_entities(self) -> None:
         """Publishers, subscriptions and the reset service."""
@@ -180,7 +183,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def activated(self) -> None:
         """Have threads for fits and models."""
-        self._background = Threads()
+        self._background = Deferred()
 
     def deactivated(self) -> None:
         """Take what waits; publish the model that is under way; save what is known."""
@@ -201,7 +204,10 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def _take(self) -> None:
         """Take every message that waits; come again when the next estimate is due."""
+        due_ns = self.state.next_due_ns
         self._take_samples()
+        if self.state.next_due_ns != due_ns:
+            self._background.begin()
         self._timer.timer_period_ns = round(self._wait_s() * 1e9)
         self._timer.reset()
 
@@ -217,7 +223,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
                     continue
                 self._latest = block.record(-1)
                 if len(block.stamp_ns) == len(raws):
-                    self._lag_ns = int(np.min(self._arrived_ns - block.stamp_ns))
+                    lag_ns = int(np.min(self._arrived_ns - block.stamp_ns))
+                    self._lag_ns = lag_ns if self._lag_ns is None else min(lag_ns, self._lag_ns + DRIFT_NS)
                 if self._resumed:
                     self._check_age(int(block.stamp_ns[0]))
                 self._step(block)
