@@ -77,8 +77,8 @@ LEAD_S = 0.003
 SHORTEST_WAIT_S = 0.00025
 """Time after which a message is looked for again that did not come when it was expected [s]."""
 DRIFT_NS = 20_000
-"""What the delay of a message may grow by from one look to the next [ns]: that one was late says nothing of the next, and
-clocks drift by less (0.1 ms a second)."""
+"""What the delay of a message may grow by from one look to the next [ns]: that one was late says nothing of the next,
+and clocks drift by less (0.1 ms a second)."""
 
 WARM_UP_EVENT = 40
 """Samples before the event of the warm-up: more than are needed to learn the sample time."""
