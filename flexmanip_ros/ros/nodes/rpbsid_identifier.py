@@ -76,9 +76,6 @@ LEAD_S = 0.003
 """Time before an estimate is due at which those before are taken [s]: a few are left then, so it comes soon."""
 SHORTEST_WAIT_S = 0.00025
 """Time after which a message is looked for again that did not come when it was expected [s]."""
-DRIFT_NS = 20_000
-"""What the delay of a message may grow by from one look to the next [ns]: that one was late says nothing of the next,
-and clocks drift by less (0.1 ms a second)."""
 
 WARM_UP_EVENT = 40
 """Samples before the event of the warm-up: more than are needed to learn the sample time."""
@@ -145,7 +142,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self._arrived_ns = np.zeros(0)
         """When each of the latest messages arrived, on the system clock."""
         self._lag_ns: int | None = None
-        """How much later than its stamp the quickest one arrived of late, whatever clock the stamp is of."""
+        """How much later than their stamps they arrived (median), whatever clock the stamps are of."""
 
     def make_entities(self) -> None:
         """Publishers, subscriptions and the reset service."""
@@ -223,8 +220,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
                     continue
                 self._latest = block.record(-1)
                 if len(block.stamp_ns) == len(raws):
-                    lag_ns = int(np.min(self._arrived_ns - block.stamp_ns))
-                    self._lag_ns = lag_ns if self._lag_ns is None else min(lag_ns, self._lag_ns + DRIFT_NS)
+                    self._lag_ns = int(np.median(self._arrived_ns - block.stamp_ns))
                 if self._resumed:
                     self._check_age(int(block.stamp_ns[0]))
                 self._step(block)
