@@ -11,6 +11,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import scipy.special
 from numba import njit
 from numpy.typing import NDArray
 
@@ -51,8 +52,8 @@ MOST_MODES = 4
 """The lowest ones are judged."""
 MOST_SKEW = 1e8
 """Condition of the eigenvectors of an A that is as good as defective."""
-CERTAIN = 2.57
-"""Deviations within which Student's t with five degrees of freedom lies in 95 %: six stretches are compared."""
+CERTAIN = 0.975
+"""Below this quantile Student's t lies in all but 2.5 %, and in 95 % between it and its negative."""
 
 
 def length(dt: float) -> int:
@@ -123,12 +124,12 @@ def swing(poles: Complex, turns: Complex, gains: Complex, U: Array, Z: Complex, 
 
 def frequency_errors(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np.bool_] | None = None
                      ) -> tuple[Array, Array]:
-    """Relative errors (g,) of the model's lowest frequencies that the samples show, and their standard deviations.
+    """Relative errors (g,) of the model's lowest frequencies that the samples show, and half their 95 % intervals.
 
     One Gauss-Newton step from the model's own frequencies (Rao's score over its information) on stretches of
     ``horizon`` samples of Y (N, m), outputs at unit power; the state at the begin of each is free. The deviations are
-    White's sandwich: from the scatter of the scores of the stretches. Empty where there is no mode, nan where there
-    are too few stretches. seen: as in ``missed``.
+    White's sandwich: from the scatter of the scores of the stretches, of which Student's t allows for there being few.
+    Empty where there is no mode, nan where there are too few stretches. seen: as in ``missed``.
     """
     values, right = np.linalg.eig(model.A + 0j)
     logs = np.log(np.where(values == 0.0, 1e-300, values))
@@ -172,7 +173,8 @@ def frequency_errors(model: StateSpace, U: Array, Y: Array, horizon: int, seen: 
     step = inverse @ np.sum(scores, axis=0)
     scatter = np.array([score - information @ step for score, information in zip(scores, informations, strict=True)])
     root = scatter @ inverse
-    return step, np.sqrt(np.sum(root ** 2, axis=0) * len(scores) / (len(scores) - 1))
+    deviation = np.sqrt(np.sum(root ** 2, axis=0) * len(scores) / (len(scores) - 1))
+    return step, float(scipy.special.stdtrit(len(scores) - 1, CERTAIN)) * deviation
 
 
 def unfitted(model: StateSpace, U: Array, Y: Array, seen: NDArray[np.bool_]) -> float:
@@ -255,7 +257,7 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...]) -> Identifie
     if np.any(shares[chosen] > MISSED):
         return found._replace(status=Status.ORDER_TOO_LOW)
     with np.errstate(over='ignore', invalid='ignore'):
-        error, deviation = frequency_errors(model, rows.u, rows.y[:, chosen], stretch, seen)
-    if np.any(np.abs(error) - CERTAIN * deviation > OFF):
+        error, chance = frequency_errors(model, rows.u, rows.y[:, chosen], stretch, seen)
+    if np.any(np.abs(error) - chance > OFF):
         return found._replace(status=Status.INCONSISTENT)
     return found
