@@ -250,7 +250,7 @@ def break_window(refined: Refined) -> Refined:
     k = old.root.shape[0]
     root = np.zeros((k, k))
     root[:k - n, :k - n] = triangle(old.root[:k - n].T).T[:, :k - n]
-    root[k - n:, k - n:] = 10.0 * np.eye(n)  # signals are at unit power
+    root[k - n:, k - n:] = 10.0 * np.eye(n)  # nothing is known of it: signals are at unit power
     theta = old.theta._replace(x=np.zeros(n))
     return fresh._replace(batch=False, recursion=old._replace(theta=theta, root=root, lost=True))
 

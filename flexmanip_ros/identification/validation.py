@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
 from flexmanip_ros.identification.realization import markov
 from flexmanip_ros.types import Array, StateSpace
+
+CONSTANTS = 10.0
+"""Time constants of the slowest pole in a record: after them e^-10, or 5e-5, of a state is left; or it grew so much."""
+ROWS_A_STATE = 10
+"""Samples for each state at least: fewer are fitted by noise."""
+QUICKEST = 1e-3
+"""Least size of a pole that is asked for its time constant."""
 
 
 def vaf(y: Array, yhat: Array) -> Array:
@@ -83,10 +92,10 @@ def state_at_end(model: StateSpace, U: Array, Y: Array) -> Array:
     """
     n = model.order
     A, B, C, D = model.A, model.B, model.C, model.D
-    radius = float(np.abs(np.linalg.eigvals(A)).max(initial=1e-3))
+    rate = abs(math.log(float(np.abs(np.linalg.eigvals(A)).max(initial=QUICKEST))))
     stretch = U.shape[0]
-    if abs(np.log(max(radius, 1e-3))) > 0.0:
-        stretch = min(stretch, max(10 * n, int(10.0 / abs(np.log(max(radius, 1e-3))))))
+    if rate > 0.0:
+        stretch = min(stretch, max(ROWS_A_STATE * n, int(CONSTANTS / rate)))
     U, Y = U[U.shape[0] - stretch:], Y[Y.shape[0] - stretch:]
     forced, power = np.zeros(n), np.eye(n)
     rows, target = [], []

@@ -173,6 +173,7 @@ def drift(score: Array, counts: Integers) -> float:
     """Factor on the payload's variance: how much farther it moved than it should, beyond chance."""
     if counts[BATCHES] == 0:
         return 1.0
+    # a mean of N squared standard normals is 1 +- sqrt(2 / N)
     beyond: float = score[DRIFT] - 2.0 * math.sqrt(2.0 / counts[BATCHES])
     return max(1.0, beyond)
 
@@ -183,6 +184,7 @@ def misjudged(noise: Array, counts: Integers) -> float:
 
     1 where the innovations of a sensor exceed its white noise, else 0.
     """
+    # a mean of N squares scatters by sqrt(2 / N); 2.5 times that is exceeded by chance in 0.6 % of the blocks
     chance = 2.5 * math.sqrt(2.0 / max(counts[BLOCKS], 1))
     for i in range(noise.shape[0]):
         if noise[i, EFFECTIVE] >= (1.0 + chance) * max(noise[i, WHITE], noise[i, FLOOR]):
