@@ -1,12 +1,13 @@
 """Joint states and events in, estimates out.
 
 A message becomes a row of the sample log. Two estimators, payload and identifier, are cursors into that log and take
-its rows in groups. The live node calls ``step`` for each message, a replay ``run`` for a recording: the same messages
+its rows in groups. The live node calls ``step`` with the messages that came, a replay ``run`` for a recording: the same
 give the same estimates bit for bit.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
@@ -36,6 +37,8 @@ HOPELESS = 2000
 """Messages without a single usable one after which a replay gives up."""
 REPLAY_GROUP = 2000
 """Rows that a replay takes at once at least: what Python adds to a row is then below a microsecond."""
+JITTER = 0.1
+"""Share of the sample time by which a stamp may be late and its sample still be the one that is due at an instant."""
 ROUNDING = 1e-6
 """Share of an instant by which a stamp may fall short of it, for stamps that are rounded to nanoseconds."""
 
@@ -89,10 +92,12 @@ class State(NamedTuple):
 
     @property
     def next_due_ns(self) -> int | None:
-        """Stamp of the next instant of ``publish_rate`` [ns]; None before the first usable message."""
-        if self.config is None or self.payload is None:
+        """Stamp of the sample that the next estimate is due with [ns], if none is missing; None while nobody knows."""
+        last_ns, dt_ns = self.clock.last_ns, self.clock.dt * 1e9
+        if self.config is None or last_ns is None or not dt_ns > 0.0:
             return None
-        return self.first_ns + round((self.published + 1) * 1e9 / self.config.publish_rate)
+        instant_ns = self.first_ns + (self.published + 1) * 1e9 / self.config.publish_rate
+        return last_ns + round(max(math.ceil((instant_ns - last_ns) / dt_ns - JITTER), 1) * dt_ns)
 
     def stamp_of(self, kind: EventKind) -> int | None:
         """Return the stamp of the latest event of a kind [ns], None when there was none."""

@@ -28,7 +28,7 @@ from flexmanip_ros import pipeline
 from flexmanip_ros.errors import CheckpointError
 from flexmanip_ros.parameters import IdentifierParameters, flatten, leaves
 
-NAME, FORMAT = b'flexmanip_ros checkpoint ', b'7\n'
+NAME, FORMAT = b'flexmanip_ros checkpoint ', b'8\n'
 """The format changes with what a state holds, and with the place of a class."""
 CHECKSUM = hashlib.sha256().digest_size
 PACKAGE = 'flexmanip_ros.'
@@ -204,8 +204,9 @@ class CheckpointWriter:
         if time.monotonic() < self._next_s or (self._thread is not None and self._thread.is_alive()):
             return
         self._next_s = time.monotonic() + self._period_s
-        self._thread = threading.Thread(target=self.save, args=(config, state), name='checkpoint')
-        self._thread.start()
+        thread = threading.Thread(target=self.save, args=(config, state), name='checkpoint')
+        thread.start()
+        self._thread = thread
 
     def save(self, config: IdentifierParameters, state: pipeline.State) -> None:
         """Save now; a failure is kept in ``problem`` for the diagnostics."""

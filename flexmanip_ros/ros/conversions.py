@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import array
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -54,20 +54,23 @@ class JointStateReader:
             return _decoded(raw)
         return record
 
-    def blocks(self, raws: list[bytes]) -> Iterator[JointBlock | SignalError]:
+    def blocks(self, raws: Sequence[bytes]) -> Iterator[JointBlock | SignalError]:
         """Yield the messages in blocks of one layout each; where bytes are no JointState, what is wrong."""
-        while raws:
+        first, most = 0, len(raws)
+        while first < len(raws):
+            part = raws[first:first + most]
             try:
-                block, self._layout = cdr.joint_block(raws, self._layout)
-            except (cdr.CdrError, UnicodeDecodeError):
+                block, self._layout = cdr.joint_block(part, self._layout)
+            except (cdr.CdrError, UnicodeDecodeError, struct.error):
                 try:
-                    block = JointBlock.of(_decoded(raws[0]))
+                    block = JointBlock.of(_decoded(part[0]))
                 except SignalError as error:
                     yield error
-                    raws = raws[1:]
+                    first += 1
                     continue
             yield block
-            raws = raws[len(block.stamp_ns):]
+            count = len(block.stamp_ns)
+            first, most = first + count, 2 * count  # layouts that alternate must not be looked at to the end each time
 
 
 class JointStateWriter:

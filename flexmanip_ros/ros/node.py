@@ -65,6 +65,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         """Events of the middleware, by topic: missed deadlines, incompatible publishers, ..."""
         self._entities_made = False
         self._batches: list[rclpy_workarounds.Batches] = []
+        self._alarms: list[rclpy_workarounds.Alarm] = []
         self._logged_at: dict[str, float] = {}
         self._waits_for = ''
         try:
@@ -213,8 +214,15 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         self._batches.append(made)
         return made
 
+    def alarm(self, callback: Callable[[], None]) -> rclpy_workarounds.Alarm:
+        """Return what runs a callback after times that differ, see ``Alarm``."""
+        self._alarms.append(rclpy_workarounds.Alarm(self, callback))
+        return self._alarms[-1]
+
     def destroy_node(self) -> None:
-        """Take along the subscriptions that the executor does not know of."""
+        """Take along alarms, and the subscriptions that the executor does not know of."""
+        while self._alarms:
+            self._alarms.pop().close()
         while self._batches:
             self._batches.pop().give_back(self)
         super().destroy_node()

@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import InertiaStamped
+from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
 from std_srvs.srv import Trigger
@@ -76,6 +77,8 @@ LEAD_S = 0.003
 """Time before an estimate is due at which those before are taken [s]: a few are left then, so it comes soon."""
 SHORTEST_WAIT_S = 0.00025
 """Time after which a message is looked for again that did not come when it was expected [s]."""
+MOST_DOUBLED = 7
+"""How often that time doubles, until it is more than ``LONGEST_WAIT_S``."""
 
 WARM_UP_EVENT = 40
 """Samples before the event of the warm-up: more than are needed to learn the sample time."""
@@ -139,16 +142,17 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         """What was last logged of status, trusted payload and missing announcement."""
         self._latest: JointRecord | None = None
         """The latest joint state that is not drawn yet."""
-        self._arrived_ns = np.zeros(0)
-        """When each of the latest messages arrived, on the system clock."""
         self._lag_ns: int | None = None
-        """How much later than their stamps they arrived (median), whatever clock the stamps are of."""
+        """How much later than their stamps the latest messages arrived (median), whatever clock the stamps are of."""
+        self._missed = 0
+        """How often since then nothing came that was expected."""
 
     def make_entities(self) -> None:
         """Publishers, subscriptions and the reset service."""
         self.outputs = {name: self.publisher(kind, f'~/{name}', profile()) for name, (kind, profile) in TOPICS.items()}
         self._joint_states = self.batches(JointState, 'joint_states', qos.sensor_input(), matched=self.losses.matched)
-        self._timer = self.create_timer(LONGEST_WAIT_S, self._take, clock=self._steady)
+        self._alarm = self.alarm(self._take)
+        self._alarm.after(LONGEST_WAIT_S)
         for topic in ('capture_event', 'capture_detected'):
             self.subscription(Header, topic, partial(self._on_event, topic), qos.latched_input())
         self.create_service(Trigger, '~/reset', self._on_reset)
@@ -179,7 +183,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
                 f'payload_method {config.payload_method}; {config.publish_rate:g} estimates a second')
 
     def activated(self) -> None:
-        """Have threads for fits and models."""
+        """Have threads for fits and models; what came before is none of the samples."""
+        self._waiting()
         self._background = Deferred()
 
     def deactivated(self) -> None:
@@ -193,7 +198,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self._checkpoints.save(self.config, self.state)
 
     def configuration_changed(self, config: IdentifierParameters) -> None:
-        """Go on with what may change at run time."""
+        """Go on with what may change at run time; the samples before it are taken with what was."""
+        self._take_samples()
         self.state = pipeline.reconfigure(config, self.state, self._background)
 
     def _forget(self) -> None:
@@ -203,51 +209,63 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         """Take every message that waits; come again when the next estimate is due."""
         due_ns = self.state.next_due_ns
         self._take_samples()
-        if self.state.next_due_ns != due_ns:
+        wait_s = self._wait_s()
+        if wait_s > LEAD_S or self.state.next_due_ns != due_ns:
             self._background.begin()
-        self._timer.timer_period_ns = round(self._wait_s() * 1e9)
-        self._timer.reset()
+        self._alarm.after(wait_s)
 
     def _take_samples(self) -> None:
         """Convert, take one step of the pipeline, publish."""
-        raws = self._waiting()
+        raws, arrived_ns = self._waiting()
         if not self.active or not raws:
             return
         with self.meter.of(len(raws)):
+            first = 0
             for block in self._reader.blocks(raws):
+                count = 1 if isinstance(block, SignalError) else len(block.stamp_ns)
                 if isinstance(block, SignalError):
                     self._reject('encoding', str(block))
-                    continue
-                self._latest = block.record(-1)
-                if len(block.stamp_ns) == len(raws):
-                    self._lag_ns = int(np.median(self._arrived_ns - block.stamp_ns))
-                if self._resumed:
-                    self._check_age(int(block.stamp_ns[0]))
-                self._step(block)
+                else:
+                    self._take_block(block, arrived_ns[first:first + count])
+                first += count
             if self._checkpoints is not None:
                 self._checkpoints.save_when_due(self.config, self.state)
 
-    def _waiting(self) -> list[bytes]:
-        """Return the messages that wait. Also while the node is not active: what it ignores is not lost."""
+    def _take_block(self, block: JointBlock, arrived_ns: NDArray[np.int64]) -> None:
+        if self._resumed:
+            self._check_age(int(block.stamp_ns[0]))
+        self._step(block)
+        if self.state.clock.last_ns == block.stamp_ns[-1]:  # it was not another arm's
+            self._lag_ns, self._missed = int(np.median(arrived_ns - block.stamp_ns)), 0
+            self._latest = block.record(-1)
+
+    def _waiting(self) -> tuple[list[bytes], NDArray[np.int64]]:
+        """Return the messages that wait and when they arrived [ns].
+
+        Also while the node is not active: what it ignores is not lost.
+        """
         raws, arrived_ns = [], []
         for raw, info in self._joint_states.take() if self.context.ok() else ():
             self.losses.note(sequence_number(info))
             raws.append(raw)
             arrived_ns.append(info['received_timestamp'])
-        self._arrived_ns = np.array(arrived_ns)
-        return raws
+        return raws, np.array(arrived_ns, dtype=np.int64)
 
     def _wait_s(self) -> float:
-        """Return the time until the message is expected that the next estimate is due with [s]."""
+        """Return the time until the message is expected that the next estimate is due with [s]; at first less."""
+        longest_s = LONGEST_WAIT_S
+        if self.state.clock.dt > 0.0:  # half of what its queue holds
+            longest_s = min(longest_s, 0.5 * self._joint_states.depth * self.state.clock.dt)
         due_ns = self.state.next_due_ns
         if due_ns is None or self._lag_ns is None:
-            return LONGEST_WAIT_S
+            return longest_s
         wait_s = (due_ns + self._lag_ns - time.time_ns()) * 1e-9
-        if wait_s < -LONGEST_WAIT_S:  # the publisher has stopped
-            return LONGEST_WAIT_S
         if wait_s > 2.0 * LEAD_S:
             wait_s -= LEAD_S
-        return min(max(wait_s, SHORTEST_WAIT_S), LONGEST_WAIT_S)
+        elif wait_s < SHORTEST_WAIT_S:  # late: twice as long each time
+            wait_s = SHORTEST_WAIT_S * 2.0 ** min(self._missed, MOST_DOUBLED)
+            self._missed += 1
+        return min(wait_s, longest_s)
 
     def _on_event(self, topic: str, message: Header) -> None:
         if not self.active:
@@ -267,7 +285,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         try:
             self.state, estimates = pipeline.step(self.config, self.state, item, self._background)
         except FlexmanipError as error:
-            self._reject('configuration', str(error))
+            self._reject('configuration', str(error), len(item.stamp_ns) if isinstance(item, JointBlock) else 1)
             return
         self._publish(estimates)
         clock = self.state.clock
@@ -308,8 +326,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
                 'the saved state is older than checkpoint_max_age; the identifier starts with nothing known')
             self._forget()
 
-    def _reject(self, reason: str, words: str) -> None:
-        self.rejected += 1
+    def _reject(self, reason: str, words: str, count: int = 1) -> None:
+        self.rejected += count
         self.log_throttled(reason, words)
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
