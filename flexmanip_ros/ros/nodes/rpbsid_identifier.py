@@ -119,8 +119,8 @@ def _made_up(config: IdentifierParameters) -> Iterator[JointRecord | CaptureEven
 class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
     """Converts, takes one step of the pipeline, publishes.
 
-    A callback for each of 1000 messages a second takes a tenth of a core. So messages are taken together: when the one
-    is expected that an estimate is due with, and 3 ms before.
+    Messages are taken together, which costs a third of a callback for each (see ``Batches``): when the one is expected
+    that an estimate is due with, and 3 ms before.
 
     A model is taken 5 ms (by the stamps) after the sample that it was asked for at. Where no sample follows, the last
     model goes out when the node is deactivated.
