@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -29,6 +30,7 @@ class Ros:
         self.executor = make_executor(self.context)
         self._nodes: list[Node] = []
         self._stop = threading.Event()
+        self._jobs: deque[Callable[[], Any]] = deque()
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._spin, name='executor')
         self.helper = self.add(Node('helper', context=self.context))
@@ -38,6 +40,9 @@ class Ros:
         try:
             while not self._stop.is_set():
                 self.executor.spin_once(timeout_sec=0.02)
+                if self._jobs:
+                    self._jobs[0]()
+                    self._jobs.popleft()
         except BaseException as error:  # shown by close(), on the thread of the test
             self.failure = error
 
@@ -54,11 +59,13 @@ class Ros:
         return node
 
     def remove(self, node: Any) -> None:
-        """Stop and destroy a node as its process would end."""
-        node.close()
-        self.executor.remove_node(node)
+        """Stop and destroy a node as its process would end: on the thread of the executor.
+
+        That lets go of what a node has when it spins next.
+        """
         self._nodes.remove(node)
-        node.destroy_node()
+        self._jobs.extend([node.close, lambda: self.executor.remove_node(node), node.destroy_node])
+        self.wait(lambda: not self._jobs, what='the end of a node')
 
     def wait(self, condition: Callable[[], Any], timeout: float = 15.0, what: str = '') -> Any:
         """Return the first true value of a condition; fail after the time-out."""
