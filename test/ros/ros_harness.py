@@ -55,8 +55,13 @@ class Ros:
     def managed(self, node: Any) -> Any:
         """Spin a node of the package, configured and active."""
         self.add(node)
-        node.autostart()
+        self.run(node.autostart)
         return node
+
+    def run(self, *jobs: Callable[[], Any]) -> None:
+        """Do something on the thread of the executor, as a process does, and wait for it; one job after each spin."""
+        self._jobs.extend(jobs)
+        self.wait(lambda: not self._jobs, timeout=300.0, what='what runs beside the callbacks')
 
     def remove(self, node: Any) -> None:
         """Stop and destroy a node as its process would end: on the thread of the executor.
@@ -64,8 +69,7 @@ class Ros:
         That lets go of what a node has when it spins next.
         """
         self._nodes.remove(node)
-        self._jobs.extend([node.close, lambda: self.executor.remove_node(node), node.destroy_node])
-        self.wait(lambda: not self._jobs, what='the end of a node')
+        self.run(node.close, lambda: self.executor.remove_node(node), node.destroy_node)
 
     def wait(self, condition: Callable[[], Any], timeout: float = 15.0, what: str = '') -> Any:
         """Return the first true value of a condition; fail after the time-out."""

@@ -181,6 +181,13 @@ def test_simulated_time_drives_the_samples_and_a_jump_back_begins_anew(ros: Ros)
     node, heard = start(ros, use_sim_time=True)
     clock = ros.publisher(Clock, '/clock', 10)
     node.trigger_activate()
+
+    def is_heard() -> bool:
+        """What is sent before the reader has found the clock is lost."""
+        clock.publish(Clock(clock=time_message(10**9)))
+        return bool(node.get_clock().now().nanoseconds == 10**9)
+
+    ros.wait(is_heard)
     for tick in range(1, 41):
         clock.publish(Clock(clock=time_message(10**9 + tick * STEP_NS)))
         ros.wait(lambda tick=tick: len(heard) >= tick - 1)
