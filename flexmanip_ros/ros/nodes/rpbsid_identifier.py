@@ -199,7 +199,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def configuration_changed(self, config: IdentifierParameters) -> None:
         """Go on with what may change at run time; the samples before it are taken with what was."""
-        self._take_samples()
+        if self.active:
+            self._take_samples()
         self.state = pipeline.reconfigure(config, self.state, self._background)
 
     def _forget(self) -> None:
