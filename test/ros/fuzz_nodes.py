@@ -86,7 +86,7 @@ class Bench:
         self.diagnostics = ros.listen(DiagnosticArray, '/diagnostics')
         self.writers = {topic: ros.publisher(kind, topic, DEEP) for topic, kind in self.subject.hears.items()}
         self._samples = self.sent = 0
-        self._echoes = ros.listen(Empty, 'echo')
+        self._echoes = ros.listen(Empty, 'echo', node=self.node)
         self._echo = ros.publisher(Empty, 'echo')
 
     def send(self, sent: list[tuple[str, Any]], *, wait: bool = True) -> None:

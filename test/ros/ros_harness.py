@@ -1,4 +1,4 @@
-"""Nodes of a test on one context, spun by a thread; everything waits with a time-out."""
+"""Nodes of a test in one context, each spun as in its process; everything waits with a time-out."""
 
 from __future__ import annotations
 
@@ -20,73 +20,111 @@ from flexmanip_ros.ros.rclpy_workarounds import make_executor
 Found = TypeVar('Found', bound=Node)
 
 
+class Spun:
+    """A node on an executor and a thread of its own, which end in the order of ``ros.node.run``.
+
+    The events executor of rclpy 7.1 must not lose entities while it spins: an event of one that has gone by then ends
+    the process with a segmentation fault, or raises InvalidHandle (https://github.com/ros2/rclpy/issues/1644).
+    """
+
+    def __init__(self, node: Node, context: Context) -> None:
+        self.node = node
+        self.executor = make_executor(context)
+        self.failure: BaseException | None = None
+        self.jobs: deque[Callable[[], Any]] = deque()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._spin, name=node.get_name())
+        self._thread.start()
+
+    def _spin(self) -> None:
+        try:
+            self.executor.add_node(self.node)
+            while not self._stop.is_set():
+                self.executor.spin_once(timeout_sec=0.02)
+                if self.jobs:
+                    self.jobs[0]()
+                    self.jobs.popleft()
+            if hasattr(self.node, 'close'):
+                self.node.close()
+        except BaseException as error:  # shown by the test that waits
+            self.failure = error
+        finally:
+            self.executor.shutdown()
+            self.node.destroy_node()
+
+    def end(self) -> None:
+        """Stop and destroy the node as its process would end."""
+        self._stop.set()
+        self._thread.join()
+
+
 class Ros:
-    """One context, its executor on a thread, and helpers that wait with a time-out."""
+    """One context, its nodes, and helpers that wait with a time-out."""
 
     def __init__(self, domain: int) -> None:
         self.domain = domain
         self.context = Context()
         rclpy.init(context=self.context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-        self.executor = make_executor(self.context)
-        self._nodes: list[Node] = []
-        self._stop = threading.Event()
-        self._jobs: deque[Callable[[], Any]] = deque()
-        self.failure: BaseException | None = None
-        self._thread = threading.Thread(target=self._spin, name='executor')
+        self._spun: list[Spun] = []
         self.helper = self.add(Node('helper', context=self.context))
-        self._thread.start()
-
-    def _spin(self) -> None:
-        try:
-            while not self._stop.is_set():
-                self.executor.spin_once(timeout_sec=0.02)
-                if self._jobs:
-                    self._jobs[0]()
-                    self._jobs.popleft()
-        except BaseException as error:  # shown by close(), on the thread of the test
-            self.failure = error
 
     def add(self, node: Found) -> Found:
         """Spin a node."""
-        self._nodes.append(node)
-        self.executor.add_node(node)
+        self._spun.append(Spun(node, self.context))
+        self.wait(lambda: node.executor is not None, what='an executor')
         return node
 
     def managed(self, node: Any) -> Any:
         """Spin a node of the package, configured and active."""
         self.add(node)
-        self.run(node.autostart)
+        self.run(node, node.autostart)
         return node
 
-    def run(self, *jobs: Callable[[], Any]) -> None:
-        """Do something on the thread of the executor, as a process does, and wait for it; one job after each spin."""
-        self._jobs.extend(jobs)
-        self.wait(lambda: not self._jobs, timeout=300.0, what='what runs beside the callbacks')
+    def run(self, node: Node, job: Callable[[], Any]) -> None:
+        """Do something on the thread of a node, as its process does, and wait for it."""
+        spun = self._of(node)
+        spun.jobs.append(job)
+        self.wait(lambda: not spun.jobs, timeout=300.0, what='what runs beside the callbacks')
 
     def remove(self, node: Any) -> None:
-        """Stop and destroy a node as its process would end: on the thread of the executor.
+        """Stop and destroy a node as its process would end."""
+        spun = self._of(node)
+        spun.end()
+        self._raise()
+        self._spun.remove(spun)
 
-        That lets go of what a node has when it spins next.
-        """
-        self._nodes.remove(node)
-        self.run(node.close, lambda: self.executor.remove_node(node), node.destroy_node)
+    def failed(self) -> BaseException | None:
+        """Return what ended a node, once."""
+        for spun in self._spun:
+            if spun.failure is not None:
+                failure, spun.failure = spun.failure, None
+                return failure
+        return None
+
+    def _raise(self) -> None:
+        failure = self.failed()
+        if failure is not None:
+            raise failure
+
+    def _of(self, node: Node) -> Spun:
+        return next(spun for spun in self._spun if spun.node is node)
 
     def wait(self, condition: Callable[[], Any], timeout: float = 15.0, what: str = '') -> Any:
         """Return the first true value of a condition; fail after the time-out."""
         limit = time.monotonic() + timeout
         while time.monotonic() < limit:
-            if self.failure is not None:
-                raise self.failure
+            self._raise()
             value = condition()
             if value:
                 return value
             time.sleep(0.002)
         raise AssertionError(f'not within {timeout} s: {what or condition}')
 
-    def listen(self, kind: type, topic: str, profile: QoSProfile | int = 1000) -> list[Any]:
-        """Return a list that fills with what comes on a topic."""
+    def listen(self, kind: type, topic: str, profile: QoSProfile | int = 1000, node: Node | None = None) -> list[Any]:
+        """Return a list that fills with what comes on a topic; node: who takes it, after what came before."""
         heard: list[Any] = []
-        self.helper.create_subscription(kind, topic, heard.append, profile)
+        node = node or self.helper
+        self.run(node, lambda: node.create_subscription(kind, topic, heard.append, profile))
         return heard
 
     def publisher(self, kind: type, topic: str, profile: QoSProfile | int = 1000, readers: int = 1) -> Any:
@@ -104,18 +142,11 @@ class Ros:
         return future.result()
 
     def close(self) -> None:
-        """End everything in the order that leaves nothing running."""
-        self._stop.set()
-        self._thread.join()
-        for node in self._nodes:
-            if hasattr(node, 'close'):
-                node.close()
-        self.executor.shutdown()
-        for node in self._nodes:
-            node.destroy_node()
+        """End the nodes, the latest first."""
+        for spun in reversed(self._spun):
+            spun.end()
         rclpy.shutdown(context=self.context)
-        if self.failure is not None:
-            raise self.failure
+        self._raise()
 
 
 def overrides(**values: Any) -> list[Parameter]:

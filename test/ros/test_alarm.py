@@ -42,7 +42,6 @@ def test_what_it_raises_ends_the_executor_as_what_a_timer_raises(ros: Ros) -> No
     with pytest.raises(LookupError, match='seen'):
         ros.wait(lambda: False)
     alarm.close()
-    ros.failure = None
 
 
 def test_diagnostics_come_once_a_second_while_samples_are_taken(ros: Ros) -> None:
