@@ -37,8 +37,11 @@ HOPELESS = 2000
 """Messages without a single usable one after which a replay gives up."""
 REPLAY_GROUP = 2000
 """Rows that a replay takes at once at least: what Python adds to a row is then below a microsecond."""
-JITTER = 0.1
-"""Share of the sample time by which a stamp may be late and its sample still be the one that is due at an instant."""
+EARLY_STAMP = 0.1
+"""Share of the sample time by which the sample that an estimate is due with may seem to come before its instant.
+
+Its stamp is foretold by the mean interval, and may be earlier than it will be. The node looks for it then, as the next
+one would be a sample time later."""
 ROUNDING = 1e-6
 """Share of an instant by which a stamp may fall short of it, for stamps that are rounded to nanoseconds."""
 
@@ -97,7 +100,7 @@ class State(NamedTuple):
         if self.config is None or last_ns is None or not dt_ns > 0.0:
             return None
         instant_ns = self.first_ns + (self.published + 1) * 1e9 / self.config.publish_rate
-        return last_ns + round(max(math.ceil((instant_ns - last_ns) / dt_ns - JITTER), 1) * dt_ns)
+        return last_ns + round(max(math.ceil((instant_ns - last_ns) / dt_ns - EARLY_STAMP), 1) * dt_ns)
 
     def stamp_of(self, kind: EventKind) -> int | None:
         """Return the stamp of the latest event of a kind [ns], None when there was none."""

@@ -70,10 +70,10 @@ class JointBlock(NamedTuple):
                           self.effort[taken])
 
     @classmethod
-    def of(cls, *records: JointRecord) -> JointBlock:
-        """Return a block of messages of one layout, at least one."""
-        arrays = (np.array([getattr(one, field) for one in records]) for field in ('position', 'velocity', 'effort'))
-        return cls(records[0].names, np.array([one.stamp_ns for one in records]), *arrays)
+    def of(cls, record: JointRecord) -> JointBlock:
+        """Return a block of one message."""
+        return cls(record.names, np.array([record.stamp_ns]), record.position[None], record.velocity[None],
+                   record.effort[None])
 
 
 class Sample(NamedTuple):

@@ -24,7 +24,7 @@ from flexmanip_ros.errors import FlexmanipError, ModelError
 SUCCESS, DEFECT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 LONGEST = 1e9
 """Largest time that is accepted [s]; larger ones overflow a stamp in nanoseconds."""
-AGAIN_S = 0.05
+LOADING_S = 0.05
 """Time after which a signal comes again that came while a kernel was loaded, which takes some milliseconds."""
 TRACEBACK = 'FLEXMANIP_TRACEBACK'
 """Environment variable; where it is set, a defect prints its traceback."""
@@ -165,18 +165,23 @@ def run(prog: str, body: Callable[[], int]) -> int:
 
 
 def is_postponed(number: int, frame: FrameType | None) -> bool:
-    """Return whether a signal came while LLVM calls back to load a kernel; it then comes again ``AGAIN_S`` later.
+    """Return whether a signal came while LLVM calls back to load a kernel; it then comes again ``LOADING_S`` later.
 
     An exception in such a callback is printed and lost, or ends the process with SIGSEGV.
     """
     while frame is not None:
         if frame.f_globals.get('__name__', '').startswith('llvmlite.'):
-            again = threading.Timer(AGAIN_S, os.kill, (os.getpid(), number))
-            again.daemon = True
-            again.start()
+            send_again(number, LOADING_S)
             return True
         frame = frame.f_back
     return False
+
+
+def send_again(number: int, seconds: float) -> None:
+    """Let a signal come to this process once more after a time [s]."""
+    timer = threading.Timer(seconds, os.kill, (os.getpid(), number))
+    timer.daemon = True
+    timer.start()
 
 
 @contextmanager

@@ -52,8 +52,8 @@ MOST_MODES = 4
 """The lowest ones are judged."""
 MOST_SKEW = 1e8
 """Condition of the eigenvectors of an A that is as good as defective."""
-CERTAIN = 0.975
-"""Below this quantile Student's t lies in all but 2.5 %, and in 95 % between it and its negative."""
+TWO_SIDED = 0.975
+"""Student's t lies between this quantile and its negative in 95 %."""
 
 
 def length(dt: float) -> int:
@@ -174,7 +174,7 @@ def frequency_errors(model: StateSpace, U: Array, Y: Array, horizon: int, seen: 
     scatter = np.array([score - information @ step for score, information in zip(scores, informations, strict=True)])
     root = scatter @ inverse
     deviation = np.sqrt(np.sum(root ** 2, axis=0) * len(scores) / (len(scores) - 1))
-    return step, float(scipy.special.stdtrit(len(scores) - 1, CERTAIN)) * deviation
+    return step, float(scipy.special.stdtrit(len(scores) - 1, TWO_SIDED)) * deviation
 
 
 def unfitted(model: StateSpace, U: Array, Y: Array, seen: NDArray[np.bool_]) -> float:

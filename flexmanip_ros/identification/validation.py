@@ -10,7 +10,7 @@ from numba import njit
 from flexmanip_ros.identification.realization import markov
 from flexmanip_ros.types import Array, StateSpace
 
-CONSTANTS = 10.0
+TIME_CONSTANTS = 10.0
 """Time constants of the slowest pole in a record: after them e^-10, or 5e-5, of a state is left; or it grew so much."""
 ROWS_A_STATE = 10
 """Samples for each state at least: fewer are fitted by noise."""
@@ -95,7 +95,7 @@ def state_at_end(model: StateSpace, U: Array, Y: Array) -> Array:
     rate = abs(math.log(float(np.abs(np.linalg.eigvals(A)).max(initial=QUICKEST))))
     stretch = U.shape[0]
     if rate > 0.0:
-        stretch = min(stretch, max(ROWS_A_STATE * n, int(CONSTANTS / rate)))
+        stretch = min(stretch, max(ROWS_A_STATE * n, int(TIME_CONSTANTS / rate)))
     U, Y = U[U.shape[0] - stretch:], Y[Y.shape[0] - stretch:]
     forced, power = np.zeros(n), np.eye(n)
     rows, target = [], []

@@ -10,7 +10,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any, Generic, TypeVar
 
 import rclpy
@@ -64,8 +64,8 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         self.events: dict[str, int] = {}
         """Events of the middleware, by topic: missed deadlines, incompatible publishers, ..."""
         self._entities_made = False
-        self._batches: list[rclpy_workarounds.Batches] = []
-        self._alarms: list[rclpy_workarounds.Alarm] = []
+        self._unknown_to_rclpy = ExitStack()
+        """Ends what ``destroy_node`` does not know of."""
         self._logged_at: dict[str, float] = {}
         self._waits_for = ''
         try:
@@ -211,20 +211,18 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         """Create a subscription whose serialized messages wait until they are taken, see ``Batches``."""
         made = rclpy_workarounds.Batches(
             self, self.subscription(kind, topic, _unused, profile, raw=True, matched=matched))
-        self._batches.append(made)
+        self._unknown_to_rclpy.callback(made.give_back, self)
         return made
 
     def alarm(self, callback: Callable[[], None]) -> rclpy_workarounds.Alarm:
         """Return what runs a callback after times that differ, see ``Alarm``."""
-        self._alarms.append(rclpy_workarounds.Alarm(self, callback))
-        return self._alarms[-1]
+        made = rclpy_workarounds.Alarm(self, callback)
+        self._unknown_to_rclpy.callback(made.close)
+        return made
 
     def destroy_node(self) -> None:
         """Take along alarms, and the subscriptions that the executor does not know of."""
-        while self._alarms:
-            self._alarms.pop().close()
-        while self._batches:
-            self._batches.pop().give_back(self)
+        self._unknown_to_rclpy.close()
         super().destroy_node()
 
     def _count(self, topic: str, what: str, count: int) -> None:

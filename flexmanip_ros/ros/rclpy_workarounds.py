@@ -9,7 +9,6 @@ import faulthandler
 import gc
 import inspect
 import math
-import os
 import signal
 import threading
 import time
@@ -28,7 +27,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.subscription import Subscription
 
-from flexmanip_ros.cli.console import is_postponed
+from flexmanip_ros.cli.console import is_postponed, send_again
 
 POLL_S = 0.1
 """Longest wait inside the executor, hence the longest delay of a signal on an idle node."""
@@ -68,9 +67,7 @@ def interrupt_on_signals(*, again: bool = False) -> list[int]:
             return
         caught.append(number)
         if again:
-            repeat = threading.Timer(AGAIN_S, os.kill, (os.getpid(), number))
-            repeat.daemon = True
-            repeat.start()
+            send_again(number, AGAIN_S)
         raise KeyboardInterrupt
 
     for number in (signal.SIGINT, signal.SIGTERM):
