@@ -15,6 +15,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
 
+from flexmanip_ros.parameters import leaves
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.nodes import rpbsid_identifier
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
@@ -70,6 +71,22 @@ def test_transitions_in_any_order_do_what_they_may_and_leave_nothing_behind(
             held.add(entities(node))
     assert len(held) == 1
     assert threading.active_count() <= 5  # this one, the executor, and what computes or saves meanwhile
+
+
+@pytest.mark.parametrize('cls', NODES)
+def test_every_parameter_that_may_change_may_change_in_every_state(ros: Ros, cls: Any) -> None:
+    node = ros.add(cls(context=ros.context, overrides=overrides(**NODES[cls], autostart=False)))
+    changes = [node.get_parameter(leaf.name) for leaf in leaves(type(node.config)) if leaf.live]
+    answers: list[Any] = []
+
+    def change() -> None:
+        answers.extend(node.set_parameters(changes))
+
+    for step in (change, node.trigger_configure, change, node.trigger_activate, change, node.trigger_deactivate, change,
+                 node.trigger_cleanup, change):
+        ros.run(node, step)
+    assert [answer.reason for answer in answers if not answer.successful] == []
+    assert len(answers) == 5 * len(changes)
 
 
 def test_two_nodes_of_one_name_say_so(ros: Ros) -> None:

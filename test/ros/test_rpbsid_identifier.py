@@ -5,7 +5,7 @@ import pytest
 from geometry_msgs.msg import InertiaStamped
 from identifier_harness import CAPTURE, Live, recording, replayed
 from rclpy.parameter import Parameter
-from ros_harness import Ros, overrides
+from ros_harness import Ros
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
 from std_srvs.srv import Trigger
@@ -13,7 +13,6 @@ from std_srvs.srv import Trigger
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.ros import conversions, qos
 from flexmanip_ros.ros.demo import compare
-from flexmanip_ros.ros.nodes.rpbsid_identifier import RpbsidIdentifier
 from flexmanip_ros.types import JointRecord
 
 
@@ -163,13 +162,6 @@ def test_a_clock_that_goes_back_resets_instead_of_mixing_two_times(ros: Ros, jum
     fresh = replayed(live, list(again))
     ros.wait(lambda: len(live.said[messages.MODEL]) >= len(both[messages.MODEL]))
     assert live.said[messages.MODEL][-1].data.tobytes() == fresh[messages.MODEL][-1].data.tobytes()
-
-
-def test_a_parameter_may_change_before_the_node_is_configured(ros: Ros) -> None:
-    node = ros.add(RpbsidIdentifier(context=ros.context, overrides=overrides(payload_method='none', autostart=False)))
-    (result,) = node.set_parameters([Parameter('publish_rate', value=100.0)])
-    assert result.successful
-    assert node.config.publish_rate == 100.0
 
 
 def test_the_publishing_rate_changes_while_it_runs(ros: Ros) -> None:
