@@ -45,13 +45,13 @@ def test_bad_samples_get_no_torque_and_are_counted(ros: Ros) -> None:
     heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
     node = start(ros)
     states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
-    good, nan, short, unnamed, late = (joint_state(k) for k in (5, 6, 7, 8, 4))
-    nan.position[2] = math.nan
+    good, nan, nan_rate, short, unnamed, late = (joint_state(k) for k in (5, 6, 7, 8, 9, 4))
+    nan.position[2] = nan_rate.velocity[1] = math.nan
     short.velocity = []
     unnamed.name = ['a', 'b', 'c', 'd']
-    for message in (good, nan, short, unnamed, late):
+    for message in (good, nan, nan_rate, short, unnamed, late):
         states.publish(message)
-    ros.wait(lambda: node.dropped == 4)
+    ros.wait(lambda: node.dropped == 5)
     ros.wait(lambda: heard)
     assert node.sent == 1
     assert np.isfinite(heard[0].data).all()

@@ -150,7 +150,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         if record.position.size != count or record.velocity.size != count:
             return None
         position, velocity = record.position[self._places], record.velocity[self._places]
-        if not max(np.abs(position).max(), np.abs(velocity).max()) < LARGEST:  # false for NaN too
+        if not np.abs([position, velocity]).max() < LARGEST:  # false for NaN too
             return None
         fresh = time.monotonic() - self._added_at <= self.config.stale_after
         return controller.Measured(position, velocity, self._added if fresh else np.zeros(len(self.config.joints)))
