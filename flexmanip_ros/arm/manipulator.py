@@ -11,9 +11,12 @@ Python. Outputs are linear: positions = ``arm.output @ q``, rates = ``arm.output
 bends.
 
 The shape functions of a link are those of the pinned link. ``sines``: phi_j = sin(j pi x / L). ``component_modes``
-(Craig and Bampton): beside them the two shapes that moments at the ends bend, since sines have no curvature at the
-ends, where the torques act. The shapes are combined to the modes of the pinned link, so that mass and stiffness matrix
-of a link alone stay diagonal; a sine stays what it is.
+(Craig and Bampton): beside them the static shapes of moments at the ends, since sines have no curvature at the ends,
+where the torques act, and of a uniform load, to which a link bends as its middle is accelerated (a residual vector:
+what the sines beyond the last would add). The shapes are combined to the modes of the pinned link, so that mass and
+stiffness matrix of a link alone stay diagonal; a sine stays what it is. The last mode, which has the load's shape less
+all others, would be three times as fast as they are, and is followed by that shape without delay in any case: it gets
+the inertia (mass scaling, Olovsson et al. 2005) that makes it as fast as the last would be without it.
 """
 
 from __future__ import annotations
@@ -28,8 +31,8 @@ from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
-STATIC = 2
-"""Static shapes of a link: a moment at its root and one at its tip."""
+MOMENTS, STATIC = 2, 3
+"""Static shapes of a link: of moments at its ends, and with that of a uniform load."""
 
 
 class ShapeFunctions(NamedTuple):
@@ -38,19 +41,22 @@ class ShapeFunctions(NamedTuple):
     sines: int
     """Number of sines."""
     combination: Array
-    """(k, k) shapes out of the sines and, in the last two columns, x (1 - x) and x (1 - x) (1 - 2 x)."""
+    """(k, k) shapes out of the sines and x (1 - x), x (1 - x) (1 - 2 x), (x (1 - x))^2."""
     stiffness: Array
     """(k,) integral of phi''^2: times EI / L^3 the stiffness of the mode [N/m]."""
+    inertia: Array
+    """(k,) mean of phi^2, and for the last what is added to it: times rho L that of the mode [kg]."""
 
     def at(self, x: Array) -> tuple[Array, Array, Array]:
         """Return phi, phi' and phi'' at x (N,) of a link of length 1, (k, N) each."""
         turn = np.pi * np.arange(1, self.sines + 1)[:, None]
-        raw = [np.sin(turn * x), turn * np.cos(turn * x), -turn ** 2 * np.sin(turn * x)]
-        if len(self.combination) > self.sines:
-            raw[0] = np.vstack([raw[0], x - x ** 2, x - 3.0 * x ** 2 + 2.0 * x ** 3])
-            raw[1] = np.vstack([raw[1], 1.0 - 2.0 * x, 1.0 - 6.0 * x + 6.0 * x ** 2])
-            raw[2] = np.vstack([raw[2], np.full_like(x, -2.0), -6.0 + 12.0 * x])
-        phi, slope, curvature = (self.combination @ values for values in raw)
+        u, v = x - x ** 2, 1.0 - 2.0 * x
+        static = len(self.combination) - self.sines
+        phi, slope, curvature = (
+            self.combination @ np.vstack([sines, *shapes[:static]]) for sines, shapes in (
+                (np.sin(turn * x), (u, u * v, u ** 2)),
+                (turn * np.cos(turn * x), (v, 1.0 - 6.0 * u, 2.0 * u * v)),
+                (-turn ** 2 * np.sin(turn * x), (np.full_like(x, -2.0), -6.0 * v, 2.0 - 12.0 * u))))
         return phi, slope, curvature
 
 
@@ -59,18 +65,33 @@ def count(arm: ArmParameters) -> int:
     return arm.modes + (STATIC if arm.shape_functions == 'component_modes' else 0)
 
 
+def fastest_mode(arm: ArmParameters) -> float:
+    """Return the largest frequency of a pinned link [rad/s]."""
+    shapes = shape_functions(arm.modes, arm.shape_functions == 'component_modes')
+    square = np.max(shapes.stiffness / shapes.inertia)
+    return max(float(np.sqrt(square * EI / rho)) / L ** 2 for EI, rho, L in zip(
+        arm.bending_stiffness, arm.linear_density, arm.link_length, strict=True))
+
+
 @lru_cache(maxsize=64)
 def shape_functions(sines: int, static: bool) -> ShapeFunctions:
     """Return the shapes of a pinned link, in the order of their frequencies."""
     turn: Array = np.pi * np.arange(1, sines + 1, dtype=np.float64)
     if not static:
-        return ShapeFunctions(sines, np.eye(sines), np.asarray(turn ** 4 / 2.0, dtype=np.float64))
-    raw = ShapeFunctions(sines, np.eye(sines + STATIC), np.zeros(0))
+        return ShapeFunctions(sines, np.eye(sines), np.asarray(turn ** 4 / 2.0, dtype=np.float64), np.full(sines, 0.5))
+    loaded, others = _pinned_modes(sines, STATIC), _pinned_modes(sines, MOMENTS)
+    loaded.inertia[-1] *= loaded.stiffness[-1] / others.stiffness[-1]
+    return loaded
+
+
+def _pinned_modes(sines: int, static: int) -> ShapeFunctions:
+    size = sines + static
+    raw = ShapeFunctions(sines, np.eye(size), np.zeros(0), np.zeros(0))
     x, weight = quadrature(20 + 4 * sines)
     phi, _, curvature = raw.at(x)
     square, V = scipy.linalg.eigh((curvature * weight) @ curvature.T, (phi * weight) @ phi.T)
     V *= np.sqrt(0.5) * np.sign(raw.at(np.zeros(1))[1].T @ V)
-    return ShapeFunctions(sines, V.T.copy(), square / 2.0)
+    return ShapeFunctions(sines, V.T.copy(), square / 2.0, np.full(size, 0.5))
 
 
 def quadrature(points: int) -> tuple[Array, Array]:
@@ -121,7 +142,7 @@ class Manipulator(NamedTuple):
     tip_slope: Array
     """(L, k) phi'(L)."""
     rotary: Array
-    """(n, n) hubs, rotors and bodies that turn with a slope, and the base."""
+    """(n, n) hubs, rotors and bodies that turn with a slope, the base, and what is added to the last modes."""
     stiffness: Array
     """(n,) diagonal of K."""
     damping: Array
@@ -244,7 +265,7 @@ def manipulator(arm: ArmParameters, kappa: int | None = None, points: int | None
         phi=phi, G=G / scale[..., None], slope=slope / scale,
         curvature=curvature / scale ** 2, along=weight * length[:, None] * arm.shortening,
         tip_shortening=G[-1] / scale, root_slope=root, tip_slope=tip,
-        rotary=_rotary(arm, root, tip, joint), stiffness=stiffness, damping=_damping(arm, stiffness, k),
+        rotary=_rotary(arm, shapes, root, tip, joint), stiffness=stiffness, damping=_damping(arm, shapes, stiffness),
         unit_stiffness=unit, torque=_torque_matrix(arm, joint), joint=joint,
         output=_output_matrix(arm, shapes, joint),
         viscous=np.array(arm.joint_viscous_friction), coulomb=np.array(arm.joint_coulomb_friction),
@@ -276,8 +297,8 @@ def joint_rows(arm: ArmParameters, root: Array, tip: Array, n: int) -> Array:
     return rows
 
 
-def _rotary(arm: ArmParameters, root: Array, tip: Array, joint: Array) -> Array:
-    """Constant mass of the bodies whose angle is a chord plus a slope, of the rotors and of the base."""
+def _rotary(arm: ArmParameters, shapes: ShapeFunctions, root: Array, tip: Array, joint: Array) -> Array:
+    """Constant mass of bodies whose angle is a chord plus a slope, rotors, the base, and what is added to a mode."""
     links, k = root.shape
     R = np.zeros((joint.shape[1], joint.shape[1]))
     for i in range(links):
@@ -287,22 +308,24 @@ def _rotary(arm: ArmParameters, root: Array, tip: Array, joint: Array) -> Array:
             row[i], row[modal(arm, k, i)] = 1.0, slopes[i]
             R += J * np.outer(row, row)
         R += arm.rotor_inertia[i] * np.outer(joint[i], joint[i])
+        at = modal(arm, k, i)
+        R[at, at] += arm.linear_density[i] * arm.link_length[i] * np.diag(shapes.inertia - 0.5)
     if arm.base_mass:
         R[-1, -1] += arm.base_inertia
     return R
 
 
-def _damping(arm: ArmParameters, stiffness: Array, k: int) -> Array:
+def _damping(arm: ArmParameters, shapes: ShapeFunctions, stiffness: Array) -> Array:
     """Diagonal of the modal damping matrix, (n,) [N s/m].
 
     ``stiffness``: D = (2 zeta / omega_i1) K; ``modal``: 2 zeta omega_ij M, omega_ij of the pinned link.
     """
     D = np.zeros(stiffness.size)
     for i, (L, rho) in enumerate(zip(arm.link_length, arm.linear_density, strict=True)):
-        K = stiffness[modal(arm, k, i)]
-        omega = np.sqrt(K / (rho * L / 2))
-        D[modal(arm, k, i)] = 2 * arm.damping_ratio * (
-            K / omega[0] if arm.damping_model == 'stiffness' else rho * L / 2 * omega)
+        at = modal(arm, len(shapes.inertia), i)
+        M, K = rho * L * shapes.inertia, stiffness[at]
+        omega = np.sqrt(K / M)
+        D[at] = 2 * arm.damping_ratio * (K / omega[0] if arm.damping_model == 'stiffness' else M * omega)
     return D
 
 

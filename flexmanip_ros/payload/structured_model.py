@@ -13,7 +13,7 @@ import scipy
 from flexmanip_ros.arm.capture import tip_jacobian
 from flexmanip_ros.arm.late_torque import efforts_needed
 from flexmanip_ros.arm.linearization import mass_matrix
-from flexmanip_ros.arm.manipulator import Manipulator, manipulator, modal, workspace
+from flexmanip_ros.arm.manipulator import Manipulator, fastest_mode, manipulator, modal, workspace
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.measurement_update import MeasurementModel
@@ -212,14 +212,12 @@ def motion(config: IdentifierParameters) -> ProcessModel:
     if frozen:  # no forces of higher order than the displacements
         arm = arm._replace(along=np.zeros_like(arm.along))
     lightest = config.arm.tip_mass + config.arm.linear_density[-1] * config.arm.link_length[-1] / 3
-    fastest = max(np.sqrt(nominal.stiffness[modal(config.arm, nominal.kappa, i)] * 2 / (rho * L)).max()
-                  for i, (rho, L) in enumerate(zip(config.arm.linear_density, config.arm.link_length, strict=True)))
     return ProcessModel(
         arm=arm, work=workspace(nominal), kind=np.array([kind for kind, _ in kinds], dtype=np.int64),
         link=np.array([link for _, link in kinds], dtype=np.int64), frozen=frozen,
         M0=np.zeros((n, n)), Mp=np.zeros((4, n, n)), stiffness=nominal.stiffness, damping=unit, rotary=nominal.rotary,
         scale=lightest, least=_least(nominal, lightest),
-        least_rotor=_least_rotor(nominal), substeps=STEP_ANGLE / fastest, payload=np.zeros(4),
+        least_rotor=_least_rotor(nominal), substeps=STEP_ANGLE / fastest_mode(config.arm), payload=np.zeros(4),
         effort=np.zeros(links), gain=np.ones(links), late=np.zeros((links, 2)), slope=np.zeros((links, 2)),
         opened=np.array([size, *range(size)]), p=np.zeros(size), a=np.zeros(n), k=np.zeros((19, n)),
         dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)), G=np.zeros((n, size)), X=np.zeros((2 * n, nx)),

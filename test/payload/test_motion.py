@@ -28,7 +28,7 @@ def bent(arm, n: int) -> np.ndarray:
     rng = np.random.default_rng(0)
     x = np.zeros(2 * n + arm.kind.size)
     x[:2], x[n:n + 2] = (1.0, 0.6), (0.3, -0.4)
-    size = np.tile([1.0, 0.1, 0.02, 0.01, 0.01], 2)
+    size = np.tile([1.0, 0.1, 0.02, 0.01, 0.01, 0.002], 2)
     x[2:n] = rng.normal(size=n - 2) * 5e-3 * size
     x[n + 2:2 * n] = rng.normal(size=n - 2) * 0.5 * size
     values = {Kind.MASS: 0.7, Kind.FIRST_X: 0.05, Kind.FIRST_Y: 0.02, Kind.INERTIA: 0.02, Kind.STIFFNESS: 0.02,

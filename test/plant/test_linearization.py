@@ -83,17 +83,18 @@ def test_a_sample_time_of_zero_is_refused() -> None:
 
 @pytest.mark.parametrize('inertia', [0.0, 2.0])
 def test_the_default_shape_functions_are_converged(inertia: float) -> None:
-    """Torque to encoder at 1, 3 and 10 Hz, and two frequencies, against nine sines and the static shapes a link."""
+    """Torque to encoder at 1, 3 and 10 Hz, to bend at 1 and 3 Hz, and two frequencies, against nine sines a link."""
     payload = manipulator.payload_array(20.0, inertia)
     q, found = np.radians([60.0, 45.0]), []
     for modes in (ArmParameters().modes, 9):
         arm = manipulator.manipulator(ArmParameters(modes=modes))
         M = linearization.mass_matrix(arm, payload, np.append(q, np.zeros(2 * arm.kappa)))
         K = np.diag(arm.stiffness)
-        response = [arm.output[:2] @ np.linalg.solve(K - (2 * np.pi * f) ** 2 * M, arm.torque)
+        response = [arm.output @ np.linalg.solve(K - (2 * np.pi * f) ** 2 * M, arm.torque)
                     for f in (1.0, 3.0, 10.0)]
         squares = np.sort(np.linalg.eigvals(np.linalg.solve(M, K)).real)
         found.append((np.array(response), np.sqrt(squares[2:4])))
     (ours, frequencies), (converged, exact) = found
-    assert ours == pytest.approx(converged, rel=3e-3)
+    assert ours[:, :2] == pytest.approx(converged[:, :2], rel=3e-3)
+    assert ours[:2, 2:] == pytest.approx(converged[:2, 2:], rel=2e-5)
     assert frequencies == pytest.approx(exact, rel=5e-5)
