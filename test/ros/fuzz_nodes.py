@@ -12,7 +12,7 @@ from fuzz_messages import NEXT, messages
 from geometry_msgs.msg import InertiaStamped
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from joint_states import START_NS, STEP_NS
+from joint_states import START_NS, STEP_NS, joint_state
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
@@ -151,6 +151,40 @@ def fuzz(bench: Bench, examples: int) -> None:
         bench.check()
 
     run()
+
+
+def good(kind: type, k: int) -> Any:
+    """Return message k of a stream that a node can use; of joint states the stamps advance."""
+    if kind is JointState:
+        return joint_state(k, start_ns=LATER_NS)
+    if kind is InertiaStamped:
+        message = InertiaStamped()
+        message.inertia.m, message.inertia.ixx, message.inertia.iyy, message.inertia.izz = 20.0, 0.5, 0.5, 1.0
+        return message
+    return kind(data=[20.0, 0.1, 19.8, 20.2, 1.0])
+
+
+def poisoned(message: Any, place: int, value: float) -> Any:
+    """Set number ``place`` of a message, in the order of ``numbers``; None when it has no such."""
+    left = place
+    for name, kind in message.get_fields_and_field_types().items():
+        part = getattr(message, name)
+        if hasattr(part, 'get_fields_and_field_types'):
+            count = sum(1 for _ in numbers(part))
+            if left < count:
+                poisoned(part, left, value)
+                return message
+            left -= count
+        elif 'double' in kind:
+            count = len(part) if hasattr(part, '__len__') else 1
+            if left < count:
+                if hasattr(part, '__len__'):
+                    part[left] = value
+                else:
+                    setattr(message, name, value)
+                return message
+            left -= count
+    return None
 
 
 def is_number(value: float) -> bool:
