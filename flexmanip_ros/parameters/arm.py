@@ -39,7 +39,8 @@ class ArmParameters:
         'every mode', choices=('stiffness', 'modal'))
     shape_functions: str = parameter(
         'component_modes', 'shapes of a bent link: component_modes, sines and three static shapes, of moments at the '
-        'ends, as of torques, and of a uniform load; sines, sines alone (the paper)', choices=('component_modes', 'sines'))
+        'ends, as of torques, and of a uniform load; sines, sines alone (the paper)',
+        choices=('component_modes', 'sines'))
     modes: int = parameter(
         3, 'number of sines among the shape functions of each link (payload_method block uses order / 4 sines instead)',
         low=1, high=12)

@@ -50,10 +50,10 @@ from flexmanip_ros.payload.filter_state import (
 )
 from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, misfit, observe
 from flexmanip_ros.payload.process_model import (
-    DAMPING,
     INERTIA,
     confine,
     correction,
+    dissipates,
     keep_inertia,
     lower_bound,
     predict,
@@ -111,7 +111,7 @@ along a narrow valley that bends, and damping in proportion to the information h
 MARQUARDT = 1e-3
 """The same for an empty arm, in proportion to the information: its priors are rough."""
 CHANCE = 3.0
-"""Standard deviations by which the filter may put a damping ratio below zero: more is no noise."""
+"""Standard deviations by which the filter may put a damping or a friction below zero: more is no noise."""
 REJECTIONS = 8
 """How often a step is shortened that raises the cost."""
 
@@ -390,8 +390,8 @@ def keep_possible(motion: ProcessModel, m: FilterState, chance: float) -> None:
     """Put an entry of p that is below its bound onto it, and move all other states with it (Simon and Chia, 2002).
 
     The bound alone would be a ratchet: of each step across it the other states would keep their part. A damping ratio
-    may be ``chance`` standard deviations below zero: of an undamped arm half the noise puts it there, and an estimate
-    that is kept from it is biased.
+    or a friction may be ``chance`` standard deviations below zero: of an arm without them half the noise puts it there,
+    and an estimate that is kept from it is biased.
     """
     first = m.x.size - motion.kind.size
     for c in range(motion.kind.size):
@@ -400,7 +400,7 @@ def keep_possible(motion: ProcessModel, m: FilterState, chance: float) -> None:
             continue
         row = m.S[first + c]
         square = dot(row, row)
-        if motion.kind[c] == DAMPING:
+        if dissipates(motion, c):
             below -= chance * np.sqrt(square)
         if below > 0.0 and square > 0.0:
             for i in range(m.x.size):

@@ -188,15 +188,21 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
 
 
 @inner
+def dissipates(motion: ProcessModel, c: int) -> bool:
+    """Whether entry c of p is a damping or a friction."""
+    return motion.kind[c] in (DAMPING, VISCOUS, COULOMB)
+
+
+@inner
 def lower_bound(motion: ProcessModel, c: int) -> float:
-    """Return the least that entry c of p can be: the mass matrix is positive, and no damping is below zero."""
+    """Return the least that entry c of p can be: the mass matrix is positive, no damping or friction below zero."""
     kind = motion.kind[c]
     low: float = -np.inf
     if kind == MASS:
         low = 0.5 * motion.least[0]
     elif kind == ROTOR:
         low = motion.least_rotor[motion.link[c]]
-    elif kind == DAMPING:
+    elif dissipates(motion, c):
         low = 0.0
     return low
 
