@@ -65,8 +65,8 @@ if TYPE_CHECKING:
     from flexmanip_ros.payload.measurement_update import MeasurementModel
     from flexmanip_ros.payload.process_model import ProcessModel
 
-NOISE_EVERY = 50
-"""Samples between additions of process noise."""
+NOISE_EVERY = 200
+"""Samples between additions of process noise: at 1 kHz a hundredth of `memory_time`. One takes three samples' time."""
 FIRST_ITERATION = 8
 """Samples after an event before the first Gauss-Newton iteration: fewer tell less than the prior."""
 
