@@ -310,15 +310,15 @@ def payload_real_arms(rows: list[dict[str, Any]]) -> Claims:
 
 def plant_convergence(result: dict[str, Any]) -> Claims:
     """Assumed modes converge to the finite element plant as kappa grows: frequencies, bends and encoder angles."""
-    rows = result['rows']
+    rows, own = result['rows'], 1e-6  # the bends of 40 elements are off by half of that themselves
     steps = [after / before for one, two in itertools.pairwise(rows)
-             for before, after in zip(one['response'], two['response'], strict=True)]
+             for before, after in zip(one['response'], two['response'], strict=True) if before > own]
     yield Claim('bends and angles: difference over that of the kappa before, worst', max(steps), high=1.0)
     yield Claim('encoder angles: difference at kappa 12 over that at kappa 6', max(
         late / early for late, early in zip(rows[-1]['response'][:2], rows[4]['response'][:2], strict=True)),
-        high=0.55)  # docs/lab/plant.md: they fall with 1/kappa, a half; with a tenth of it for what is of higher order
-    # docs/lab/plant.md: "Frequencies level off at the elements' own error", which is below 1e-5 in four modes
-    yield Claim('frequencies at the largest kappa: worst relative difference', max(rows[-1]['frequency']), high=1e-5)
+        high=0.2)  # with sines alone they fell with 1/kappa, to a half
+    # docs/lab/plant.md: frequencies level off at the elements' own error
+    yield Claim('frequencies at the largest kappa: worst relative difference', max(rows[-1]['frequency']), high=1e-6)
 
 
 def plant_hour(result: dict[str, Any]) -> Claims:
