@@ -14,9 +14,9 @@ The shape functions of a link are those of the pinned link. ``sines``: phi_j = s
 (Craig and Bampton): beside them the static shapes of moments at the ends, since sines have no curvature at the ends,
 where the torques act, and of a uniform load, to which a link bends as its middle is accelerated (a residual vector:
 what the sines beyond the last would add). The shapes are combined to the modes of the pinned link, so that mass and
-stiffness matrix of a link alone stay diagonal; a sine stays what it is. The last mode, which has the load's shape less
-all others, would be three times as fast as they are, and is followed by that shape without delay in any case: it gets
-the inertia (mass scaling, Olovsson et al. 2005) that makes it as fast as the last would be without it.
+stiffness matrix of a link alone stay diagonal; a sine stays what it is. The last mode has the load's shape less all
+others. It would be two to four times as fast as they are, and far faster than its load. So it gets more inertia, which
+makes it as fast as the fastest would be without the load's shape (mass scaling, Olovsson et al. 2005).
 """
 
 from __future__ import annotations

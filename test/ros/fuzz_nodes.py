@@ -164,29 +164,6 @@ def good(kind: type, k: int) -> Any:
     return kind(data=[20.0, 0.1, 19.8, 20.2, 1.0])
 
 
-def poisoned(message: Any, place: int, value: float) -> Any:
-    """Set number ``place`` of a message, in the order of ``numbers``; None when it has no such."""
-    left = place
-    for name, kind in message.get_fields_and_field_types().items():
-        part = getattr(message, name)
-        if hasattr(part, 'get_fields_and_field_types'):
-            count = sum(1 for _ in numbers(part))
-            if left < count:
-                poisoned(part, left, value)
-                return message
-            left -= count
-        elif 'double' in kind:
-            count = len(part) if hasattr(part, '__len__') else 1
-            if left < count:
-                if hasattr(part, '__len__'):
-                    part[left] = value
-                else:
-                    setattr(message, name, value)
-                return message
-            left -= count
-    return None
-
-
 def is_number(value: float) -> bool:
     """Say whether a value is no NaN."""
     return not math.isnan(value)
@@ -199,9 +176,24 @@ def is_bounded(value: float) -> bool:
 
 def numbers(message: Any) -> Iterator[float]:
     """Yield every floating-point number in a message."""
+    for owner, key in places(message):
+        yield getattr(owner, key) if isinstance(key, str) else owner[key]
+
+
+def poison(message: Any, place: int, value: float) -> None:
+    """Set number ``place`` of a message, in the order of ``numbers``."""
+    owner, key = list(places(message))[place]
+    if isinstance(key, str):
+        setattr(owner, key, value)
+    else:
+        owner[key] = value
+
+
+def places(message: Any) -> Iterator[tuple[Any, str | int]]:
+    """Yield where each floating-point number of a message stands: a message and a field, or an array and an index."""
     for name, kind in message.get_fields_and_field_types().items():
         value = getattr(message, name)
         if hasattr(value, 'get_fields_and_field_types'):
-            yield from numbers(value)
+            yield from places(value)
         elif 'double' in kind:
-            yield from value if hasattr(value, '__len__') else (value,)
+            yield from ((value, k) for k in range(len(value))) if hasattr(value, '__len__') else ((message, name),)

@@ -93,18 +93,12 @@ class Ros:
         self._raise()
         self._spun.remove(spun)
 
-    def failed(self) -> BaseException | None:
-        """Return what ended a node, once."""
+    def _raise(self) -> None:
+        """Raise what ended a node, once."""
         for spun in self._spun:
             if spun.failure is not None:
                 failure, spun.failure = spun.failure, None
-                return failure
-        return None
-
-    def _raise(self) -> None:
-        failure = self.failed()
-        if failure is not None:
-            raise failure
+                raise failure
 
     def _of(self, node: Node) -> Spun:
         return next(spun for spun in self._spun if spun.node is node)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from fuzz_nodes import LATER_NS, SUBJECTS, Bench, fuzz, good, numbers, poisoned
+from fuzz_nodes import LATER_NS, SUBJECTS, Bench, fuzz, good, numbers, poison
 from identifier_harness import CAPTURE, recording
 from joint_states import joint_state
 from ros_harness import Ros
@@ -35,15 +35,16 @@ def test_one_number_that_is_out_of_range_in_a_good_message_makes_no_node_say_nan
     bench, k = Bench(ros, name), 0
     lengths = {'effort_controller/commands': 2, 'payload_controller/added_efforts': 2}
     for topic, kind in bench.subject.hears.items():
+        if kind is Header:  # it holds no such number
+            continue
         for value in (math.nan, math.inf, -math.inf, 1e308, -1e308, 5e-324):
-            for place in range(sum(1 for _ in numbers(good(kind, 0))) if kind is not Header else 0):
+            for place in range(lengths.get(topic, len(list(numbers(good(kind, 0)))))):
                 message = good(kind, k)
                 if topic in lengths:
                     message.data = message.data[:lengths[topic]]
-                message = poisoned(message, place, value)
-                sent = [] if message is None else [(topic, message)]
+                poison(message, place, value)
                 around = [('joint_states', joint_state(k + 1 + i, start_ns=LATER_NS)) for i in range(2)]
-                bench.send([*sent, *(around if 'joint_states' in bench.subject.hears else [])])
+                bench.send([(topic, message), *(around if 'joint_states' in bench.subject.hears else [])])
                 bench.check()
                 k += 3
     bench.alive()
