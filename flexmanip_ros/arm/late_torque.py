@@ -36,7 +36,7 @@ def late_torque(efforts: Array, i: int, delay: float, lag: float, period: float,
 
     efforts: (P, >= i + 1), column i: the effort held over it, and those over the samples before it, newest last. What a
     delay below zero needs of the future is extrapolated. For a given delay + lag the torque is even in the lag up to
-    second order; so it is continued to a lag below zero, and a fit meets no bound.
+    second order; so it is continued to a lag below zero, where noise may put that of a torque which is not late.
     """
     newest = efforts.shape[0] - 1
     mirrored = lag < 0.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from flexmanip_ros.numerics.compiled import inner, kernel
@@ -127,3 +129,85 @@ def backward(L: Array, b: Array) -> None:
         for p in range(r + 1, b.size):
             value -= L[p, r] * b[p]
         b[r] = value / L[r, r]
+
+
+class Bounds(NamedTuple):
+    """At most c linear inequalities rows . u >= least of a vector u (n,), and the scratch to meet them."""
+
+    rows: Array
+    """(c, n); overwritten with rows of length one."""
+    least: Array
+    """(c,); scaled with them."""
+    gram: Array
+    """(c, c) scratch."""
+    factor: Array
+    """(c, c) scratch."""
+    multiplier: Array
+    """(c,) scratch."""
+    active: Array
+    """(c,) scratch: 1 where the vector is on the bound."""
+    shortest: Array
+    """(n,) the shortest vector that meets the first ``count`` of them."""
+
+
+def allocate_bounds(c: int, n: int) -> Bounds:
+    """Allocate for c inequalities of vectors of n."""
+    return Bounds(np.zeros((c, n)), np.zeros(c), np.zeros((c, c)), np.zeros((c, c)), np.zeros(c), np.zeros(c),
+                  np.zeros(n))
+
+
+MOST_PIVOTS = 200
+"""Of nine inequalities: those of an arm take some ten."""
+MET = 1e-9
+"""Shortfall that is rounding: of the inequality, in lengths of its row."""
+
+
+@kernel
+def meet(bounds: Bounds, count: int) -> bool:
+    """Fill bounds.shortest with the shortest u that meets the first ``count`` inequalities; False: none was found.
+
+    u = rows' z with multipliers z >= 0 of which each is zero or its inequality an equality. That linear complementarity
+    problem is solved by least-index principal pivoting (Murty 1974), which ends where no two rows are parallel.
+    """
+    rows, least, Q, L = bounds.rows, bounds.least, bounds.gram, bounds.factor
+    z, active, u = bounds.multiplier, bounds.active, bounds.shortest
+    for i in range(count):
+        length = np.sqrt(dot(rows[i], rows[i]))
+        if not length > 0.0:
+            return False
+        least[i] /= length
+        for c in range(u.size):
+            rows[i, c] /= length
+        for j in range(i + 1):
+            Q[i, j] = dot(rows[i], rows[j])
+            Q[j, i] = Q[i, j]
+        active[i] = 0.0
+        z[i] = 0.0
+    found = False
+    for _ in range(MOST_PIVOTS):
+        first = count
+        for i in range(count):  # the least index at which the signs are wrong
+            short = least[i]
+            for j in range(count):
+                short -= Q[i, j] * z[j] * active[j]
+            if z[i] < -MET if active[i] == 1.0 else short > MET:
+                first = i
+                break
+        if first == count:
+            found = True
+            break
+        active[first] = 1.0 - active[first]
+        for i in range(count):  # multipliers of those on their bound; identity in place of the others
+            z[i] = least[i] if active[i] == 1.0 else 0.0
+            for j in range(i + 1):
+                both = active[i] * active[j]
+                L[i, j] = both * Q[i, j] - (both if i == j else 0.0)
+        if not factor_information(L[:count, :count]):
+            break
+        forward(L[:count, :count], z[:count])
+        backward(L[:count, :count], z[:count])
+    for c in range(u.size):
+        u[c] = 0.0
+        for i in range(count if found else 0):
+            u[c] += z[i] * rows[i, c]
+    return found

@@ -64,6 +64,8 @@ class MeasurementModel(NamedTuple):
     """Efforts that a torque depends on."""
     block: int
     """Samples in a block: a tenth of the slowest vibration."""
+    noise_every: int
+    """Samples between additions of process noise: a hundredth of ``memory_time``. One takes three samples' time."""
     diffusion: Array
     """(nx,) standard deviation that each state gains in the square root of a second."""
     deviation: Array

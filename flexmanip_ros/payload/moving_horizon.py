@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexmanip_ros.numerics.compiled import inner, merged
-from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, factor_information, forward
+from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, factor_information, forward, meet
 from flexmanip_ros.payload.filter_state import (
     AGAIN,
     BEFORE,
@@ -49,15 +49,7 @@ from flexmanip_ros.payload.filter_state import (
     WHITE,
 )
 from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, misfit, observe
-from flexmanip_ros.payload.process_model import (
-    INERTIA,
-    confine,
-    correction,
-    dissipates,
-    keep_inertia,
-    lower_bound,
-    predict,
-)
+from flexmanip_ros.payload.process_model import INERTIA, correction, keep_inertia, lacking, predict
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -65,14 +57,14 @@ if TYPE_CHECKING:
     from flexmanip_ros.payload.measurement_update import MeasurementModel
     from flexmanip_ros.payload.process_model import ProcessModel
 
-NOISE_EVERY = 200
-"""Samples between additions of process noise: at 1 kHz a hundredth of `memory_time`. One takes three samples' time."""
 FIRST_ITERATION = 8
 """Samples after an event before the first Gauss-Newton iteration: fewer tell less than the prior."""
 
 
 ROWS = 8
 """Rows that are read again for each new sample."""
+CLOSING = 4
+"""Times that all rows of the horizon are read again at most when it closes: a fit that comes takes one or two."""
 GROWTH = 4
 """A converged fit is repeated once the horizon has a quarter more samples: fewer hardly move it."""
 AT_REST = 0.5
@@ -111,7 +103,7 @@ along a narrow valley that bends, and damping in proportion to the information h
 MARQUARDT = 1e-3
 """The same for an empty arm, in proportion to the information: its priors are rough."""
 CHANCE = 3.0
-"""Standard deviations by which the filter may put a damping or a friction below zero: more is no noise."""
+"""Standard deviations by which the filter may put what is nonnegative below zero: more is no noise."""
 REJECTIONS = 8
 """How often a step is shortened that raises the cost."""
 
@@ -226,11 +218,11 @@ def least_damping(m: FilterState) -> float:
 def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
     """Set xi to the accepted one and a step of Levenberg and Marquardt, m.g; what p holds stays possible.
 
-    What would fall below its bound ends on it, and the rest follows: the least quadratic cost on that constraint
-    (projection of Simon and Chia, 2002). Inertia, whose bound bends, is moved alone.
+    The step ends where the quadratic cost is least within the bounds: the shortest way back, ``meet``, in the metric of
+    that cost. Inertia, whose bound bends, is moved alone.
     """
     nx = m.xi.size
-    L, f, p = sensors.L, sensors.f, motion.p
+    L, p = sensors.L, motion.p
     for i in range(nx):
         m.g[i] = m.gradient[i]
         for c in range(i + 1):
@@ -243,30 +235,27 @@ def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
     for i in range(nx):
         m.xi[i] = m.accepted[i] + m.g[i]
     first = nx - p.size
-    for turn in range(2 * p.size):  # twice each: what one moves may violate another
-        c = turn % p.size
-        below = m.x0[first + c] + dot(m.S0[first + c], m.xi) - lower_bound(motion, c)
-        if below < 0.0:
-            for i in range(nx):
-                f[i] = m.S0[first + c, i]
-            forward(L, f)
-            square = dot(f, f)
-            backward(L, f)
-            for i in range(nx if square > 0.0 else 0):
-                m.xi[i] -= below / square * f[i]
-                m.g[i] -= below / square * f[i]
     for c in range(p.size):
         p[c] = m.x0[first + c] + dot(m.S0[first + c], m.xi)
-    confine(motion, p)
-    for c in range(p.size):
-        i = first + c
-        moved = p[c] - m.x0[i] - dot(m.S0[i], m.xi)
-        own = m.counts[USED] - 1  # the column of this state alone is the last in its row
-        while own >= 0 and m.S0[i, own] == 0.0:
+    count = lacking(motion, p, m.S0, 0.0)
+    for i in range(count):
+        forward(L, motion.bounds.rows[i])
+    if count > 0 and meet(motion.bounds, count):
+        backward(L, motion.bounds.shortest)
+        for i in range(nx):
+            m.xi[i] += motion.bounds.shortest[i]
+            m.g[i] += motion.bounds.shortest[i]
+        for c in range(p.size):
+            p[c] = m.x0[first + c] + dot(m.S0[first + c], m.xi)
+    if p.size > INERTIA and motion.kind[INERTIA] == INERTIA:
+        lacks, own = -p[INERTIA], m.counts[USED] - 1
+        keep_inertia(motion, p)
+        lacks += p[INERTIA]
+        while own >= 0 and m.S0[first + INERTIA, own] == 0.0:  # its own column is the last in its row
             own -= 1
-        if moved != 0.0 and own >= 0:
-            m.xi[own] += moved / m.S0[i, own]
-            m.g[own] += moved / m.S0[i, own]
+        if lacks > 0.0 and own >= 0:
+            m.xi[own] += lacks / m.S0[first + INERTIA, own]
+            m.g[own] += lacks / m.S0[first + INERTIA, own]
     return True
 
 
@@ -285,7 +274,7 @@ def reject_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
 
 @merged
 def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array) -> bool:
-    """Let the Gauss-Newton iteration take up to ``ROWS`` samples."""
+    """Let the Gauss-Newton iteration take up to ``ROWS`` samples; when the horizon closes, until it converges."""
     stored = m.counts[STORED]
     if stored >= HORIZON:
         return True
@@ -293,27 +282,24 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
     if stored + 1 < FIRST_ITERATION:
         return True
     last = stored + 1 == HORIZON
-    # a fit that has come but lags behind the filter is carried to the newest row at once
-    behind = last and m.counts[AGAIN] == 0 and 0 < m.counts[BEFORE] < m.counts[STORED]
-    budget = ROWS
-    if last:
-        budget = HORIZON if behind else 0
-    for _ in range(budget):
+    for _ in range(CLOSING * HORIZON if last else ROWS):
         if m.counts[ITERATING] == 0:
             before = m.counts[BEFORE]
-            more = max(before // GROWTH, 1) if m.score[SHIFT] < AT_REST and not behind else 1
-            if m.counts[AGAIN] == 0 and m.counts[STORED] < before + more:
+            if last:
+                due = before < m.counts[STORED] or dot(m.g, m.gradient) >= CONVERGED * before
+            else:
+                more = max(before // GROWTH, 1) if m.score[SHIFT] < AT_REST else 1
+                due = m.counts[AGAIN] == 1 or m.counts[STORED] >= before + more
+            if not due:
                 break
             begin_iteration(m)
         until = m.counts[BEFORE]
-        if behind:
-            until = m.counts[STORED]
-        elif m.counts[AGAIN] == 0:
-            until = min(m.counts[STORED], until + until // 2 + FIRST_ITERATION)
+        if m.counts[AGAIN] == 0:
+            until = m.counts[STORED] if last else min(m.counts[STORED], until + until // 2 + FIRST_ITERATION)
         if not iterate_sample(motion, sensors, m, table):
             if m.counts[BEFORE] == 0 or not reject_step(motion, sensors, m):
                 return False
-        elif m.counts[ITERATED] == until and (not finish_iteration(motion, sensors, m) or misfits(motion, m)):
+        elif m.counts[ITERATED] >= until and (not finish_iteration(motion, sensors, m) or misfits(motion, m)):
             return False
     if last:
         if m.counts[HELD] == 1 and m.score[SHIFT] >= AT_REST:  # what was linearized on the way tells too much
@@ -335,7 +321,7 @@ def misfits(motion: ProcessModel, m: FilterState) -> bool:
     if m.counts[REFITS] >= most or early:
         return False
     expected = m.xi.size + m.noise.shape[0] * m.counts[MEASURED]
-    failed = bool(m.score[COST_BEFORE] > UNFIT * expected)
+    failed = bool(m.counts[AGAIN] == 1 or m.score[COST_BEFORE] > UNFIT * expected)
     m.counts[REFITS] += failed
     return failed
 
@@ -346,7 +332,7 @@ def fails(m: FilterState) -> bool:
     if m.counts[REFITS] >= MOST_REFITS:
         return False
     expected = m.xi.size + m.noise.shape[0] * m.counts[BEFORE]
-    failed = bool(m.score[COST_BEFORE] > UNFIT * expected or 2 * m.counts[BEFORE] < m.counts[STORED])
+    failed = bool(m.score[COST_BEFORE] > UNFIT * expected or m.counts[BEFORE] < m.counts[STORED])
     m.counts[REFITS] += failed
     return failed
 
@@ -387,26 +373,17 @@ def control_step(motion: ProcessModel, m: FilterState, duration: float) -> None:
 
 @inner
 def keep_possible(motion: ProcessModel, m: FilterState, chance: float) -> None:
-    """Put an entry of p that is below its bound onto it, and move all other states with it (Simon and Chia, 2002).
+    """Move the state to the most likely one whose p is possible (inequality-constrained filter, Simon and Chia 2002).
 
-    The bound alone would be a ratchet: of each step across it the other states would keep their part. A damping ratio
-    or a friction may be ``chance`` standard deviations below zero: of an arm without them half the noise puts it there,
-    and an estimate that is kept from it is biased.
+    An entry of p that is moved alone would be a ratchet: of each step across its bound the other states would keep
+    their part. A damping, a friction or a delay may be ``chance`` standard deviations below zero: of an arm without
+    them half the noise puts it there, and an estimate that is kept from it is biased.
     """
     first = m.x.size - motion.kind.size
-    for c in range(motion.kind.size):
-        below = lower_bound(motion, c) - m.x[first + c]
-        if below <= 0.0:
-            continue
-        row = m.S[first + c]
-        square = dot(row, row)
-        if dissipates(motion, c):
-            below -= chance * np.sqrt(square)
-        if below > 0.0 and square > 0.0:
-            for i in range(m.x.size):
-                m.x[i] += dot(m.S[i], row) / square * below
-        elif below > 0.0:
-            m.x[first + c] += below
+    count = lacking(motion, m.x[first:], m.S, chance)
+    if count > 0 and meet(motion.bounds, count):
+        for i in range(m.x.size):
+            m.x[i] += dot(m.S[i], motion.bounds.shortest)
     keep_inertia(motion, m.x[first:])
 
 
@@ -415,7 +392,7 @@ def diffuse(sensors: MeasurementModel, m: FilterState, duration: float) -> None:
     """Add the process noise of a while, so that the memory stays finite."""
     m.score[NOW] += duration
     m.counts[SINCE_NOISE] += 1
-    if m.counts[SINCE_NOISE] < NOISE_EVERY or m.counts[STORED] < HORIZON:
+    if m.counts[SINCE_NOISE] < sensors.noise_every or m.counts[STORED] < HORIZON:
         return
     root = np.sqrt(m.score[NOW])
     for i in range(m.x.size):

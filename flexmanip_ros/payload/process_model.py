@@ -17,10 +17,12 @@ from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, acceleration, b
 from flexmanip_ros.arm.jacobian import complete_jacobian, force_jacobian, solve_columns
 from flexmanip_ros.arm.late_torque import late_torque
 from flexmanip_ros.numerics.compiled import inlined, inner, kernel, merged
+from flexmanip_ros.numerics.square_root import dot
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
     from flexmanip_ros.arm.manipulator import Manipulator, Workspace
+    from flexmanip_ros.numerics.square_root import Bounds
 
 SERIES = 12
 """Terms of an exponential whose error does not matter: 1e-9 of what turns by one radian."""
@@ -130,6 +132,8 @@ class ProcessModel(NamedTuple):
     """(L, 2) derivatives of the torques by these."""
     opened: NDArray[np.int64]
     """(1 + np,) how many entries of p are not taken as known, then which these are."""
+    bounds: Bounds
+    """Scratch for what p can be."""
     p: Array
     """(np,) scratch."""
     a: Array
@@ -188,9 +192,9 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
 
 
 @inner
-def dissipates(motion: ProcessModel, c: int) -> bool:
-    """Whether entry c of p is a damping or a friction."""
-    return motion.kind[c] in (DAMPING, VISCOUS, COULOMB)
+def nonnegative(motion: ProcessModel, c: int) -> bool:
+    """Whether entry c of p cannot be below zero: it takes energy away, or a torque would come before its effort."""
+    return motion.kind[c] in (DAMPING, VISCOUS, COULOMB, TORQUE_DELAY, TORQUE_LAG)
 
 
 @inner
@@ -202,17 +206,37 @@ def lower_bound(motion: ProcessModel, c: int) -> float:
         low = 0.5 * motion.least[0]
     elif kind == ROTOR:
         low = motion.least_rotor[motion.link[c]]
-    elif dissipates(motion, c):
+    elif nonnegative(motion, c):
         low = 0.0
     return low
 
 
 @inner
-def confine(motion: ProcessModel, p: Array) -> None:
-    """Move p (np,) to what can be, see ``lower_bound``; the inertia last."""
+def lacking(motion: ProcessModel, p: Array, S: Array, chance: float) -> int:
+    """Write what p (np,) lacks to be possible into motion.bounds, and its spread, the last np rows of S.
+
+    Returns the number of bounds; 0: p keeps them all. What may not be below zero may be ``chance`` standard deviations
+    below it. What is taken as known stays.
+    """
+    first, count, violated = S.shape[0] - p.size, 0, False
     for c in range(p.size):
-        p[c] = max(p[c], lower_bound(motion, c))
-    keep_inertia(motion, p)
+        violated |= p[c] < lower_bound(motion, c)
+    if not violated:
+        return 0
+    rows, least, violated = motion.bounds.rows, motion.bounds.least, False
+    for c in range(p.size):
+        square = dot(S[first + c], S[first + c])
+        low = lower_bound(motion, c)
+        if low == -np.inf or square == 0.0:
+            continue
+        least[count] = low - p[c]
+        if nonnegative(motion, c):
+            least[count] -= chance * np.sqrt(square)
+        violated |= least[count] > 0.0
+        for r in range(S.shape[1]):
+            rows[count, r] = S[first + c, r]
+        count += 1
+    return count if violated else 0
 
 
 @inner

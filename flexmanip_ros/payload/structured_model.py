@@ -14,6 +14,7 @@ from flexmanip_ros.arm.capture import tip_jacobian
 from flexmanip_ros.arm.late_torque import efforts_needed
 from flexmanip_ros.arm.linearization import mass_matrix
 from flexmanip_ros.arm.manipulator import Manipulator, fastest_mode, manipulator, modal, workspace
+from flexmanip_ros.numerics.square_root import allocate_bounds
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.measurement_update import MeasurementModel
@@ -219,9 +220,9 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         scale=lightest, least=_least(nominal, lightest),
         least_rotor=_least_rotor(nominal), substeps=STEP_ANGLE / fastest_mode(config.arm), payload=np.zeros(4),
         effort=np.zeros(links), gain=np.ones(links), late=np.zeros((links, 2)), slope=np.zeros((links, 2)),
-        opened=np.array([size, *range(size)]), p=np.zeros(size), a=np.zeros(n), k=np.zeros((19, n)),
-        dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)), G=np.zeros((n, size)), X=np.zeros((2 * n, nx)),
-        Y=np.zeros((2 * n, nx)))
+        opened=np.array([size, *range(size)]), bounds=allocate_bounds(size, nx), p=np.zeros(size), a=np.zeros(n),
+        k=np.zeros((19, n)), dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)), G=np.zeros((n, size)),
+        X=np.zeros((2 * n, nx)), Y=np.zeros((2 * n, nx)))
 
 
 def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Array) -> MeasurementModel:
@@ -243,7 +244,8 @@ def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Ar
     nx = diffusion.size
     block = max(2, round(0.1 / (model.slowest * dt)))
     return MeasurementModel(H=H, period=dt, rate=rate, gain=gain, offset=offset, delay=delay,
-                            reach=torque_reach(model, dt), block=block, diffusion=diffusion,
+                            reach=torque_reach(model, dt), block=block,
+                            noise_every=max(1, round(0.01 * config.payload.memory_time / dt)), diffusion=diffusion,
                             deviation=np.zeros(nx), f=np.zeros(nx), L=np.zeros((nx, nx)), W=np.zeros((nx, 2 * nx)))
 
 
