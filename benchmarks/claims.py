@@ -228,7 +228,7 @@ def payload_coverage(rows: list[dict[str, Any]]) -> Claims:
     """On matched plants the 95 % intervals of `structured` cover 93-97 %."""
     for row in rows:
         for after, share in zip(row['samples_after_capture'], row['coverage'], strict=True):
-            yield covers(f'{row["outputs"]}, {after} ms: coverage', share, row['runs'])
+            yield covers(f'{row["case"]}, {after} ms: coverage', share, row['runs'])
 
 
 def payload_elements(rows: list[dict[str, Any]]) -> Claims:

@@ -59,7 +59,7 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         return Payload(0.0, math.inf, 0.0, math.inf, 1.0, begun)
     state = model.payload
     held = bool(m.counts[mem.HELD])
-    consistency, drift, reckoned = figures(m.noise, sensors.rate, m.score, m.counts)
+    consistency, drift, reckoned = figures(m.noise, sensors.rate, m.score, m.counts, sensors.block)
     if math.isnan(consistency):
         consistency = plain_misfit(sensors, m)
     fitting = held and m.counts[STORED] < HORIZON
@@ -179,20 +179,23 @@ def drift(score: Array, counts: Integers) -> float:
 
 
 @kernel
-def misjudged(noise: Array, counts: Integers) -> float:
-    """Share of the model-error allowance that the interval carries, 0 to 1.
+def misjudged(noise: Array, counts: Integers, block: int) -> float:
+    """Share of the model-error allowance that the interval carries, 0 to 1; block: samples in one.
 
-    1 where the innovations of a sensor exceed its white noise, else 0.
+    It grows with the power of the innovations over the white noise, of the sensor where that is most: from what chance
+    explains if each sample counts, to what it explains if each block counts as one.
     """
     # a mean of N squares scatters by sqrt(2 / N); 2.5 times that is exceeded by chance in 0.6 % of the blocks
-    chance = 2.5 * math.sqrt(2.0 / max(counts[BLOCKS], 1))
+    most = 2.5 * math.sqrt(2.0 / max(counts[BLOCKS], 1))
+    least = most / math.sqrt(block)
+    excess = 0.0
     for i in range(noise.shape[0]):
-        if noise[i, EFFECTIVE] >= (1.0 + chance) * max(noise[i, WHITE], noise[i, FLOOR]):
-            return 1.0
-    return 0.0
+        excess = max(excess, noise[i, EFFECTIVE] / max(noise[i, WHITE], noise[i, FLOOR]) - 1.0)
+    return min(max((excess - least) / (most - least), 0.0), 1.0)
 
 
 @kernel
-def figures(noise: Array, rate: NDArray[np.bool_], score: Array, counts: Integers) -> tuple[float, float, float]:
+def figures(noise: Array, rate: NDArray[np.bool_], score: Array, counts: Integers, block: int
+            ) -> tuple[float, float, float]:
     """Return misfit, drift and ``misjudged``, in one call."""
-    return misfit(noise, rate), drift(score, counts), misjudged(noise, counts)
+    return misfit(noise, rate), drift(score, counts), misjudged(noise, counts, block)

@@ -33,7 +33,7 @@ def test_a_coverage_has_the_bounds_of_the_documents_or_of_chance_in_fewer_runs(c
 
 @pytest.mark.parametrize(('share', 'holds'), [(0.93, True), (0.929, False), (0.97, True), (0.971, False)])
 def test_a_coverage_of_a_thousand_runs_outside_93_to_97_percent_falls_short(claims, share, holds):
-    row = {'outputs': 'all', 'runs': 1000, 'samples_after_capture': [100], 'coverage': [share]}
+    row = {'case': 'all', 'runs': 1000, 'samples_after_capture': [100], 'coverage': [share]}
     assert claims.claims_of('payload_coverage', [row])[0].holds is holds
 
 
