@@ -132,7 +132,7 @@ def backward(L: Array, b: Array) -> None:
 
 
 class Bounds(NamedTuple):
-    """At most c linear inequalities rows . u >= least of a vector u (n,), and the scratch to meet them."""
+    """At most c linear inequalities rows . u >= least of a vector u (n,), and scratch for ``least_distance``."""
 
     rows: Array
     """(c, n); overwritten with rows of length one."""
@@ -157,17 +157,18 @@ def allocate_bounds(c: int, n: int) -> Bounds:
 
 
 MOST_PIVOTS = 200
-"""Of nine inequalities: those of an arm take some ten."""
+"""Pivots after which it is given up: the nine bounds of an arm take some ten."""
 MET = 1e-9
-"""Shortfall that is rounding: of the inequality, in lengths of its row."""
+"""What an inequality may lack by rounding, its row of length one."""
 
 
 @kernel
-def meet(bounds: Bounds, count: int) -> bool:
+def least_distance(bounds: Bounds, count: int) -> bool:
     """Fill bounds.shortest with the shortest u that meets the first ``count`` inequalities; False: none was found.
 
-    u = rows' z with multipliers z >= 0 of which each is zero or its inequality an equality. That linear complementarity
-    problem is solved by least-index principal pivoting (Murty 1974), which ends where no two rows are parallel.
+    Least-distance programming (Lawson and Hanson): u = rows' z with multipliers z >= 0, of which each is zero or its
+    inequality an equality. That linear complementarity problem is solved by least-index principal pivoting (Murty
+    1974). It ends where no row depends on the others.
     """
     rows, least, Q, L = bounds.rows, bounds.least, bounds.gram, bounds.factor
     z, active, u = bounds.multiplier, bounds.active, bounds.shortest

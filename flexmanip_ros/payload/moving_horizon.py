@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexmanip_ros.numerics.compiled import inner, merged
-from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, factor_information, forward, meet
+from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, factor_information, forward, least_distance
 from flexmanip_ros.payload.filter_state import (
     AGAIN,
     BEFORE,
@@ -49,7 +49,7 @@ from flexmanip_ros.payload.filter_state import (
     WHITE,
 )
 from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, misfit, observe
-from flexmanip_ros.payload.process_model import INERTIA, correction, keep_inertia, lacking, predict
+from flexmanip_ros.payload.process_model import INERTIA, correction, gather_bounds, keep_inertia, predict
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -218,8 +218,8 @@ def least_damping(m: FilterState) -> float:
 def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
     """Set xi to the accepted one and a step of Levenberg and Marquardt, m.g; what p holds stays possible.
 
-    The step ends where the quadratic cost is least within the bounds: the shortest way back, ``meet``, in the metric of
-    that cost. Inertia, whose bound bends, is moved alone.
+    Where it would leave the bounds it ends where the quadratic cost is least within them: ``least_distance`` in the
+    metric of that cost. Inertia, whose bound is curved, is moved alone.
     """
     nx = m.xi.size
     L, p = sensors.L, motion.p
@@ -237,10 +237,10 @@ def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
     first = nx - p.size
     for c in range(p.size):
         p[c] = m.x0[first + c] + dot(m.S0[first + c], m.xi)
-    count = lacking(motion, p, m.S0, 0.0)
+    count = gather_bounds(motion, p, m.S0, 0.0)
     for i in range(count):
         forward(L, motion.bounds.rows[i])
-    if count > 0 and meet(motion.bounds, count):
+    if count > 0 and least_distance(motion.bounds, count):
         backward(L, motion.bounds.shortest)
         for i in range(nx):
             m.xi[i] += motion.bounds.shortest[i]
@@ -380,8 +380,8 @@ def keep_possible(motion: ProcessModel, m: FilterState, chance: float) -> None:
     them half the noise puts it there, and an estimate that is kept from it is biased.
     """
     first = m.x.size - motion.kind.size
-    count = lacking(motion, m.x[first:], m.S, chance)
-    if count > 0 and meet(motion.bounds, count):
+    count = gather_bounds(motion, m.x[first:], m.S, chance)
+    if count > 0 and least_distance(motion.bounds, count):
         for i in range(m.x.size):
             m.x[i] += dot(m.S[i], motion.bounds.shortest)
     keep_inertia(motion, m.x[first:])

@@ -212,11 +212,11 @@ def lower_bound(motion: ProcessModel, c: int) -> float:
 
 
 @inner
-def lacking(motion: ProcessModel, p: Array, S: Array, chance: float) -> int:
-    """Write what p (np,) lacks to be possible into motion.bounds, and its spread, the last np rows of S.
+def gather_bounds(motion: ProcessModel, p: Array, S: Array, chance: float) -> int:
+    """Write into motion.bounds by how much each bound is above p (np,), and the row of S that moves it.
 
-    Returns the number of bounds; 0: p keeps them all. What may not be below zero may be ``chance`` standard deviations
-    below it. What is taken as known stays.
+    Returns the number of bounds; 0: p keeps them all. Those of zero are lower by ``chance`` standard deviations. What
+    is taken as known has none. S: square root of the covariance, its last np rows are those of p.
     """
     first, count, violated = S.shape[0] - p.size, 0, False
     for c in range(p.size):

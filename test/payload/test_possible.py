@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from recording import event, record, run
 from scipy.optimize import nnls
 
-from flexmanip_ros.numerics.square_root import allocate_bounds, meet
+from flexmanip_ros.numerics.square_root import allocate_bounds, least_distance
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import structured
 from flexmanip_ros.payload.process_model import Kind
@@ -20,7 +20,7 @@ from flexmanip_ros.payload.process_model import Kind
 def shortest(rows: np.ndarray, least: np.ndarray) -> np.ndarray:
     bounds = allocate_bounds(*rows.shape)
     bounds.rows[:], bounds.least[:] = rows, least
-    assert meet(bounds, len(rows))
+    assert least_distance(bounds, len(rows))
     return bounds.shortest
 
 
