@@ -61,6 +61,9 @@ def test_after_all_of_it_the_identifier_claims_nothing_wrong_and_after_a_reset_t
                 bench.send([('capture_event', header(CAPTURE))])
             bench.send([('joint_states', message_of(sample))], wait=k % 100 == 99)
         estimate = bench.node.estimate
+        if estimate is None:  # what was made up may stand beside the clock of the samples: nothing is claimed then
+            assert not reset
+            continue
         right = abs(estimate.payload.mass - 20.0) < 4.0 * estimate.payload.std + 0.05
         assert right or estimate.status is not Status.TRACKING
         bench.check()

@@ -126,7 +126,7 @@ def test_silence_means_zero_torque_once(ros: Ros) -> None:
 
 
 def test_the_arm_is_brought_to_a_new_setpoint_live(ros: Ros) -> None:
-    common = {'arm__modes': 1, 'rate': 250.0}
+    common = {'arm__modes': 1, 'arm__damping_ratio': 0.02, 'rate': 250.0}  # undamped, late torques ring it ever more
     node = start(ros, readers=0, rate=250.0, setpoint_rate=1.0)
     heard = ros.listen(JointState, 'joint_states', qos.sensor_output())
     plant = ros.add(PlantSimulator(context=ros.context, overrides=overrides(noise='none', **common)))
