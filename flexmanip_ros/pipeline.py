@@ -127,10 +127,9 @@ def step(config: IdentifierParameters, state: State, item: Item, background: Bac
     while taken < count:
         if isinstance(item, JointBlock):
             sampled, some = sampling.push_block(config, state.clock, state.log, item, taken)
-            stamp_ns = int(item.stamp_ns[taken])
         else:
-            sampled, some, stamp_ns = sampling.push(config, state.clock, state.log, item), 1, item.stamp_ns
-        state = _sampled(config, state, sampled, stamp_ns, background)
+            sampled, some = sampling.push(config, state.clock, state.log, item), 1
+        state = _sampled(config, state, sampled, background)
         state, found = catch_up(state, background, group)
         estimates += found
         taken += some
@@ -217,7 +216,7 @@ def finish(config: IdentifierParameters, state: State, background: Background = 
     if state.config is None:
         return state, ()
     sampled = sampling.flush(config, state.clock, state.log)
-    state = _sampled(config, state, sampled, state.first_ns, background)
+    state = _sampled(config, state, sampled, background)
     state, estimates = catch_up(state, background)
     state, model = _take_model(state, background)
     return state, (*estimates, *model)
@@ -268,20 +267,19 @@ def reconfigure(config: IdentifierParameters, state: State, background: Backgrou
     return state._replace(published=last, model=model, pending=pending)
 
 
-def _sampled(config: IdentifierParameters, state: State, sampled: sampling.Sampled, stamp_ns: int,
-             background: Background) -> State:
-    """Go on with clock and log after a message; build the estimators once the signals are known."""
+def _sampled(config: IdentifierParameters, state: State, sampled: sampling.Sampled, background: Background) -> State:
+    """Go on with clock and log after a message; build the estimators with the first that can be used."""
     if sampled.reset:
         state = State(config=state.config)
     state = state._replace(clock=sampled.clock, log=sampled.log)
-    outputs = sampled.clock.outputs
-    if state.payload is not None or outputs is None:
+    outputs, first_ns = sampled.clock.outputs, sampled.clock.last_ns
+    if state.payload is not None or outputs is None or first_ns is None:
         return state
     settled = config if config.outputs == outputs else replace(config, outputs=outputs)
     early = state.early
     payload, identifier = estimator.init(settled)
     state = state._replace(config=settled, payload=EventReplay(payload), identifier=EventReplay(identifier),
-                           first_ns=stamp_ns, published=-1, early=())
+                           first_ns=first_ns, published=-1, early=())
     for event in early:
         state = _insert(state, event, background)
     return state

@@ -186,3 +186,11 @@ def test_a_capture_from_before_the_first_sample_counts_all_along_however_late_it
     assert live[-1].status is Status.TRACKING
     assert payload.lower < plant.payload_mass < payload.upper
     assert same(live, list(pipeline.run(config, late)))
+
+
+@pytest.mark.parametrize('position', [[np.nan] * 4, [0.0] * 3], ids=['not finite', 'of another size'])
+@pytest.mark.parametrize('stamp_ns', [0, 10**15])
+def test_a_first_message_that_cannot_be_used_sets_no_clock(position: list[float], stamp_ns: int) -> None:
+    good = [record._replace(stamp_ns=record.stamp_ns + 10**12) for record in records(300)]
+    unusable = good[0]._replace(stamp_ns=stamp_ns, position=np.array(position))
+    assert same(step_through([unusable, *good])[1], step_through(good)[1])
