@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
-from fuzz_messages import NEXT, messages
+from fuzz_messages import LATER, NEXT, messages
 from geometry_msgs.msg import InertiaStamped
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from joint_states import START_NS, STEP_NS, joint_state
+from joint_states import STEP_NS, joint_state
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
@@ -34,8 +34,7 @@ IDENTIFIED = {f'rpbsid_identifier/{name}': kind for name, kind in (
     ('payload_mass', Float64), ('payload_estimate', Float64MultiArray), ('payload', InertiaStamped))}
 DEEP = QoSProfile(
     depth=1000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-LATER_NS = START_NS + 10**12
-"""Samples of the made-up messages are later than those of a recording: that one is a new clock."""
+LATER_NS = LATER * 10**9
 
 
 class Subject(NamedTuple):
