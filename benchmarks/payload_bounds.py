@@ -46,6 +46,7 @@ def truth() -> dict[str, float]:
              'torque_gain': 'joint{}_torque_gain', 'bend_gain': 'link{}_bend_gain', 'bend_offset': 'link{}_bend_offset'}
     values = {name.format(i + 1): getattr(TRUE, field)[i] for field, name in names.items() for i in range(2)}
     values |= {f'link{i + 1}_damping_ratio': TRUE.damping_ratio for i in range(2)}
+    values |= dict.fromkeys(('torque_delay', 'joint1_torque_lag', 'joint2_torque_lag', 'bend_delay'), 0.0)
     return values | {'payload_mass': PLANT.payload_mass, 'payload_com_x': PLANT.payload_com[0],
                      'payload_com_y': PLANT.payload_com[1], 'payload_inertia': PLANT.payload_inertia,
                      'object_spin': PLANT.object_spin}
@@ -106,9 +107,9 @@ def main() -> None:
     print('quantity                        after     value     prior     bound       rms  efficiency')
     for k, count in enumerate(counts[1:]):
         for name, values in bounds.items():
-            if name not in tracking[0][k]:
+            if not any(name in found[k] for found in tracking):
                 continue
-            errors = np.array([found[k][name] for found in tracking]) - true[name]
+            errors = np.array([found[k].get(name, np.nan) for found in tracking]) - true[name]  # only some learn delays
             errors = errors[np.isfinite(errors)]
             rms = float(np.sqrt(np.mean(errors ** 2))) if errors.size else np.nan
             of_arm = not name.startswith(('payload', 'object'))
