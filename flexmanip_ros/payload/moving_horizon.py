@@ -247,15 +247,12 @@ def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
             m.g[i] += motion.bounds.shortest[i]
         for c in range(p.size):
             p[c] = m.x0[first + c] + dot(m.S0[first + c], m.xi)
-    if p.size > INERTIA and motion.kind[INERTIA] == INERTIA:
-        lacks, own = -p[INERTIA], m.counts[USED] - 1
-        keep_inertia(motion, p)
-        lacks += p[INERTIA]
-        while own >= 0 and m.S0[first + INERTIA, own] == 0.0:  # its own column is the last in its row
-            own -= 1
-        if lacks > 0.0 and own >= 0:
-            m.xi[own] += lacks / m.S0[first + INERTIA, own]
-            m.g[own] += lacks / m.S0[first + INERTIA, own]
+    lacks, own = keep_inertia(motion, p), m.counts[USED] - 1
+    while lacks > 0.0 and own >= 0 and m.S0[first + INERTIA, own] == 0.0:  # its own column is the last in its row
+        own -= 1
+    if lacks > 0.0 and own >= 0:
+        m.xi[own] += lacks / m.S0[first + INERTIA, own]
+        m.g[own] += lacks / m.S0[first + INERTIA, own]
     return True
 
 
@@ -313,7 +310,7 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
 
 @inner
 def misfits(motion: ProcessModel, m: FilterState) -> bool:
-    """Whether the fit costs far more than white noise, and will go on to: another start is due."""
+    """Whether another start is due: the fit costs far more than white noise, or came to no end in ``TRIALS``."""
     most = MOST_REFITS - 1
     if m.counts[HELD] == 1:
         most = STARTS if motion.kind.size > INERTIA and motion.kind[INERTIA] == INERTIA else 0
@@ -328,7 +325,7 @@ def misfits(motion: ProcessModel, m: FilterState) -> bool:
 
 @inner
 def fails(m: FilterState) -> bool:
-    """Whether the moving-horizon estimation ended in a minimum that is none: it fits too badly, or too few samples."""
+    """Whether the fit at the end of the horizon is none: it costs far more than white noise, or lacks some samples."""
     if m.counts[REFITS] >= MOST_REFITS:
         return False
     expected = m.xi.size + m.noise.shape[0] * m.counts[BEFORE]

@@ -240,11 +240,14 @@ def gather_bounds(motion: ProcessModel, p: Array, S: Array, chance: float) -> in
 
 
 @inner
-def keep_inertia(motion: ProcessModel, p: Array) -> None:
-    """Move the inertia in p (np,) to the least that mass and first moments leave."""
-    if p.size > INERTIA and motion.kind[INERTIA] == INERTIA:
-        moment = p[FIRST_X] * p[FIRST_X] + p[FIRST_Y] * p[FIRST_Y]
-        p[INERTIA] = max(p[INERTIA], motion.least[1] + moment / (p[MASS] - motion.least[0]))
+def keep_inertia(motion: ProcessModel, p: Array) -> float:
+    """Raise the inertia in p (np,) to the least that mass and first moments leave; return by how much [kg m^2]."""
+    if p.size <= INERTIA or motion.kind[INERTIA] != INERTIA:
+        return 0.0
+    moment = p[FIRST_X] * p[FIRST_X] + p[FIRST_Y] * p[FIRST_Y]
+    before, least = p[INERTIA], motion.least[1] + moment / (p[MASS] - motion.least[0])
+    p[INERTIA] = max(before, least)
+    return float(p[INERTIA] - before)
 
 
 @inner

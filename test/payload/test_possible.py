@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -50,7 +48,7 @@ def test_wrong_gains_and_no_friction_do_not_lose_what_is_caught(seed: int) -> No
     arm = ArmParameters(damping_ratio=0.003, modes=5, torque_gain=(1.04, 1.04), bend_gain=(0.98, 0.98),
                         bend_offset=(5e-4, 5e-4))
     mass, caught = rng.uniform(10.0, 40.0), event(3.0)
-    config = IdentifierParameters(arm=replace(ArmParameters(), damping_ratio=0.0))
+    config = IdentifierParameters()
     samples = record(5.0, (caught,), degrees=(rng.uniform(0.0, 90.0), rng.uniform(20.0, 100.0)), payload=mass, arm=arm,
                      seed=seed, outputs=config.outputs)
     state = run(config, samples, (caught,))

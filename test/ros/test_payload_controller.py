@@ -137,7 +137,7 @@ def test_the_arm_is_brought_to_a_new_setpoint_live(ros: Ros) -> None:
     goal = np.array(heard[0].position[:2]) + np.array([0.05, -0.05])
     (result,) = node.set_parameters([Parameter('setpoint', value=goal.tolist())])
     assert result.successful
-    # 2 to 13 s on an idle machine: the loop runs by the wall's clock, and late torques ring the arm
+    # the loop runs by the wall's clock, so torques come late and ring the arm: its damping ends that
     ros.wait(lambda: np.abs(np.array(heard[-1].position[:2]) - goal).max() < 0.01, timeout=60.0)
     assert plant.dropped_commands == 0
 
