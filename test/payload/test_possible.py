@@ -28,9 +28,10 @@ def test_the_shortest_way_within_bounds_is_that_of_nonnegative_least_squares(
         seed: int, count: int, size: int, alike: float) -> None:
     """Lawson and Hanson's least distance: u = -r / r_n, r the residual of least |E z - f|, z >= 0."""
     rng = np.random.default_rng(seed)
-    rows = rng.standard_normal((count, size)) * 10.0 ** rng.uniform(-3.0, 3.0, (count, 1))
+    rows = rng.standard_normal((count, size))
     if count > 1:  # as of viscous and Coulomb friction: what one takes the other gives
         rows[1] = alike * rows[1] - rows[0]
+    rows *= 10.0 ** rng.uniform(-3.0, 3.0, (count, 1))
     lengths = np.linalg.norm(rows, axis=1)
     least = rng.standard_normal(count)
     found = shortest(rows, least * lengths)
