@@ -8,6 +8,7 @@ stamps alone. An event older than ``rewind_time`` is applied at once and counted
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
@@ -125,7 +126,8 @@ def insert(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog,
     replay = replay._replace(late_events=replay.late_events + 1)
     if all(taken.stamp_ns <= first_ns for taken in replay.latest):
         return _restart(config, replay)
-    return _wait(replay, event._replace(stamp_ns=replay.last_ns + 1))
+    late_ns = replay.last_ns + 1 - event.stamp_ns
+    return _wait(replay, event._replace(stamp_ns=replay.last_ns + 1, std_s=math.hypot(event.std_s, late_ns * 1e-9)))
 
 
 def _restart(config: IdentifierParameters, replay: EventReplay[E]) -> EventReplay[E]:

@@ -22,11 +22,22 @@ class EventKind(Enum):
     RELEASE = 'release'
 
 
+DATING_STD_S = 0.003
+"""Standard deviation of the instant of an event that was found in the signals [s]: half of them are dated to 2 ms
+(benchmark ``detection_delay``), which is 0.67 of it."""
+
+
 class CaptureEvent(NamedTuple):
     """The arm took or let go of an object at ``stamp_ns``; that stamp is the first after the jump."""
 
     stamp_ns: int
     kind: EventKind
+    std_s: float = 0.0
+    """Standard deviation of the instant [s]; 0: it is known."""
+
+    def heard_on(self, topic: str) -> CaptureEvent:
+        """Return the event as it came on a topic: what comes on ``capture_detected`` was found in the signals."""
+        return self._replace(std_s=DATING_STD_S) if topic.endswith('capture_detected') else self
 
 
 def events_at(start_ns: int, capture_s: float, release_s: float, end_s: float = math.inf) -> tuple[CaptureEvent, ...]:

@@ -316,7 +316,7 @@ class _Recording:
     def event(self, topic: str, raw: bytes) -> Iterator[CaptureEvent]:
         """Decode an event; note one that is none."""
         try:
-            yield cdr.capture_event(raw)
+            yield cdr.capture_event(raw).heard_on(topic)
         except (cdr.CdrError, UnicodeDecodeError) as err:
             self._faults.append(f"message {self.taken} (on '{topic}') is garbled: {err}")
         except ValueError as err:

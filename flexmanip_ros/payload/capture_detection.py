@@ -16,7 +16,7 @@ from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Rows, SampleLog
-from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, JointRecord
+from flexmanip_ros.types import DATING_STD_S, CaptureEvent, EventKind, JointBlock, JointRecord
 
 SETTLE = 0.5
 """Seconds after the start or an event before the next can be told."""
@@ -156,7 +156,7 @@ def _watch(
     assert state.since is not None
     lag = min(int(glr.level[1]), cursor - 1 - state.since, glr.trace.shape[0] - 1)
     kind = EventKind.RELEASE if m.counts[mem.HELD] else EventKind.CAPTURE
-    event = CaptureEvent(int(rows.between(cursor - 1 - lag, cursor).stamp_ns[0]), kind)
+    event = CaptureEvent(int(rows.between(cursor - 1 - lag, cursor).stamp_ns[0]), kind, DATING_STD_S)
     return _after(state, event), event
 
 

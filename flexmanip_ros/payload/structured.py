@@ -5,6 +5,7 @@ A Kalman filter with moving-horizon estimation (``moving_horizon``). States are 
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -119,7 +120,7 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     rows = np.pad(state.efforts, ((0, 0), (1, 0)))
     predict(state.model.motion, m.x, m.S, m.x.size, rows, state.sensors.period, min(ahead * 1e-9, LONGEST_S),
             m.counts[mem.FINENESS])
-    _change(config, state.model, m, event.kind)
+    _change(config, state.model, m, event)
     last_ns = state.last_ns + ahead
     return state._replace(memory=m, last_ns=last_ns, horizon=Horizon(state.cursor, last_ns, state.efforts))
 
@@ -129,14 +130,14 @@ def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
     return judge(config, state.model, state.sensors, state.memory, state.restarts)
 
 
-def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, kind: EventKind) -> None:
+def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, event: CaptureEvent) -> None:
     """Reopen what an event changes: the rates, and what is held."""
-    payload = model.payload
+    payload, kind = model.payload, event.kind
     held = bool(m.counts[mem.HELD])
     before = max(float(m.x[payload]), 0.0) if held else 0.0
     if kind is EventKind.CAPTURE and m.counts[mem.SEEN] < UNTAUGHT:
         structured_model.take_as_known(model, m)
-    columns = structured_model.jump(config, model, m)
+    columns = structured_model.jump(config, model, m, math.hypot(event.std_s, config.payload.event_time_std))
     opened = np.zeros((m.x.size, model.body))
     if kind is EventKind.CAPTURE:
         if not held:

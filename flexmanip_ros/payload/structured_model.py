@@ -444,11 +444,13 @@ def triangular(S: Array) -> Array:
     return root
 
 
-def jump(config: IdentifierParameters, model: Model, m: mem.FilterState) -> Array:
+def jump(config: IdentifierParameters, model: Model, m: mem.FilterState, instant_std: float) -> Array:
     """Columns (nx, c) of the rate jump at an event: an impulse at the tip, force and moment, and what it leaves open.
 
     Whatever a body of unknown mass does to the rates, it does through such an impulse p on the arm as it was: q'
-    jumps by M^-1 J' p, p the expected mass times the expected speed, and a moment likewise.
+    jumps by M^-1 J' p, p the expected mass times the expected speed, and a moment likewise. Where that is later than
+    the stamp by t, q lacks t M^-1 J' p. t is independent of p, so the variance is the product, instant_std [s] squared
+    times that of the rates.
     """
     motion = model.motion
     n, links = motion.arm.stiffness.size, motion.arm.length.size
@@ -467,8 +469,10 @@ def jump(config: IdentifierParameters, model: Model, m: mem.FilterState) -> Arra
     impulse = np.array([mass * speed, mass * speed, moment * speed + inertia * SPIN])[:len(J)]
     rates = np.linalg.solve(M, J.T) * impulse
     other = OTHER_JUMP * np.sqrt((rates ** 2).sum(axis=1))
-    columns = np.zeros((m.x.size, rates.shape[1] + n))
-    columns[n:2 * n] = np.hstack([rates, np.diag(other)])
+    jumps = np.hstack([rates, np.diag(other)])
+    columns = np.zeros((m.x.size, 2 * jumps.shape[1] if instant_std > 0.0 else jumps.shape[1]))
+    columns[n:2 * n, :jumps.shape[1]] = jumps
+    columns[:n, jumps.shape[1]:] = instant_std * jumps if instant_std > 0.0 else 0.0
     return columns
 
 

@@ -22,7 +22,7 @@ from flexmanip_ros.payload import cramer_rao
 from flexmanip_ros.payload.structured_model import chords, unobservable_reason
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.whole_recording import Smoothed
-from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, Mode, Payload, Status
+from flexmanip_ros.types import QUANTILE, Array, Estimate, EventKind, Mode, Payload, Status
 
 ADVICE: Mapping[Status, str] = {
     Status.WARMING_UP: 'record for longer, while the arm moves',
@@ -171,7 +171,9 @@ def event_time(state: pipeline.State, kind: EventKind) -> float | None:
     """Return when the latest event of a kind was, from the first sample's stamp [s]; None if not reached."""
     stamp = state.stamp_of(kind)
     waiting = () if state.payload is None else state.payload.pending
-    return None if stamp is None or CaptureEvent(stamp, kind) in waiting else (stamp - state.first_ns) / 1e9
+    if stamp is None or (stamp, kind) in (event[:2] for event in waiting):
+        return None
+    return (stamp - state.first_ns) / 1e9
 
 
 def _known(value: float) -> float | None:

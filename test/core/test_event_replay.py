@@ -111,6 +111,8 @@ def test_an_event_too_old_to_go_back_for_is_applied_at_once_and_counted() -> Non
     assert state.payload is not None
     assert state.payload.late_events == 1
     assert state.payload.rewinds == 0
+    (taken,) = [event for _, event in state.payload.applied]
+    assert taken.std_s == pytest.approx((taken.stamp_ns - 100 * MS) * 1e-9)  # it is applied so much too late
 
 
 def test_an_event_announced_twice_counts_once() -> None:

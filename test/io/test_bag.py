@@ -17,7 +17,7 @@ from flexmanip_ros.errors import BagError
 from flexmanip_ros.io import bag, cdr
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.messages import Diagnostics, DiagnosticStatus, Inertia, model_matrix
-from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, StateSpace
+from flexmanip_ros.types import DATING_STD_S, CaptureEvent, EventKind, JointRecord, StateSpace
 
 
 @pytest.mark.parametrize('storage', list(StoragePlugin))
@@ -144,6 +144,15 @@ def test_a_namespace_is_found_and_two_are_asked_about(tmp_path):
     assert 'several topics' in good_part(tmp_path / 'two')[1]
     assert len(list(bag.read(tmp_path / 'two', bag.Topics('/left/joint_states')))) == 1
     assert len(list(bag.read(tmp_path / 'two', bag.Topics('/right/joint_states')))) == 2
+
+
+@pytest.mark.parametrize(('topic', 'std_s'), [('/arm/capture_event', 0.0), ('/arm/capture_detected', DATING_STD_S)])
+def test_the_instant_of_an_event_is_known_where_it_was_announced_and_not_where_it_was_detected(tmp_path, topic, std_s):
+    event = CaptureEvent(START, EventKind.CAPTURE)
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.write('/arm/joint_states', START, joint_state_record(0))
+        writer.write(topic, START, event)
+    assert list(bag.read(tmp_path / 'bag'))[-1] == event._replace(std_s=std_s)
 
 
 def test_progress_is_told_from_the_metadata(tmp_path):

@@ -273,7 +273,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             return
         self._take_samples()  # those before the event
         try:
-            event = capture_event(message)
+            event = capture_event(message).heard_on(topic)
         except FlexmanipError as error:
             self._reject(topic, str(error))
             return
