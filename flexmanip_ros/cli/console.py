@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from flexmanip_ros.errors import FlexmanipError, ModelError
 
@@ -80,9 +80,21 @@ def parser(prog: str, words: str, epilog: str) -> Parser:
                   formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
+class Once(argparse.Action):
+    """An option that may be given once: of two values the first would be lost without a word."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any,
+                 option_string: str | None = None) -> None:
+        """Take the value, or say that there is one."""
+        if getattr(namespace, self.dest) is not None:
+            parser.error(f'{option_string} was given twice; give one file with the parameters of both')
+        setattr(namespace, self.dest, values)
+
+
 def add_parameters(made: Parser, owner: str, note: str = '') -> None:
     """Add --params and --set. owner: whose parameters they are; note: what else --set can name."""
-    made.add_argument('--params', metavar='FILE.yaml', help=f'ROS parameter file with the parameters of {owner}')
+    made.add_argument('--params', metavar='FILE.yaml', action=Once,
+                      help=f'ROS parameter file with the parameters of {owner}')
     made.add_argument('--set', metavar='name=value', action='append', default=[],
                       help=f'set one parameter{note}; the value is YAML; may be repeated')
 

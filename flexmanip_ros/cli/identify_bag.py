@@ -58,7 +58,8 @@ def _parser() -> console.Parser:
         help='write the estimates: a table where the name ends in .csv or .npz, else a rosbag2 recording')
     add('--report', metavar='REPORT.html', help='write a report: one HTML page with figures and tables')
     add('--save-arm', metavar='FILE.yaml',
-        help='write what the arm taught (stiffness, damping, friction, rotors, gains, offsets) as a parameter file')
+        help='write the parameters of the arm, with what it taught (stiffness, damping, friction, rotors, gains, '
+        'offsets, delays), as a parameter file')
     add('--configurations', metavar='FILE.csv',
         help='write frequencies and damping over the angle between the links, with deviations (a moving arm: '
         'docs/moving_arm.md); --report draws them')
@@ -74,7 +75,7 @@ def _parser() -> console.Parser:
     looked.add_argument('--no-detect', action='store_false', dest='detect', help='never look for them in the signals')
     for kind in ('capture', 'release'):
         add(f'--{kind}-time', metavar='SECONDS', type=console.seconds,
-            help=f'add a {kind} at this time [s], counted from the first stamp')
+            help=f'add a {kind} at this time [s], counted from the first stamp; below 0: before the recording')
     return made
 
 

@@ -85,13 +85,13 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     """
     started = time.perf_counter()
     if request.report is not None:
-        check_place(request.report)
-        require_matplotlib()
         if request.output is not None and Path(request.output).resolve() == Path(request.report).resolve():
             raise ParameterError(f"--output and --report are both '{request.report}'", 'give two names')
-    for place in (request.save_arm, request.configurations):
+        check_place(request.report, '.html', '.htm')
+        require_matplotlib()
+    for place, endings in ((request.save_arm, ('.yaml', '.yml')), (request.configurations, ('.csv',))):
         if place is not None:
-            check_place(place)
+            check_place(place, *endings)
     progress = progress or Report()
     messages = _Messages(request, progress)
     kept: list[Estimate] = []
@@ -322,7 +322,7 @@ def _remark(state: pipeline.State, foreign: int) -> str:
                     'the result is of the samples after that')
     if events is not None:
         parts += [f'a {event.kind.value} has a stamp after the last sample and was not applied'
-                 for event in events.pending if event in events.latest]
+                 for event in events.pending]
         if events.late_events:
             parts.append(f'{events.late_events} events arrived more than rewind_time after their stamp; '
                         'they were applied on arrival')

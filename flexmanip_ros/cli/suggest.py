@@ -91,7 +91,7 @@ def suggest(source: str, place: str, given: Mapping[str, Any], topics: bag.Topic
     given: parameters that stay as they are; until_s: the samples from there on are not looked at [s].
     Raises FlexmanipError where the recording tells too little, and where the file cannot be written.
     """
-    check_place(place)
+    check_place(place, '.yaml', '.yml')
     with console.progress('looking at the signals', 'messages') as shown:
         recording = _recording(source, topics, until_s, shown)
     signals = observe(recording.blocks)
@@ -119,7 +119,7 @@ def file_text(heading: str, words: Sequence[str], values: Mapping[str, Any]) -> 
 
 def _recording(source: str, topics: bag.Topics, until_s: float | None, progress: bag.Progress) -> _Recording:
     """Read up to a time; of a damaged recording what comes before the damage."""
-    found = _Recording()
+    found, is_cut = _Recording(), until_s is None
     try:
         for item in bag.read_blocks(source, topics, progress):
             if isinstance(item, CaptureEvent):
@@ -128,6 +128,7 @@ def _recording(source: str, topics: bag.Topics, until_s: float | None, progress:
             first = found.blocks[0].stamp_ns[0] if found.blocks else item.stamp_ns[0]
             used = np.full(len(item.stamp_ns), True) if until_s is None else (
                 item.stamp_ns < first + round(until_s * 1e9))
+            is_cut |= not used.all()
             if used.any():
                 found.blocks.append(item if used.all() else item.part(used))
     except BagError:
@@ -135,6 +136,8 @@ def _recording(source: str, topics: bag.Topics, until_s: float | None, progress:
             raise
     if not found.blocks:
         raise ParameterError(f'the recording has no sample before {until_s:g} s', 'choose a later time')
+    if not is_cut:
+        raise ParameterError(f'the recording has no sample to score from {until_s:g} s on', 'choose an earlier time')
     return found
 
 

@@ -50,8 +50,11 @@ def write_file(path: str | Path, fill: Callable[[Any], Any]) -> None:
         raise OutputError(f"'{path}' cannot be written: {err.strerror}", 'give another place') from err
 
 
-def check_place(path: str | Path) -> None:
-    """Raise OutputError when a file cannot be written there. Call it before a long run."""
+def check_place(path: str | Path, *endings: str) -> None:
+    """Raise OutputError when a file cannot be written there, or its name has none of the endings, if any are given.
+
+    Call it before a long run.
+    """
     folder = Path(path).absolute().parent
     try:
         is_directory = stat.S_ISDIR(os.stat(path).st_mode)
@@ -65,6 +68,8 @@ def check_place(path: str | Path) -> None:
         raise OutputError(f"directory '{folder}' does not exist", 'make it first, or give another place')
     if not os.access(folder, os.W_OK):
         raise OutputError(f"directory '{folder}' cannot be written", 'give another place')
+    if endings and Path(path).suffix.lower() not in endings:
+        raise OutputError(f"'{path}' does not end in {' or '.join(endings)}", 'give such a name')
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.parameters import IdentifierParameters, flatten
 from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.payload.structured import StructuredState
 from flexmanip_ros.types import ArmParameter
@@ -63,19 +63,19 @@ def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple
 
 
 def as_parameters(config: IdentifierParameters, found: Sequence[ArmParameter]) -> dict[str, Any]:
-    """Return parameters by dotted name, with which the arm is given as it was found.
+    """Return every parameter of the arm by dotted name: as it was found, and what it does not teach as it was given.
 
-    The damping ratio is one parameter: the mean of the links, each weighted by its information.
+    The damping ratio is one parameter: the mean of the links, each weighted by its information. A delay of the bends
+    that is less than two deviations below zero is none.
     """
     by_name = {one.name: one for one in found}
-    values: dict[str, Any] = {}
+    values: dict[str, Any] = flatten(config.arm, 'arm.')
     for kind, field in FIELDS.items():
         given = getattr(config.arm, field)
         each = given if isinstance(given, tuple) else (given,)
         here = [by_name.get(NAMES[kind].format(link + 1)) for link in range(len(each))]
         if any(here):
-            least = 0.0 if kind in POSITIVE else -np.inf
-            new = tuple(before if one is None else max(float(f'{one.value:.6g}'), least)
+            new = tuple(before if one is None else float(f'{_possible(kind, one):.6g}')
                         for one, before in zip(here, each, strict=True))
             values[f'arm.{field}'] = new if isinstance(given, tuple) else new[0]
     ratios = [one for one in found if one.name.endswith('_damping_ratio')]
@@ -84,3 +84,9 @@ def as_parameters(config: IdentifierParameters, found: Sequence[ArmParameter]) -
         mean = float(weights @ np.array([one.value for one in ratios]) / weights.sum())
         values['arm.damping_ratio'] = max(float(f'{mean:.6g}'), 0.0)
     return values
+
+
+def _possible(kind: Kind, one: ArmParameter) -> float:
+    """Return the value as a parameter can have it."""
+    nearly_zero = kind is Kind.BEND_DELAY and one.value > -2.0 * one.std
+    return max(one.value, 0.0) if kind in POSITIVE or nearly_zero else one.value

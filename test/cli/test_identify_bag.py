@@ -17,7 +17,7 @@ from flexmanip_ros.cli.simulate_bag import main as simulate
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.io.parameter_file import read
-from flexmanip_ros.parameters import IdentifierParameters, configure
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, PlantParameters, configure, flatten
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, Status
 
 START = 1_700_000_000_000_000_000
@@ -180,6 +180,23 @@ def test_an_event_in_the_recording_is_found(capsys, tmp_path):
     assert json.loads(out)['capture_time_s'] == 3.0
 
 
+@pytest.mark.parametrize(('arguments', 'words'), [
+    (('--params', 'a.yaml', '--params', 'b.yaml'), '--params was given twice'),
+    (('--report', 'report.pdf'), 'does not end in .html'),
+    (('--save-arm', 'arm.json'), 'does not end in .yaml'),
+    (('--configurations', 'table.xlsx'), 'does not end in .csv'),
+    (('--suggest', 'found.yaml', '--validate-from', '100'), 'no sample to score from 100 s on')])
+def test_what_would_be_in_vain_is_said_before_the_work(capsys, recording, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    try:
+        code, _, err = _run(capsys, recording, *arguments)
+    except SystemExit as end:  # of the parser
+        code, err = end.code, capsys.readouterr().err
+    assert code == 2
+    assert words in err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_the_arm_taught_is_saved_and_given_back_as_parameters(capsys, tmp_path):
     place, saved = tmp_path / 'faulty', tmp_path / 'arm.yaml'
     faults = {'torque_gain': (1.04, 0.97), 'bend_gain': (0.98, 1.02), 'bend_offset': (5e-4, -3e-4),
@@ -197,6 +214,8 @@ def test_what_the_arm_taught_is_saved_and_given_back_as_parameters(capsys, tmp_p
     assert [float(row['relative_angle_deg']) for row in rows] == pytest.approx(np.arange(0.0, 181.0, 2.5))
     assert all(float(row['frequency1_hz']) < float(row['frequency2_hz']) for row in rows if row['seen'] == '1')
     written = read(saved, 'rpbsid_identifier')
+    assert set(flatten(ArmParameters(), 'arm.')) == set(written)  # nothing is lost where it is given back
+    configure(PlantParameters, written)  # a simulated arm takes it too
     code, out, _ = _run(capsys, place, '--params', saved, '--json')
     result = json.loads(out.splitlines()[-1])
     assert result['status'] == 'TRACKING'
