@@ -87,7 +87,7 @@ endif
 
 # The wheel in a fresh environment, every command of the first pages, and a colcon build with its kernels.
 test-wheel: setup $(VENV)/.development
-	@FLEXMANIP_FRESH=1 $(BIN)/python -m pytest test/packaging
+	@FLEXMANIP_FRESH=1 $(BIN)/python -m pytest -o faulthandler_timeout=2400 test/packaging
 
 lint: setup $(VENV)/.development
 	@$(BIN)/ruff check .

@@ -44,11 +44,11 @@ def as_samples(position: np.ndarray, velocity: np.ndarray, effort: np.ndarray, d
 
 
 def follow(
-    config: IdentifierParameters, samples: Rows, capture: int, marks: Sequence[int], truth: float,
+    config: IdentifierParameters, samples: Rows, capture: int, marks: Sequence[int], truth: float, std_s: float = 0.0,
 ) -> Trial:
-    """Run with the capture before sample ``capture``; estimates after each of ``marks`` samples from it."""
+    """Run with the capture before sample ``capture``, known to std_s [s]; estimates after ``marks`` samples from it."""
     state = structured.advance(config, structured.init(config), samples.between(0, capture))
-    state = structured.event(config, state, CaptureEvent(int(samples.stamp_ns[capture]), EventKind.CAPTURE))
+    state = structured.event(config, state, CaptureEvent(int(samples.stamp_ns[capture]), EventKind.CAPTURE, std_s))
     found, start = [], capture
     for mark in marks:
         state = structured.advance(config, state, samples.between(start, capture + mark))

@@ -228,7 +228,7 @@ class _Messages:
             return f'found in the signals: {listed}{doubt}'
         if self._looked and not self._findings.watched:
             return ('the signals cannot tell: the empty arm does not move as its parameters say, or moves too '
-                    'shortly; check the parameters arm.*, or give --capture-time')
+                    'shortly; check the parameters arm.*, give those that --save-arm wrote of it, or --capture-time')
         if self._looked:
             return ('none found in the signals, so the arm is taken as empty' if not self.events else
                     'no others found in the signals') + '; give --capture-time if it caught something'

@@ -51,7 +51,7 @@ def _parser() -> console.Parser:
     add('--release-time', metavar='SECONDS', type=console.seconds, default=-1.0,
         help='time of the release [s]; default: never')
     add('--expected', action='store_true',
-        help='print how accurate a payload estimate from this torque can be; this takes some seconds')
+        help='print how accurate a payload estimate from this torque can be; this takes half a minute')
     console.add_parameters(made, 'plant_simulator and excitation', f', {PREFIX}NAME for one of the torque')
     return made
 
