@@ -17,8 +17,8 @@ ENOUGH = 512
 # Columns of ``noise``, one row a sensor: variance used by the filter; variance of the innovations; its slow part;
 # sum and sum of squares of the residuals in this block; least variance assumed; variance of the fourth differences
 # (white noise only); information on the payload that came from this sensor; sum of squares in this iteration; variance
-# used at the last event; variance of the residuals of the last fit.
-EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EVENT, FITTED = range(11)
+# used at the last event.
+EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EVENT = range(10)
 # Elements of ``counts``.
 (HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN, BEFORE,
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
@@ -35,7 +35,7 @@ class FilterState(NamedTuple):
     S: Array
     """(nx, nx) square root of the covariance."""
     noise: Array
-    """(m, 11) what is known of each sensor's noise."""
+    """(m, 10) what is known of each sensor's noise."""
     recent: Array
     """(m, 4) its last measurements."""
     counts: NDArray[np.int64]
@@ -79,7 +79,7 @@ class FilterState(NamedTuple):
 def memory(nx: int, m: int) -> FilterState:
     """Allocate for nx states and m sensors."""
     return FilterState(
-        x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)),
+        x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 10)), recent=np.zeros((m, 4)),
         counts=np.zeros(22, dtype=np.int64), score=np.zeros(11), x0=np.zeros(nx), S0=np.zeros((nx, nx)),
         xi=np.zeros(nx), accepted=np.zeros(nx), normal=np.zeros((nx, nx)), gradient=np.zeros(nx),
         xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),

@@ -205,7 +205,7 @@ def learn_noise(sensors: MeasurementModel, m: FilterState) -> None:
 def misfit(noise: Array, rate: NDArray[np.bool_]) -> float:
     """Innovation power over white noise, each sensor weighted by what it tells of the payload; nan: none yet.
 
-    noise: (m, 11), see ``filter_state``; rate: (m,) whether a sensor is one of rates. Those are left out where there
+    noise: (m, 10), see ``filter_state``; rate: (m,) whether a sensor is one of rates. Those are left out where there
     are displacements: they show the modes that the model leaves out, and have been given a larger noise.
     """
     total = sum_of_weights = 0.0

@@ -26,7 +26,6 @@ from flexmanip_ros.payload.filter_state import (
     ENOUGH,
     FINENESS,
     FIT,
-    FITTED,
     FLOOR,
     HELD,
     HORIZON,
@@ -47,10 +46,9 @@ from flexmanip_ros.payload.filter_state import (
     STORED,
     TRIED,
     USED,
-    WEIGHT,
     WHITE,
 )
-from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, observe
+from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, misfit, observe
 from flexmanip_ros.payload.process_model import INERTIA, correction, gather_bounds, keep_inertia, predict
 from flexmanip_ros.types import Array
 
@@ -90,8 +88,7 @@ STARTS = 2
 MOST_REFITS = 4
 """How often a fit is begun again after an event: an arm that is another one never fits."""
 STRAY, STRAY_EVERY = 3.0, 500
-"""Power of every sensor, over that of its white noise or of its last fit's residuals, with which the filter is begun
-again: what rings beyond the model was there in the fit too. Samples between two looks."""
+"""Power over white noise of every sensor with which the filter is begun again; samples between two looks."""
 FINEST = 3
 """Of the steps, see ``process_model.predict``."""
 COARSER = 0.1
@@ -193,9 +190,7 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
             return False
         for i in range(m.noise.shape[0]):
             m.noise[i, POWER] = m.noise[i, FIT] / max(m.counts[MEASURED], 1)
-            m.noise[i, SLOW] = m.noise[i, FITTED] = m.noise[i, POWER]
-        if reweight(sensors, m):
-            m.counts[AGAIN] = 1
+            m.noise[i, SLOW] = m.noise[i, POWER]
         # the step was not seen to lower the cost yet: the filter takes no more of it than it can tell
         part = min(1.0, TRUSTED / np.sqrt(max(gained, 1e-300)))
         payload = 2 * sensors.H.shape[1]
@@ -211,25 +206,6 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
         if m.counts[ITERATED] >= ENOUGH and gained < 0.5 * nx and m.score[SHIFT] < AT_REST:
             m.counts[STORED] = HORIZON
     return True
-
-
-@inner
-def reweight(sensors: MeasurementModel, m: FilterState) -> bool:
-    """Lower each variance r that is ``UNFIT`` times what the fit left; return whether there was one.
-
-    Iteratively reweighted least squares: what an earlier fit did not explain was taken for noise. r is at least twice
-    the white noise, as at first, and COST_BEFORE becomes that of the new variances. Rates keep theirs: they show the
-    modes that the model leaves out.
-    """
-    found_any = False
-    for i in range(m.noise.shape[0]):
-        before = m.noise[i, EFFECTIVE]
-        found = max(m.noise[i, POWER], 2.0 * m.noise[i, WHITE], 2.0 * m.noise[i, FLOOR])
-        if not sensors.rate[i] and UNFIT * found < before:
-            m.noise[i, EFFECTIVE] = found
-            m.score[COST_BEFORE] += m.noise[i, FIT] * (1.0 / found - 1.0 / before)
-            found_any = True
-    return found_any
 
 
 @inner
@@ -307,8 +283,7 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
         if m.counts[ITERATING] == 0:
             before = m.counts[BEFORE]
             if last:
-                due = (before < m.counts[STORED] or m.counts[AGAIN] == 1
-                       or dot(m.g, m.gradient) >= CONVERGED * before)
+                due = before < m.counts[STORED] or dot(m.g, m.gradient) >= CONVERGED * before
             else:
                 more = max(before // GROWTH, 1) if m.score[SHIFT] < AT_REST else 1
                 due = m.counts[AGAIN] == 1 or m.counts[STORED] >= before + more
@@ -361,7 +336,7 @@ def fails(m: FilterState) -> bool:
 
 @inner
 def strays(sensors: MeasurementModel, m: FilterState) -> bool:
-    """Whether the filter left the arm after all: sensors show far more than their noise, and than their last fit left.
+    """Whether the filter left the arm after all: sensors show far more than their noise, block after block.
 
     Of an arm that holds something all must: a fit is begun again at a cost. Of an empty arm those must in the mean that
     tell of its inertia.
@@ -370,14 +345,10 @@ def strays(sensors: MeasurementModel, m: FilterState) -> bool:
         return False
     if m.counts[STORED] < HORIZON or m.counts[SINCE_EVENT] % STRAY_EVERY != 0:
         return False
-    least, total, weights = STRAY, 0.0, 1e-300
+    least = STRAY
     for i in range(m.noise.shape[0]):
-        ratio = m.noise[i, POWER] / max(m.noise[i, WHITE], m.noise[i, FLOOR], m.noise[i, FITTED])
-        least = min(least, ratio)
-        if not sensors.rate[i]:
-            total += m.noise[i, WEIGHT] * ratio
-            weights += m.noise[i, WEIGHT]
-    left = bool(least >= STRAY if m.counts[HELD] == 1 else total >= UNFIT * weights)
+        least = min(least, m.noise[i, POWER] / max(m.noise[i, WHITE], m.noise[i, FLOOR]))
+    left = bool(least >= STRAY if m.counts[HELD] == 1 else misfit(m.noise, sensors.rate) >= UNFIT)
     m.counts[REFITS] += left
     return left
 
