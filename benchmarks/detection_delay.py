@@ -61,23 +61,18 @@ def delays(runs: int) -> dict[str, object]:
         if after:
             row = samples.log.row_at(after[0][0].stamp_ns, 0)
             followed.append(trials.follow(config, samples, row, MARKS, 20.0, after[0][0].std_s))
-    wrong = (1.0 - inside(followed)) * tracking(followed)
     return {'case': 'random instants', 'runs': runs, 'within_50_ms': float(np.mean(np.array(delay) <= 50.0)),
             'median_delay_ms': float(np.median(delay)), 'longest_delay_ms': float(np.max(delay)),
             'median_dating_error_ms': float(np.median(dated)), 'early_alarms': early, 'samples_after': MARKS,
-            'payload_inside': trials.numbers(inside(followed).mean(axis=0), 3),
-            'payload_outside_and_tracking': trials.numbers(wrong.mean(axis=0), 3),
+            'payload_inside': trials.numbers(trials.coverage(followed), 3),
+            'payload_outside_and_tracking': trials.numbers(trusted_and_wrong(followed), 3),
             'payload_median_error_percent': trials.numbers(np.median(np.abs(trials.errors(followed)), axis=0), 3)}
 
 
-def inside(followed: list[trials.Trial]) -> np.ndarray:
-    """Whether the truth is in the interval, (trials, marks)."""
-    return np.array([[one.lower <= trial.truth <= one.upper for one in trial.found] for trial in followed], dtype=float)
-
-
-def tracking(followed: list[trials.Trial]) -> np.ndarray:
-    """Whether the payload is TRACKING, (trials, marks)."""
-    return np.array([[one.status is Status.TRACKING for one in trial.found] for trial in followed], dtype=float)
+def trusted_and_wrong(followed: list[trials.Trial]) -> np.ndarray:
+    """Share of runs that are TRACKING with the truth outside the interval, (marks,)."""
+    return np.mean([[one.status is Status.TRACKING and not one.lower <= trial.truth <= one.upper
+                     for one in trial.found] for trial in followed], axis=0)
 
 
 def at_rest(runs: int) -> dict[str, object]:

@@ -469,11 +469,13 @@ def jump(config: IdentifierParameters, model: Model, m: mem.FilterState, instant
     impulse = np.array([mass * speed, mass * speed, moment * speed + inertia * SPIN])[:len(J)]
     rates = np.linalg.solve(M, J.T) * impulse
     other = OTHER_JUMP * np.sqrt((rates ** 2).sum(axis=1))
-    jumps = np.hstack([rates, np.diag(other)])
-    columns = np.zeros((m.x.size, 2 * jumps.shape[1] if instant_std > 0.0 else jumps.shape[1]))
-    columns[n:2 * n, :jumps.shape[1]] = jumps
-    columns[:n, jumps.shape[1]:] = instant_std * jumps if instant_std > 0.0 else 0.0
-    return columns
+    columns = np.zeros((m.x.size, rates.shape[1] + n))
+    columns[n:2 * n] = np.hstack([rates, np.diag(other)])
+    if instant_std == 0.0:
+        return columns
+    moved = np.zeros_like(columns)
+    moved[:n] = instant_std * columns[n:2 * n]
+    return np.hstack([columns, moved])
 
 
 BRIDGE_TERMS = 64

@@ -171,9 +171,8 @@ def event_time(state: pipeline.State, kind: EventKind) -> float | None:
     """Return when the latest event of a kind was, from the first sample's stamp [s]; None if not reached."""
     stamp = state.stamp_of(kind)
     waiting = () if state.payload is None else state.payload.pending
-    if stamp is None or (stamp, kind) in (event[:2] for event in waiting):
-        return None
-    return (stamp - state.first_ns) / 1e9
+    is_to_come = any(event.kind is kind and event.stamp_ns == stamp for event in waiting)
+    return None if stamp is None or is_to_come else (stamp - state.first_ns) / 1e9
 
 
 def _known(value: float) -> float | None:
