@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 PROG = 'simulate_bag'
 START_NS = 1_700_000_000_000_000_000
 """Stamp of the first sample; fixed, so that the same arguments give the same bytes."""
+CAPTURE_TIME = 3.0
+"""Time of the capture where none is given [s]."""
 PREFIX = 'excitation.'
 EXAMPLES = """examples:
   simulate_bag recording                                20 kg caught at 3 s, 6 s at 1 kHz, 40 dB
@@ -46,8 +48,8 @@ def _parser() -> console.Parser:
     add('--duration', metavar='SECONDS', type=console.seconds, default=6.0, help='simulated time [s]; default: 6')
     add('--seed', metavar='N', type=int, help='seed of the noise (parameter seed)')
     add('--payload', metavar='KG', type=float, help='mass of the object [kg] (parameter payload_mass)')
-    add('--capture-time', metavar='SECONDS', type=console.seconds, default=3.0,
-        help='time of the capture [s]; default: 3; negative: never')
+    add('--capture-time', metavar='SECONDS', type=console.seconds,
+        help=f'time of the capture [s]; default: {CAPTURE_TIME:g}; negative: never')
     add('--release-time', metavar='SECONDS', type=console.seconds, default=-1.0,
         help='time of the release [s]; default: never')
     add('--expected', action='store_true',
@@ -81,13 +83,13 @@ def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.io.bag_writer import BagWriter
     from flexmanip_ros.io.outputs import check_place, write_text
     from flexmanip_ros.simulation import excitation, simulator
-    from flexmanip_ros.types import CaptureEvent, JointRecord, events_at
+    from flexmanip_ros.types import CaptureEvent, JointRecord
 
     plant, torque = configurations(given)
     if not 0.0 < given.duration <= 1e6:
         raise ParameterError(f'--duration is {given.duration:g}', 'give seconds above 0, up to 1e6')
     count = max(round(given.duration * plant.rate), 1)
-    events = events_at(START_NS, given.capture_time, given.release_time, given.duration)
+    events = _events(given)
     target = Path(given.bag)
     if not target.name:
         raise BagError(f"'{given.bag}' is no name for a recording", 'give the name of a directory to make')
@@ -106,8 +108,24 @@ def _main(given: argparse.Namespace) -> int:
     write_text(truth_path, json.dumps(truth(plant, torque, events), indent=1) + '\n')
     if given.expected:
         print(excitation.describe(torque))
-    print(f"wrote '{target}' ({count} samples, {given.duration:g} s) and '{truth_path}'")
+    empty = '' if events else ', the arm stays empty'
+    print(f"wrote '{target}' ({count} samples, {given.duration:g} s{empty}) and '{truth_path}'")
     return console.SUCCESS
+
+
+def _events(given: argparse.Namespace) -> tuple[CaptureEvent, ...]:
+    """Return the events of the recording. Raises ParameterError where one that was asked for cannot happen in it."""
+    from flexmanip_ros.types import events_at
+
+    capture = CAPTURE_TIME if given.capture_time is None else given.capture_time
+    for name, at in (('--capture-time', given.capture_time), ('--release-time', given.release_time)):
+        if at is not None and at >= given.duration:
+            raise ParameterError(f'{name} is {at:g} s and the recording ends at {given.duration:g} s',
+                                 'give an earlier time or a longer --duration')
+    if given.release_time >= 0.0 and not 0.0 <= capture < given.release_time:
+        raise ParameterError(f'--release-time is {given.release_time:g} s and nothing is caught before',
+                             'give a --capture-time before it')
+    return events_at(START_NS, capture, given.release_time, given.duration)
 
 
 def truth(plant: PlantParameters, torque: ExcitationParameters, events: Sequence[CaptureEvent]) -> dict[str, Any]:

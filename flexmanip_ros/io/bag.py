@@ -267,6 +267,8 @@ class _Recording:
             raise
         except Exception as err:  # broken bytes lead the library to errors of many kinds
             self._damage = ' '.join(str(err).split()).rstrip('.') or type(err).__name__
+            if self.path.is_dir() and not (self.path / 'metadata.yaml').is_file():
+                self._damage = 'metadata.yaml is missing'
             yield from self._salvaged()
 
     def _salvaged(self) -> Iterator[tuple[str, bytes]]:

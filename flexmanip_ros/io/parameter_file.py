@@ -143,14 +143,24 @@ def load(cls: type[Config], node: str, path: str | Path | None, overrides: Itera
     """Return the configuration of ``node`` from a parameter file (or none) and ``name=value`` overrides."""
     from_file = {} if path is None else read(path, node, optional=optional)
     from_line = parse_overrides(overrides)
-    if path is not None:
-        try:
-            return configure(cls, {**from_file, **from_line})
-        except ParameterError as err:
-            if any(f"'{name}'" in err.problem for name in from_line):
-                raise
-            raise ParameterError(f"{err.problem} in parameter file '{path}'", err.remedy) from err
-    return configure(cls, from_line)
+    try:
+        return configure(cls, {**from_file, **from_line})
+    except ParameterError as err:
+        if path is None or any(f"'{name}'" in err.problem for name in from_line):
+            raise
+        where = f" in parameter file '{path}'"
+        if from_line and _stands(cls, from_file):
+            where = f": parameter file '{path}' does not go with --set {', '.join(from_line)}"
+        raise ParameterError(err.problem + where, err.remedy) from err
+
+
+def _stands(cls: type[Config], values: dict[str, Any]) -> bool:
+    """Whether the parameters of a file are right by themselves."""
+    try:
+        configure(cls, values)
+    except ParameterError:
+        return False
+    return True
 
 
 def load_arm(path: str | Path | None, overrides: Iterable[str] = ()) -> ArmParameters:

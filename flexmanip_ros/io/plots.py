@@ -23,7 +23,7 @@ from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.whole_recording import Scores, Smoothed, Sweep
 from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, JointRecord, Status
-from flexmanip_ros.view.screen import COLOURS, EVENT_COLOUR, MODES_APART, PAYLOAD_COLOUR, STATUS_LOOKS
+from flexmanip_ros.view.screen import COLOURS, EVENT_COLOUR, KNOWN_BAND, MODES_APART, PAYLOAD_COLOUR, STATUS_LOOKS
 
 LINES: tuple[Any, ...] = ('-', (0, (4, 1.2)), (0, (1.2, 1)), (0, (6, 1.2, 1.2, 1.2)))
 """Line styles, so that signals in one plot differ by more than their colour."""
@@ -120,7 +120,7 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int, truth: Se
             room = max(max(known_all) - min(known_all), 0.1 * max(known_all))
             ax.set_ylim(min(known_all) - room, max(known_all) + room)
         else:
-            limit(ax, _lowest(values[:, :, 0]), [])
+            limit(ax, _lowest(values[:, :, 0], values[:, :, 1]), [])
             ax.set_ylim(bottom=max(ax.get_ylim()[0], 0.0))
         _note_beyond(ax, values[-1, :, 0])
     ax.set_ylabel('frequency\n[Hz]')
@@ -135,13 +135,16 @@ def _band(ax: Any, x: Array, frequency: Array, std: Array, k: int) -> None:
             label=f'mode {k + 1}, 95 % band')
 
 
-def _lowest(values: Array) -> Array:
-    """Return the frequencies (T, k) that set the range, those far above the lowest as NaN.
+def _lowest(values: Array, stds: Array) -> Array:
+    """Return the frequencies (T, k) that set the range, those far above the lowest that is known as NaN.
 
     Noise gives modes far above those of the arm; a range that includes them would hide the change at a capture.
     """
-    settled = values[values.shape[0] // 2:]
+    settled, spread = values[values.shape[0] // 2:], stds[values.shape[0] // 2:]
     low = settled[np.isfinite(settled)]
+    known = settled[QUANTILE * spread <= KNOWN_BAND * settled]  # a drift of the sensors is a mode near 0 Hz
+    if known.size:
+        low = known
     if low.size == 0:
         return values
     return np.where(values <= MODES_APART * np.percentile(low, 5), values, np.nan)

@@ -90,8 +90,7 @@ def statistic(state: DetectionState) -> tuple[float, float]:
     """Return the latest statistic and its threshold (0 and infinite before there are any)."""
     if state.glr is None:
         return 0.0, float('inf')
-    level = state.glr.level
-    return float(level[0]), float(max(level[3], kernel.CALM * level[2]))
+    return float(state.glr.level[0]), float(kernel.limit(state.glr))
 
 
 def threshold(config: TriggerParameters, dt: float) -> float:
@@ -106,10 +105,10 @@ def threshold(config: TriggerParameters, dt: float) -> float:
 
 
 def _start(config: TriggerParameters, state: DetectionState, row: Rows) -> DetectionState:
-    """Let the filter start; then allocate the watch for its sample time."""
+    """Let the filter start; then, if there is none yet, allocate the watch for its sample time."""
     since = row.first if state.since is None else state.since
     state = replace(state, filter=structured.advance(state.identifier, state.filter, row), since=since)
-    if state.filter.memory is None or state.filter.model is None:
+    if state.filter.memory is None or state.filter.model is None or state.glr is not None:
         return state
     dt = float(np.median(np.diff(row.since(since).stamp_ns))) * 1e-9
     w = max(kernel.SHORTEST + 2, round(config.detection_window / dt))
@@ -118,8 +117,9 @@ def _start(config: TriggerParameters, state: DetectionState, row: Rows) -> Detec
     glr = kernel.GlrState(
         trace=np.zeros((w, m, kernel.CAUSES)), factors=np.zeros((w, kernel.CAUSES, kernel.CAUSES)),
         scores=np.zeros((w, kernel.CAUSES)), past=np.zeros((w, m)), clock=np.zeros(6, dtype=np.int64),
-        level=np.array([0.0, 0.0, 0.0, threshold(config, dt)]), history=np.zeros(2 * w),
-        statistic=np.zeros(w), flow=np.zeros((n2, n2)), state=np.zeros((2, n2, 2)))
+        level=np.array([0.0, 0.0, 0.0, threshold(config, dt)]), history=np.zeros((2, 2 * w)),
+        torques=row.u[-1].copy(), drive=np.zeros(3), statistic=np.zeros(w), flow=np.zeros((n2, n2)),
+        state=np.zeros((2, n2, 2)))
     return replace(state, glr=glr, dt=dt)
 
 
@@ -142,21 +142,22 @@ def _watch(
         filtered.model.motion, filtered.sensors, m, glr, light * np.array([SPEED, ACCELERATION, JERK]),
         state.dt, float(np.exp(-state.dt / PEAK_MEMORY)), round(SETTLE / state.dt), confirm, table, first,
         np.zeros(kernel.CAUSES), True)
-    cursor = rows.first + abs(taken) - first
-    if taken < 0:
-        fresh = init(config)
-        return replace(fresh, filter=fresh.filter._replace(cursor=cursor)), None
-    last = rows.between(cursor - 1, cursor)
-    filtered = filtered._replace(
-        memory=m, cursor=cursor, last_ns=int(last.stamp_ns[0]), efforts=structured.latest(
-            filtered.sensors, last.u, table[:abs(taken), 1:1 + last.u.shape[1]]))
-    state = replace(state, filter=filtered, glr=glr)
+    until = abs(taken)
+    part = rows.between(rows.first, rows.first + until - first)
+    after = structured.after_rows(filtered, m, part, table[:until])
+    if taken < 0:  # the fit of the empty arm begins again, and may learn more of it
+        last = part.since(part.until - 1)
+        fresh = structured.restart(state.identifier, filtered, after, last)
+        glr = _quiet(glr)
+        glr.level[2] = 0.0  # what the model missed before
+        return replace(state, filter=fresh, glr=glr), None
+    state = replace(state, filter=after, glr=glr)
     if glr.clock[kernel.ALARMED] <= confirm:
         return state, None
     assert state.since is not None
-    lag = min(int(glr.level[1]), cursor - 1 - state.since, glr.trace.shape[0] - 1)
+    lag = min(int(glr.level[1]), part.until - 1 - state.since, glr.trace.shape[0] - 1)
     kind = EventKind.RELEASE if m.counts[mem.HELD] else EventKind.CAPTURE
-    event = CaptureEvent(int(rows.between(cursor - 1 - lag, cursor).stamp_ns[0]), kind, DATING_STD_S)
+    event = CaptureEvent(int(rows.between(part.until - 1 - lag, part.until).stamp_ns[0]), kind, DATING_STD_S)
     return _after(state, event), event
 
 

@@ -369,13 +369,18 @@ def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> St
     table, first = input_table(state, rows)
     failed = filtered(state.model.motion, state.sensors, m, table, first) - first
     taken = rows.between(rows.first, min(rows.first + failed + 1, rows.until))
-    efforts = table[:first + len(taken), 1:1 + rows.u.shape[1]]
-    after = state._replace(cursor=taken.until, last_ns=int(taken.stamp_ns[-1]),
-                           efforts=latest(state.sensors, taken.u[-1:], efforts),
-                           missing=int(taken.missing[-1]), peak=_peaks(state, taken)[-1])
+    after = after_rows(state, m, taken, table[:first + len(taken)])
     if failed == len(rows):
-        return after._replace(memory=m)
-    return advance(config, _restart(config, after, m, taken.since(taken.until - 1)), rows.since(taken.until))
+        return after
+    return advance(config, restart(config, state, after, taken.since(taken.until - 1)), rows.since(taken.until))
+
+
+def after_rows(state: StructuredState, m: mem.FilterState, taken: Rows, table: Array) -> StructuredState:
+    """Return the state once the filter, now with memory m, took these rows, the last of the table (N, 1 + L + m)."""
+    assert state.sensors is not None
+    efforts = latest(state.sensors, taken.u[-1:], table[:, 1:1 + taken.u.shape[1]])
+    return state._replace(memory=m, cursor=taken.until, last_ns=int(taken.stamp_ns[-1]), efforts=efforts,
+                          missing=int(taken.missing[-1]), peak=_peaks(state, taken)[-1])
 
 
 def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
@@ -406,19 +411,23 @@ def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
     return whole, before + rows.first - begin
 
 
-def _restart(config: IdentifierParameters, state: StructuredState, m: mem.FilterState, last: Rows) -> StructuredState:
-    """Begin again after the last row, at which numbers left the finite range or a fit failed, with memory m.
+def restart(config: IdentifierParameters, before: StructuredState, state: StructuredState, last: Rows,
+            ) -> StructuredState:
+    """Begin again after the last row, at which numbers left the finite range or a fit failed.
+
+    before: the state before the rows that were taken with it.
 
     The first fit estimates few parameters of the arm and a point mass; later ones all of ``payload.learn``, and a rigid
     body. The object begins with its prior; the arm with what was learned before the event, or as given if that fails at
     once.
     """
+    assert before.memory is not None
     assert state.model is not None
     assert state.memory is not None
     assert state.efforts is not None
-    model = state.model
+    model, m = state.model, state.memory
     refits = int(m.counts[mem.REFITS])
-    unfit = refits > state.memory.counts[mem.REFITS]
+    unfit = refits > before.memory.counts[mem.REFITS]
     if unfit and refits <= STARTS and m.counts[mem.HELD] and model.body > 1 and m.counts[mem.STORED] < mem.HORIZON:
         m = mem.copy(m)
         _open_body(config, model, m)

@@ -35,7 +35,9 @@ STATUS_LOOKS: dict[Status, tuple[str, str]] = {
 }
 """Colour and hatch of each status, so that they differ by more than their colour."""
 MODES_APART = 4.0
-"""Ratio to the lowest frequency above which a mode does not set the range of a plot [-]."""
+"""Ratio to the lowest known frequency above which a mode does not set the range of a plot [-]."""
+KNOWN_BAND = 0.3
+"""Half width of its 95 % band, over the frequency, up to which a mode is known."""
 
 LOOPED_NS = 1_000_000_000
 """Stamps that go back further than this are a new run, and the page begins again."""
@@ -106,8 +108,8 @@ class Source(NamedTuple):
             'statuses': [[status.name, status.value, STATUS_LOOKS[status][0]] for status in Status],
             'tracking': STATUSES[Status.TRACKING.name],
             'colours': COLOURS, 'payload_colour': PAYLOAD_COLOUR, 'event_colour': EVENT_COLOUR,
-            'modes_apart': MODES_APART, 'stale_after': config.stale_after, 'exaggeration': config.exaggeration,
-            'window': config.window, 'windows': WINDOWS,
+            'modes_apart': MODES_APART, 'known_band': KNOWN_BAND, 'stale_after': config.stale_after,
+            'exaggeration': config.exaggeration, 'window': config.window, 'windows': WINDOWS,
         }
 
 

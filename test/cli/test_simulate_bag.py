@@ -76,6 +76,9 @@ def test_parameters_come_from_the_file_then_set_then_named_arguments(tmp_path):
     (['--payload', '-1'], "parameter 'payload_mass'"),
     (['--duration', '0'], '--duration'),
     (['--params', 'nothing.yaml'], 'does not exist'),
+    (['--capture-time', '9'], 'the recording ends at 6 s'),
+    (['--release-time', '2'], 'nothing is caught before'),
+    (['--capture-time', '-1', '--release-time', '2'], 'nothing is caught before'),
 ])
 def test_bad_arguments_are_one_line_and_exit_2(tmp_path, capsys, arguments, words):
     assert main([str(tmp_path / 'bag'), *arguments]) == 2

@@ -33,6 +33,16 @@ def test_missing_things_are_named(tmp_path):
         assert 'cannot be read' in good_part(tmp_path / name)[1]
 
 
+def test_a_recording_without_its_metadata_is_read_and_says_so(tmp_path):
+    path = write(tmp_path / 'bag')
+    whole = len(list(bag.read(path)))
+    (path / 'metadata.yaml').unlink()
+    read, line = good_part(path)
+    assert len(read) == whole
+    assert 'metadata.yaml is missing' in line
+    assert 'ros2 bag reindex' in line
+
+
 def test_a_missing_topic_is_answered_with_those_that_are_there(tmp_path):
     path = write(tmp_path / 'bag', topic='/other')
     line = good_part(path)[1]

@@ -54,6 +54,12 @@ def test_an_override_wins_over_the_file(tmp_path):
     assert (config.order, config.past_window) == (4, 12)
 
 
+def test_an_override_that_does_not_go_with_the_file_is_named(tmp_path):
+    path = _file(tmp_path, f'{NODE}: {{ros__parameters: {{arm: {{linear_density: [0.5, 0.4]}}}}}}')
+    with pytest.raises(ParameterError, match=r"yaml' does not go with --set arm\.link_length; give 1"):
+        load(IdentifierParameters, NODE, path, ['arm.link_length=[0.4]'])
+
+
 @pytest.mark.parametrize(('text', 'words'), [
     ('order: 4', 'ros__parameters'),
     ('just words', 'in place of a node'),

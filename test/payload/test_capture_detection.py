@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import scipy.linalg
 from recording import ARM, BENDS, RATES, event, record, rows_of
 
-from flexmanip_ros.parameters import PlantParameters, TriggerParameters
+from flexmanip_ros.parameters import ArmParameters, PlantParameters, TriggerParameters
 from flexmanip_ros.payload import capture_detection
+from flexmanip_ros.payload import capture_detection_kernel as kernel
 from flexmanip_ros.simulation import simulator
 from flexmanip_ros.types import EventKind
 
@@ -60,6 +64,36 @@ def test_a_capture_at_rest_is_told_when_the_torque_resumes():
     ((found, told),) = detect(settings(), samples)
     assert found.kind is EventKind.CAPTURE
     assert 2.0e9 < told <= 2.15e9  # an arm that rested has taught nothing of its friction and gains
+
+
+@pytest.mark.parametrize('own', [
+    {'joint_viscous_friction': (5.0, 3.0)},
+    {'joint_viscous_friction': (0.8, 0.8), 'joint_coulomb_friction': (0.15, 0.15), 'rotor_inertia': (0.2, 0.2)},
+], ids=['viscous', 'friction and rotor'])
+def test_a_capture_by_an_arm_with_friction_is_told_once_the_empty_arm_has_taught_it(own):
+    capture = event(3.0)
+    samples = record(3.6, (capture,), outputs=BENDS, arm=replace(ARM, **own))
+    ((found, told),) = detect(settings(BENDS), samples)
+    assert told - capture.stamp_ns <= 100e6
+    assert abs(found.stamp_ns - capture.stamp_ns) <= 20e6
+
+
+def test_steps_of_both_torques_raise_no_alarm_though_the_arm_has_more_modes_than_the_model():
+    ideal = ArmParameters(damping_ratio=0.003)
+    samples = record(4.2, degrees=(71.0, 85.0), outputs=BENDS, seed=2, arm=replace(ideal, modes=5))
+    assert detect(replace(settings(BENDS), arm=ideal), samples, block=1000) == []
+
+
+def test_the_exponential_of_a_sample_is_that_of_scipy_where_friction_makes_it_stiff():
+    samples = record(0.3, arm=replace(ARM, joint_coulomb_friction=(1.0, 0.5)), outputs=BENDS)
+    config = replace(settings(BENDS), arm=replace(ARM, joint_coulomb_friction=(1.0, 0.5)))
+    state, _ = capture_detection.advance(config, capture_detection.init(config), samples)
+    motion, n = state.filter.model.motion, state.filter.model.motion.arm.stiffness.size
+    motion.dqd[0, 0] = -5000.0  # a joint that sticks
+    flow = np.zeros((2 * n, 2 * n))
+    kernel.transition(motion, flow, np.zeros((2, 2 * n, 2)), 1e-3)
+    block = np.block([[np.zeros((n, n)), np.eye(n)], [motion.dq, motion.dqd]])
+    assert flow == pytest.approx(scipy.linalg.expm(1e-3 * block), rel=1e-4, abs=1e-4 * np.abs(flow).max())
 
 
 def test_single_samples_give_the_events_of_a_block():
