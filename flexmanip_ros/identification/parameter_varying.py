@@ -2,11 +2,13 @@
 
 In the basis x = [w; w'] of the measured displacements no change of coordinates is needed as the arm turns:
 
-    w'' = -G(c) w - D w' + H(c) tau,   y = w + E(c) tau + F tau'' + b,   c = cos(theta2 - theta1)
+    w'' = -(1 - mu a) G(c) w - D w' + H(c) tau,   y = w + E(c) tau + F tau'' + b,   c = cos(theta2 - theta1)
 
-G, H and E are linear in three functions of c (``varying_kernel.basis``). D holds two terms with the rates of the
-links, b is a slow offset, F and E stand for the modes above those of the model. Samples pass one low-pass filter
-above the modes; blocks of ``BLOCK`` of them update parameters and state together, as in ``recursive_fit``.
+G, H and E are linear in three functions of c (``varying_kernel.basis``). a is the square of the angle through which the
+links swing, mu the softening with it; the published model is that of small vibrations, a = 0. D holds two terms with
+the rates of the links, b is a slow offset, F and E stand for the modes above those of the model. Samples pass one
+low-pass filter above the modes; blocks of ``BLOCK`` of them update parameters and state together, as in
+``recursive_fit``.
 """
 
 from __future__ import annotations
@@ -35,14 +37,16 @@ MOST_TRIALS, SHORTER = 3, 0.3
 """Trials for each iteration of a fit at most, and factor on a step that would raise its cost."""
 VARIES, KNOWN = 0.12, 1.0
 """Prior deviations, as shares of the largest entry: of the parts of G and H that vary with c, and of the rest."""
-UNEVEN = 0.03
+UNEVEN = 0.01
 """The same of the parts of G that change as no arm of two links does. Where link 2 points the other way, c and the
 bends of link 2 change sign: G of a link alone is even in c, what couples the links is odd."""
+SOFT = 0.75
+"""Prior deviation of mu: the square of Duffing's frequency, x'' + (1 + x^2) x = 0, rises by 3/4 of the amplitude's."""
 DIRECT, DAMPED, TURNING, OFFSET, SHARED = 0.05, 0.05, 2.0, 0.3, 1.0
 """Prior deviations of E and F, D, its terms with rates, b and zeta; signals at unit power, time in 1 / shift."""
-WALK = 0.001
+WALK = 0.0003
 """Standard deviation by which a parameter may move in a block, as a share of its prior one."""
-STATE_WALK, OFFSET_WALK = 0.005, 0.01
+STATE_WALK, OFFSET_WALK = 0.02, 0.01
 """The same of the state and of the offset b, as shares of the size of the displacements."""
 NOISE_BLOCKS, SHARE_BLOCKS = 8, 16
 """Blocks over which the noise, and the share that is not predicted, are remembered."""
@@ -74,12 +78,11 @@ class Varying(NamedTuple):
     """The fit and what it remembers, constant in size; h displacements, r inputs, k parameters.
 
     shift: unit of time [1/s]; scale_u (r,), scale_y (h,): factors on signals; theta: (k,) see ``parts``; x: (2h,);
-    root: (k + 2h, k + 2h) S with S S' their covariance; noise: (h, h); averaged over the last blocks, share: (h,) of
-    the outputs' amplitude that the prediction of a block misses, and swing: ``Block.swing``; corner [Hz], every: the
-    filter and the samples that it keeps one of; filtered: (4, r + h + 2) its state; dt: sample time [s]; angle:
-    relative angle of the links at the end [rad]; blocks: number taken; strikes: bad ones in a row; lost: samples were
-    missing, so filter and state begin anew; settling: kept samples until the filter that began anew is trusted; gain:
-    (n, m) published K.
+    root: (k + 2h, k + 2h) S with S S' their covariance; noise: (h, h); averaged over the last blocks, share (h,) and
+    chi2: see ``Missed``; corner [Hz], every: the filter and the samples that it keeps one of; filtered: (4, r + h + 2)
+    its state; dt: sample time [s]; angle: relative angle of the links at the end [rad]; blocks: number taken; strikes:
+    bad ones in a row; lost: samples were missing, so filter and state begin anew; settling: kept samples until the
+    filter that began anew is trusted; gain: (n, m) published K.
     """
 
     shift: float
@@ -90,7 +93,7 @@ class Varying(NamedTuple):
     root: Array
     noise: Array
     share: Array
-    swing: float
+    chi2: float
     corner: float
     every: int
     filtered: Array
@@ -155,7 +158,7 @@ def shown(config: IdentifierParameters) -> Roles | None:
 def parts(h: int, r: int) -> dict[str, tuple[slice, tuple[int, ...]]]:
     """Return where each part of theta stands, and its shape: G, H, E by functions of c, F, D by rates, b, zeta."""
     shapes = {'G': (FUNCTIONS, h, h), 'H': (FUNCTIONS, h, r), 'E': (FUNCTIONS, h, r), 'F': (h, r), 'D': (3, h, h),
-              'b': (h,), 'zeta': (1,)}
+              'b': (h,), 'mu': (1,), 'zeta': (1,)}
     found, at = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)
@@ -183,7 +186,7 @@ def prior(G: Array, H: Array) -> Array:
     return np.concatenate([
         np.abs(G).max() * shares(h).ravel(), np.repeat(share * np.abs(H).max(), h * r),
         np.repeat(DIRECT * np.array([1.0, 0.3, 0.3]), h * r), np.full(h * r, DIRECT),
-        np.full(h * h, DAMPED), np.full(2 * h * h, TURNING), np.full(h, OFFSET), np.full(1, SHARED)])
+        np.full(h * h, DAMPED), np.full(2 * h * h, TURNING), np.full(h, OFFSET), np.full(1, SOFT), np.full(1, SHARED)])
 
 
 def walk(theta: Array, h: int, r: int, size: Array) -> Array:
@@ -193,27 +196,32 @@ def walk(theta: Array, h: int, r: int, size: Array) -> Array:
     return np.concatenate([found, STATE_WALK * size, STATE_WALK * size])
 
 
-def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array
+def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, swing: float = 0.0
           ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """G, G1, H, H1, D, E of ``simulate_block`` at c, where c changes by ``by_s`` towards the end of the block."""
+    """G, G1, H, H1, D, E of ``simulate_block`` at c, where c changes by ``by_s`` towards the end of the block.
+
+    swing: see ``Block.swing``.
+    """
     value, by_c, _ = basis(c, float(theta[-1]))
     G, H, E = (part(theta, name, h, r) for name in 'GHE')
     D = np.tensordot(rates, part(theta, 'D', h, r), 1)
     direct = np.hstack([np.tensordot(value, E, 1), part(theta, 'F', h, r), part(theta, 'b', h, r)[:, None]])
-    return (np.tensordot(value, G, 1), np.tensordot(by_c * by_s, G, 1), np.tensordot(value, H, 1),
+    less = 1.0 - float(part(theta, 'mu', h, r)[0]) * swing
+    return (less * np.tensordot(value, G, 1), less * np.tensordot(by_c * by_s, G, 1), np.tensordot(value, H, 1),
             np.tensordot(by_c * by_s, H, 1), D, direct)
 
 
-def to_local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array) -> Array:
+def to_local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, swing: float = 0.0) -> Array:
     """(l, k + 2h) derivative of the local parameters and the state by theta and the state."""
     value, by_c, by_zeta = basis(c, float(theta[-1]))
     at = {name: where.start for name, (where, _) in parts(h, r).items()}
     a, b, q, k = h * h, h * r, 2 * r + 1, len(theta)
     at_e = 3 * a + 2 * b
     T = np.zeros((at_e + h * q + 2 * h, k + 2 * h))
+    less = 1.0 - float(part(theta, 'mu', h, r)[0]) * swing
     for i in range(FUNCTIONS):
         j = np.arange(a)
-        T[j, at['G'] + i * a + j], T[a + j, at['G'] + i * a + j] = value[i], by_c[i] * by_s
+        T[j, at['G'] + i * a + j], T[a + j, at['G'] + i * a + j] = less * value[i], less * by_c[i] * by_s
         T[2 * a + 2 * b + j, at['D'] + i * a + j] = rates[i]
         j = np.arange(b)
         T[2 * a + j, at['H'] + i * b + j], T[2 * a + b + j, at['H'] + i * b + j] = value[i], by_c[i] * by_s
@@ -222,7 +230,8 @@ def to_local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array) 
             T[at_e + j // r * q + r + j % r, at['F'] + j] = 1.0
     j = np.arange(h)
     T[at_e + j * q + 2 * r, at['b'] + j] = 1.0
-    T[:a, at['zeta']] = np.tensordot(by_zeta, part(theta, 'G', h, r), 1).ravel()
+    T[:a, at['mu']] = -swing * np.tensordot(value, part(theta, 'G', h, r), 1).ravel()
+    T[:a, at['zeta']] = less * np.tensordot(by_zeta, part(theta, 'G', h, r), 1).ravel()
     T[2 * a:2 * a + b, at['zeta']] = np.tensordot(by_zeta, part(theta, 'H', h, r), 1).ravel()
     j = np.arange(2 * h)
     T[at_e + h * q + j, k + j] = 1.0
@@ -308,7 +317,7 @@ def _run(v: Varying, block: Block, theta: Array, x: Array, noise: Array) -> Run:
     X[:, width - 2 * h:] = np.eye(2 * h)
     end = x.copy()
     whiten = np.linalg.inv(np.linalg.cholesky(noise))
-    G, G1, H, H1, D, E = local(theta, h, r, block.c, block.by_s, block.rates)
+    G, G1, H, H1, D, E = local(theta, h, r, block.c, block.by_s, block.rates, block.swing)
     simulate_block(block.U, block.slope, block.V, block.Y, block.s, block.dt, G, G1, H, H1, D, E, end, whiten, N, g,
                    moments, X)
     return Run(N, g, moments, X, end)
@@ -329,8 +338,10 @@ def noise_of(signals: Array, v: Varying) -> Array:
     return np.diag(np.maximum(white * v.scale_y * inside, 1e-4 * size + 1e-12) ** 2)
 
 
-def updated(v: Varying, blocks: Sequence[Block], noise: Array, iterations: int) -> Varying | None:
+def updated(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, iterations: int) -> Varying | None:
     """Update parameters and state by blocks; None where the numbers leave the finite range.
+
+    noise: (h, h) covariance that weighs the residuals; white: (h, h) that of the sensors.
 
     The first block begins with the state of v, further ones after gaps, each with an unknown state of its own.
     """
@@ -339,31 +350,31 @@ def updated(v: Varying, blocks: Sequence[Block], noise: Array, iterations: int) 
     if v.blocks:
         root = triangle(np.hstack([root, np.diag(walk(v.theta, h, r, np.std(blocks[0].Y, axis=0)))]).T).T
     after_gap = bool(v.blocks) and not v.x.any()
-    fit = _fitted(v, blocks, noise, iterations, root, _first_state(v, blocks[0], noise) if after_gap else v.x)
+    first = _first_state(v, blocks[0], noise) if after_gap else v.x
+    fit = _fitted(v, blocks, noise, white, iterations, root, first)
     if fit is None:
         return None
-    theta, runs, after, share = fit
+    theta, runs, after, missed = fit
     block, run, Y = blocks[-1], runs[-1], np.vstack([block.Y for block in blocks])
     moments = np.sum([one.moments for one in runs], axis=0) / len(Y)
-    after[k:] = run.X @ to_local(theta, h, r, block.c, block.by_s, block.rates) @ after
+    after[k:] = run.X @ to_local(theta, h, r, block.c, block.by_s, block.rates, block.swing) @ after
     fresh = max(1.0 / (v.blocks + 1.0), 1.0 / NOISE_BLOCKS)
     known = (1.0 - fresh) * v.noise + fresh * moments if v.blocks else moments
+    share, chi2, strikes = v.share, v.chi2, 0
     if not v.blocks:
-        share, strikes = np.sqrt(np.diag(moments) / np.var(Y, axis=0)), 0
-    elif after_gap:  # the state was unknown: that was no prediction
-        share, strikes = v.share, 0
-    else:
-        strikes = v.strikes + 1 if float(share.max()) > UNPREDICTED else 0
-        share = v.share + (share - v.share) * max(1.0 / v.blocks, 1.0 / SHARE_BLOCKS)
+        share, chi2 = np.sqrt(np.diag(moments) / np.var(Y, axis=0)), float(np.mean(np.diag(moments) / np.diag(white)))
+    elif not after_gap:  # there the state was unknown: that was no prediction
+        part_of = max(1.0 / v.blocks, 1.0 / SHARE_BLOCKS)
+        strikes = v.strikes + 1 if float(missed.share.max()) > UNPREDICTED else 0
+        share, chi2 = share + (missed.share - share) * part_of, chi2 + (missed.chi2 - chi2) * part_of
     return v._replace(theta=theta, x=run.end, root=after if len(blocks) == 1 else triangle(after.T).T, noise=known,
-                      share=share, angle=block.angle,
-                      swing=v.swing + (block.swing - v.swing) * max(1.0 / (v.blocks + 1.0), 1.0 / SHARE_BLOCKS),
+                      share=share, chi2=chi2, angle=block.angle,
                       blocks=v.blocks + 1, strikes=strikes)
 
 
-def _fitted(v: Varying, blocks: Sequence[Block], noise: Array, iterations: int, root: Array, x: Array
-            ) -> tuple[Array, list[Run], Array, Array] | None:
-    """Return theta, the runs with it, the root of the covariance of theta and the last state, the share of the first.
+def _fitted(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, iterations: int, root: Array, x: Array
+            ) -> tuple[Array, list[Run], Array, Missed] | None:
+    """Return theta, the runs with it, the root of the covariance of theta and the last state, what the first missed.
 
     Gauss-Newton iterations in units of ``root``, the prior's, from the states that fit best; with more than one a step
     that raises the cost is shortened (backtracking).
@@ -379,7 +390,7 @@ def _fitted(v: Varying, blocks: Sequence[Block], noise: Array, iterations: int, 
         return found[:k], [_run(v, block, found[:k], found[at[k:]], noise)
                            for block, at in zip(blocks, places, strict=True)]
 
-    share, after, step, i = v.share, root, np.zeros(len(base)), 0
+    missed, after, step, i = Missed(v.share, v.chi2), root, np.zeros(len(base)), 0
     best, lowest, z = step, math.inf, step
     for _ in range(MOST_TRIALS * iterations + 1):
         theta, runs = runs_at(z)
@@ -395,9 +406,9 @@ def _fitted(v: Varying, blocks: Sequence[Block], noise: Array, iterations: int, 
             break
         information, gradient = np.zeros_like(root), np.zeros_like(z)
         for block, run, at in zip(blocks, runs, places, strict=True):
-            along = to_local(theta, h, r, block.c, block.by_s, block.rates)
+            along = to_local(theta, h, r, block.c, block.by_s, block.rates, block.swing)
             if i == 0:
-                share = _missed(block, run, noise, along[:, :k] @ root[:k])
+                missed = _missed(block, run, noise, white, along[:, :k] @ root[:k])
             turned = along @ root[at]
             information += turned.T @ run.N @ turned
             gradient += turned.T @ run.g
@@ -411,18 +422,29 @@ def _fitted(v: Varying, blocks: Sequence[Block], noise: Array, iterations: int, 
         z, i = z + step, i + 1
     if z is not best:
         theta, runs = runs_at(best)
-    return theta, runs, after[places[-1]], share
+    return theta, runs, after[places[-1]], missed
 
 
-def _missed(block: Block, run: Run, noise: Array, own: Array) -> Array:
-    """(h,) share of the amplitude of a block that its prediction misses.
+class Missed(NamedTuple):
+    """What the prediction of a block misses; parameters' deviations explain more of it the larger they are.
+
+    share: (h,) of the outputs' amplitude; chi2: power of the residuals over that expected from white noise.
+    """
+
+    share: Array
+    chi2: float
+
+
+def _missed(block: Block, run: Run, noise: Array, white: Array, own: Array) -> Missed:
+    """Return what the prediction of a block misses.
 
     own: derivative of the local parameters along the parameters' deviations. What these explain is no fault of the
     model.
     """
+    left = np.diag(run.moments) / len(block.Y)
     power = np.maximum(np.var(block.Y, axis=0), np.diag(noise))
-    found = np.sqrt(np.diag(run.moments / len(block.Y)) / power)
-    return np.asarray(found / (1.0 + float(np.sum((run.N @ own) * own)) / block.Y.size) ** 0.25)
+    explained = 1.0 + float(np.sum((run.N @ own) * own)) / block.Y.size
+    return Missed(np.sqrt(left / power) / explained ** 0.25, float(np.mean(left / np.diag(white))) / explained)
 
 
 def advance(config: IdentifierParameters, v: Varying, rows: Rows) -> Varying | None:
@@ -463,7 +485,8 @@ def taken(v: Varying, signals: Array) -> Varying | None:
     if len(out) < BLOCK // v.every // 4:  # a gap follows, or the filter has just settled
         return v
     iterations = ITERATIONS if v.blocks < SHARE_BLOCKS else 1
-    return updated(v, [block_of(v, out, second)], v.noise + 0.05 * noise_of(signals, v), iterations)
+    white = noise_of(signals, v)
+    return updated(v, [block_of(v, out, second)], v.noise + 0.05 * white, white, iterations)
 
 
 def reopened(v: Varying, waiting: int) -> Varying:

@@ -40,7 +40,7 @@ class Configurations(NamedTuple):
     condition: float
 
     def at(self, angles: Array) -> Identified:
-        """Return the model at measured angles (2,) [rad]."""
+        """Return the model at measured angles (2,) [rad], see ``with_relative``."""
         return self.with_relative(float(relative_angle(self.config, angles)))
 
     def now(self, rows: Rows) -> Identified:
@@ -52,15 +52,20 @@ class Configurations(NamedTuple):
         here = rows.missing == 0
         Y, angles = rows.y[:, list(role.displacements)], relative_angle(self.config, rows.angles)
         if np.count_nonzero(here) < count // 2:  # too few since a gap
-            return self.with_relative(v.angle)
+            return self.with_relative(v.angle, present=True)
         s = np.linspace(-1.0, 0.0, len(rows))
-        return self.with_relative(float(straight(s[here], Y[here] * v.scale_y, angles[here, None])[0, 0]))
+        return self.with_relative(float(straight(s[here], Y[here] * v.scale_y, angles[here, None])[0, 0]), present=True)
 
-    def with_relative(self, angle: float) -> Identified:
-        """Return the model where link 2 makes this angle with link 1 [rad]."""
+    def with_relative(self, angle: float, *, present: bool = False) -> Identified:
+        """Return the model where link 2 makes this angle with link 1 [rad].
+
+        present: the arm stands there, so its predictions tell how wrong the frequencies are. Elsewhere the deviations
+        of the parameters do, times the Birge ratio of the predictions (root of chi square over degrees of freedom).
+        """
         role = shown(self.config)
         assert role is not None
-        model, along = _matrices(self, math.cos(angle), role)
+        ratio = 1.0 if present else math.sqrt(max(self.varying.chi2, 1.0))
+        model, along = _matrices(self, math.cos(angle), role, ratio)
         v = self.varying
         found = Identified(
             model=model, spread=along.flat(), singular_values=self.singular_values, excitation=self.excitation,
@@ -76,31 +81,29 @@ def judge(found: Identified, v: Varying) -> Status:
     oscillations = modes(found)
     if len(oscillations) < len(v.scale_y):
         return Status.INCONSISTENT
-    vague = math.hypot(VAGUE, v.swing)  # a wide band for the amplitude is no lack of information
-    if any(mode.frequency_std_hz > vague * mode.frequency_hz for mode in oscillations):
+    if any(mode.frequency_std_hz > VAGUE * mode.frequency_hz for mode in oscillations):
         return Status.WARMING_UP if v.blocks < EARLY else Status.POORLY_EXCITED
     return Status.TRACKING
 
 
 def unmodelled(v: Varying) -> float:
-    """Return the relative error of frequencies that explains what predictions over a block miss, and the amplitude's.
+    """Return the relative error of frequencies that explains what predictions over a block miss.
 
     A frequency off by the share e turns the phase by shift t e in a time t, in the mean over a block of the time T
-    by shift T e / sqrt(3) (root of the mean square). An arm softens or stiffens with its amplitude by the order of the
-    square of the angle through which it swings (cos a = 1 - a^2 / 2): a model of small bends leaves that out.
+    by shift T e / sqrt(3) (root of the mean square). Half of the power that is missed counts as one of phase, half as
+    one of amplitude.
     """
-    phase = math.sqrt(3.0) * float(v.share.mean()) / (v.shift * BLOCK * v.dt)
-    return math.hypot(phase, v.swing)
+    return math.sqrt(3.0 / 2.0) * float(v.share.mean()) / (v.shift * BLOCK * v.dt)
 
 
-def _matrices(read: Configurations, c: float, role: Roles) -> tuple[StateSpace, Tangent]:
-    """Model at c in JointState units, and the directions in which it varies."""
+def _matrices(read: Configurations, c: float, role: Roles, ratio: float) -> tuple[StateSpace, Tangent]:
+    """Model at c in JointState units, and the directions in which it varies; ratio: on the parameters' deviations."""
     v = read.varying
     h, r = len(v.scale_y), len(v.scale_u)
     m, n = len(role.states), 2 * h
     G, _, H, _, D, E = local(v.theta, h, r, c, 0.0, AT_REST)
     a, b, q = h * h, h * r, 2 * r + 1
-    L = to_local(v.theta, h, r, c, 0.0, AT_REST)[:, :len(v.theta)] @ v.root[:len(v.theta)]
+    L = to_local(v.theta, h, r, c, 0.0, AT_REST)[:, :len(v.theta)] @ (ratio * v.root[:len(v.theta)])
     error = unmodelled(v)
     more = np.zeros((len(L), 2))
     more[:a, 0] = 2.0 * error * G.ravel()

@@ -123,7 +123,7 @@ def _around(G: Array, H: Array, D: Array, c: float) -> tuple[Array, Array]:
     value, variance = basis(c, ZETA)[0][:, None, None], shares(h) ** 2
     g = variance * value / np.sum(variance * value ** 2, axis=0) * G
     b, d = (np.concatenate([X.ravel(), np.zeros(2 * X.size)]) for X in (H, D))
-    theta = np.concatenate([g.ravel(), b, np.zeros(4 * h * r), d, np.zeros(h), np.full(1, ZETA)])
+    theta = np.concatenate([g.ravel(), b, np.zeros(4 * h * r), d, np.zeros(h), np.zeros(1), np.full(1, ZETA)])
     return theta, np.diag(np.concatenate([prior(G, H), np.full(2 * h, UNKNOWN)]))
 
 
@@ -144,7 +144,7 @@ def _from_recursion(old: Recursion, role: Roles, r: int, dt: float, c: float) ->
     theta, root = _around(G / shift ** 2, H / shift ** 2, D / shift, c)
     return Varying(
         shift=shift, scale_u=scale[:r].copy(), scale_y=scale[r:][list(role.displacements)].copy(), theta=theta,
-        x=np.zeros(2 * h), root=root, noise=np.zeros((h, h)), share=np.zeros(h), swing=0.0, corner=corner,
+        x=np.zeros(2 * h), root=root, noise=np.zeros((h, h)), share=np.zeros(h), chi2=1.0, corner=corner,
         every=every, filtered=np.zeros((4, r + h + 2)), dt=dt, angle=0.0, blocks=0, strikes=0, lost=False,
         settling=0, gain=np.zeros((0, 0)))
 
@@ -178,10 +178,10 @@ def _fit_at_once(v: Varying, signals: Array, missing: NDArray[np.int64]) -> Vary
         if not blocks:
             continue
         noise = (LATE if count < WINDOW else 4.0) * least + 1e-4 * power
-        found = updated(begin, blocks, noise, ITERATIONS)
+        found = updated(begin, blocks, noise, least, ITERATIONS)
         if found is not None:  # once more, with the noise that it leaves
             begin = begin._replace(theta=found.theta)
-            found = updated(begin, blocks, 1.5 * found.noise + least, ITERATIONS)
+            found = updated(begin, blocks, 1.5 * found.noise + least, least, ITERATIONS)
         if found is None:
             return None
         begin, v = begin._replace(theta=found.theta), found
