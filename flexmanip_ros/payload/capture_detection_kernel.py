@@ -43,7 +43,7 @@ REFRESH = 16
 """Samples between computations of the traces."""
 CALM = 3.0
 """The statistic must exceed this times its own recent peaks: what the model always misses is no event. A capture by an
-arm as it is reaches 20 to 1000 times them within 0.1 s; with 2 one run in twelve had a false alarm, with 3 none."""
+arm as it is reaches 10 to 1000 times them within 0.1 s; with 2 three runs of 48 had a false alarm, with 3 none."""
 CAUSED = 0.25
 """Share of the largest energy below which a peak is not taken for the torque's doing: chance has peaks as well."""
 MOST_HALVINGS = 20
