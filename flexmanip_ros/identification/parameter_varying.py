@@ -37,17 +37,23 @@ MOST_TRIALS, SHORTER = 3, 0.3
 """Trials for each iteration of a fit at most, and factor on a step that would raise its cost."""
 VARIES, KNOWN = 0.12, 1.0
 """Prior deviations, as shares of the largest entry: of the parts of G and H that vary with c, and of the rest."""
-UNEVEN = 0.01
+UNEVEN = 0.015
 """The same of the parts of G that change as no arm of two links does. Where link 2 points the other way, c and the
 bends of link 2 change sign: G of a link alone is even in c, what couples the links is odd."""
-SOFT = 0.75
-"""Prior deviation of mu: the square of Duffing's frequency, x'' + (1 + x^2) x = 0, rises by 3/4 of the amplitude's."""
+SOFT = 0.2
+"""Prior deviation of mu. Of Duffing's x'' + (1 + x^2) x = 0 it is 3/4; that of the default arm with 20 kg is 0.2. Until
+an arm has swung with several amplitudes, a larger one follows what else the model misses."""
 DIRECT, DAMPED, TURNING, OFFSET, SHARED = 0.05, 0.05, 2.0, 0.3, 1.0
 """Prior deviations of E and F, D, its terms with rates, b and zeta; signals at unit power, time in 1 / shift."""
-WALK = 0.0003
-"""Standard deviation by which a parameter may move in a block, as a share of its prior one."""
-STATE_WALK, OFFSET_WALK = 0.02, 0.01
-"""The same of the state and of the offset b, as shares of the size of the displacements."""
+WALK = 0.001, 0.0003
+"""Standard deviation by which a parameter may move in a block, as a share of its prior one: at first, and later on."""
+STATE_WALK = 0.005, 0.02
+"""The same of the state, as a share of the size of the displacements. In the end the arm is the same for long, and what
+the model misses goes to the state."""
+STARTING = 600.0
+"""Blocks in which the one becomes the other (as a forgetting factor approaches 1, Ljung and Soderstrom 1983, 5.6)."""
+OFFSET_WALK = 0.01
+"""Standard deviation by which the offset b may move in a block, as a share of the size of the displacements."""
 NOISE_BLOCKS, SHARE_BLOCKS = 8, 16
 """Blocks over which the noise, and the share that is not predicted, are remembered."""
 UNPREDICTED = 0.7
@@ -189,11 +195,13 @@ def prior(G: Array, H: Array) -> Array:
         np.full(h * h, DAMPED), np.full(2 * h * h, TURNING), np.full(h, OFFSET), np.full(1, SOFT), np.full(1, SHARED)])
 
 
-def walk(theta: Array, h: int, r: int, size: Array) -> Array:
-    """(k + 2h,) standard deviations of the random walk in a block whose displacements have the size (h,)."""
-    found = WALK * prior(part(theta, 'G', h, r)[0], part(theta, 'H', h, r)[0])
+def walk(theta: Array, h: int, r: int, size: Array, blocks: int) -> Array:
+    """(k + 2h,) standard deviations of the random walk after so many blocks; size: (h,) of the displacements."""
+    early = math.exp(-blocks / STARTING)
+    share, of_state = (early * first + (1.0 - early) * later for first, later in (WALK, STATE_WALK))
+    found = share * prior(part(theta, 'G', h, r)[0], part(theta, 'H', h, r)[0])
     found[parts(h, r)['b'][0]] = OFFSET_WALK * size
-    return np.concatenate([found, STATE_WALK * size, STATE_WALK * size])
+    return np.concatenate([found, of_state * size, of_state * size])
 
 
 def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, swing: float = 0.0
@@ -348,7 +356,7 @@ def updated(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
     h, r, k = len(v.scale_y), len(v.scale_u), len(v.theta)
     root = v.root
     if v.blocks:
-        root = triangle(np.hstack([root, np.diag(walk(v.theta, h, r, np.std(blocks[0].Y, axis=0)))]).T).T
+        root = triangle(np.hstack([root, np.diag(walk(v.theta, h, r, np.std(blocks[0].Y, axis=0), v.blocks))]).T).T
     after_gap = bool(v.blocks) and not v.x.any()
     first = _first_state(v, blocks[0], noise) if after_gap else v.x
     fit = _fitted(v, blocks, noise, white, iterations, root, first)
