@@ -43,6 +43,19 @@ def test_a_recording_without_its_metadata_is_read_and_says_so(tmp_path):
     assert 'ros2 bag reindex' in line
 
 
+def test_an_interrupt_while_a_recording_is_opened_leaves_no_file_without_an_end(tmp_path, monkeypatch):
+    opening = Writer.open
+
+    def interrupted(writer):
+        opening(writer)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Writer, 'open', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        BagWriter(tmp_path / 'bag')
+    assert not (tmp_path / 'bag').exists()
+
+
 def test_a_missing_topic_is_answered_with_those_that_are_there(tmp_path):
     path = write(tmp_path / 'bag', topic='/other')
     line = good_part(path)[1]
