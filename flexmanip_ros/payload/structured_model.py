@@ -478,10 +478,6 @@ def jump(config: IdentifierParameters, model: Model, m: mem.FilterState, instant
     return np.hstack([columns, moved])
 
 
-BRIDGE_TERMS = 64
-"""Terms of a Brownian bridge at most; over 0.1 s they reach to 320 Hz, beyond the modes of the arm."""
-
-
 def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, dt: float) -> Array:
     """Columns (nx, c) by which torques that change by ``change`` (L,) [N m] in ``count`` samples leave the state open.
 
@@ -501,7 +497,7 @@ def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, 
     step = scipy.linalg.expm(flow * dt)
     p = np.arange(1, count + 1) / (count + 1)
     power, shape = np.linalg.eigh(np.minimum.outer(p, p) - np.outer(p, p))
-    profiles = (shape * np.sqrt(np.maximum(power, 0.0)))[:, -BRIDGE_TERMS:]
+    profiles = shape * np.sqrt(np.maximum(power, 0.0))
     state = np.zeros((2 * n, change.size, profiles.shape[1]))
     for profile in profiles:
         state = np.tensordot(step[:2 * n, :2 * n], state, 1) + step[:2 * n, 2 * n:, None] * profile

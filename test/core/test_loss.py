@@ -111,6 +111,32 @@ def test_messages_lost_at_a_step_of_the_torque_do_not_bias_the_payload(
     assert abs(found.mass - 20.0) < 3.5 * found.std < 0.1
 
 
+@pytest.mark.parametrize('first', [4455, 4467, 4480])
+def test_a_burst_in_which_both_torques_change_does_not_widen_the_interval_for_good(
+        messages: list[JointRecord | CaptureEvent], whole: list[Estimate], first: int) -> None:
+    """45 ms, with both steps at 4.5 s, hide the motion: then it is learned again, with the payload as it was known."""
+    lost = np.zeros(COUNT, dtype=bool)
+    lost[first:first + 46] = True
+    found, known = (items[-1].payload for items in (later(surviving(messages, lost)), whole))
+    assert found is not None
+    assert known is not None
+    assert found.status is Status.TRACKING
+    assert abs(found.mass - 20.0) < 3.0 * found.std
+    assert found.std < 2.0 * known.std
+
+
+def test_a_torque_without_steps_is_interpolated_over_lost_messages() -> None:
+    events = (CaptureEvent(CAPTURE * 1_000_000, EventKind.CAPTURE),)
+    torque = excitation.sequence(configure(ExcitationParameters, {'shape': 'multisine'}), COUNT)
+    items = list(simulator.records(simulator.simulate(PLANT, torque, events), events))
+    whole, found = (later(some)[-1].payload for some in (items, surviving(items, at_random(0.05))))
+    assert whole is not None
+    assert found is not None
+    assert found.status is Status.TRACKING
+    assert abs(found.mass - 20.0) < 3.0 * found.std
+    assert found.std < 1.2 * whole.std
+
+
 def test_a_message_that_never_came_is_a_row_that_is_marked(messages: list[JointRecord | CaptureEvent]) -> None:
     lost = np.zeros(COUNT, dtype=bool)
     lost[[100, 200, 201, 202]] = True
