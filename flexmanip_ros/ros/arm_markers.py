@@ -86,7 +86,8 @@ class ArmMarkers:
         self._ends = _marker('joint', 0, Marker.SPHERE_LIST, (2.0 * width,) * 3, JOINT)
         self._ends.points = [Point() for _ in range(links + 1)]
         self._object = _marker('object', 0, Marker.SPHERE, (width,) * 3, TRUSTED)
-        self._text = _marker('payload', 0, Marker.TEXT_VIEW_FACING, (0.0, 0.0, 2.0 * width), JOINT)
+        # scale.z: height of the letters; RViz makes a space as wide as half of scale.x, or that of letters of 1 m
+        self._text = _marker('payload', 0, Marker.TEXT_VIEW_FACING, (width, 0.0, 2.0 * width), JOINT)
         self._above = 4.0 * width
         self.message = MarkerArray(markers=[*self._links, self._ends, self._object, self._text])
 
@@ -129,6 +130,8 @@ class ArmMarkers:
         _paint(self._text, colour)
         self._text.pose.position.x, self._text.pose.position.y = x, y + self._above
         self._text.text = words(payload)
+        # RViz never draws a text that began empty, and keeps one that becomes empty
+        self._text.action = Marker.ADD if self._text.text else Marker.DELETE
 
 
 def words(payload: Payload | None) -> str:

@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexmanip_ros.parameters import ArmParameters
-from flexmanip_ros.ros.arm_markers import draw
+from visualization_msgs.msg import Marker
+
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
+from flexmanip_ros.ros.arm_markers import ArmMarkers, draw
+from flexmanip_ros.types import JointRecord, Payload, Status
 
 ARM = ArmParameters(link_length=(3.0, 2.0), sensor_position=(0.5, 0.4))
 
@@ -47,3 +50,17 @@ def test_chord_angles_are_absolute() -> None:
     drawn = draw(arm, np.array([0.3, 0.5]), np.array([0.02, 0.01]))
     chords = drawn.links[:, -1] - drawn.links[:, 0]
     np.testing.assert_allclose(np.arctan2(chords[:, 1], chords[:, 0]), [0.3, 0.5])
+
+
+def test_no_text_is_shown_before_the_first_estimate() -> None:
+    """RViz never draws a text that began empty."""
+    config = IdentifierParameters()
+    names = tuple(name.rpartition('/')[0] for name in (*config.angles, *config.outputs[:2]))
+    record = JointRecord(0, names, np.zeros(4), np.zeros(4), np.zeros(4))
+    markers = ArmMarkers(config)
+    text = next(marker for marker in markers.message.markers if marker.ns == 'payload')
+    known = Payload(20.0, 0.1, 19.8, 20.2, 1.0, Status.TRACKING)
+    for payload, action in ((None, Marker.DELETE), (known, Marker.ADD), (None, Marker.DELETE)):
+        assert markers.update(record, payload)
+        assert text.action == action
+    assert text.scale.x > 0.0  # else its spaces are those of letters of 1 m
