@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from visualization_msgs.msg import Marker
 
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
