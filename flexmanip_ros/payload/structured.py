@@ -324,8 +324,9 @@ def _parts(state: StructuredState, rows: Rows) -> list[tuple[bool, Rows]]:
         return []
     before = state.efforts[-1] if state.efforts is not None else rows.u[0]
     absent = np.concatenate([[state.missing], rows.missing[:-1]]) * (rows.missing == 0)
-    broken, slope = rows.gap, np.diff(np.vstack([before, rows.u]), axis=0)
+    broken = rows.gap
     if absent.any():
+        slope = np.diff(np.vstack([before, rows.u]), axis=0)
         at = np.arange(len(rows)) - absent - 1  # the last row before the missing ones
         change = _unforeseen(slope, np.where(at[:, None] < 0, state.slope, slope[np.maximum(at, 0)]), absent[:, None])
         broken = broken | (absent[:, None] * np.abs(change) > UNKNOWN_TORQUE * _peaks(state, rows)).any(axis=1)
