@@ -37,7 +37,7 @@ MOST_TRIALS, SHORTER = 3, 0.3
 """Trials for each iteration of a fit at most, and factor on a step that would raise its cost."""
 VARIES, KNOWN = 0.12, 1.0
 """Prior deviations, as shares of the largest entry: of the parts of G and H that vary with c, and of the rest."""
-UNEVEN = 0.015
+UNEVEN = 0.005
 """The same of the parts of G that change as no arm of two links does. Where link 2 points the other way, c and the
 bends of link 2 change sign: G of a link alone is even in c, what couples the links is odd."""
 SOFT = 0.2
@@ -45,14 +45,10 @@ SOFT = 0.2
 an arm has swung with several amplitudes, a larger one follows what else the model misses."""
 DIRECT, DAMPED, TURNING, OFFSET, SHARED = 0.05, 0.05, 2.0, 0.3, 1.0
 """Prior deviations of E and F, D, its terms with rates, b and zeta; signals at unit power, time in 1 / shift."""
-WALK = 0.001, 0.0003
-"""Standard deviation by which a parameter may move in a block, as a share of its prior one: at first, and later on."""
-STATE_WALK = 0.005, 0.02
-"""The same of the state, as a share of the size of the displacements. In the end the arm is the same for long, and what
-the model misses goes to the state."""
-STARTING = 600.0
-"""Blocks in which the first becomes the second, as a forgetting factor approaches 1 (Ljung and Soderstrom 1983). With
-half as many f2 of a wandering arm is off by 0.54 % (19 of 20, one minute), with these by 0.50 %."""
+WALK = 0.0001
+"""Standard deviation by which a parameter may move in a block, as a share of its prior one: 0.5 % in ten minutes."""
+STATE_WALK = 0.01
+"""The same of the state, as a share of the size of the displacements."""
 OFFSET_WALK = 0.01
 """Standard deviation by which the offset b may move in a block, as a share of the size of the displacements."""
 NOISE_BLOCKS, SHARE_BLOCKS = 8, 16
@@ -196,13 +192,11 @@ def prior(G: Array, H: Array) -> Array:
         np.full(h * h, DAMPED), np.full(2 * h * h, TURNING), np.full(h, OFFSET), np.full(1, SOFT), np.full(1, SHARED)])
 
 
-def walk(theta: Array, h: int, r: int, size: Array, blocks: int) -> Array:
-    """(k + 2h,) standard deviations of the random walk after so many blocks; size: (h,) of the displacements."""
-    early = math.exp(-blocks / STARTING)
-    share, of_state = (early * first + (1.0 - early) * later for first, later in (WALK, STATE_WALK))
-    found = share * prior(part(theta, 'G', h, r)[0], part(theta, 'H', h, r)[0])
+def walk(theta: Array, h: int, r: int, size: Array) -> Array:
+    """(k + 2h,) standard deviations of the random walk in a block; size: (h,) of the displacements."""
+    found = WALK * prior(part(theta, 'G', h, r)[0], part(theta, 'H', h, r)[0])
     found[parts(h, r)['b'][0]] = OFFSET_WALK * size
-    return np.concatenate([found, of_state * size, of_state * size])
+    return np.concatenate([found, STATE_WALK * size, STATE_WALK * size])
 
 
 def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, swing: float = 0.0
@@ -211,7 +205,7 @@ def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, swi
 
     swing: see ``Block.swing``.
     """
-    value, by_c, _ = basis(c, float(theta[-1]))
+    value, by_c, _, _ = basis(c, float(theta[-1]))
     G, H, E = (part(theta, name, h, r) for name in 'GHE')
     D = np.tensordot(rates, part(theta, 'D', h, r), 1)
     direct = np.hstack([np.tensordot(value, E, 1), part(theta, 'F', h, r), part(theta, 'b', h, r)[:, None]])
@@ -222,7 +216,7 @@ def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, swi
 
 def to_local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, swing: float = 0.0) -> Array:
     """(l, k + 2h) derivative of the local parameters and the state by theta and the state; see ``local``."""
-    value, by_c, by_zeta = basis(c, float(theta[-1]))
+    value, by_c, by_zeta, by_both = basis(c, float(theta[-1]))
     at = {name: where.start for name, (where, _) in parts(h, r).items()}
     a, b, q, k = h * h, h * r, 2 * r + 1, len(theta)
     at_e = 3 * a + 2 * b
@@ -239,9 +233,12 @@ def to_local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, 
             T[at_e + j // r * q + r + j % r, at['F'] + j] = 1.0
     j = np.arange(h)
     T[at_e + j * q + 2 * r, at['b'] + j] = 1.0
-    T[:a, at['mu']] = -swing * np.tensordot(value, part(theta, 'G', h, r), 1).ravel()
-    T[:a, at['zeta']] = less * np.tensordot(by_zeta, part(theta, 'G', h, r), 1).ravel()
-    T[2 * a:2 * a + b, at['zeta']] = np.tensordot(by_zeta, part(theta, 'H', h, r), 1).ravel()
+    G, H, E = (part(theta, name, h, r).reshape(FUNCTIONS, -1) for name in 'GHE')
+    T[:a, at['mu']], T[a:2 * a, at['mu']] = -swing * value @ G, -swing * by_s * by_c @ G
+    T[:a, at['zeta']], T[a:2 * a, at['zeta']] = less * by_zeta @ G, less * by_s * by_both @ G
+    T[2 * a:2 * a + b, at['zeta']], T[2 * a + b:2 * a + 2 * b, at['zeta']] = by_zeta @ H, by_s * by_both @ H
+    j = np.arange(b)
+    T[at_e + j // r * q + j % r, at['zeta']] = by_zeta @ E
     j = np.arange(2 * h)
     T[at_e + h * q + j, k + j] = 1.0
     return T
@@ -357,7 +354,7 @@ def updated(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
     h, r, k = len(v.scale_y), len(v.scale_u), len(v.theta)
     root = v.root
     if v.blocks:
-        root = triangle(np.hstack([root, np.diag(walk(v.theta, h, r, np.std(blocks[0].Y, axis=0), v.blocks))]).T).T
+        root = triangle(np.hstack([root, np.diag(walk(v.theta, h, r, np.std(blocks[0].Y, axis=0)))]).T).T
     after_gap = bool(v.blocks) and not v.x.any()
     first = _first_state(v, blocks[0], noise) if after_gap else v.x
     fit = _fitted(v, blocks, noise, white, iterations, root, first)

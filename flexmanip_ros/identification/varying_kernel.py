@@ -124,8 +124,8 @@ def simulate_block(U: Array, slope: Array, V: Array, Y: Array, s: Array, dt: flo
     g += np.dot(J.T, residual)
 
 
-def basis(c: float, zeta: float) -> tuple[Array, Array, Array]:
-    """Functions of the configuration (3,): 1, c / (1 - k c^2), c^2 / (1 - k c^2); their derivatives by c and zeta.
+def basis(c: float, zeta: float) -> tuple[Array, Array, Array, Array]:
+    """Functions of the configuration (3,): 1, c / (1 - k c^2), c^2 / (1 - k c^2); derivatives by c, by zeta, by both.
 
     k = 1 / (1 + exp(-zeta)), between 0 and 1. The mass matrix of two links is affine in c = cos(theta2 - theta1), and
     c couples one coordinate of link 1 with those of link 2. So its inverse is exact in these three functions, with
@@ -136,4 +136,5 @@ def basis(c: float, zeta: float) -> tuple[Array, Array, Array]:
     value = np.array([1.0, c / below, c * c / below])
     by_c = np.array([0.0, (1.0 + k * c * c) / below ** 2, 2.0 * c / below ** 2])
     by_zeta = np.array([0.0, dk * c ** 3 / below ** 2, dk * c ** 4 / below ** 2])
-    return value, by_c, by_zeta
+    by_both = np.array([0.0, dk * c * c * (3.0 + k * c * c) / below ** 3, 4.0 * dk * c ** 3 / below ** 3])
+    return value, by_c, by_zeta, by_both
