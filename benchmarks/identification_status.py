@@ -34,8 +34,8 @@ ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get('FLEXMANIP_DATA', ROOT.parent / 'shared' / 'data'))
 AHEAD_S, LAST_S, LATELY_S = 0.25, 1.0, 0.5
 EVERY = 7
-"""Samples between two instants from which predictions are made. With 20 the third mode, at 50 Hz, was seen always at the
-same phase, and its share of a rate was chance."""
+"""Samples between two instants from which predictions are made. With 20 the third mode, at 50 Hz, was seen always at
+the same phase, and its share of a rate was chance."""
 CAPTURE_S = 3.0
 PLAIN = ('physics_20kg_60_45', 'physics_100kg_0_0', 'arm_gains', 'arm_wander_60s')
 """Recordings of the default arm with a point mass, so that its frequencies are known."""

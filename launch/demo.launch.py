@@ -28,6 +28,9 @@ ARGUMENTS = (
     ('log_level', 'info', 'debug | info | warn | error'),
 )
 
+CHOICES = {'view': ('true', 'false', 'True', 'False', '1', '0')}
+"""launch tells of another word only once some nodes have been started, and leaves them running."""
+
 
 def _number(name):
     return ParameterValue(LaunchConfiguration(name), value_type=float)
@@ -42,7 +45,7 @@ def _node(executable, parameters, **more):
 def generate_launch_description():
     """Return the nodes with their arguments."""
     return LaunchDescription([
-        *(DeclareLaunchArgument(name, default_value=default, description=words)
+        *(DeclareLaunchArgument(name, default_value=default, description=words, choices=CHOICES.get(name))
           for name, default, words in ARGUMENTS),
         _node('rpbsid_identifier', {
             'payload_method': ParameterValue(LaunchConfiguration('payload_method'), value_type=str)},

@@ -14,6 +14,8 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 
 PACKAGE = 'flexmanip_ros'
+YES_OR_NO = 'true', 'false', 'True', 'False', '1', '0'
+"""launch tells of another word only once a node has been started, and leaves it running."""
 
 
 def check_params_file(context):
@@ -42,7 +44,7 @@ def generate_launch_description():
                               description='topic of the joint states'),
         DeclareLaunchArgument('namespace', default_value='', description='namespace of both nodes'),
         DeclareLaunchArgument('use_sim_time', default_value='false', description='take time from /clock'),
-        DeclareLaunchArgument('trigger', default_value='true',
+        DeclareLaunchArgument('trigger', default_value='true', choices=YES_OR_NO,
                               description='start capture_trigger too (services capture and release)'),
         DeclareLaunchArgument('trigger_mode', default_value='service', description='service | time | auto'),
         DeclareLaunchArgument('prefix', default_value='', description=(

@@ -104,7 +104,9 @@ def advance(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
             state = advance(config, state, part)
             continue
         if broken:
-            state = (_bridge if 0 < state.missing <= BRIDGED else _resume)(config, state, part)
+            assert state.sensors is not None
+            # over longer ``unknown_torque``, linearized at one instant, is some percent off: known modes would be wrong
+            state = (_bridge if 0 < state.missing <= state.sensors.block else _resume)(config, state, part)
         state = _run(config, state, part)
     return state
 
@@ -309,10 +311,6 @@ def _bridge(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
     return state._replace(memory=m, missing=0, horizon=Horizon(state.cursor, state.last_ns, state.efforts))
 
 
-BRIDGED = 10
-"""Missing samples at most after which the motion is not begun anew where a torque changed. Over more of them
-``unknown_torque``, linearized at one instant, is some percent off (45 ms), and after bursts of 10 to 100 ms the payload
-is as uncertain either way."""
 UNKNOWN_TORQUE = 0.1
 """Change of a torque over missing samples, over its peak, times their number, that is too small to matter: it leaves
 some 1e-4 of what a step of the whole torque does."""

@@ -54,8 +54,8 @@ def draw(arm: ArmParameters, angles: Array, bends: Array, points: int = POINTS) 
 
 
 LINK_COLOURS = (0.0, 0.45, 0.70), (0.84, 0.37, 0.0)
-TRUSTED, DOUBTFUL, JOINT = (0.0, 0.62, 0.45), (0.90, 0.62, 0.0), (0.3, 0.3, 0.3)
-"""Red, green and blue of Okabe and Ito's colours."""
+TRUSTED, DOUBTFUL, JOINT = (0.0, 0.45, 0.33), (0.70, 0.40, 0.0), (0.3, 0.3, 0.3)
+"""Red, green and blue. Those of the links are Okabe and Ito's; of text they are darker, to be read on light grey."""
 DENSITY = 1000.0
 """The object is drawn as a ball of this density [kg/m^3], that of water."""
 THICKNESS = 1.0 / 60.0

@@ -6,6 +6,7 @@ import difflib
 import sys
 from collections.abc import Callable, Iterable
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -140,7 +141,9 @@ def arm_line(node: Any) -> str:
     given = any(name.startswith('arm.') for name in parameter_overrides(node))
     defaults = flatten(type(arm)())
     changed = [f'arm.{name}' for name, value in flatten(arm).items() if value != defaults[name]]
-    files = [path for option, path in pairwise(sys.argv) if option == '--params-file']
+    # launch_ros writes the parameters that stand in a launch file into files of its own
+    files = [path for option, path in pairwise(sys.argv)
+             if option == '--params-file' and not Path(path).name.startswith('launch_params_')]
     if given:
         origin = f'set at start: {", ".join(changed) or "the defaults"}'
         origin += f' (parameter files: {", ".join(files)})' if files else ''

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
+from flexmanip_ros.io.parameter_file import load_arm
 from flexmanip_ros.parameters import leaves
 from flexmanip_ros.parameters.document import NODES
 
@@ -112,9 +114,28 @@ def test_the_view_has_the_arm_of_the_parameters_and_a_layout_that_is_installed(d
     given = {name: item['default_value'] for name, item in arguments.items()}
     nodes = describe(given)
     used = {item.args[0] for item in everything(nodes) if isinstance(item, LaunchConfiguration)}
-    assert used | {'params_file'} == set(arguments)
+    assert used | {'params_file', 'namespace', 'layout'} == set(arguments)
     assert '<robot name' in nodes[0].kwargs['parameters'][0]['robot_description']
     assert [node.kwargs['package'] for node in nodes] == ['robot_state_publisher', 'rviz2']
+
+
+@pytest.mark.parametrize('described', [ROOT / 'launch' / 'view.launch.py'], indirect=True, ids=['view.launch.py'])
+def test_a_small_arm_in_a_namespace_fills_the_view(described: list[Any]) -> None:
+    arguments = {item.args[0]: item.kwargs for item in described if isinstance(item, DeclareLaunchArgument)}
+    (describe,) = [item.kwargs['function'] for item in described if isinstance(item, OpaqueFunction)]
+    given = {name: item['default_value'] for name, item in arguments.items()}
+    small = {**given, 'params_file': str(ROOT / 'config' / 'arms' / 'quanser.yaml'), 'namespace': 'left'}
+    widths = []
+    for chosen in (given, small):
+        publisher, viewer = describe(chosen)
+        layout = Path(viewer.kwargs['arguments'][1])
+        camera = yaml.safe_load(layout.read_text(encoding='utf-8'))['Visualization Manager']['Views']['Current']
+        reach = sum(load_arm(chosen['params_file'] or None).link_length)
+        widths.append((camera['Scale'] * reach, camera['X'] / reach))
+        layout.unlink()
+    assert widths[1] == pytest.approx(widths[0])
+    assert publisher.kwargs['namespace'] == 'left'
+    assert ('/rpbsid_identifier/arm', '/left/rpbsid_identifier/arm') in viewer.kwargs['remappings']
 
 
 @pytest.mark.parametrize('described', FILES, indirect=True, ids=lambda path: path.name)

@@ -24,6 +24,7 @@ import sys
 import time
 from collections.abc import Iterator
 from functools import partial
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,8 @@ ARM_RATE = 25.0
 """Pictures of the arm a second [Hz]."""
 LONGEST_WAIT_S = 0.02
 """Messages wait so long at most [s]: the time between two estimates at 50 Hz."""
+MOST_AT_ONCE = 100
+"""Messages that a callback takes: signals and services wait for its end, and the queue may hold 1000."""
 LEAD_S = 0.003
 """Time before an estimate is due at which those before are taken [s]: a few are left then, so it comes soon."""
 SHORTEST_WAIT_S = 0.00025
@@ -184,11 +187,11 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def activated(self) -> None:
         """Have threads for fits and models; what came before is none of the samples."""
-        self._waiting()
+        self._waiting(None)
         self._background = Deferred()
 
     def deactivated(self) -> None:
-        """Take what waits; publish the model that is under way; save what is known."""
+        """Take ``MOST_AT_ONCE`` waiting messages at most; publish the model that is under way; save what is known."""
         self._take_samples()
         self.state, estimates = pipeline.finish(self.config, self.state, self._background)
         self._publish(estimates)
@@ -209,17 +212,19 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
     def _take(self) -> None:
         """Take every message that waits; come again when the next estimate is due."""
         due_ns = self.state.next_due_ns
-        self._take_samples()
+        if self._take_samples() == MOST_AT_ONCE:
+            self._alarm.after(SHORTEST_WAIT_S)
+            return
         wait_s = self._wait_s()
         if wait_s > LEAD_S or self.state.next_due_ns != due_ns:
             self._background.begin()
         self._alarm.after(wait_s)
 
-    def _take_samples(self) -> None:
-        """Convert, take one step of the pipeline, publish."""
+    def _take_samples(self) -> int:
+        """Convert, take one step of the pipeline, publish; return how many messages were taken."""
         raws, arrived_ns = self._waiting()
         if not self.active or not raws:
-            return
+            return len(raws)
         with self.meter.of(len(raws)):
             first = 0
             for block in self._reader.blocks(raws):
@@ -231,6 +236,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
                 first += count
             if self._checkpoints is not None:
                 self._checkpoints.save_when_due(self.config, self.state)
+        return len(raws)
 
     def _take_block(self, block: JointBlock, arrived_ns: NDArray[np.int64]) -> None:
         if self._resumed:
@@ -240,13 +246,13 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self._lag_ns, self._missed = int(np.median(arrived_ns - block.stamp_ns)), 0
             self._latest = block.record(-1)
 
-    def _waiting(self) -> tuple[list[bytes], NDArray[np.int64]]:
-        """Return the messages that wait and when they arrived [ns].
+    def _waiting(self, most: int | None = MOST_AT_ONCE) -> tuple[list[bytes], NDArray[np.int64]]:
+        """Return the messages that wait, ``most`` of them (None: all), and when they arrived [ns].
 
         Also while the node is not active: what it ignores is not lost.
         """
         raws, arrived_ns = [], []
-        for raw, info in self._joint_states.take() if self.context.ok() else ():
+        for raw, info in islice(self._joint_states.take(), most) if self.context.ok() else ():
             self.losses.note(sequence_number(info))
             raws.append(raw)
             arrived_ns.append(info['received_timestamp'])
@@ -332,7 +338,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self.log_throttled(reason, words)
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._waiting()
+        self._waiting(None)
         self._forget()
         response.success, response.message = True, 'everything identified so far is forgotten'
         self.get_logger().info(f'reset: {response.message}')
