@@ -210,7 +210,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self.state, self.estimate, self._resumed, self._logged = pipeline.init(), None, False, {}
 
     def _take(self) -> None:
-        """Take every message that waits; come again when the next estimate is due."""
+        """Take the messages that wait; come again when the next estimate is due, or at once for what is left."""
         due_ns = self.state.next_due_ns
         if self._take_samples() == MOST_AT_ONCE:
             self._alarm.after(SHORTEST_WAIT_S)
