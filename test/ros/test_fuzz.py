@@ -100,6 +100,7 @@ def test_samples_whose_stamps_hardly_advance_do_not_fill_the_memory(
         for k, item in enumerate(message):
             item.header.stamp = time_message(10**18 + first + k)
         bench.send([('joint_states', item) for item in message])
+        ros.wait(lambda until=first + 100: bench.node.state.counters.received >= until, what='samples to be taken')
     assert 500 < bench.remembered() <= 1200
 
 
