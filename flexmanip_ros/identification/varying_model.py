@@ -90,10 +90,10 @@ def unmodelled(v: Varying) -> float:
     """Return the relative error of frequencies that explains what predictions over a block miss.
 
     A frequency off by the share e turns the phase by shift t e in a time t, in the mean over a block of the time T
-    by shift T e / sqrt(3) (root of the mean square). Of an error that is as likely to be one of the amplitude, half
-    the power is one of the phase.
+    by shift T e / sqrt(3) (root of the mean square). Half of the power that is missed counts as one of phase, half as
+    one of amplitude.
     """
-    return math.sqrt(1.5) * float(v.share.mean()) / (v.shift * BLOCK * v.dt)
+    return math.sqrt(3.0 / 2.0) * float(v.share.mean()) / (v.shift * BLOCK * v.dt)
 
 
 def _matrices(read: Configurations, c: float, role: Roles, ratio: float) -> tuple[StateSpace, Tangent]:

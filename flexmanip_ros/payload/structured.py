@@ -55,7 +55,7 @@ class StructuredState(NamedTuple):
     peak: Array = np.empty(0)
     """(L,) largest size of each torque so far [N m]."""
     slope: Array = np.zeros(1)
-    """(L,) its change over the last sample that was measured [N m]."""
+    """(L,) change of each torque over the last sample that was measured [N m]."""
     restarts: int = 0
     """How often numbers left the finite range."""
     refits: int = 0
@@ -105,7 +105,7 @@ def advance(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
             continue
         if broken:
             assert state.sensors is not None
-            # over longer ``unknown_torque``, linearized at one instant, is some percent off: known modes would be wrong
+            # ``unknown_torque`` is linearized at one instant; over more than a block that is some percent off
             state = (_bridge if 0 < state.missing <= state.sensors.block else _resume)(config, state, part)
         state = _run(config, state, part)
     return state

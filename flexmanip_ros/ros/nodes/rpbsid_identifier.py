@@ -75,7 +75,7 @@ ARM_RATE = 25.0
 LONGEST_WAIT_S = 0.02
 """Messages wait so long at most [s]: the time between two estimates at 50 Hz."""
 MOST_AT_ONCE = 100
-"""Messages that a callback takes: signals and services wait for its end, and the queue may hold 1000."""
+"""Messages that a callback takes, 0.1 s at 1 kHz: signals and services wait for its end, and 1000 may wait."""
 LEAD_S = 0.003
 """Time before an estimate is due at which those before are taken [s]: a few are left then, so it comes soon."""
 SHORTEST_WAIT_S = 0.00025
