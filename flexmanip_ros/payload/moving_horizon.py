@@ -63,8 +63,11 @@ FIRST_ITERATION = 8
 
 ROWS = 8
 """Rows that are read again for each new sample."""
-CLOSING = 4
-"""Times that all rows of the horizon are read again at most when it closes: a fit that comes takes one or two."""
+CLOSING = 16
+"""Times that all rows of the horizon are read again at most when it closes: a fit of an empty arm takes up to ten."""
+WORK = 4
+"""Integration steps for each row that is read again, in the mean, over those of an arm without friction: a joint that
+sticks takes three, a wrong arm's hundreds."""
 GROWTH = 4
 """A converged fit is repeated once the horizon has a quarter more samples: fewer hardly move it."""
 AT_REST = 0.5
@@ -102,6 +105,10 @@ LEVENBERG = 1.0
 along a narrow valley that bends, and damping in proportion to the information hardly lets a step go along it."""
 MARQUARDT = 1e-3
 """The same for an empty arm, in proportion to the information: its priors are rough."""
+FADING, FADED = 8.0, 1e-3
+"""Factor by which a rejected step raises the damping, and an accepted one lowers it (Marquardt 1963); share of the
+damping above, below which it is zero: that one hardly shortens a step. At zero at once, every second step of a fit in a
+valley that bends is rejected."""
 CHANCE = 3.0
 """Standard deviations by which the filter may put what is nonnegative below zero: more is no noise."""
 REJECTIONS = 8
@@ -128,19 +135,20 @@ def begin_iteration(m: FilterState) -> None:
 
 
 @merged
-def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array) -> bool:
-    """Take one sample since the event into the iteration: N += f f' / r, g += f e / r. False: the step was too long.
+def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array) -> int:
+    """Take one sample since the event into the iteration: N += f f' / r, g += f e / r.
 
     table: (N, 1 + L + m), the rows before the event that a late torque needs, then the first sample after it. The cost
-    is the sum of e^2 / r.
+    is the sum of e^2 / r. Return how many integration steps that took; 0: the step of the iteration was too long.
     """
     k = m.counts[ITERATED] + sensors.reach - 1
     sample = table[k]
     n, nx, used = sensors.H.shape[1], m.x.size, m.counts[USED]
     links, f = motion.effort.size, sensors.f[:used]
     rows = table[k + 1 - sensors.reach:k + 1]
-    if not predict(motion, m.xr, m.Sr, used, rows, sensors.period, sample[0], m.counts[FINENESS]):
-        return False
+    steps = predict(motion, m.xr, m.Sr, used, rows, sensors.period, sample[0], m.counts[FINENESS])
+    if steps == 0:
+        return 0
     measured = sample[1 + links] == sample[1 + links]
     if measured:
         m.counts[MEASURED] += 1
@@ -157,8 +165,11 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
                 m.N[a, b] += scaled * f[b]
     m.counts[ITERATED] += 1
     if not m.score[COST] < LOST * (nx + m.noise.shape[0] * m.counts[ITERATED]):
-        return False
-    return m.counts[ITERATED] != m.counts[BEFORE] or not m.score[COST] > m.score[COST_BEFORE] + SLACK
+        return 0
+    # the cost only grows: a step may be rejected before its last sample
+    if m.counts[ITERATED] <= m.counts[BEFORE] and m.score[COST] > m.score[COST_BEFORE] + SLACK:
+        return 0
+    return int(steps)
 
 
 @inner
@@ -173,11 +184,11 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
     fits = m.score[COST] < FITS * (nx + m.noise.shape[0] * m.counts[MEASURED])
     enough = CONVERGED * m.counts[ITERATED]
     # two steps may undo each other for ever where the valley bends
-    still = (m.counts[BEFORE] == m.counts[ITERATED] and m.score[LAMBDA] <= least_damping(m)
+    still = (m.counts[BEFORE] == m.counts[ITERATED] and m.score[LAMBDA] <= first_damping(m)
              and m.score[COST_BEFORE] - m.score[COST] < enough)
     m.counts[BEFORE] = m.counts[ITERATED]
     m.score[COST_BEFORE] = m.score[COST]
-    m.score[LAMBDA] = m.score[LAMBDA] / 8.0 if m.score[LAMBDA] > least_damping(m) and not fits else 0.0
+    m.score[LAMBDA] = m.score[LAMBDA] / FADING if m.score[LAMBDA] > FADED * first_damping(m) else 0.0
     m.counts[REJECTED] = 0
     m.counts[ITERATING] = 0
     if not damped_step(motion, sensors, m):
@@ -209,8 +220,8 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
 
 
 @inner
-def least_damping(m: FilterState) -> float:
-    """Return the damping with which a rejected step is taken again first; one below it becomes zero."""
+def first_damping(m: FilterState) -> float:
+    """Return the damping with which a rejected step is taken again first."""
     return LEVENBERG if m.counts[HELD] == 1 else MARQUARDT
 
 
@@ -260,7 +271,7 @@ def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
 def reject_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
     """Take a shorter step from the accepted xi, nearer to the gradient, and begin the iteration again."""
     m.counts[REJECTED] += 1
-    m.score[LAMBDA] = max(8.0 * m.score[LAMBDA], least_damping(m))
+    m.score[LAMBDA] = FADING * m.score[LAMBDA] if m.score[LAMBDA] > 0.0 else first_damping(m)
     if m.counts[REJECTED] > REJECTIONS:  # a valley that bends: go on from here
         m.score[COST_BEFORE] = 1e300
     if not damped_step(motion, sensors, m):
@@ -279,11 +290,16 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
     if stored + 1 < FIRST_ITERATION:
         return True
     last = stored + 1 == HORIZON
-    for _ in range(CLOSING * HORIZON if last else ROWS):
+    rows = CLOSING * HORIZON if last else ROWS
+    work = WORK * rows * max(sensors.period / motion.substeps, 1.0)
+    for _ in range(rows):
+        if work <= 0.0:
+            break
         if m.counts[ITERATING] == 0:
             before = m.counts[BEFORE]
             if last:
-                due = before < m.counts[STORED] or dot(m.g, m.gradient) >= CONVERGED * before
+                # until the step is within one standard deviation (Newton decrement): the filter goes on from here
+                due = before < m.counts[STORED] or m.score[LAMBDA] > 0.0 or dot(m.g, m.gradient) >= 1.0
             else:
                 more = max(before // GROWTH, 1) if m.score[SHIFT] < AT_REST else 1
                 due = m.counts[AGAIN] == 1 or m.counts[STORED] >= before + more
@@ -293,7 +309,9 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
         until = m.counts[BEFORE]
         if m.counts[AGAIN] == 0:
             until = m.counts[STORED] if last else min(m.counts[STORED], until + until // 2 + FIRST_ITERATION)
-        if not iterate_sample(motion, sensors, m, table):
+        steps = iterate_sample(motion, sensors, m, table)
+        work -= steps
+        if steps == 0:
             if m.counts[BEFORE] == 0 or not reject_step(motion, sensors, m):
                 return False
         elif m.counts[ITERATED] >= until and (not finish_iteration(motion, sensors, m) or misfits(motion, m)):

@@ -46,6 +46,9 @@ STIFF_STEP = 2.0
 
 MOST_STEPS = 2000.0
 """Steps from a sample to the next: an arm that needs more is none."""
+STIFFEST = 200.0
+"""Rate of the stiffest damper over that of the fastest mode: an arm of which more is learned is none. A joint that
+sticks in an arm as it is has five."""
 
 
 class Kind(IntEnum):
@@ -382,15 +385,15 @@ def note_opened(motion: ProcessModel, S: Array, used: int) -> None:
 @kernel
 def predict(
     motion: ProcessModel, x: Array, S: Array, used: int, rows: Array, period: float, duration: float, fineness: int,
-) -> bool:
-    """Carry x and S over a time [s] with the torque held; False when numbers left the finite range.
+) -> int:
+    """Carry x and S over a time [s] with the torque held. Return in how many steps; 0: numbers left the finite range.
 
     used: number of columns of S, the first ones, that are not zero; rows: (P, >= 1 + L) columns 1 to L of the last one
     are the efforts held meanwhile [N m], those before it are what the torque depends on too; period: their sample time
     [s]; fineness: 0 steps of fourth order, 1 of fifth, 2 half as long, 3 a quarter. A time of zero only linearizes at
     x: motion.k[0], dq, dqd and G.
     """
-    n = motion.arm.stiffness.size
+    n, taken = motion.arm.stiffness.size, 0
     set_parameters(motion, x)
     note_opened(motion, S, used)
     for i in range(motion.effort.size):
@@ -402,9 +405,9 @@ def predict(
     done, steps, h, turn, pace = 0.0, 1.0, 0.0, 0.0, 1.0
     while True:
         if not linearize(motion, x[:n], x[n:2 * n], motion.k[0]):
-            return False
+            return 0
         if left <= 0.0:
-            return True
+            return 1
         if done == 0.0:
             stiff = 0.0
             for r in range(n):
@@ -412,20 +415,21 @@ def predict(
             pace = slower(motion, left)
             longest = min(motion.substeps * pace, STIFF_STEP / max(stiff, 1e-9))
             steps = np.ceil(left / longest - 1e-9)
-            if not steps < MOST_STEPS:
-                return False
+            if not (steps < MOST_STEPS and stiff * motion.substeps < STIFFEST * STIFF_STEP):
+                return 0
             h = left / max(steps, 1.0)
             turn = max(STEP_ANGLE / motion.substeps, stiff)
             spread(motion, S, used, h, terms(turn * h, SPREAD_ERROR))  # it weighs: the begin's linearization will do
         fifth = fineness > 0 and pace == 1.0
         if not exponential_step(motion, x, h * fine, terms(turn * h * fine, MOTION_ERROR), fifth):
-            return False
+            return 0
+        taken += 1
         done += fine
         if done >= 1.0:
             done = 0.0
             left = left - h if steps > 1.0 else 0.0
             if left <= 0.0:
-                return True
+                return taken
 
 
 @inner

@@ -109,3 +109,17 @@ def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(arm):
             arm.effort[:] = arm.gain * TORQUE / np.exp(0.03)
             process_model.accelerate(arm, x[:n].copy(), x[n:2 * n].copy(), acceleration)
         np.testing.assert_allclose((high - low) / 2e-5, G[:, c], rtol=1e-4, atol=1e-5 * np.abs(G[:, c]).max() + 1e-9)
+
+
+def test_steps_are_counted_and_an_arm_too_stiff_to_be_one_is_refused(arm):
+    n = arm.arm.stiffness.size
+    x, rows = bent(arm, n), np.zeros((1, 3))
+    viscous = np.flatnonzero(arm.kind == Kind.VISCOUS)
+    spread = np.zeros((x.size, x.size))
+    steps = []
+    for friction in (0.0, 100.0, 1e4):  # [N m s/rad]
+        state = x.copy()
+        state[2 * n + viscous] = friction
+        steps.append(process_model.predict(arm, state, spread, 0, rows, 1e-3, 1e-3, 0))
+    assert 1 <= steps[0] < steps[1]
+    assert steps[2] == 0

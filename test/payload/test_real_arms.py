@@ -81,9 +81,12 @@ def test_every_arm_that_is_shipped_knows_its_payload(preset: str, mass: float, p
     assert abs(found.mass - mass) < 3.5 * found.std
 
 
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', [0, 1, 2, 3, 9, 11])
 def test_a_floating_arm_with_every_fault_learns_frictions_that_can_be_and_knows_what_it_catches(seed: int) -> None:
-    """Frictions below zero are how such a fit was lost: with them the fit of one arm in three never came."""
+    """Frictions below zero are how such a fit was lost: with them the fit of one arm in three never came.
+
+    Those of 9 and 11 come since a rejected step's damping fades over the next ones, and the closing horizon waits.
+    """
     rng, told = np.random.default_rng(seed), ArmParameters(damping_ratio=0.003, base_mass=700.0, base_inertia=180.0)
     arm = replace(
         told, modes=5, joint_viscous_friction=(0.8, 0.8), joint_coulomb_friction=(0.15, 0.15),
@@ -107,14 +110,18 @@ def test_hubs_do_not_bias_a_light_payload() -> None:
     assert abs(found.mass - 1.5) < 3.5 * found.std
 
 
-def test_a_body_is_known_half_a_second_after_its_capture() -> None:
+def test_bodies_are_known_half_a_second_after_their_capture() -> None:
     arm, caught = ArmParameters(damping_ratio=0.003), event(2.0)
     config, truth = IdentifierParameters(arm=arm), (0.08, 0.05)
-    samples = record(2.6, (caught,), arm=arm, payload_com=truth, payload_inertia=1.0, seed=2)
-    found = structured.estimate(config, run(config, samples, (caught,)))
-    assert found.status is Status.TRACKING
-    assert found.com[:2] == pytest.approx(truth, abs=0.006)
-    assert found.lower < 20.0 < found.upper
+    inside = 0
+    for seed in range(2, 8):
+        samples = record(2.6, (caught,), arm=arm, payload_com=truth, payload_inertia=1.0, seed=seed)
+        found = structured.estimate(config, run(config, samples, (caught,)))
+        assert found.status is Status.TRACKING
+        assert found.com[:2] == pytest.approx(truth, abs=0.006)
+        assert abs(found.mass - 20.0) < 3.5 * found.std
+        inside += found.lower < 20.0 < found.upper
+    assert inside >= 5  # of intervals of 95 % two in six miss once in thirty times
 
 
 def test_an_undamped_arm_that_rings_ever_more_is_followed() -> None:
