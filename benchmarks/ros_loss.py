@@ -90,7 +90,7 @@ def live(case: str, seed: int) -> tuple[list[Said], int]:
         node('rpbsid_identifier'), [sys.executable, str(HERE / 'parts' / 'lossy_relay.py'), case, str(seed)],
         node('capture_trigger', *before, '-p', 'mode:=time', '-p', f'capture_time:={CAPTURE_S}'),
         node('excitation', *before, '-p', 'clock:=joint_states'),
-        node('plant_simulator', *before, '-p', f'payload_mass:={PAYLOAD}')]
+        node('plant_simulator', *before, '-p', f'payload_mass:={PAYLOAD}', '-p', f'seed:={seed}')]
     rclpy.init()
     observer = Observer()
     executor = make_executor()
