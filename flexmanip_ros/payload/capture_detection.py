@@ -16,7 +16,7 @@ from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Rows, SampleLog
-from flexmanip_ros.types import DATING_STD_S, CaptureEvent, EventKind, JointBlock, JointRecord
+from flexmanip_ros.types import DATING_STD_S, Array, CaptureEvent, EventKind, JointBlock, JointRecord
 
 SETTLE = 0.5
 """Seconds after the start or an event before the next can be told."""
@@ -90,7 +90,7 @@ def statistic(state: DetectionState) -> tuple[float, float]:
     """Return the latest statistic and its threshold (0 and infinite before there are any)."""
     if state.glr is None:
         return 0.0, float('inf')
-    return float(state.glr.level[0]), float(kernel.limit(state.glr))
+    return float(state.glr.level[kernel.STATISTIC]), float(kernel.limit(state.glr))
 
 
 def threshold(config: TriggerParameters, dt: float) -> float:
@@ -102,6 +102,28 @@ def threshold(config: TriggerParameters, dt: float) -> float:
     looks = 3600.0 / dt / INDEPENDENT
     chance = min(0.5, config.false_alarms_per_hour / looks)
     return float(scipy.special.chdtri(kernel.CAUSES, chance))
+
+
+def onset(glr: kernel.GlrState, variance: Array, longest: int) -> float:
+    """Return the mean of how many samples ago the force at the tip began, each onset as likely as another before.
+
+    variance: (m,) of the white noise [rad^2 or m^2]: the one that the filter takes grows with the event. longest:
+    samples since the last gap. An onset has the likelihood exp(s' P s / 2) / sqrt(det(I + N)), its six causes
+    integrated over: s their score, N their information, P the inverse of I + N. An early onset has more freedom to
+    fit what a later one explains; the determinant is the price of it.
+    """
+    w, newest = glr.trace.shape[0], int(glr.clock[kernel.NEWEST])
+    lags = np.arange(min(int(glr.clock[kernel.FILLED]), longest + 1, w))
+    weighted = glr.innovations[(newest - lags) % w] / variance
+    trace = glr.trace[:lags.size]
+    information = np.eye(kernel.CAUSES) + np.cumsum(
+        np.einsum('lia,lib->lab', trace / variance[:, np.newaxis], trace), axis=0)
+    scores = np.array([np.tensordot(trace[:lag + 1], weighted[lag::-1], ((0, 1), (0, 1))) for lag in lags])
+    explained = np.einsum('la,la->l', scores, np.linalg.solve(information, scores[..., np.newaxis])[..., 0])
+    likelihood = 0.5 * (explained - np.linalg.slogdet(information)[1])
+    told = lags >= kernel.SHORTEST - 1
+    chance = np.exp(likelihood[told] - likelihood[told].max())
+    return float(np.average(lags[told], weights=chance))
 
 
 def _start(config: TriggerParameters, state: DetectionState, row: Rows) -> DetectionState:
@@ -116,9 +138,10 @@ def _start(config: TriggerParameters, state: DetectionState, row: Rows) -> Detec
     m = len(state.filter.model.roles)
     glr = kernel.GlrState(
         trace=np.zeros((w, m, kernel.CAUSES)), factors=np.zeros((w, kernel.CAUSES, kernel.CAUSES)),
-        scores=np.zeros((w, kernel.CAUSES)), past=np.zeros((w, m)), clock=np.zeros(6, dtype=np.int64),
-        level=np.array([0.0, 0.0, 0.0, threshold(config, dt)]), history=np.zeros((2, 2 * w)),
-        torques=row.u[-1].copy(), drive=np.zeros(3), statistic=np.zeros(w), flow=np.zeros((n2, n2)),
+        scores=np.zeros((w, kernel.CAUSES)), past=np.zeros((w, m)), innovations=np.zeros((w, m)),
+        clock=np.zeros(6, dtype=np.int64),
+        level=np.array([0.0, 0.0, threshold(config, dt)]), history=np.zeros((2, 2 * w)),
+        torques=row.u[-1].copy(), drive=np.zeros(3), flow=np.zeros((n2, n2)),
         state=np.zeros((2, n2, 2)))
     return replace(state, glr=glr, dt=dt)
 
@@ -149,13 +172,13 @@ def _watch(
         last = part.since(part.until - 1)
         fresh = structured.restart(state.identifier, filtered, after, last)
         glr = _quiet(glr)
-        glr.level[2] = 0.0  # what the model missed before
+        glr.level[kernel.PEAK] = 0.0  # what the model missed before
         return replace(state, filter=fresh, glr=glr), None
     state = replace(state, filter=after, glr=glr)
     if glr.clock[kernel.ALARMED] <= confirm:
         return state, None
     assert state.since is not None
-    lag = min(int(glr.level[1]), part.until - 1 - state.since, glr.trace.shape[0] - 1)
+    lag = round(onset(glr, np.maximum(m.noise[:, mem.WHITE], m.noise[:, mem.FLOOR]), part.until - 1 - state.since))
     kind = EventKind.RELEASE if m.counts[mem.HELD] else EventKind.CAPTURE
     event = CaptureEvent(int(rows.between(part.until - 1 - lag, part.until).stamp_ns[0]), kind, DATING_STD_S)
     return _after(state, event), event
@@ -181,7 +204,7 @@ def _quiet(glr: kernel.GlrState) -> kernel.GlrState:
     """Forget what was gathered; wait before the next alarm. What the model always misses stays known."""
     fresh = kernel.GlrState._make(part.copy() for part in glr)
     fresh.clock[:] = 0
-    fresh.level[:2] = 0.0
+    fresh.level[kernel.STATISTIC] = 0.0
     fresh.history[:] = 0.0
     fresh.scores[:] = 0.0
     return fresh

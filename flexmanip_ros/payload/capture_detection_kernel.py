@@ -48,11 +48,11 @@ CAUSED = 0.25
 """Share of the largest energy below which a peak is not taken for the torque's doing: chance has peaks as well."""
 MOST_HALVINGS = 20
 """Halvings of a sample time in the exponential: the linearization of an arm that needs more is none."""
-DATING = 3.0
-"""The latest onset whose statistic is that close to the largest dates the event."""
 
 # elements of ``clock``
 NEWEST, FILLED, SINCE_TRACES, QUIET, HISTORY, ALARMED = range(6)
+# elements of ``level``
+STATISTIC, PEAK, THRESHOLD = range(3)
 # elements of ``drive``: energy of the torque's changes; the largest of late; the one that belongs to the recent peak
 ENERGY, LARGEST, AT_PEAK = range(3)
 
@@ -67,11 +67,13 @@ class GlrState(NamedTuple):
     scores: Array
     """(w, 6) gathered for each onset, a ring."""
     past: Array
-    """(w, m) innovations over their variance, a ring."""
+    """(w, m) innovations over their variance then, limited to five deviations, a ring."""
+    innovations: Array
+    """(w, m) innovations as they are [rad or m], a ring."""
     clock: NDArray[np.int64]
     """(6,) counters."""
     level: Array
-    """(4,) statistic, lag of its maximum, recent peak, threshold."""
+    """(3,) statistic, recent peak, threshold."""
     history: Array
     """(2, 2 w) statistics of the last samples and the energies of the torque's changes then: they count once they are
     older than these."""
@@ -79,8 +81,6 @@ class GlrState(NamedTuple):
     """(L,) the last torques [N m]."""
     drive: Array
     """(3,) energies of the torque's changes [N^2 m^2]."""
-    statistic: Array
-    """(w,) of each lag."""
     flow: Array
     """(n2, n2) scratch: state transition of a sample."""
     state: Array
@@ -223,7 +223,8 @@ def update_glr(m: FilterState, glr: GlrState, scratch: Array) -> None:
         variance = max(m.innovation[i, 1], m.noise[i, EFFECTIVE])
         most = 5.0 * np.sqrt(variance)
         glr.past[clock[NEWEST], i] = min(max(m.innovation[i, 0], -most), most) / variance
-    best, best_lag = 0.0, 0
+        glr.innovations[clock[NEWEST], i] = m.innovation[i, 0]
+    best = 0.0
     for lag in range(clock[FILLED]):
         onset = (clock[NEWEST] - lag) % w
         score = glr.scores[onset]
@@ -239,12 +240,8 @@ def update_glr(m: FilterState, glr: GlrState, scratch: Array) -> None:
         statistic = 0.0
         for a in range(CAUSES):
             statistic += scratch[a] * scratch[a]
-        glr.statistic[lag] = statistic
         best = max(best, statistic)
-    for lag in range(clock[FILLED] - 1, SHORTEST - 2, -1):
-        if glr.statistic[lag] > best - DATING:
-            best_lag = lag
-    glr.level[0], glr.level[1] = best, best_lag
+    glr.level[STATISTIC] = best
 
 
 @inner
@@ -266,7 +263,7 @@ def limit(glr: GlrState) -> float:
     """
     drive = glr.drive
     larger = drive[ENERGY] / max(drive[AT_PEAK], CAUSED * drive[LARGEST], 1e-300)
-    most: float = max(glr.level[3], CALM * glr.level[2] * max(larger, 1.0))
+    most: float = max(glr.level[THRESHOLD], CALM * glr.level[PEAK] * max(larger, 1.0))
     return most
 
 
@@ -276,12 +273,12 @@ def remember(glr: GlrState, fade: float) -> None:
     clock, history, drive = glr.clock, glr.history, glr.drive
     clock[HISTORY] = (clock[HISTORY] + 1) % history.shape[1]
     old, energy = history[0, clock[HISTORY]], history[1, clock[HISTORY]]
-    history[0, clock[HISTORY]], history[1, clock[HISTORY]] = glr.level[0], drive[ENERGY]
-    glr.level[2] *= fade
+    history[0, clock[HISTORY]], history[1, clock[HISTORY]] = glr.level[STATISTIC], drive[ENERGY]
+    glr.level[PEAK] *= fade
     drive[LARGEST] = max(drive[LARGEST] * fade, drive[ENERGY])
     least = CAUSED * drive[LARGEST]
-    if old * max(drive[AT_PEAK], least) > glr.level[2] * max(energy, least):
-        glr.level[2], drive[AT_PEAK] = old, energy
+    if old * max(drive[AT_PEAK], least) > glr.level[PEAK] * max(energy, least):
+        glr.level[PEAK], drive[AT_PEAK] = old, energy
 
 
 @inner
@@ -327,11 +324,11 @@ def advance(
                 return k + 1
         elif clock[QUIET] > glr.trace.shape[0]:  # the statistic is of samples since then alone
             if clock[QUIET] > hold:
-                clock[ALARMED] = glr.level[0] > limit(glr)
-            elif m.counts[STORED] < HORIZON and glr.level[0] > glr.level[3]:
+                clock[ALARMED] = glr.level[STATISTIC] > limit(glr)
+            elif m.counts[STORED] < HORIZON and glr.level[STATISTIC] > glr.level[THRESHOLD]:
                 # the model is still wrong and will be another one: wait again, without what it missed
                 clock[QUIET] = glr.trace.shape[0]
-                glr.level[2] = 0.0
+                glr.level[PEAK] = 0.0
                 glr.history[0] = 0.0
             remember(glr, fade)
     taken: int = table.shape[0]
@@ -340,8 +337,9 @@ def advance(
 
 UNWATCHED = GlrState(
     trace=np.zeros((0, 0, 0)), factors=np.zeros((0, 0, 0)), scores=np.zeros((0, 0)), past=np.zeros((0, 0)),
+    innovations=np.zeros((0, 0)),
     clock=np.zeros(0, dtype=np.int64), level=np.zeros(0), history=np.zeros((0, 0)), torques=np.zeros(0),
-    drive=np.zeros(0), statistic=np.zeros(0), flow=np.zeros((0, 0)), state=np.zeros((0, 0, 0)))
+    drive=np.zeros(0), flow=np.zeros((0, 0)), state=np.zeros((0, 0, 0)))
 """In the place of a test that is not run."""
 
 

@@ -96,6 +96,25 @@ def test_the_exponential_of_a_sample_is_that_of_scipy_where_friction_makes_it_st
     assert flow == pytest.approx(scipy.linalg.expm(1e-3 * block), rel=1e-4, abs=1e-4 * np.abs(flow).max())
 
 
+@pytest.mark.parametrize('ago', [8, 30, 77])
+@pytest.mark.parametrize('strength', [3.0, 300.0], ids=['faint', 'heavy'])
+def test_an_onset_is_dated_from_its_trace_whatever_came_of_the_noise_since(ago, strength):
+    """The white noise weighs the innovations: the variance that the filter takes them for has grown with the event."""
+    rng, (w, m), newest = np.random.default_rng(ago), (100, 3), 17
+    lags = np.arange(w)[:, np.newaxis]
+    ring = np.cos(0.09 * lags * (1.0 + np.arange(m))) - 1.0  # (w, m) of a force that is held
+    trace = np.stack([ring, np.cumsum(ring, axis=0) / 20.0, ring[:, ::-1], -ring, ring * lags / w, 0.1 * ring], axis=2)
+    variance = np.array([1e-8, 4e-8, 1e-10])
+    trace *= np.sqrt(variance)[:, np.newaxis]
+    now = np.sqrt(variance) * rng.standard_normal((w, m))
+    now[:ago + 1] += (trace @ (strength * np.array([1.0, 0.2, 0.0, 0.0, 0.5, 0.0])))[ago::-1]
+    innovations = np.zeros((w, m))
+    innovations[(newest - np.arange(w)) % w] = now
+    glr = kernel.UNWATCHED._replace(trace=trace, innovations=innovations, clock=np.array([newest, w, 0, 0, 0, 0]))
+    assert capture_detection.onset(glr, variance, w) == pytest.approx(ago, abs=2.0)
+    assert capture_detection.onset(glr, variance, ago - 3) <= ago - 3  # not before the last gap
+
+
 def test_single_samples_give_the_events_of_a_block():
     samples = record(1.6, (event(1.3),))
     config = settings()
