@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from itertools import pairwise
+from statistics import median
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
@@ -54,7 +55,8 @@ def test_diagnostics_come_once_a_second_while_samples_are_taken(ros: Ros) -> Non
             time.sleep(max(began + 1e-3 * k - time.monotonic(), 0.0))
     ros.wait(lambda: len(_own(live.diagnostics)) >= 4)
     stamps = [conversions.stamp_ns(message.header.stamp) for message in _own(live.diagnostics)]
-    assert min(b - a for a, b in pairwise(stamps)) > 100_000_000
+    # the median: after a stall of the machine the late one and the next come together, once
+    assert 0.5e9 < median(b - a for a, b in pairwise(stamps)) < 1.5e9
 
 
 def _own(heard: list[DiagnosticArray]) -> list[DiagnosticArray]:
