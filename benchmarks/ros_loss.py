@@ -1,8 +1,8 @@
 """Claim: 1 and 5 % of loss, bursts of 10 to 100 ms a second, 100 ms of jitter: TRACKING in 95 % of the estimates.
 
 From 1 s after the capture of 20 kg on, live (plant, relay and identifier are processes over DDS; the relay loses or
-holds back joint states) and replayed (the same faults in simulated runs). Each is the mean of several runs: whether a
-burst hides a step of the torque is chance. Use: ros_loss.py [runs]
+holds back joint states) and replayed (the same faults in simulated runs). Each is the mean of ten runs: whether a burst
+hides a step of the torque is chance, and a run's estimates depend on one another. Use: ros_loss.py [runs]
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def mean(runs: Sequence[dict[str, float]]) -> dict[str, float]:
 
 def main() -> None:
     """Measure, print and write JSON."""
-    seeds = range(1, 1 + (int(sys.argv[1]) if len(sys.argv) > 1 else 5))
+    seeds = range(1, 1 + (int(sys.argv[1]) if len(sys.argv) > 1 else 10))
     rows: list[dict[str, Any]] = []
     for case in CASES:
         rows.append({'case': case, 'how': 'live', 'runs': len(seeds),
