@@ -5,14 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Inertia, InertiaStamped, Vector3
 from rcl_interfaces.srv import SetParameters
-from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from ros_harness import Ros, overrides
 from std_msgs.msg import Float64MultiArray
 
@@ -106,9 +103,7 @@ def test_a_payload_that_is_not_that_of_its_estimate_is_not_told(ros: Ros) -> Non
 def test_a_driver_that_does_not_answer_is_said_and_its_requests_are_not_kept(
         ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(payload_adapter, 'ANSWER_S', 0.05)
-    deaf = Context()
-    rclpy.init(context=deaf, domain_id=ros.domain, signal_handler_options=SignalHandlerOptions.NO)
-    node = Node('deaf', context=deaf)  # never spun
+    node = Node('deaf', context=ros.context)  # never spun
     node.create_service(SetParameters, 'driver/set_parameters', lambda request, response: response)
     adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
         target_node='driver', settle_time=0.0, min_period=0.01)))
@@ -120,7 +115,6 @@ def test_a_driver_that_does_not_answer_is_said_and_its_requests_are_not_kept(
         ros.wait(lambda first=first: adapter._asked is not first, what='another request')
     assert len(adapter._client._pending_requests) <= 1
     node.destroy_node()
-    rclpy.shutdown(context=deaf)
 
 
 class WithInertia:
