@@ -23,6 +23,7 @@ from flexmanip_ros.payload.filter_state import (
     COST_BEFORE,
     DOUBT,
     EFFECTIVE,
+    ENDING,
     ENOUGH,
     FINENESS,
     FIT,
@@ -289,7 +290,7 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
     m.counts[STORED] = stored + 1
     if stored + 1 < FIRST_ITERATION:
         return True
-    last = stored + 1 == HORIZON
+    last = stored + 1 == HORIZON or m.counts[ENDING] == 1
     rows = CLOSING * HORIZON if last else ROWS
     work = WORK * rows * max(sensors.period / motion.substeps, 1.0)
     for _ in range(rows):
