@@ -120,6 +120,36 @@ def payload_jacobian(
 
 
 @inner
+def add_body_forces(arm: Manipulator, q: Array, qdd: Array, dp: Array, work: Workspace) -> None:
+    """Add to dp (n, 4), the derivative of the forces by the payload's parameters, that of more accelerations qdd (n,).
+
+    Right after ``force_jacobian``, whose work.frame, work.J and work.P it reads.
+    """
+    n = q.size
+    g, J, mass = work.frame[0], work.J[arm.length.size], work.F[2]
+    turn, accelerated, x, y = 0.0, 0.0, 0.0, 0.0
+    for r in range(n):
+        accelerated += g[r] * qdd[r]
+        x += J[0, r] * qdd[r]
+        y += J[1, r] * qdd[r]
+        turn += g[r] * q[r]
+        if arm.floating:  # the translation that keeps the momentum
+            x -= work.P[0, r] / mass * qdd[r]
+            y -= work.P[1, r] / mass * qdd[r]
+    tx, ty = np.cos(turn), np.sin(turn)
+    along, across = tx * x + ty * y, tx * y - ty * x
+    for r in range(n):
+        a, b = J[0, r], J[1, r]
+        if arm.floating:
+            a -= work.P[0, r] / mass
+            b -= work.P[1, r] / mass
+        dp[r, 0] += a * x + b * y
+        dp[r, 1] += (b * tx - a * ty) * accelerated + g[r] * across
+        dp[r, 2] -= (a * tx + b * ty) * accelerated + g[r] * along
+        dp[r, 3] += g[r] * accelerated
+
+
+@inner
 def tip_load_jacobian(arm: Manipulator, i: int, q: Array, left: Array, right: Array, work: Workspace) -> None:
     """Add the force work.F at the tip of link i, with its derivatives Fq and Fv, to the link's own rows."""
     k = arm.kappa
