@@ -98,7 +98,8 @@ def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(arm):
     n = arm.arm.stiffness.size
     x = bent(arm, n)
     low, high = np.zeros(n), np.zeros(n)
-    linearize(arm, x)
+    moment = np.array([[0.0, *(TORQUE / arm.gain)]]), 1e-3, 1e-13, 0  # over no time they are those at x
+    assert process_model.predict(arm, x.copy(), np.eye(x.size), x.size, *moment)
     G = arm.G.copy()
     for c in range(G.shape[1]):
         up, down = x.copy(), x.copy()
@@ -109,6 +110,33 @@ def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(arm):
             arm.effort[:] = arm.gain * TORQUE / np.exp(0.03)
             process_model.accelerate(arm, x[:n].copy(), x[n:2 * n].copy(), acceleration)
         np.testing.assert_allclose((high - low) / 2e-5, G[:, c], rtol=1e-4, atol=1e-5 * np.abs(G[:, c]).max() + 1e-9)
+
+
+def test_what_is_learned_moves_a_vibration_that_turns_by_a_radian_in_a_sample_as_far_as_the_motion_does():
+    arm = motion(configure(IdentifierParameters, {}))
+    n, samples, sample = arm.arm.stiffness.size, 20, 1e-3
+    assert sample / arm.substeps > 0.5  # a step is at most two radians of the fastest mode
+    x = bent(arm, n)
+    rows = np.array([[0.0, *(TORQUE / arm.gain)]])
+
+    def moved(state, spread):
+        state = state.copy()
+        for _ in range(samples):
+            assert process_model.predict(arm, state, spread, spread.shape[1], rows, sample, sample, 3)
+        return state[:2 * n]
+
+    spread, none = np.eye(x.size), np.zeros((x.size, 0))
+    moved(x, spread)
+    size = np.abs(spread[:2 * n, :2 * n]).max(axis=1)  # of what each state can become
+    for c in range(arm.kind.size):
+        if arm.kind[c] in (Kind.BEND_GAIN, Kind.BEND_OFFSET):  # of the sensors
+            continue
+        step = np.zeros(x.size)
+        step[2 * n + c] = 1e-4
+        exact = (moved(x + step, none) - moved(x - step, none)) / 2e-4 / size
+        found = spread[:2 * n, 2 * n + c] / size
+        # held at the begin of a sample, a stiffness is 50 % off, a damping 70 %
+        assert np.linalg.norm(found - exact) <= 0.04 * np.linalg.norm(exact), Kind(arm.kind[c]).name
 
 
 def test_steps_are_counted_and_an_arm_too_stiff_to_be_one_is_refused(arm):
