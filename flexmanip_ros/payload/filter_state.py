@@ -22,7 +22,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
 # Elements of ``counts``.
 (HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN, BEFORE,
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
- FINENESS, CALM, ENDING) = range(23)
+ FINENESS, CALM) = range(22)
 # Elements of ``score``.
 MOVE, VARIANCE, SHIFT, DOUBT, DRIFT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA = range(11)
 
@@ -39,10 +39,10 @@ class FilterState(NamedTuple):
     recent: Array
     """(m, 4) its last measurements."""
     counts: NDArray[np.int64]
-    """(23,) counters; USED: number of columns of S and S0, the first ones, that are not zero; IN_A_ROW: samples since
+    """(22,) counters; USED: number of columns of S and S0, the first ones, that are not zero; IN_A_ROW: samples since
     the last one that was missing; MEASURED: samples of this iteration that were not; TRIED: iterations that did
     not fit, over the same samples; FINENESS: how fine a step of the motion is; CALM: samples since a coarser one
-    was too coarse; ENDING: 1 while the horizon is fitted to its last row, because a gap follows."""
+    was too coarse."""
     score: Array
     """(11,) MOVE: sum of the payload's updates in this batch, VARIANCE: the variance they should have; SHIFT: by how
     many standard deviations the last iteration moved the payload, DOUBT: root of the sum of the squares of that step
@@ -80,7 +80,7 @@ def memory(nx: int, m: int) -> FilterState:
     """Allocate for nx states and m sensors."""
     return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 10)), recent=np.zeros((m, 4)),
-        counts=np.zeros(23, dtype=np.int64), score=np.zeros(11), x0=np.zeros(nx), S0=np.zeros((nx, nx)),
+        counts=np.zeros(22, dtype=np.int64), score=np.zeros(11), x0=np.zeros(nx), S0=np.zeros((nx, nx)),
         xi=np.zeros(nx), accepted=np.zeros(nx), normal=np.zeros((nx, nx)), gradient=np.zeros(nx),
         xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
         g=np.zeros(nx), innovation=np.zeros((m, 2)), power=np.ones(m))

@@ -23,7 +23,6 @@ from flexmanip_ros.payload.filter_state import (
     COST_BEFORE,
     DOUBT,
     EFFECTIVE,
-    ENDING,
     ENOUGH,
     FINENESS,
     FIT,
@@ -284,13 +283,13 @@ def reject_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
 @merged
 def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array) -> bool:
     """Let the Gauss-Newton iteration take up to ``ROWS`` samples; when the horizon closes, until it converges."""
-    if m.counts[STORED] >= HORIZON:
+    stored = m.counts[STORED]
+    if stored >= HORIZON:
         return True
-    stored = m.counts[STORED] + 1
-    m.counts[STORED] = stored
-    if stored < FIRST_ITERATION:
+    m.counts[STORED] = stored + 1
+    if stored + 1 < FIRST_ITERATION:
         return True
-    last = stored == HORIZON or m.counts[ENDING] == 1
+    last = stored + 1 == HORIZON
     rows = CLOSING * HORIZON if last else ROWS
     work = WORK * rows * max(sensors.period / motion.substeps, 1.0)
     for _ in range(rows):
@@ -300,16 +299,16 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
             before = m.counts[BEFORE]
             if last:
                 # until the step is within one standard deviation (Newton decrement): the filter goes on from here
-                due = before < stored or m.score[LAMBDA] > 0.0 or dot(m.g, m.gradient) >= 1.0
+                due = before < m.counts[STORED] or m.score[LAMBDA] > 0.0 or dot(m.g, m.gradient) >= 1.0
             else:
                 more = max(before // GROWTH, 1) if m.score[SHIFT] < AT_REST else 1
-                due = m.counts[AGAIN] == 1 or stored >= before + more
+                due = m.counts[AGAIN] == 1 or m.counts[STORED] >= before + more
             if not due:
                 break
             begin_iteration(m)
         until = m.counts[BEFORE]
         if m.counts[AGAIN] == 0:
-            until = stored if last else min(stored, until + until // 2 + FIRST_ITERATION)
+            until = m.counts[STORED] if last else min(m.counts[STORED], until + until // 2 + FIRST_ITERATION)
         steps = iterate_sample(motion, sensors, m, table)
         work -= steps
         if steps == 0:
@@ -323,7 +322,7 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
             for i in range(m.x.size):
                 for c in range(m.x.size):
                     m.S[i, c] *= wider
-        return not fails(m, stored)
+        return not fails(m)
     return True
 
 
@@ -343,12 +342,12 @@ def misfits(motion: ProcessModel, m: FilterState) -> bool:
 
 
 @inner
-def fails(m: FilterState, rows: int) -> bool:
-    """Whether the fit of the last rows is none: it costs far more than white noise, or lacks some of them."""
+def fails(m: FilterState) -> bool:
+    """Whether the fit at the end of the horizon is none: it costs far more than white noise, or lacks some samples."""
     if m.counts[REFITS] >= MOST_REFITS:
         return False
     expected = m.xi.size + m.noise.shape[0] * m.counts[BEFORE]
-    failed = bool(m.score[COST_BEFORE] > UNFIT * expected or m.counts[BEFORE] < rows)
+    failed = bool(m.score[COST_BEFORE] > UNFIT * expected or m.counts[BEFORE] < m.counts[STORED])
     m.counts[REFITS] += failed
     return failed
 

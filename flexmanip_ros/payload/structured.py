@@ -104,8 +104,10 @@ def advance(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
             state = advance(config, state, part)
             continue
         if broken:
-            state = _after_gap(config, state, part)
-        state = _run(config, state, part) if state.memory is not None else advance(config, state, part)
+            assert state.sensors is not None
+            # ``unknown_torque`` is linearized at one instant; over more than a block that is some percent off
+            state = (_bridge if 0 < state.missing <= state.sensors.block else _resume)(config, state, part)
+        state = _run(config, state, part)
     return state
 
 
@@ -273,44 +275,15 @@ def _part(config: IdentifierParameters, state: StructuredState, rows: Rows, unti
     return advance(config, state, rows.between(state.cursor, until)) if until > state.cursor else state
 
 
-def _after_gap(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
-    """Go on with the first row after a gap. An open horizon closes before it: the fit of its rows is what is kept."""
+def _resume(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
+    """After a gap: start at the measurements of the first row."""
+    state = state._replace(missing=0)
     assert state.model is not None
-    assert state.memory is not None
+    fresh = reopen(config, state, measurements(state.model, rows.between(rows.first, rows.first + 1))[0])
+    assert fresh.memory is not None
     assert state.sensors is not None
-    first = rows.between(rows.first, rows.first + 1)
-    there = state._replace(missing=0, last_ns=int(first.stamp_ns[0]), efforts=latest(state.sensors, first.u))
-    m, fitted = _last_fit(state, rows)
-    if not fitted:
-        return restart(config, state, there._replace(memory=m), first)
-    # ``unknown_torque`` is linearized at one instant; over more than a block that is some percent off
-    if 0 < state.missing <= state.sensors.block:
-        return _bridge(state._replace(memory=m), rows)
-    fresh = reopen(config, there._replace(memory=m), measurements(state.model, first)[0])
-    assert there.efforts is not None
-    return fresh._replace(horizon=Horizon(rows.first, there.last_ns, there.efforts))
-
-
-def _last_fit(state: StructuredState, rows: Rows) -> tuple[mem.FilterState, bool]:
-    """Return the memory once an open horizon was fitted to its last row, the one before ``rows``, and whether it fits.
-
-    Until then the filter is on its way: what it was linearized at tells too much.
-    """
-    assert state.model is not None
-    assert state.memory is not None
-    assert state.sensors is not None
-    m = mem.copy(state.memory)
-    if m.counts[mem.STORED] >= mem.HORIZON:
-        return m, True
-    table, last = input_table(state, rows)
-    table = table[:last + 1].copy()  # one more row that takes no time and measures nothing
-    table[last, 0], table[last, 1 + rows.u.shape[1]:] = 0.0, np.nan
-    stored = m.counts[mem.STORED]
-    m.counts[mem.ENDING] = 1
-    fitted = filtered(state.model.motion, state.sensors, m, table, last) > last
-    m.counts[mem.ENDING] = 0
-    m.counts[mem.STORED] = stored if fitted else mem.HORIZON
-    return m, fitted
+    last_ns, efforts = int(rows.stamp_ns[0]), latest(state.sensors, rows.u[:1])
+    return fresh._replace(last_ns=last_ns, efforts=efforts, horizon=Horizon(rows.first, last_ns, efforts))
 
 
 def latest(sensors: MeasurementModel, efforts: Array, before: Array | None = None) -> Array:
@@ -323,7 +296,7 @@ def latest(sensors: MeasurementModel, efforts: Array, before: Array | None = Non
     return efforts[-missing:].copy()
 
 
-def _bridge(state: StructuredState, rows: Rows) -> StructuredState:
+def _bridge(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
     """The torque changed, nobody knows when, while samples were missing: open the state by what that may have done."""
     assert state.model is not None
     assert state.memory is not None

@@ -491,9 +491,8 @@ def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, 
     predict(motion, m.x, m.S, 0, np.zeros((1, 1 + change.size)), dt, 0.0, 0)
     flow = np.zeros((2 * n + change.size, 2 * n + change.size))
     flow[:n, n:2 * n], flow[n:2 * n, :n], flow[n:2 * n, n:2 * n] = np.eye(n), motion.dq, motion.dqd
-    # right after a capture the impulse at the tip is open, and with it what the object, still unknown, makes of a torque
-    payload = motion.payload if m.counts[mem.SINCE_EVENT] else np.zeros(4)
-    M = motion.M0 + np.tensordot(payload, motion.Mp, 1) if motion.frozen else mass_matrix(motion.arm, payload, m.x[:n])
+    M = motion.M0 + np.tensordot(motion.payload, motion.Mp, 1) if motion.frozen \
+        else mass_matrix(motion.arm, motion.payload, m.x[:n])
     flow[n:2 * n, 2 * n:] = np.linalg.solve(M, motion.arm.torque * (motion.gain * change))
     step = scipy.linalg.expm(flow * dt)
     p = np.arange(1, count + 1) / (count + 1)
