@@ -29,8 +29,8 @@ def bent(arm, n: int) -> np.ndarray:
     x = np.zeros(2 * n + arm.kind.size)
     x[:2], x[n:n + 2] = (1.0, 0.6), (0.3, -0.4)
     size = np.tile([1.0, 0.1, 0.02, 0.01, 0.01, 0.002], 2)
-    x[2:n] = rng.normal(size=n - 2) * 5e-3 * size
-    x[n + 2:2 * n] = rng.normal(size=n - 2) * 0.5 * size
+    x[2:2 + size.size] = rng.normal(size=size.size) * 5e-3 * size
+    x[n + 2:n + 2 + size.size] = rng.normal(size=size.size) * 0.5 * size
     values = {Kind.MASS: 0.7, Kind.FIRST_X: 0.05, Kind.FIRST_Y: 0.02, Kind.INERTIA: 0.02, Kind.STIFFNESS: 0.02,
               Kind.DAMPING: 0.01, Kind.VISCOUS: 0.05, Kind.COULOMB: 0.02, Kind.ROTOR: 0.01, Kind.TORQUE_GAIN: 0.03}
     x[2 * n:] = [values.get(Kind(kind), 0.0) for kind in arm.kind]
@@ -112,8 +112,11 @@ def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(arm):
         np.testing.assert_allclose((high - low) / 2e-5, G[:, c], rtol=1e-4, atol=1e-5 * np.abs(G[:, c]).max() + 1e-9)
 
 
-def test_what_is_learned_moves_a_vibration_that_turns_by_a_radian_in_a_sample_as_far_as_the_motion_does():
-    arm = motion(configure(IdentifierParameters, {}))
+@pytest.mark.parametrize('base', [
+    {}, {'arm.base_mass': 700.0, 'arm.base_inertia': 180.0, 'arm.base_joint_offset': [0.3, 0.1]}],
+    ids=['pinned', 'floating'])
+def test_what_is_learned_moves_a_vibration_that_turns_by_a_radian_in_a_sample_as_far_as_the_motion_does(base):
+    arm = motion(configure(IdentifierParameters, base))
     n, samples, sample = arm.arm.stiffness.size, 20, 1e-3
     assert sample / arm.substeps > 0.5  # a step is at most two radians of the fastest mode
     x = bent(arm, n)
