@@ -13,7 +13,7 @@ from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
 from flexmanip_ros.payload import capture_detection_kernel as kernel
 from flexmanip_ros.payload import filter_state as mem
-from flexmanip_ros.payload import structured
+from flexmanip_ros.payload import structured, structured_model
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Rows, SampleLog
 from flexmanip_ros.types import DATING_STD_S, Array, CaptureEvent, EventKind, JointBlock, JointRecord
@@ -27,7 +27,8 @@ PEAK_MEMORY = 20.0
 INDEPENDENT = 0.5
 """Samples a look that is as good as independent, over all onsets of the window (for the false alarms)."""
 SPEED, ACCELERATION, JERK = 0.3, 5.0, 200.0
-"""Prior deviations of what the tip's light mass would gain: impulse [m/s], step [m/s^2], ramp [m/s^3]."""
+"""Prior deviations of what the tip's light mass would gain: impulse [m/s], step [m/s^2], ramp [m/s^3]. Of a moment: as
+much, at the radius of gyration that a body is thought to have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +109,7 @@ def onset(glr: kernel.GlrState, variance: Array, longest: int) -> float:
     """Return the mean of how many samples ago the force at the tip began, each onset as likely as another before.
 
     variance: (m,) of the white noise [rad^2 or m^2]: the one that the filter takes grows with the event. longest:
-    samples since the last gap. An onset has the likelihood exp(s' P s / 2) / sqrt(det(I + N)), its six causes
+    samples since the last gap. An onset has the likelihood exp(s' P s / 2) / sqrt(det(I + N)), its nine causes
     integrated over: s their score, N their information, P the inverse of I + N. An early onset has more freedom to
     fit what a later one explains; the determinant is the price of it.
     """
@@ -116,7 +117,7 @@ def onset(glr: kernel.GlrState, variance: Array, longest: int) -> float:
     lags = np.arange(min(int(glr.clock[kernel.FILLED]), longest + 1, w))
     weighted = glr.innovations[(newest - lags) % w] / variance
     trace = glr.trace[:lags.size]
-    information = np.eye(kernel.CAUSES) + np.cumsum(
+    information = np.eye(trace.shape[2]) + np.cumsum(
         np.einsum('lia,lib->lab', trace / variance[:, np.newaxis], trace), axis=0)
     scores = np.array([np.tensordot(trace[:lag + 1], weighted[lag::-1], ((0, 1), (0, 1))) for lag in lags])
     explained = np.einsum('la,la->l', scores, np.linalg.solve(information, scores[..., np.newaxis])[..., 0])
@@ -142,7 +143,7 @@ def _start(config: TriggerParameters, state: DetectionState, row: Rows) -> Detec
         clock=np.zeros(6, dtype=np.int64),
         level=np.array([0.0, 0.0, threshold(config, dt)]), history=np.zeros((2, 2 * w)),
         torques=row.u[-1].copy(), drive=np.zeros(3), flow=np.zeros((n2, n2)),
-        state=np.zeros((2, n2, 2)))
+        state=np.zeros((2, n2, kernel.DIRECTIONS)))
     return replace(state, glr=glr, dt=dt)
 
 
@@ -160,11 +161,11 @@ def _watch(
     glr = kernel.GlrState._make(part.copy() for part in glr)
     table, first = structured.input_table(filtered, rows)
     confirm = round(CONFIRM / state.dt)
-    light = filtered.model.motion.scale
+    light, arm = filtered.model.motion.scale, filtered.model.motion.arm
+    prior = light * np.outer([SPEED, ACCELERATION, JERK], [1.0, 1.0, structured_model.COM_STD * arm.length[-1]])
     taken = kernel.advance(
-        filtered.model.motion, filtered.sensors, m, glr, light * np.array([SPEED, ACCELERATION, JERK]),
-        state.dt, float(np.exp(-state.dt / PEAK_MEMORY)), round(SETTLE / state.dt), confirm, table, first,
-        np.zeros(kernel.CAUSES), True)
+        filtered.model.motion, filtered.sensors, m, glr, prior, state.dt, float(np.exp(-state.dt / PEAK_MEMORY)),
+        round(SETTLE / state.dt), confirm, table, first, np.zeros(kernel.CAUSES), True)
     until = abs(taken)
     part = rows.between(rows.first, rows.first + until - first)
     after = structured.after_rows(filtered, m, part, table[:until])

@@ -1,8 +1,8 @@
 """Compiled change detection: tell that something began to push on the tip within the last samples.
 
-A capture or release acts on the arm as a force at the tip: an impulse, and the inertia of the object from
-then on. Its trace in the innovations of a filter that does not know of it is H exp(A t) of an impulse, a step
-and a ramp of force in two directions: six numbers, tested for every onset in the window (generalized
+A capture or release acts on the arm as a force and a moment at the tip: an impulse, and the inertia of the object
+from then on. Its trace in the innovations of a filter that does not know of it is H exp(A t) of an impulse, a step
+and a ramp of force in two directions and of moment: nine numbers, tested for every onset in the window (generalized
 likelihood ratio).
 """
 
@@ -35,8 +35,10 @@ if TYPE_CHECKING:
     from flexmanip_ros.payload.measurement_update import MeasurementModel
     from flexmanip_ros.payload.process_model import ProcessModel
 
-CAUSES = 6
-"""Impulse, step and ramp of the force at the tip, along x and y."""
+DIRECTIONS = 3
+"""Of what acts on the tip: force along x and y, moment."""
+CAUSES = 3 * DIRECTIONS
+"""Impulse, step and ramp of each."""
 SHORTEST = 3
 """Samples after the onset before it can be told."""
 REFRESH = 16
@@ -61,11 +63,11 @@ class GlrState(NamedTuple):
     """What the detector remembers; w onsets in the window, m sensors."""
 
     trace: Array
-    """(w, m, 6) innovation at each lag after an onset, per unit of prior standard deviation."""
+    """(w, m, 9) innovation at each lag after an onset, per unit of prior standard deviation."""
     factors: Array
-    """(w, 6, 6) Cholesky factor of I + information at each lag."""
+    """(w, 9, 9) Cholesky factor of I + information at each lag."""
     scores: Array
-    """(w, 6) gathered for each onset, a ring."""
+    """(w, 9) gathered for each onset, a ring."""
     past: Array
     """(w, m) innovations over their variance then, limited to five deviations, a ring."""
     innovations: Array
@@ -84,7 +86,7 @@ class GlrState(NamedTuple):
     flow: Array
     """(n2, n2) scratch: state transition of a sample."""
     state: Array
-    """(2, n2, 2) scratch."""
+    """(2, n2, 3) scratch."""
 
 
 @inner
@@ -129,16 +131,20 @@ def transition(motion: ProcessModel, flow: Array, state: Array, dt: float) -> No
 @inner
 def traces(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr: GlrState, prior: Array, dt: float
            ) -> None:
-    """Compute the traces of an onset from the linearization; prior: (3,) deviations of the causes."""
-    n = motion.arm.stiffness.size
+    """Compute the traces of an onset from the linearization; prior: (3, 3) deviations by order and direction."""
+    n, links, k = motion.arm.stiffness.size, motion.arm.length.size, motion.arm.kappa
     w, sensors_count = glr.trace.shape[0], glr.trace.shape[1]
     flow, state = glr.flow, glr.state
     transition(motion, flow, state, dt)
-    for c in range(2):
+    for c in range(DIRECTIONS):
         for i in range(n):
-            motion.a[i] = motion.work.J[motion.arm.length.size, c, i]
-            if motion.arm.floating:
+            motion.a[i] = motion.work.J[links, c, i] if c < 2 else 0.0
+            if motion.arm.floating and c < 2:
                 motion.a[i] -= motion.work.P[c, i] / motion.work.F[2]
+        if c == 2:  # the moment works on the angle of the last cross-section
+            motion.a[links - 1] = 1.0
+            for j in range(k):
+                motion.a[links + (links - 1) * k + j] = motion.arm.tip_slope[links - 1, j]
         solve(motion.work.M, motion.a)
         for i in range(n):
             state[0, i, c] = 0.0
@@ -146,26 +152,26 @@ def traces(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr:
     for lag in range(w):
         for i in range(sensors_count):
             offset = n if sensors.rate[i] else 0
-            for c in range(2):
+            for c in range(DIRECTIONS):
                 value = 0.0
                 for j in range(n):
                     value += sensors.H[i, j] * state[0, offset + j, c]
-                glr.trace[lag, i, c] = value * prior[0]
-                before = glr.trace[lag - 1] if lag > 0 else glr.trace[lag]
-                step, ramp = 0.0, 0.0
-                if lag > 0:
-                    step = before[i, 2 + c] / prior[1] + dt * before[i, c] / prior[0]
-                    ramp = before[i, 4 + c] / prior[2] + dt * before[i, 2 + c] / prior[1]
-                glr.trace[lag, i, 2 + c] = step * prior[1]
-                glr.trace[lag, i, 4 + c] = ramp * prior[2]
+                glr.trace[lag, i, c] = value * prior[0, c]
+                for order in range(1, 3):  # a step is the integral of an impulse, a ramp that of a step
+                    a, d = order * DIRECTIONS + c, (order - 1) * DIRECTIONS + c
+                    value = 0.0
+                    if lag > 0:
+                        before = glr.trace[lag - 1, i]
+                        value = before[a] / prior[order, c] + dt * before[d] / prior[order - 1, c]
+                    glr.trace[lag, i, a] = value * prior[order, c]
         for i in range(2 * n):
-            for c in range(2):
+            for c in range(DIRECTIONS):
                 value = 0.0
                 for j in range(2 * n):
                     value += flow[i, j] * state[0, j, c]
                 state[1, i, c] = value
         for i in range(2 * n):
-            for c in range(2):
+            for c in range(DIRECTIONS):
                 state[0, i, c] = state[1, i, c]
     information(m, glr)
     rescore(glr)
@@ -346,5 +352,5 @@ UNWATCHED = GlrState(
 def filtered(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array, first: int) -> int:
     """Run the filter alone, see ``advance``; return the row after the last one taken, less than N where it failed."""
     none = np.zeros(0)
-    taken = advance(motion, sensors, m, UNWATCHED, none, 0.0, 0.0, 0, 0, table, first, none, False)
+    taken = advance(motion, sensors, m, UNWATCHED, np.zeros((0, 0)), 0.0, 0.0, 0, 0, table, first, none, False)
     return taken if taken >= 0 else -taken - 1

@@ -115,6 +115,15 @@ def test_an_onset_is_dated_from_its_trace_whatever_came_of_the_noise_since(ago, 
     assert capture_detection.onset(glr, variance, ago - 3) <= ago - 3  # not before the last gap
 
 
+@pytest.mark.parametrize('floating', [{}, {'base_mass': 700.0, 'base_inertia': 180.0}], ids=['pinned', 'floating'])
+def test_a_body_which_pushes_with_a_moment_too_is_dated_as_well_as_a_point(floating):
+    arm, capture = ArmParameters(damping_ratio=0.003, **floating), event(2.0)
+    samples = record(2.4, (capture,), outputs=BENDS, arm=arm, payload_com=(0.1, -0.05), payload_inertia=1.2,
+                     object_spin=0.15)
+    ((found, _),) = detect(TriggerParameters(mode='auto', arm=arm, outputs=BENDS), samples)
+    assert abs(found.stamp_ns - capture.stamp_ns) <= 4e6
+
+
 def test_single_samples_give_the_events_of_a_block():
     samples = record(1.6, (event(1.3),))
     config = settings()
