@@ -97,12 +97,12 @@ def statistic(state: DetectionState) -> tuple[float, float]:
 def threshold(config: TriggerParameters, dt: float) -> float:
     """Return what the statistic exceeds by chance as rarely as the parameters allow.
 
-    Under no event it is chi-square with as many degrees of freedom as there are causes; an hour holds so many
+    Under no event it is chi-square with as many degrees of freedom as there are causes tested; an hour holds so many
     independent looks, each at every onset of the window.
     """
     looks = 3600.0 / dt / INDEPENDENT
     chance = min(0.5, config.false_alarms_per_hour / looks)
-    return float(scipy.special.chdtri(kernel.CAUSES, chance))
+    return float(scipy.special.chdtri(kernel.TESTED, chance))
 
 
 def onset(glr: kernel.GlrState, variance: Array, longest: int) -> float:
@@ -138,8 +138,8 @@ def _start(config: TriggerParameters, state: DetectionState, row: Rows) -> Detec
     n2 = 2 * state.filter.model.motion.arm.stiffness.size
     m = len(state.filter.model.roles)
     glr = kernel.GlrState(
-        trace=np.zeros((w, m, kernel.CAUSES)), factors=np.zeros((w, kernel.CAUSES, kernel.CAUSES)),
-        scores=np.zeros((w, kernel.CAUSES)), past=np.zeros((w, m)), innovations=np.zeros((w, m)),
+        trace=np.zeros((w, m, kernel.CAUSES)), factors=np.zeros((w, kernel.TESTED, kernel.TESTED)),
+        scores=np.zeros((w, kernel.TESTED)), past=np.zeros((w, m)), innovations=np.zeros((w, m)),
         clock=np.zeros(6, dtype=np.int64),
         level=np.array([0.0, 0.0, threshold(config, dt)]), history=np.zeros((2, 2 * w)),
         torques=row.u[-1].copy(), drive=np.zeros(3), flow=np.zeros((n2, n2)),
@@ -165,7 +165,7 @@ def _watch(
     prior = light * np.outer([SPEED, ACCELERATION, JERK], [1.0, 1.0, structured_model.COM_STD * arm.length[-1]])
     taken = kernel.advance(
         filtered.model.motion, filtered.sensors, m, glr, prior, state.dt, float(np.exp(-state.dt / PEAK_MEMORY)),
-        round(SETTLE / state.dt), confirm, table, first, np.zeros(kernel.CAUSES), True)
+        round(SETTLE / state.dt), confirm, table, first, np.zeros(kernel.TESTED), True)
     until = abs(taken)
     part = rows.between(rows.first, rows.first + until - first)
     after = structured.after_rows(filtered, m, part, table[:until])

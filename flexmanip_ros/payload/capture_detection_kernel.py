@@ -2,8 +2,8 @@
 
 A capture or release acts on the arm as a force and a moment at the tip: an impulse, and the inertia of the object
 from then on. Its trace in the innovations of a filter that does not know of it is H exp(A t) of an impulse, a step
-and a ramp of force in two directions and of moment: nine numbers, tested for every onset in the window (generalized
-likelihood ratio).
+and a ramp of force in two directions and of moment: nine numbers. The six of the force are tested for every onset in
+the window (generalized likelihood ratio); all nine date the onset (``capture_detection.onset``).
 """
 
 from __future__ import annotations
@@ -38,7 +38,10 @@ if TYPE_CHECKING:
 DIRECTIONS = 3
 """Of what acts on the tip: force along x and y, moment."""
 CAUSES = 3 * DIRECTIONS
-"""Impulse, step and ramp of each."""
+"""Impulse, step and ramp of each: those of the force along x and y first, then those of the moment."""
+TESTED = 6
+"""Causes that are tested, those of the force: whatever is caught pushes with one. Three more degrees of freedom find a
+capture 2 ms later, and one at rest 9 ms."""
 SHORTEST = 3
 """Samples after the onset before it can be told."""
 REFRESH = 16
@@ -65,9 +68,9 @@ class GlrState(NamedTuple):
     trace: Array
     """(w, m, 9) innovation at each lag after an onset, per unit of prior standard deviation."""
     factors: Array
-    """(w, 9, 9) Cholesky factor of I + information at each lag."""
+    """(w, 6, 6) Cholesky factor of I + information at each lag."""
     scores: Array
-    """(w, 9) gathered for each onset, a ring."""
+    """(w, 6) gathered for each onset, a ring."""
     past: Array
     """(w, m) innovations over their variance then, limited to five deviations, a ring."""
     innovations: Array
@@ -156,9 +159,10 @@ def traces(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr:
                 value = 0.0
                 for j in range(n):
                     value += sensors.H[i, j] * state[0, offset + j, c]
-                glr.trace[lag, i, c] = value * prior[0, c]
+                glr.trace[lag, i, c if c < 2 else TESTED] = value * prior[0, c]
                 for order in range(1, 3):  # a step is the integral of an impulse, a ramp that of a step
-                    a, d = order * DIRECTIONS + c, (order - 1) * DIRECTIONS + c
+                    a = order * 2 + c if c < 2 else TESTED + order
+                    d = a - 2 if c < 2 else a - 1
                     value = 0.0
                     if lag > 0:
                         before = glr.trace[lag - 1, i]
@@ -185,12 +189,12 @@ def rescore(glr: GlrState) -> None:
     for lag in range(glr.clock[FILLED]):
         onset = (newest - lag) % w
         score = glr.scores[onset]
-        for a in range(CAUSES):
+        for a in range(TESTED):
             score[a] = 0.0
         for since in range(lag + 1):
             for i in range(glr.trace.shape[1]):
                 e = glr.past[(onset + since) % w, i]
-                for a in range(CAUSES):
+                for a in range(TESTED):
                     score[a] += glr.trace[since, i, a] * e
 
 
@@ -198,7 +202,7 @@ def rescore(glr: GlrState) -> None:
 def information(m: FilterState, glr: GlrState) -> None:
     """Factor the information of every lag."""
     for lag in range(glr.trace.shape[0]):
-        for a in range(CAUSES):
+        for a in range(TESTED):
             for b in range(a + 1):
                 value = 0.0
                 for i in range(glr.trace.shape[1]):
@@ -206,12 +210,12 @@ def information(m: FilterState, glr: GlrState) -> None:
                 glr.factors[lag, a, b] = value
     # sums over the lags, then factors: the sums would be lost if each were factored at once
     for lag in range(1, glr.trace.shape[0]):
-        for a in range(CAUSES):
+        for a in range(TESTED):
             for b in range(a + 1):
                 glr.factors[lag, a, b] += glr.factors[lag - 1, a, b]
     for lag in range(glr.trace.shape[0]):
         if not factor_information(glr.factors[lag]):  # an arm that is none: nothing can be told of an onset
-            for a in range(CAUSES):
+            for a in range(TESTED):
                 for b in range(a + 1):
                     glr.factors[lag, a, b] = 1e150 if a == b else 0.0
 
@@ -223,7 +227,7 @@ def update_glr(m: FilterState, glr: GlrState, scratch: Array) -> None:
     clock = glr.clock
     clock[NEWEST] = (clock[NEWEST] + 1) % w
     clock[FILLED] = min(clock[FILLED] + 1, w)
-    for a in range(CAUSES):
+    for a in range(TESTED):
         glr.scores[clock[NEWEST], a] = 0.0
     for i in range(glr.trace.shape[1]):
         variance = max(m.innovation[i, 1], m.noise[i, EFFECTIVE])
@@ -236,15 +240,15 @@ def update_glr(m: FilterState, glr: GlrState, scratch: Array) -> None:
         score = glr.scores[onset]
         for i in range(glr.trace.shape[1]):
             e = glr.past[clock[NEWEST], i]
-            for a in range(CAUSES):
+            for a in range(TESTED):
                 score[a] += glr.trace[lag, i, a] * e
         if lag + 1 < SHORTEST:
             continue
-        for a in range(CAUSES):
+        for a in range(TESTED):
             scratch[a] = score[a]
         forward(glr.factors[lag], scratch)
         statistic = 0.0
-        for a in range(CAUSES):
+        for a in range(TESTED):
             statistic += scratch[a] * scratch[a]
         best = max(best, statistic)
     glr.level[STATISTIC] = best
