@@ -161,8 +161,8 @@ def _watch(
     glr = kernel.GlrState._make(part.copy() for part in glr)
     table, first = structured.input_table(filtered, rows)
     confirm = round(CONFIRM / state.dt)
-    light, arm = filtered.model.motion.scale, filtered.model.motion.arm
-    prior = light * np.outer([SPEED, ACCELERATION, JERK], [1.0, 1.0, structured_model.COM_STD * arm.length[-1]])
+    mass, moment = structured_model.body_std(state.identifier, filtered.model)[:2] / structured_model.PAYLOAD_STD
+    prior = np.outer([SPEED, ACCELERATION, JERK], [mass, mass, moment])
     taken = kernel.advance(
         filtered.model.motion, filtered.sensors, m, glr, prior, state.dt, float(np.exp(-state.dt / PEAK_MEMORY)),
         round(SETTLE / state.dt), confirm, table, first, np.zeros(kernel.TESTED), True)

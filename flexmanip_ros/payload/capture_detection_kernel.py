@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 DIRECTIONS = 3
 """Of what acts on the tip: force along x and y, moment."""
 CAUSES = 3 * DIRECTIONS
-"""Impulse, step and ramp of each: those of the force along x and y first, then those of the moment."""
+"""Impulse, step and ramp of each direction in turn."""
 TESTED = 6
-"""Causes that are tested, those of the force: whatever is caught pushes with one. Three more degrees of freedom find a
-capture 2 ms later, and one at rest 9 ms."""
+"""Causes that are tested, the first ones, those of the force: whatever is caught pushes with one. Three more degrees of
+freedom find a capture 2 ms later, and one at rest 9 ms."""
 SHORTEST = 3
 """Samples after the onset before it can be told."""
 REFRESH = 16
@@ -159,14 +159,13 @@ def traces(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr:
                 value = 0.0
                 for j in range(n):
                     value += sensors.H[i, j] * state[0, offset + j, c]
-                glr.trace[lag, i, c if c < 2 else TESTED] = value * prior[0, c]
+                glr.trace[lag, i, 3 * c] = value * prior[0, c]
                 for order in range(1, 3):  # a step is the integral of an impulse, a ramp that of a step
-                    a = order * 2 + c if c < 2 else TESTED + order
-                    d = a - 2 if c < 2 else a - 1
+                    a = 3 * c + order
                     value = 0.0
                     if lag > 0:
                         before = glr.trace[lag - 1, i]
-                        value = before[a] / prior[order, c] + dt * before[d] / prior[order - 1, c]
+                        value = before[a] / prior[order, c] + dt * before[a - 1] / prior[order - 1, c]
                     glr.trace[lag, i, a] = value * prior[order, c]
         for i in range(2 * n):
             for c in range(DIRECTIONS):
