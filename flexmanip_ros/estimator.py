@@ -62,6 +62,8 @@ class ModelEstimator(NamedTuple):
     """The latest measured configuration: (2,) [rad], or (0,) when there is none."""
     configuration_range: Array = NO_ANGLES
     """What the configuration went through since the last event, see ``block_extraction.extend_range``."""
+    since_ns: int = 0
+    """Stamp of the last event; 0 before the first."""
 
     def first_needed(self, cursor: int) -> int:
         """Return the first row of the sample log that will be read again."""
@@ -70,15 +72,16 @@ class ModelEstimator(NamedTuple):
     def advance(self, config: IdentifierParameters, rows: Rows, background: Background) -> ModelEstimator:
         """Take the next rows of the log. One call with N rows gives the bits of N calls with one."""
         return ModelEstimator(rpbsid.advance(config, self.rpbsid, rows, background), rows.angles[-1].copy(),
-                              block_extraction.extend_range(config, self.configuration_range, rows))
+                              block_extraction.extend_range(config, self.configuration_range, rows), self.since_ns)
 
     def event(self, config: IdentifierParameters, event: CaptureEvent, background: Background) -> ModelEstimator:
         """The arm caught or let go of something before the next row."""
-        return self._replace(rpbsid=rpbsid.restart(config, self.rpbsid, background), configuration_range=NO_ANGLES)
+        return self._replace(rpbsid=rpbsid.restart(config, self.rpbsid, background), configuration_range=NO_ANGLES,
+                             since_ns=event.stamp_ns)
 
     def restart(self, config: IdentifierParameters, events: Sequence[CaptureEvent]) -> ModelEstimator:
         """Go on: every sample came after these events, so the model is of what the arm holds now."""
-        return self
+        return self._replace(since_ns=events[-1].stamp_ns)
 
     @property
     def outliers(self) -> int:
@@ -110,13 +113,13 @@ class ModelRequest:
     identifier: ModelEstimator
     stamp_ns: int
     dt: float
-    payload: Payload | None
     rows: Rows
     """The latest samples, on which the model is judged."""
 
     def solve(self) -> Estimate:
-        """Return the estimate with model and modes."""
-        config, identifier, payload = self.config, self.identifier, self.payload
+        """Return the estimate with model and modes, and with the payload where it rests on them."""
+        config, identifier = self.config, self.identifier
+        payload: Payload | None = None
         found, without = _identified(config, identifier.rpbsid, self.dt, self.rows)
         if found is not None and config.decimation == 1:
             found = prediction_check.judged(found, self.rows, config.outputs)
@@ -131,6 +134,14 @@ class ModelRequest:
             self.stamp_ns, _overall(config, found.status, payload), found.model, oscillations, payload,
             excitation=found.excitation, condition=found.condition, singular_values=found.singular_values,
             innovation_power=found.innovation_power, model_status=found.status)
+
+
+def with_payload(config: IdentifierParameters, estimate: Estimate, payload: Payload | None) -> Estimate:
+    """Return the estimate of a model with the payload of the same sample, where that does not rest on the model."""
+    if payload is None:
+        return estimate
+    status = estimate.status if estimate.model is None else _overall(config, estimate.model_status, payload)
+    return estimate._replace(payload=payload, status=status)
 
 
 def with_model_of(config: IdentifierParameters, stamp_ns: int, last: Estimate, payload: Payload | None

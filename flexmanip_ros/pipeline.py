@@ -8,8 +8,8 @@ give the same estimates bit for bit.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +24,7 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Rows, SampleLog
 from flexmanip_ros.samples.sampling import Clock, Counters
-from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord
+from flexmanip_ros.types import ArmParameter, CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Payload
 
 GROUP = 8
 """Rows that wait until there are so many or an estimate is due: a group costs less than its rows one by one. At 80 us a
@@ -48,10 +48,47 @@ ROUNDING = 1e-6
 Item = JointRecord | JointBlock | CaptureEvent
 
 
+class PayloadReading(NamedTuple):
+    """What the payload's estimator says at a row."""
+
+    payload: Payload | None
+    """None where it rests on the model."""
+    arm_parameters: tuple[ArmParameter, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PayloadRequest:
+    """Rows that the payload's estimator is to take; ``background.Request``."""
+
+    config: IdentifierParameters
+    payload: EventReplay[PayloadEstimator]
+    log: SampleLog
+    until: int
+    """The row to stop before."""
+    rows: Sequence[int] = ()
+    """Rows at which an estimate is due."""
+    seconds: Sequence[int] = ()
+    """The second, counted from the first stamp on, of each."""
+    told: int = -1
+    """See ``State.told``."""
+
+    def solve(self) -> tuple[EventReplay[PayloadEstimator], list[PayloadReading], int]:
+        """Return the estimator after the last row, what it says at each, and ``told``."""
+        payload, told, readings = self.payload, self.told, []
+        for row, second in zip(self.rows, self.seconds, strict=True):
+            payload = event_replay.advance(self.config, payload, self.log, row + 1, INLINE)
+            arm = estimator.arm_parameters(self.config, payload.estimator) if second > told else ()
+            told = second if arm else told
+            readings.append(PayloadReading(estimator.payload(self.config, payload.estimator), arm))
+        return event_replay.advance(self.config, payload, self.log, self.until, INLINE), readings, told
+
+
 class PendingModel(NamedTuple):
     """A model that was asked for at a row and is taken at row ``due``, or with the next estimate."""
 
     request: estimator.ModelRequest
+    payload: Payload | None
+    """The payload at that row."""
     since_ns: int
     """Stamp of the last event before it [ns]."""
     instant: int
@@ -123,33 +160,81 @@ def step(config: IdentifierParameters, state: State, item: Item, background: Bac
     if isinstance(item, CaptureEvent):
         return _insert(state, item, background), ()
     estimates: list[Estimate] = []
-    taken, count = 0, len(item.stamp_ns) if isinstance(item, JointBlock) else 1
+    taken, count = 0, _length(item)
     while taken < count:
-        if isinstance(item, JointBlock):
-            sampled, some = sampling.push_block(config, state.clock, state.log, item, taken)
-        else:
-            sampled, some = sampling.push(config, state.clock, state.log, item), 1
-        state = _sampled(config, state, sampled, background)
+        state, some = _push(config, state, item, taken, background)
         state, found = catch_up(state, background, group)
         estimates += found
         taken += some
     return state, tuple(estimates)
 
 
+def absorb(config: IdentifierParameters, items: Iterable[Item], background: Background = INLINE) -> Iterator[State]:
+    """Yield the states of a recording of which the end alone counts: no estimate is made on the way.
+
+    The last one has the bits of ``replay``. Raises SignalError when no message can be used.
+    """
+    state = init()
+    for item in items:
+        if isinstance(item, CaptureEvent):
+            state = _insert(state, item, background)
+            continue
+        taken, count = 0, _length(item)
+        while taken < count:
+            state, some = _push(config, state, item, taken, background)
+            taken += some
+        if state.payload is not None and state.log.end - state.payload.cursor >= REPLAY_GROUP:
+            state = _advance(state, state.log.end, background)
+        yield state
+        if _hopeless(state):
+            break
+    if state.config is not None:
+        state = _sampled(config, state, sampling.flush(config, state.clock, state.log), background)
+    if state.payload is not None:
+        state = _advance(state, state.log.end, background)
+    check_used(state)
+    yield state
+
+
+def _length(item: JointRecord | JointBlock) -> int:
+    return len(item.stamp_ns) if isinstance(item, JointBlock) else 1
+
+
+def _push(config: IdentifierParameters, state: State, item: JointRecord | JointBlock, taken: int,
+          background: Background) -> tuple[State, int]:
+    """Put messages into the log, of a block those from number ``taken`` on; return how many."""
+    if isinstance(item, JointBlock):
+        sampled, some = sampling.push_block(config, state.clock, state.log, item, taken)
+    else:
+        sampled, some = sampling.push(config, state.clock, state.log, item), 1
+    return _sampled(config, state, sampled, background), some
+
+
+def _hopeless(state: State) -> bool:
+    return state.counters.accepted == 0 and state.counters.received >= HOPELESS
+
+
 def catch_up(state: State, background: Background = INLINE, group: int = 1) -> tuple[State, list[Estimate]]:
     """Let the estimators take the rows of the log.
 
-    The payload's takes the rows up to each instant of ``publish_rate``, and the estimate due there is made. Where that
-    needs a new model, the identifier takes the same rows. Last the rows left over, if they are ``group`` or more.
+    The payload's takes the rows up to each instant of ``publish_rate``. Where the estimate that is due there needs a
+    new model, the identifier takes the same rows. Where several estimates are due, as in a replay, the payload is
+    estimated beside the models. Last the rows left over, if they are ``group`` or more.
     """
     estimates: list[Estimate] = []
     if state.payload is None or state.identifier is None:
         return state, estimates
-    for row in _due_rows(state):
-        state = _advance_payload(state, row + 1, background)  # meanwhile a thread may read the model
-        state, model = _take_model(state, background)
-        state, estimate = _estimate(state, background)
-        estimates += [*model, *estimate]
+    due = _due_rows(state)
+    if due:
+        request = _payload_request(state, due)
+        if len(due) > 1:
+            background.start(request)
+            state, steps = _models(state, due, background)
+            payload, readings, told = background.result(request)
+        else:
+            payload, readings, told = request.solve()  # meanwhile a thread may read the model
+            state, steps = _models(state, due, background)
+        state, estimates = _with_payloads(state._replace(payload=payload, told=told), steps, readings)
         state = _without_old_rows(state)
     if state.log.end - _running(state)[2].cursor >= group:
         state = _advance(state, state.log.end, background)
@@ -205,7 +290,7 @@ def _steps(config: IdentifierParameters, state: State, items: Iterable[Item], ba
     for item in items:
         state, found = step(config, state, item, background, REPLAY_GROUP)
         yield state, found
-        if state.counters.accepted == 0 and state.counters.received >= HOPELESS:
+        if _hopeless(state):
             break
     yield finish(config, state, background)
 
@@ -234,8 +319,7 @@ def current(state: State) -> Estimate | None:
     if payload.cursor == 0:
         return None
     model = identifier.estimator._replace(rpbsid=rpbsid.finish(config, identifier.estimator.rpbsid))
-    request = estimator.ModelRequest(config, model, payload.last_ns, state.clock.dt, None,
-                                     _latest(state, payload.cursor))
+    request = estimator.ModelRequest(config, model, payload.last_ns, state.clock.dt, _latest(state, payload.cursor))
     estimate = request.solve()
     held = estimator.payload(config, payload.estimator)
     if estimate.model is None:
@@ -304,8 +388,14 @@ def _running(state: State) -> tuple[IdentifierParameters, EventReplay[PayloadEst
 
 
 def _advance(state: State, until: int, background: Background) -> State:
-    """Let both estimators take the rows up to ``until``."""
-    return _without_old_rows(_advance_identifier(_advance_payload(state, until, background), until, background))
+    """Let both estimators take the rows up to ``until``, in a replay beside each other."""
+    config, payload, identifier = _running(state)
+    request = PayloadRequest(config, payload, state.log, until)
+    if until - payload.cursor >= REPLAY_GROUP:
+        background.start(request)
+    identifier = event_replay.advance(config, identifier, state.log, until, background)
+    payload, _, _ = background.result(request)
+    return _without_old_rows(state._replace(payload=payload, identifier=identifier))
 
 
 def _without_old_rows(state: State) -> State:
@@ -319,13 +409,8 @@ def _without_old_rows(state: State) -> State:
 def _latest(state: State, until: int) -> Rows:
     """Return the rows before ``until`` on which a model is judged: the last 1.5 s, since the last event."""
     first = max(state.log.start, until - prediction_check.length(state.clock.dt))
-    first = min(state.log.row_at(_running(state)[1].estimator.since_ns, first), until)
+    first = min(state.log.row_at(_running(state)[2].estimator.since_ns, first), until)
     return state.log.rows(first, until)
-
-
-def _advance_payload(state: State, until: int, background: Background) -> State:
-    config, payload, _ = _running(state)
-    return state._replace(payload=event_replay.advance(config, payload, state.log, until, background))
 
 
 def _advance_identifier(state: State, until: int, background: Background) -> State:
@@ -356,35 +441,76 @@ def _due_rows(state: State) -> list[int]:
     return [int(row) for row in measured[new] + cursor]
 
 
-def _estimate(state: State, background: Background) -> tuple[State, list[Estimate]]:
-    """Return the estimate due at the last row taken, and ask for its model when that is due.
+def _payload_request(state: State, due: list[int]) -> PayloadRequest:
+    config, payload, _ = _running(state)
+    first = payload.cursor
+    stamps = state.log.rows(first, due[-1] + 1).stamp_ns
+    seconds = [_instant(state, int(stamps[row - first]), ARM_RATE) for row in due]
+    return PayloadRequest(config, payload, state.log, due[-1] + 1, due, seconds, state.told)
+
+
+class ModelStep(NamedTuple):
+    """What becomes of the models at a row that an estimate is due at."""
+
+    stamp_ns: int
+    taken: list[Estimate]
+    """The model that was under way, with its payload."""
+    last: ModelEstimate | None
+    """The last model."""
+    asked: bool
+    """Whether another one was asked for."""
+
+
+def _models(state: State, due: list[int], background: Background) -> tuple[State, list[ModelStep]]:
+    """Take the model under way at each row in turn, and ask for another one when it is due.
 
     A model is due by ``model_rate``, and with every estimate for as long after an event as another may arrive
     late: so any order of arrival reads models at the same stamps.
     """
-    (config, now, _), last = _running(state), state.model
-    stamp_ns, since_ns = now.last_ns, now.estimator.since_ns
-    payload = estimator.payload(config, now.estimator)
-    second = _instant(state, stamp_ns, ARM_RATE)
-    arm = estimator.arm_parameters(config, now.estimator) if second > state.told else ()
-    state = state._replace(published=_instant(state, stamp_ns, config.publish_rate),
-                           told=second if arm else state.told)
-    settling_ns = (2.0 * config.rewind_time + 1.0 / config.publish_rate) * 1e9
-    young = stamp_ns - max(state.first_ns, since_ns) <= settling_ns
-    instant = _instant(state, stamp_ns, config.model_rate)
-    if last is not None and last.since_ns == since_ns and not young and instant <= last.instant:
-        return state, [estimator.with_model_of(config, stamp_ns, last.estimate, payload)._replace(arm_parameters=arm)]
-    state = _advance_identifier(state, now.cursor, background)
-    request = estimator.ModelRequest(config, _running(state)[2].estimator, stamp_ns, state.clock.dt,
-                                     payload, _latest(state, now.cursor))
-    background.start(request)
-    due = now.cursor - 1 + int(np.ceil(RESULT_DELAY_S / max(state.clock.dt, 1e-9)))
-    state = state._replace(pending=PendingModel(request, since_ns, instant, due))
-    if payload is None:  # it rests on the model
-        return state, []
-    estimate = estimator.without_model(config, stamp_ns, payload) if last is None else (
-        estimator.with_model_of(config, stamp_ns, last.estimate, payload))
-    return state, [estimate._replace(arm_parameters=arm)]
+    steps = []
+    for row in due:
+        config, _, identifier = _running(state)
+        state, taken = _take_model(state, background)
+        last = state.model
+        stamp_ns = int(state.log.rows(row, row + 1).stamp_ns[0])
+        since_ns = max((event.stamp_ns for event in identifier.pending if event.stamp_ns <= stamp_ns),
+                       default=identifier.estimator.since_ns)
+        state = state._replace(published=_instant(state, stamp_ns, config.publish_rate))
+        settling_ns = (2.0 * config.rewind_time + 1.0 / config.publish_rate) * 1e9
+        young = stamp_ns - max(state.first_ns, since_ns) <= settling_ns
+        instant = _instant(state, stamp_ns, config.model_rate)
+        asked = last is None or last.since_ns != since_ns or young or instant > last.instant
+        if asked:
+            state = _advance_identifier(state, row + 1, background)
+            request = estimator.ModelRequest(config, _running(state)[2].estimator, stamp_ns, state.clock.dt,
+                                             _latest(state, row + 1))
+            background.start(request)
+            result = row + int(np.ceil(RESULT_DELAY_S / max(state.clock.dt, 1e-9)))
+            state = state._replace(pending=PendingModel(request, None, since_ns, instant, result))
+        steps.append(ModelStep(stamp_ns, taken, last, asked))
+    return state, steps
+
+
+def _with_payloads(state: State, steps: list[ModelStep], readings: list[PayloadReading]
+                   ) -> tuple[State, list[Estimate]]:
+    """Return the estimates of payload and models at the rows where they are due."""
+    config = _running(state)[0]
+    estimates = steps[0].taken
+    held: Payload | None = None
+    for k, (step, (payload, arm)) in enumerate(zip(steps, readings, strict=True)):
+        if k > 0:
+            estimates += [_with_payload(config, model, held) for model in step.taken]
+        last, held = step.last, payload if step.asked else held
+        if payload is not None and last is None:
+            estimate = estimator.without_model(config, step.stamp_ns, payload)
+        elif last is None or (payload is None and step.asked):  # it rests on the model
+            continue
+        else:
+            estimate = estimator.with_model_of(config, step.stamp_ns, last.estimate, payload)
+        estimates.append(estimate._replace(arm_parameters=arm))
+    if steps[-1].asked and state.pending is not None:
+        state = state._replace(pending=state.pending._replace(payload=held))
+    return state, estimates
 
 
 def _take_model(state: State, background: Background) -> tuple[State, list[Estimate]]:
@@ -395,5 +521,9 @@ def _take_model(state: State, background: Background) -> tuple[State, list[Estim
     estimate = background.result(pending.request)
     model = None if estimate.model is None else ModelEstimate(estimate, pending.since_ns, pending.instant)
     state = state._replace(pending=None, model=model)
-    return state, [estimate._replace(payload_is_new=pending.request.payload is None)]
+    return state, [_with_payload(_running(state)[0], estimate, pending.payload)]
 
+
+def _with_payload(config: IdentifierParameters, model: Estimate, payload: Payload | None) -> Estimate:
+    """Return the estimate of a model with the payload of its row."""
+    return estimator.with_payload(config, model, payload)._replace(payload_is_new=payload is None)

@@ -437,14 +437,18 @@ def damping_jacobian(arm: Manipulator, work: Workspace, dqd: Array) -> None:
 
 
 @inner
-def complete_jacobian(arm: Manipulator, q: Array, qd: Array, dq: Array, dqd: Array, work: Workspace) -> None:
-    """Turn ``force_jacobian`` into the derivatives of the accelerations, dqdd/dq and dqdd/dqd (n, n).
+def complete_jacobian(arm: Manipulator, q: Array, qd: Array, dq: Array, dqd: Array, flow: Array, work: Workspace
+                      ) -> None:
+    """Fill flow (n, 2 n), derivatives of the accelerations by q and q', from ``force_jacobian`` in dq and dqd (n, n).
 
     Right after ``acceleration``, whose factor of M it reads in work.M: for any parameter on which the forces f (n,) of
-    the equations depend, dqdd = M^-1 df.
+    the equations depend, dqdd = M^-1 df. Completes dq and dqd to derivatives of f.
     """
+    n = q.size
     elastic_jacobian(arm, q, dq, work)
     torque_jacobian(arm, q, qd, work, dq)
     damping_jacobian(arm, work, dqd)
-    solve_columns(work.M, dq, q.size)
-    solve_columns(work.M, dqd, q.size)
+    for r in range(n):
+        for t in range(n):
+            flow[r, t], flow[r, n + t] = dq[r, t], dqd[r, t]
+    solve_columns(work.M, flow, 2 * n)

@@ -99,14 +99,16 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     output = None if request.output is None else open_output(request.output, request.config.payload_frame)
     with output or nullcontext(), closing(Threads()) as background, closing(read_ahead(messages)) as items:
         try:
-            for now, estimate in pipeline.replay(request.config, items, background):
-                state = now
-                if estimate is None:
-                    continue
-                if output is not None:
-                    output.write(estimate)
-                if request.report is not None:
-                    kept.append(estimate)
+            if output is None and request.report is None:  # the end alone is asked for
+                for now in pipeline.absorb(request.config, items, background):
+                    state = now
+            else:
+                for now, estimate in pipeline.replay(request.config, items, background):
+                    state = now
+                    if estimate is not None and output is not None:
+                        output.write(estimate)
+                    if estimate is not None and request.report is not None:
+                        kept.append(estimate)
         except MissingSignalError as err:
             raise MissingSignalError(
                 err.problem, f"{err.remedy}, or let 'identify_bag {request.bag} --suggest FILE.yaml' choose") from err

@@ -42,8 +42,9 @@ class Inline:
 
 INLINE = Inline()
 
-THREADS = 2
-"""One for a fit, which takes up to a second, and one for the models that are read meanwhile, each in 1 to 3 ms."""
+THREADS = 3
+"""One for a fit, which takes up to a second, one for the models that are read meanwhile, each in 1 to 3 ms, and one for
+the payload of a replay."""
 KEPT = 8
 """Requests kept with their results. A late event rewinds 0.2 s, and the results of that time are wanted again: at most
 a fit and, where every estimate has a model of its own, those of the last few estimates."""
@@ -58,12 +59,13 @@ class Threads:
         self._closed = False
 
     def start(self, request: Request) -> None:
-        """Begin to solve a request; the oldest one beyond ``KEPT`` is dropped. After ``close`` do nothing."""
+        """Begin to solve a request; the oldest one solved is dropped beyond ``KEPT``. After ``close`` do nothing."""
         if self._closed:
             return
         self._solved[request] = self._pool.submit(request.solve)
         if len(self._solved) > KEPT:
-            self._solved.pop(next(iter(self._solved))).cancel()
+            for known in [known for known, future in self._solved.items() if future.done()][:1]:
+                del self._solved[known]
 
     def result(self, request: Request) -> Any:
         """Return the result of a request: wait for the thread that solves it, or solve it here if none does yet."""

@@ -98,7 +98,7 @@ def transition(motion: ProcessModel, flow: Array, state: Array, dt: float) -> No
     n = motion.arm.stiffness.size
     fastest = STEP_ANGLE / motion.substeps
     for r in range(n):
-        fastest -= motion.dqd[r, r]  # Coulomb friction of a joint at rest is a stiff damper
+        fastest -= motion.F[r, n + r]  # Coulomb friction of a joint at rest is a stiff damper
     halvings = 0
     while fastest * dt > STEP_ANGLE * 2.0**halvings and halvings < MOST_HALVINGS:
         halvings += 1
@@ -113,7 +113,7 @@ def transition(motion: ProcessModel, flow: Array, state: Array, dt: float) -> No
                 state[1, i, 1] = state[1, n + i, 0]
                 value = 0.0
                 for j in range(n):
-                    value += motion.dq[i, j] * state[1, j, 0] + motion.dqd[i, j] * state[1, n + j, 0]
+                    value += motion.F[i, j] * state[1, j, 0] + motion.F[i, n + j] * state[1, n + j, 0]
                 state[1, n + i, 1] = value
             weight *= h / order
             for i in range(2 * n):

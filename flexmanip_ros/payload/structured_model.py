@@ -222,7 +222,13 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         effort=np.zeros(links), gain=np.ones(links), late=np.zeros((links, 2)), slope=np.zeros((links, 2)),
         opened=np.array([size, *range(size)]), bounds=allocate_bounds(size, nx), p=np.zeros(size), a=np.zeros(n),
         k=np.zeros((19, n)), dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)), G=np.zeros((n, size)),
-        X=np.zeros((2 * n, nx)), Y=np.zeros((2 * n, nx)))
+        F=np.zeros((n, 2 * n)), X=np.zeros((2 * n, 2 * n)), Y=np.zeros((n, n)), **spread_scratch(n, nx))
+
+
+def spread_scratch(n: int, columns: int) -> dict[str, Any]:
+    """Allocate what ``process_model.spread`` needs of a ``ProcessModel`` for a square root of so many columns."""
+    return {'now': np.zeros((2 * n, columns)), 'before': np.zeros((2 * n, columns)), 'rates': np.zeros((n, columns)),
+            'forced': np.zeros((n, columns))}
 
 
 def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Array) -> MeasurementModel:
@@ -490,7 +496,7 @@ def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, 
     n = motion.arm.stiffness.size
     predict(motion, m.x, m.S, 0, np.zeros((1, 1 + change.size)), dt, 0.0, 0)
     flow = np.zeros((2 * n + change.size, 2 * n + change.size))
-    flow[:n, n:2 * n], flow[n:2 * n, :n], flow[n:2 * n, n:2 * n] = np.eye(n), motion.dq, motion.dqd
+    flow[:n, n:2 * n], flow[n:2 * n, :2 * n] = np.eye(n), motion.F
     M = motion.M0 + np.tensordot(motion.payload, motion.Mp, 1) if motion.frozen \
         else mass_matrix(motion.arm, motion.payload, m.x[:n])
     flow[n:2 * n, 2 * n:] = np.linalg.solve(M, motion.arm.torque * (motion.gain * change))
@@ -502,7 +508,7 @@ def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, 
     for profile in profiles:
         state = np.tensordot(step[:2 * n, :2 * n], state, 1) + step[:2 * n, 2 * n:, None] * profile
     back = -dt * flow[:2 * n, :2 * n]  # what is damped within a sample cannot be carried back over one
-    back[n:, n:] /= max(1.0, dt * float(np.linalg.norm(motion.dqd, 2)))
+    back[n:, n:] /= max(1.0, dt * float(np.linalg.norm(motion.F[:, n:], 2)))
     found = scipy.linalg.expm(back) @ state.reshape(2 * n, -1)
     columns = np.zeros((m.x.size, found.shape[1]))
     columns[:2 * n] = found

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+
 import numpy as np
 from estimates import one_a_stamp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flexmanip_ros import pipeline
+from flexmanip_ros.numerics.background import Threads
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord
@@ -110,8 +113,10 @@ def test_blocks_of_messages_give_the_bits_of_single_messages(
     single = list(pipeline.replay(config, items))
     blocks = list(pipeline.replay(config, _in_blocks(items, size)))
     assert [_bits(e) for _, e in single] == [_bits(e) for _, e in blocks]
-    assert single[-1][0].counters == blocks[-1][0].counters
-    assert _bits(pipeline.current(single[-1][0])) == _bits(pipeline.current(blocks[-1][0]))
+    *_, ended = pipeline.absorb(config, _in_blocks(items, size))  # no estimate is made on the way
+    for last in (blocks[-1][0], ended):
+        assert single[-1][0].counters == last.counters
+        assert _bits(pipeline.current(single[-1][0])) == _bits(pipeline.current(last))
 
 
 def test_every_fit_after_a_capture_gives_the_same_bits_live_and_replayed() -> None:
@@ -130,3 +135,8 @@ def test_every_fit_after_a_capture_gives_the_same_bits_live_and_replayed() -> No
         replayed = list(pipeline.run(config, items))
         assert [_bits(one) for one in live] == [_bits(one) for one in replayed], len(ballast)
         assert sum(one.model_is_new for one in live) > 30
+        with closing(Threads()) as beside:  # payload, models and fits on threads of their own
+            threaded = [one for _, one in pipeline.replay(config, _in_blocks(items, 1000), beside) if one is not None]
+            *_, ended = pipeline.absorb(config, _in_blocks(items, 1000), beside)
+        assert [_bits(one) for one in live] == [_bits(one) for one in threaded]
+        assert _bits(pipeline.current(ended)) == _bits(pipeline.current(state))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.payload import process_model
@@ -84,14 +85,34 @@ def test_the_linearisation_is_the_derivative_of_the_motion(arm):
     n = arm.arm.stiffness.size
     x = bent(arm, n)
     linearize(arm, x)
-    dq, dqd = arm.dq.copy(), arm.dqd.copy()
+    F = arm.F.copy()
     for i in range(2 * n):
         up, down = x.copy(), x.copy()
         up[i] += 1e-6
         down[i] -= 1e-6
         high, low = linearize(arm, up), linearize(arm, down)
-        given = dq[:, i] if i < n else dqd[:, i - n]
+        given = F[:, i]
         np.testing.assert_allclose((high - low) / 2e-6, given, rtol=1e-4, atol=1e-6 * np.abs(given).max())
+
+
+@pytest.mark.parametrize('sticks', [0.0, 3000.0], ids=['vibrating', 'a joint sticks'])
+def test_the_spread_moves_as_the_matrix_exponential_says(arm, sticks):
+    n = arm.arm.stiffness.size
+    x, h, fastest = bent(arm, n), arm.substeps, process_model.FASTER * process_model.STEP_ANGLE / arm.substeps
+    linearize(arm, x)
+    arm.F[0, n] -= sticks
+    stiff = -np.trace(arm.F[:, n:])
+    h = min(h, process_model.STIFF_STEP / stiff)
+    rng = np.random.default_rng(3)
+    scale = np.repeat([1.0, fastest, 1.0], [n, n, arm.kind.size])[:, None]
+    arm.G[:] = rng.normal(size=arm.G.shape) * fastest ** 2
+    flow = np.zeros((x.size, x.size))
+    flow[:n, n:2 * n], flow[n:2 * n, :2 * n], flow[n:2 * n, 2 * n:] = np.eye(n), arm.F, arm.G
+    S = scale * rng.normal(size=(x.size, x.size))
+    moved = S.copy()
+    process_model.spread(arm.F, arm.G, arm.opened, moved, arm.now, arm.before, arm.rates, arm.forced, h, fastest, stiff)
+    exact = scipy.linalg.expm(h * flow) @ S
+    assert np.abs((moved - exact) / scale).max() < process_model.SPREAD_ERROR * np.abs(exact / scale).max()
 
 
 def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(arm):

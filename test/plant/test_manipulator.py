@@ -87,11 +87,11 @@ def test_derivatives_of_the_acceleration(shortening: bool, kappa: int, payload: 
     q, qd = state(kappa, 1)
     n = q.size
     tau, qdd = np.array([3.0, -2.0]), np.empty(n)
-    dq, dqd, dp = np.empty((n, n)), np.empty((n, n)), np.empty((n, 4))
+    dq, dqd, dp, flow = np.empty((n, n)), np.empty((n, n)), np.empty((n, 4)), np.empty((n, 2 * n))
     work = m.workspace(arm)
     assert acceleration(arm, payload, q, qd, tau, qdd, work)
     force_jacobian(arm, payload, q, qd, qdd, dq, dqd, dp, work)
-    complete_jacobian(arm, q, qd, dq, dqd, work)
+    complete_jacobian(arm, q, qd, dq, dqd, flow, work)
     assert np.array_equal(qdd, mechanics.accelerations(arm, payload, q, qd, tau))
 
     expected = {
@@ -101,7 +101,7 @@ def test_derivatives_of_the_acceleration(shortening: bool, kappa: int, payload: 
             slope(lambda h, e=e: mechanics.accelerations(arm, payload + h * e, q, qd, tau)) for e in np.eye(4)],
     }
     by_payload = -np.linalg.solve(linearization.mass_matrix(arm, payload, q), dp)
-    for name, got in (('q', dq), ('qd', dqd), ('payload', by_payload)):
+    for name, got in (('q', flow[:, :n]), ('qd', flow[:, n:]), ('payload', by_payload)):
         want = np.array(expected[name]).T
         assert np.abs(got - want).max() < 1e-7 * np.abs(want).max(), name
 
