@@ -56,6 +56,16 @@ def merged(function: Function) -> Function:
     return _compiled(function, inline='always')
 
 
+def library(function: Function) -> Function:
+    """Compile a function that kernels call and that calls NumPy's linear algebra: BLAS.
+
+    With reference counting, which numba asks for there.
+    """
+    counted: dict[str, Any] = {'_nrt': True, 'forceinline': False}
+    compiled: Function = njit(cache=True, nogil=True, **counted)(function)
+    return compiled
+
+
 _OPTIONS: dict[str, Any] = {'nogil': True, '_nrt': False, 'no_cfunc_wrapper': True}
 """No wrapper for callbacks from C: it unpacks all arguments once more."""
 
@@ -65,7 +75,7 @@ def _compiled(function: Function, **more: Any) -> Function:
     return compiled
 
 
-COMPILED = re.compile(r'^@(kernel|inlined|inner|merged)$', re.MULTILINE)
+COMPILED = re.compile(r'^@(kernel|inlined|inner|merged|library)$', re.MULTILINE)
 
 
 def drop_stale(package: Path) -> int:

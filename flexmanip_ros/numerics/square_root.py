@@ -5,18 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from flexmanip_ros.numerics.compiled import inner, kernel
+from flexmanip_ros.numerics.compiled import inner, kernel, library
 from flexmanip_ros.types import Array
 
 
-@njit('void(float64[:, ::1], float64[:, ::1], float64[:, ::1])', cache=True, nogil=True)
+@library
 def multiply(A: Array, B: Array, product: Array) -> None:
-    """Fill product (m, n) with A (m, k) B (k, n) by BLAS, five times as fast as loops. None may overlap another.
-
-    Compiled as it is read, since what is compiled for a ``kernel`` may call no function that allocates.
-    """
+    """Fill product (m, n) with A (m, k) B (k, n) by BLAS, five times as fast as loops. None may overlap another."""
     np.dot(A, B, product)
 
 

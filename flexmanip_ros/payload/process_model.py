@@ -158,13 +158,8 @@ class ProcessModel(NamedTuple):
     """(2 n, 2 n) scratch."""
     Y: Array
     """(n, n) scratch."""
-    now: Array
-    """(2 n, c) scratch of ``spread`` for c columns of the square root, as the next three."""
-    before: Array
-    rates: Array
-    """(n, c)."""
-    forced: Array
-    """(n, c)."""
+    scratch: Array
+    """(6 n c,) for square roots of at most c columns."""
 
 
 @inlined
@@ -485,7 +480,7 @@ def predict(
             turn = max(STEP_ANGLE / motion.substeps, stiff)
             parameter_columns(motion, x, h)
             if used > 0:
-                spread(motion.F, motion.G, motion.opened, S, motion.now, motion.before, motion.rates, motion.forced, h,
+                spread(motion.F, motion.G, motion.opened, S, used, motion.scratch, h,
                        FASTER * STEP_ANGLE / motion.substeps, stiff)  # it weighs: the begin's linearization will do
         fifth = fineness > 0 and pace == 1.0
         if not exponential_step(motion, x, h * fine, turn * h * fine, fifth):
@@ -639,16 +634,19 @@ def bessel(k: int, x: float) -> float:
 
 @kernel
 def spread(
-    flow: Array, G: Array, opened: NDArray[np.int64], S: Array, now: Array, before: Array, rates: Array, forced: Array,
-    h: float, fastest: float, stiff: float,
+    flow: Array, G: Array, opened: NDArray[np.int64], S: Array, used: int, scratch: Array, h: float, fastest: float,
+    stiff: float,
 ) -> None:
-    """S <- F S, F = exp(z) the flow of the linearization over h; z: h times its matrix.
+    """S <- F S in its first ``used`` columns, F = exp(z) the flow of the linearization over h; z: h times its matrix.
 
-    fastest, stiff: largest frequency and rate of decay [1/s]. Chebyshev expansion (Tal-Ezer and Kosloff 1984): with
-    t = h ``fastest``, exp(z) = J_0(t) + 2 sum of J_k(t) U_k(z), U_k+1 = 2 z / t U_k + U_k-1, U_1 = z / t. A vibration
-    of the largest frequency takes six products, where Taylor's series takes nine.
+    scratch: (6 n used,); fastest, stiff: largest frequency and rate of decay [1/s]. Chebyshev expansion (Tal-Ezer and
+    Kosloff 1984): with t = h ``fastest``, exp(z) = J_0(t) + 2 sum of J_k(t) U_k(z), U_k+1 = 2 z / t U_k + U_k-1,
+    U_1 = z / t. A vibration of the largest frequency takes six products, where Taylor's series takes nine.
     """
-    n, nx = flow.shape[0], S.shape[1]
+    n, half = flow.shape[0], flow.shape[1] * used
+    now, before = scratch[:half].reshape((2 * n, used)), scratch[half:2 * half].reshape((2 * n, used))
+    rates = scratch[2 * half:2 * half + n * used].reshape((n, used))
+    forced = scratch[2 * half + n * used:3 * half].reshape((n, used))
     t = h * fastest
     count, left = 0, 2.0
     ratio = stiff / fastest + np.sqrt(1.0 + (stiff / fastest) ** 2)  # by which U_k grows where the motion decays
@@ -657,16 +655,16 @@ def spread(
         left *= 0.5 * t * ratio / count
     first = bessel(0, t)
     for r in range(2 * n):
-        for c in range(nx):
+        for c in range(used):
             now[r, c] = S[r, c]
             before[r, c] = 0.0
             S[r, c] *= first
     for r in range(n):
-        for c in range(nx):
+        for c in range(used):
             forced[r, c] = 0.0
         for p in range(opened[0]):
             g, row = G[r, p], S[2 * n + opened[1 + p]]
-            for c in range(nx):
+            for c in range(used):
                 forced[r, c] += g * row[c]
     factor = 1.0 / fastest
     for k in range(1, count):
@@ -674,13 +672,13 @@ def spread(
         weight = 2.0 * bessel(k, t)
         for r in range(n):
             place, rate, acted = before[r], before[n + r], rates[r]
-            for c in range(nx):
+            for c in range(used):
                 place[c] += factor * now[n + r, c]
                 rate[c] += factor * acted[c]
             if k % 2 == 1:  # U_k of what is constant, p: it is p, 0, p, ..
-                for c in range(nx):
+                for c in range(used):
                     rate[c] += factor * forced[r, c]
-            for c in range(nx):
+            for c in range(used):
                 S[r, c] += weight * place[c]
                 S[n + r, c] += weight * rate[c]
         now, before = before, now

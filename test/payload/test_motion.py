@@ -110,7 +110,7 @@ def test_the_spread_moves_as_the_matrix_exponential_says(arm, sticks):
     flow[:n, n:2 * n], flow[n:2 * n, :2 * n], flow[n:2 * n, 2 * n:] = np.eye(n), arm.F, arm.G
     S = scale * rng.normal(size=(x.size, x.size))
     moved = S.copy()
-    process_model.spread(arm.F, arm.G, arm.opened, moved, arm.now, arm.before, arm.rates, arm.forced, h, fastest, stiff)
+    process_model.spread(arm.F, arm.G, arm.opened, moved, x.size, arm.scratch, h, fastest, stiff)
     exact = scipy.linalg.expm(h * flow) @ S
     assert np.abs((moved - exact) / scale).max() < process_model.SPREAD_ERROR * np.abs(exact / scale).max()
 
