@@ -320,6 +320,8 @@ def _parts(state: StructuredState, rows: Rows) -> list[tuple[bool, Rows]]:
     """Return the rows in pieces, and whether a gap or an unknown change of torque is before the first of each."""
     if not len(rows):
         return []
+    if not state.missing and not rows.gap.any() and not rows.missing.any():  # as nearly always
+        return [(False, rows)]
     before = state.efforts[-1] if state.efforts is not None else rows.u[0]
     absent = np.concatenate([[state.missing], rows.missing[:-1]]) * (rows.missing == 0)
     broken = rows.gap
@@ -387,11 +389,13 @@ def after_rows(state: StructuredState, m: mem.FilterState, taken: Rows, table: A
     assert state.sensors is not None
     assert state.efforts is not None
     efforts = latest(state.sensors, taken.u[-1:], table[:, 1:1 + taken.u.shape[1]])
-    slope = state.slope
+    slope, peak = state.slope, np.abs(taken.u).max(axis=0)
+    if state.peak.size:
+        peak = np.maximum(peak, state.peak)
     if not taken.missing[-1]:
         slope = taken.u[-1] - (taken.u[-2] if len(taken) > 1 else state.efforts[-1])
     return state._replace(memory=m, cursor=taken.until, last_ns=int(taken.stamp_ns[-1]), efforts=efforts, slope=slope,
-                          missing=int(taken.missing[-1]), peak=_peaks(state, taken)[-1])
+                          missing=int(taken.missing[-1]), peak=peak)
 
 
 def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
