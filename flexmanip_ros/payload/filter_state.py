@@ -13,16 +13,18 @@ HORIZON = 1024
 """Samples after an event that the moving-horizon estimation reads again, at most."""
 ENOUGH = 512
 """It ends with so many once it has converged."""
+TONES = 32
+"""Frequencies at which the spectrum of each sensor is taken."""
 
 # Columns of ``noise``, one row a sensor: variance used by the filter; variance of the innovations; its slow part;
 # sum and sum of squares of the residuals in this block; least variance assumed; variance of the fourth differences
 # (white noise only); information on the payload that came from this sensor; sum of squares in this iteration; variance
-# used at the last event.
-EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EVENT = range(10)
+# used at the last event; most that white noise can be by the median level of the spectrum.
+EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EVENT, LEVEL = range(11)
 # Elements of ``counts``.
 (HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN, BEFORE,
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
- FINENESS, CALM) = range(22)
+ FINENESS, CALM, IN_SPECTRUM, SPECTRA) = range(24)
 # Elements of ``score``.
 MOVE, VARIANCE, SHIFT, DOUBT, DRIFT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA = range(11)
 
@@ -35,14 +37,17 @@ class FilterState(NamedTuple):
     S: Array
     """(nx, nx) square root of the covariance."""
     noise: Array
-    """(m, 10) what is known of each sensor's noise."""
+    """(m, 11) what is known of each sensor's noise."""
     recent: Array
     """(m, 4) its last measurements."""
+    spectrum: Array
+    """(m, 3, TONES) of its fourth differences: both states of Goertzel's filter, mean power over that of white noise
+    of unit variance."""
     counts: NDArray[np.int64]
-    """(22,) counters; USED: number of columns of S and S0, the first ones, that are not zero; IN_A_ROW: samples since
+    """(24,) counters; USED: number of columns of S and S0, the first ones, that are not zero; IN_A_ROW: samples since
     the last one that was missing; MEASURED: samples of this iteration that were not; TRIED: iterations that did
     not fit, over the same samples; FINENESS: how fine a step of the motion is; CALM: samples since a coarser one
-    was too coarse."""
+    was too coarse; IN_SPECTRUM: samples of the present spectrum; SPECTRA: those in the mean power."""
     score: Array
     """(11,) MOVE: sum of the payload's updates in this batch, VARIANCE: the variance they should have; SHIFT: by how
     many standard deviations the last iteration moved the payload, DOUBT: root of the sum of the squares of that step
@@ -79,11 +84,11 @@ class FilterState(NamedTuple):
 def memory(nx: int, m: int) -> FilterState:
     """Allocate for nx states and m sensors."""
     return FilterState(
-        x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 10)), recent=np.zeros((m, 4)),
-        counts=np.zeros(22, dtype=np.int64), score=np.zeros(11), x0=np.zeros(nx), S0=np.zeros((nx, nx)),
-        xi=np.zeros(nx), accepted=np.zeros(nx), normal=np.zeros((nx, nx)), gradient=np.zeros(nx),
-        xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
-        g=np.zeros(nx), innovation=np.zeros((m, 2)), power=np.ones(m))
+        x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)),
+        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(24, dtype=np.int64), score=np.zeros(11), x0=np.zeros(nx),
+        S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx), normal=np.zeros((nx, nx)),
+        gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)), g=np.zeros(nx),
+        innovation=np.zeros((m, 2)), power=np.ones(m))
 
 
 def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
@@ -91,11 +96,12 @@ def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
 
     horizon False: what belongs to a complete moving horizon is shared; then only an event writes it.
     """
-    x, S, noise, recent, counts, score, x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g, innovation, power = state
+    (x, S, noise, recent, spectrum, counts, score, x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g, innovation,
+     power) = state
     if horizon or counts[STORED] < HORIZON:
         x0, S0, xi = x0.copy(), S0.copy(), xi.copy()
         accepted, normal, gradient = accepted.copy(), normal.copy(), gradient.copy()
         xr, Sr, N, g = xr.copy(), Sr.copy(), N.copy(), g.copy()
     return FilterState(
-        x.copy(), S.copy(), noise.copy(), recent.copy(), counts.copy(), score.copy(), x0, S0, xi, accepted, normal,
-        gradient, xr, Sr, N, g, innovation.copy(), power.copy())
+        x.copy(), S.copy(), noise.copy(), recent.copy(), spectrum.copy(), counts.copy(), score.copy(), x0, S0, xi,
+        accepted, normal, gradient, xr, Sr, N, g, innovation.copy(), power.copy())

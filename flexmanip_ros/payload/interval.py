@@ -19,6 +19,7 @@ from flexmanip_ros.payload.filter_state import (
     EFFECTIVE,
     FLOOR,
     HORIZON,
+    LEVEL,
     REFITS,
     SHIFT,
     STORED,
@@ -161,7 +162,8 @@ def inertia_error(config: IdentifierParameters, model: Model, mass: float) -> fl
 
 def plain_misfit(sensors: MeasurementModel, m: mem.FilterState) -> float:
     """Innovation power over white noise of the sensors of displacements, before any tells of the payload."""
-    ratio = m.noise[:, mem.POWER] / np.maximum(m.noise[:, mem.WHITE], m.noise[:, mem.FLOOR])
+    white = np.minimum(m.noise[:, mem.WHITE], m.noise[:, mem.LEVEL])
+    ratio = m.noise[:, mem.POWER] / np.maximum(white, m.noise[:, mem.FLOOR])
     return float(np.median(ratio[~sensors.rate]))
 
 
@@ -190,7 +192,8 @@ def misjudged(noise: Array, counts: Integers, block: int) -> float:
     least = most / math.sqrt(block)
     excess = 0.0
     for i in range(noise.shape[0]):
-        excess = max(excess, noise[i, EFFECTIVE] / max(noise[i, WHITE], noise[i, FLOOR]) - 1.0)
+        white = max(min(noise[i, WHITE], noise[i, LEVEL]), noise[i, FLOOR])
+        excess = max(excess, noise[i, EFFECTIVE] / white - 1.0)
     return min(max((excess - least) / (most - least), 0.0), 1.0)
 
 
@@ -198,4 +201,4 @@ def misjudged(noise: Array, counts: Integers, block: int) -> float:
 def figures(noise: Array, rate: NDArray[np.bool_], score: Array, counts: Integers, block: int
             ) -> tuple[float, float, float]:
     """Return misfit, drift and ``misjudged``, in one call."""
-    return misfit(noise, rate), drift(score, counts), misjudged(noise, counts, block)
+    return misfit(noise, rate, LEVEL), drift(score, counts), misjudged(noise, counts, block)

@@ -21,12 +21,16 @@ from flexmanip_ros.payload.filter_state import (
     IN_A_ROW,
     IN_BATCH,
     IN_BLOCK,
+    IN_SPECTRUM,
+    LEVEL,
     MOVE,
     POWER,
     SEEN,
     SINCE_EVENT,
     SLOW,
+    SPECTRA,
     STORED,
+    TONES,
     USED,
     VARIANCE,
     WEIGHT,
@@ -43,6 +47,21 @@ BLOCK_MEMORY = 120
 """Blocks over which the noise of a sensor is averaged."""
 BATCH_MEMORY = 20
 """Batches over which the moves of the payload are averaged."""
+SPECTRUM = 128
+"""Samples of one spectrum. Hann's window of that length is as wide, 1.44 / 128, as ``TONE`` are apart."""
+SPECTRUM_MEMORY = 16
+"""Spectra over which the power at each frequency is averaged: as many samples as the fourth differences."""
+TONE = 0.16 + 0.01 * np.arange(TONES)
+"""Frequencies of the spectrum, in those of the samples. Slow motion and what a step of the torque leaves in fourth
+differences are below the first; the window keeps the mirror images above one half from the last."""
+TURN = 2.0 * np.cos(2.0 * np.pi * TONE)
+"""Coefficient of Goertzel's filter at each."""
+HANN = np.sin(np.pi * (np.arange(SPECTRUM) + 0.5) / SPECTRUM) ** 2
+"""Hann's window."""
+SHARE = 1.0 / (np.sum(HANN ** 2) * (2.0 * np.sin(np.pi * TONE)) ** 8)
+"""One over the mean power, at each frequency, of the fourth differences of white noise of unit variance."""
+MEDIAN_STD = 1.25 / np.sqrt(TONES)
+"""Relative standard deviation of the median of the powers in one spectrum of white noise: sqrt(pi / 2) of a mean's."""
 
 
 class MeasurementModel(NamedTuple):
@@ -153,6 +172,7 @@ def measure(sensors: MeasurementModel, m: FilterState, y: Array, qdd: Array) -> 
         m.noise[i, WEIGHT] += gain * gain * variance
         absorb_measurement(x, S, f, e, r, variance)
         white_noise(m, i, y[i])
+    count_spectrum(m)
     m.counts[SEEN] = min(m.counts[SEEN] + 1, 2000)
     m.counts[IN_A_ROW] += 1
 
@@ -165,11 +185,64 @@ def white_noise(m: FilterState, i: int, y: float) -> None:
         difference = y - 4.0 * recent[0] + 6.0 * recent[1] - 4.0 * recent[2] + recent[3]
         square = difference * difference / 70.0
         if m.counts[SEEN] > 50:
-            square = min(square, 16.0 * m.noise[i, WHITE] + 1e-300)
+            most = 16.0 * m.noise[i, WHITE] + 1e-300
+            if square > most:
+                difference *= np.sqrt(most / square)
+                square = most
         m.noise[i, WHITE] += (square - m.noise[i, WHITE]) / max(m.counts[SEEN] - 3, 1)
+        take_spectrum(m, i, difference)
     for p in range(3, 0, -1):
         recent[p] = recent[p - 1]
     recent[0] = y
+
+
+@inner
+def take_spectrum(m: FilterState, i: int, difference: float) -> None:
+    """Take a fourth difference of sensor i into its spectrum; with the last one, bound the white noise by its median.
+
+    Undamped modes that turn fast enter the fourth differences as noise does. In the spectrum they are lines, and white
+    noise is what stands between them. The median over the frequencies is that, while lines fill less than half of them.
+    Power by Goertzel's filter with Hann's window, its mean over ``SPECTRUM_MEMORY`` spectra by Welch's method.
+    """
+    first, second, power = m.spectrum[i, 0], m.spectrum[i, 1], m.spectrum[i, 2]
+    k = m.counts[IN_SPECTRUM]
+    if k == 0:
+        for j in range(TONES):
+            first[j] = 0.0
+            second[j] = 0.0
+    windowed = HANN[k] * difference
+    for j in range(TONES):
+        now = windowed + TURN[j] * first[j] - second[j]
+        second[j] = first[j]
+        first[j] = now
+    if k < SPECTRUM - 1:
+        return
+    count = min(m.counts[SPECTRA] + 1, SPECTRUM_MEMORY)
+    for j in range(TONES):
+        now = SHARE[j] * (first[j] * first[j] + second[j] * second[j] - TURN[j] * first[j] * second[j])
+        power[j] += (now - power[j]) / count
+    for j in range(TONES):  # sorted, in what the next spectrum clears
+        place = j
+        while place > 0 and first[place - 1] > power[j]:
+            first[place] = first[place - 1]
+            place -= 1
+        first[place] = power[j]
+    median = 0.5 * (first[TONES // 2 - 1] + first[TONES // 2])
+    # a mean of N powers is chi-square with 2 N degrees of freedom, whose median is below its mean (Wilson and Hilferty)
+    level = median / (1.0 - 1.0 / (9.0 * count)) ** 3
+    m.noise[i, LEVEL] = level * (1.0 + 3.0 * MEDIAN_STD / np.sqrt(count))
+
+
+@inner
+def count_spectrum(m: FilterState) -> None:
+    """Count a sample of the spectra; begin them again after a sample that was missing."""
+    if m.counts[IN_A_ROW] < 4:
+        m.counts[IN_SPECTRUM] = 0
+        return
+    m.counts[IN_SPECTRUM] += 1
+    if m.counts[IN_SPECTRUM] == SPECTRUM:
+        m.counts[IN_SPECTRUM] = 0
+        m.counts[SPECTRA] = min(m.counts[SPECTRA] + 1, SPECTRUM_MEMORY)
 
 
 @inner
@@ -202,16 +275,17 @@ def learn_noise(sensors: MeasurementModel, m: FilterState) -> None:
 
 
 @inlined
-def misfit(noise: Array, rate: NDArray[np.bool_]) -> float:
+def misfit(noise: Array, rate: NDArray[np.bool_], most: int) -> float:
     """Innovation power over white noise, each sensor weighted by what it tells of the payload; nan: none yet.
 
-    noise: (m, 10), see ``filter_state``; rate: (m,) whether a sensor is one of rates. Those are left out where there
-    are displacements: they show the modes that the model leaves out, and have been given a larger noise.
+    noise: (m, 11), see ``filter_state``; rate: (m,) whether a sensor is one of rates. Those are left out where there
+    are displacements: they show the modes that the model leaves out, and have been given a larger noise. most: column
+    above which white noise is not, WHITE or LEVEL.
     """
     total = sum_of_weights = 0.0
     for i in range(noise.shape[0]):
         if not rate[i]:
-            total += noise[i, WEIGHT] * noise[i, POWER] / max(noise[i, WHITE], noise[i, FLOOR])
+            total += noise[i, WEIGHT] * noise[i, POWER] / max(min(noise[i, WHITE], noise[i, most]), noise[i, FLOOR])
             sum_of_weights += noise[i, WEIGHT]
     return total / sum_of_weights if sum_of_weights > 0.0 else np.nan
 

@@ -366,7 +366,7 @@ def strays(sensors: MeasurementModel, m: FilterState) -> bool:
     least = STRAY
     for i in range(m.noise.shape[0]):
         least = min(least, m.noise[i, POWER] / max(m.noise[i, WHITE], m.noise[i, FLOOR]))
-    left = bool(least >= STRAY if m.counts[HELD] == 1 else misfit(m.noise, sensors.rate) >= UNFIT)
+    left = bool(least >= STRAY if m.counts[HELD] == 1 else misfit(m.noise, sensors.rate, WHITE) >= UNFIT)
     m.counts[REFITS] += left
     return left
 

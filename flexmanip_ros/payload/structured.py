@@ -61,7 +61,7 @@ class StructuredState(NamedTuple):
     refits: int = 0
     """How often the empty arm's fit was begun again."""
     white: Array = np.empty(0)
-    """(m,) variance of each measurement's white noise, as far as it was known then."""
+    """(m, 2) variance of each measurement's white noise, as far as it was known then, and its bound by the spectrum."""
 
 
 class Horizon(NamedTuple):
@@ -251,7 +251,7 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     structured_model.first(config, model, m, Y[0])
     structured_model.freeze(config, model, np.mean(rows.angles, axis=0))
     if state.white.size:
-        m.noise[:, mem.WHITE] = state.white
+        m.noise[:, [mem.WHITE, mem.LEVEL]] = state.white
         structured_model.guess_noise(model, m.noise)
     # the simplest arm first; then all that may be learned, with late signals and without in turn
     if state.refits % 2 == 0:
@@ -470,7 +470,7 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
     fresh = init(config)._replace(restarts=state.restarts + (not unfit), cursor=state.cursor, refits=refits,
                                   efforts=state.efforts)
     if unfit and m.counts[mem.SEEN] >= UNTAUGHT:
-        fresh = fresh._replace(white=m.noise[:, mem.WHITE].copy())
+        fresh = fresh._replace(white=m.noise[:, [mem.WHITE, mem.LEVEL]])
     if m.counts[mem.HELD]:
         grasped = CaptureEvent(state.last_ns, EventKind.CAPTURE)
         fresh = fresh._replace(early=((state.cursor, grasped),))

@@ -365,7 +365,8 @@ def noise(model: Model, Y: Array) -> Array:
     """First guess of every sensor's noise from its first samples Y (N, m), as ``FilterState.noise``."""
     differences = np.diff(Y, n=4, axis=0)
     white = (1.4826 * np.median(np.abs(differences), axis=0)) ** 2 / 70
-    rows = np.zeros((len(model.roles), 10))
+    rows = np.zeros((len(model.roles), 11))
+    rows[:, mem.LEVEL] = np.inf  # no spectrum yet
     rows[:, mem.FLOOR] = [FLOORS[role.quantity] ** 2 for role in model.roles]
     rows[:, mem.WHITE] = np.maximum(white, rows[:, mem.FLOOR])
     guess_noise(model, rows)
