@@ -8,14 +8,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flexmanip_ros import event_replay
+from flexmanip_ros.event_replay import EventReplay
 from flexmanip_ros.identification import prediction_check, rpbsid
 from flexmanip_ros.identification.factor import FILLED, REJECTED
 from flexmanip_ros.identification.uncertainty import Identified, modes
-from flexmanip_ros.numerics.background import Background
+from flexmanip_ros.numerics.background import INLINE, Background
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, frequency, structured
 from flexmanip_ros.payload.arm_parameters import taught
-from flexmanip_ros.samples.sample_log import Rows
+from flexmanip_ros.samples.sample_log import Rows, SampleLog
 from flexmanip_ros.types import ArmParameter, Array, CaptureEvent, Estimate, Payload, Status
 
 NO_ANGLES: Array = np.empty(0)
@@ -103,6 +105,41 @@ def payload(config: IdentifierParameters, state: PayloadEstimator) -> Payload | 
 def arm_parameters(config: IdentifierParameters, state: PayloadEstimator) -> tuple[ArmParameter, ...]:
     """Return what the arm taught; empty where the payload rests on the model."""
     return taught(config, state.structured)
+
+
+class PayloadReading(NamedTuple):
+    """What the payload's estimator says at a row."""
+
+    payload: Payload | None
+    """None where it rests on the model."""
+    arm_parameters: tuple[ArmParameter, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PayloadRequest:
+    """Rows that the payload's estimator is to take; ``background.Request``."""
+
+    config: IdentifierParameters
+    replay: EventReplay[PayloadEstimator]
+    log: SampleLog
+    until: int
+    """The row to stop before."""
+    rows: Sequence[int] = ()
+    """Rows at which an estimate is due."""
+    seconds: Sequence[int] = ()
+    """The second, counted from the first stamp on, of each."""
+    told: int = -1
+    """The last second in which the arm's parameters were told."""
+
+    def solve(self) -> tuple[EventReplay[PayloadEstimator], list[PayloadReading], int]:
+        """Return the estimator before ``until``, what it says at each row, and the last second told."""
+        now, told, readings = self.replay, self.told, []
+        for row, second in zip(self.rows, self.seconds, strict=True):
+            now = event_replay.advance(self.config, now, self.log, row + 1, INLINE)
+            arm = arm_parameters(self.config, now.estimator) if second > told else ()
+            told = second if arm else told
+            readings.append(PayloadReading(payload(self.config, now.estimator), arm))
+        return event_replay.advance(self.config, now, self.log, self.until, INLINE), readings, told
 
 
 @dataclass(frozen=True, eq=False)

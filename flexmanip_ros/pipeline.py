@@ -8,8 +8,8 @@ give the same estimates bit for bit.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +24,7 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Rows, SampleLog
 from flexmanip_ros.samples.sampling import Clock, Counters
-from flexmanip_ros.types import ArmParameter, CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Payload
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Payload
 
 GROUP = 8
 """Rows that wait until there are so many or an estimate is due: a group costs less than its rows one by one. At 80 us a
@@ -46,41 +46,6 @@ ROUNDING = 1e-6
 """Share of an instant by which a stamp may fall short of it, for stamps that are rounded to nanoseconds."""
 
 Item = JointRecord | JointBlock | CaptureEvent
-
-
-class PayloadReading(NamedTuple):
-    """What the payload's estimator says at a row."""
-
-    payload: Payload | None
-    """None where it rests on the model."""
-    arm_parameters: tuple[ArmParameter, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class PayloadRequest:
-    """Rows that the payload's estimator is to take; ``background.Request``."""
-
-    config: IdentifierParameters
-    payload: EventReplay[PayloadEstimator]
-    log: SampleLog
-    until: int
-    """The row to stop before."""
-    rows: Sequence[int] = ()
-    """Rows at which an estimate is due."""
-    seconds: Sequence[int] = ()
-    """The second, counted from the first stamp on, of each."""
-    told: int = -1
-    """See ``State.told``."""
-
-    def solve(self) -> tuple[EventReplay[PayloadEstimator], list[PayloadReading], int]:
-        """Return the estimator after the last row, what it says at each, and ``told``."""
-        payload, told, readings = self.payload, self.told, []
-        for row, second in zip(self.rows, self.seconds, strict=True):
-            payload = event_replay.advance(self.config, payload, self.log, row + 1, INLINE)
-            arm = estimator.arm_parameters(self.config, payload.estimator) if second > told else ()
-            told = second if arm else told
-            readings.append(PayloadReading(estimator.payload(self.config, payload.estimator), arm))
-        return event_replay.advance(self.config, payload, self.log, self.until, INLINE), readings, told
 
 
 class PendingModel(NamedTuple):
@@ -390,7 +355,7 @@ def _running(state: State) -> tuple[IdentifierParameters, EventReplay[PayloadEst
 def _advance(state: State, until: int, background: Background) -> State:
     """Let both estimators take the rows up to ``until``, in a replay beside each other."""
     config, payload, identifier = _running(state)
-    request = PayloadRequest(config, payload, state.log, until)
+    request = estimator.PayloadRequest(config, payload, state.log, until)
     if until - payload.cursor >= REPLAY_GROUP:
         background.start(request)
     identifier = event_replay.advance(config, identifier, state.log, until, background)
@@ -441,12 +406,12 @@ def _due_rows(state: State) -> list[int]:
     return [int(row) for row in measured[new] + cursor]
 
 
-def _payload_request(state: State, due: list[int]) -> PayloadRequest:
+def _payload_request(state: State, due: list[int]) -> estimator.PayloadRequest:
     config, payload, _ = _running(state)
     first = payload.cursor
     stamps = state.log.rows(first, due[-1] + 1).stamp_ns
     seconds = [_instant(state, int(stamps[row - first]), ARM_RATE) for row in due]
-    return PayloadRequest(config, payload, state.log, due[-1] + 1, due, seconds, state.told)
+    return estimator.PayloadRequest(config, payload, state.log, due[-1] + 1, due, seconds, state.told)
 
 
 class ModelStep(NamedTuple):
@@ -491,7 +456,7 @@ def _models(state: State, due: list[int], background: Background) -> tuple[State
     return state, steps
 
 
-def _with_payloads(state: State, steps: list[ModelStep], readings: list[PayloadReading]
+def _with_payloads(state: State, steps: list[ModelStep], readings: list[estimator.PayloadReading]
                    ) -> tuple[State, list[Estimate]]:
     """Return the estimates of payload and models at the rows where they are due."""
     config = _running(state)[0]
