@@ -259,12 +259,16 @@ def test_a_prediction_is_judged_against_white_noise_and_not_against_its_own_resi
     np.testing.assert_allclose(np.sqrt(prediction_check.white_noise(y)), 0.01 * y.std(axis=0), rtol=0.2)
 
 
-def swinging(frequencies: tuple[float, float], u: Array | None = None) -> tuple[StateSpace, Array]:
-    """Two modes that two displacements see, and what they do under torques (N, 2), with 2 % of noise."""
+def swinging(frequencies: tuple[float, float], u: Array | None = None, damping: float = 0.005
+             ) -> tuple[StateSpace, Array]:
+    """Two modes that two displacements see, and what they do under torques (N, 2), with 2 % of noise.
+
+    damping: damping ratio of the second mode.
+    """
     A, B = np.zeros((4, 4)), np.zeros((4, 2))
-    for i, frequency in enumerate(frequencies):
+    for i, (frequency, ratio) in enumerate(zip(frequencies, (0.005, damping), strict=True)):
         at = slice(2 * i, 2 * i + 2)
-        A[at, at] = [[0.0, 1.0], [-(2.0 * np.pi * frequency) ** 2, -0.01 * 2.0 * np.pi * frequency]]
+        A[at, at] = [[0.0, 1.0], [-(2.0 * np.pi * frequency) ** 2, -2.0 * ratio * 2.0 * np.pi * frequency]]
         B[2 * i + 1] = [1.0, -0.7 + i]
     model = StateSpace(*to_discrete(A, B, 1e-3), np.array([[1.0, 0.0, 0.6, 0.0], [-0.8, 0.0, 1.0, 0.0]]),
                        np.zeros((2, 2)), np.zeros((4, 2)), 1e-3)
@@ -312,6 +316,38 @@ def test_a_frequency_that_is_not_known_to_one_per_cent_is_not_tracking() -> None
     assert prediction_check.judged(found, rows, ('a/position', 'b/position')).status is Status.POORLY_EXCITED
     early = found._replace(samples=1000.0)
     assert prediction_check.judged(early, rows, ('a/position', 'b/position')).status is Status.WARMING_UP
+
+
+@pytest.mark.parametrize(('deviation', 'said'), [(0.06, Status.TRACKING), (0.12, Status.POORLY_EXCITED)])
+def test_a_damped_mode_is_tracking_only_if_its_damping_ratio_is_known(deviation: float, said: Status) -> None:
+    u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
+    model, y = swinging((5.6, 6.1), u, damping=0.5)
+    along = np.zeros((44, 1))
+    along[15] = 1.0  # the damping of the second mode
+    found = Identified(model, along, np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=1e4)
+    light, damped = sorted(modes(found), key=lambda mode: mode.damping_ratio)
+    assert light.frequency_std_hz < 1e-9
+    found = found._replace(spread=deviation / damped.damping_ratio_std * along)
+    rows = log_of(u, y).rows(0, len(u))
+    assert prediction_check.judged(found, rows, ('a/position', 'b/position')).status is said
+    early = prediction_check.judged(found._replace(samples=1000.0), rows, ('a/position', 'b/position')).status
+    assert early is (said if said is Status.TRACKING else Status.WARMING_UP)
+
+
+def test_a_mode_that_the_last_samples_do_not_show_is_not_tracking() -> None:
+    u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
+    model, _ = swinging((5.6, 8.2), damping=0.28)
+    model = replace(model, C=model.C * [1.0, 1.0, 0.002, 0.002])
+    clean = validation.simulate(model, u)
+    y = clean + 0.02 * clean.std(axis=0) * np.random.default_rng(1).standard_normal(clean.shape)
+    rows = log_of(u, y).rows(0, len(u))
+    error, chance = prediction_check.frequency_errors(model, u, y, 250)
+    assert np.all(np.abs(error) - chance < prediction_check.OFF)  # so nothing speaks against the frequencies
+    assert chance[0] < 0.01
+    assert chance[1] > 0.2
+    for samples, said in ((1000.0, Status.WARMING_UP), (1e4, Status.POORLY_EXCITED)):
+        found = Identified(model, 1e-6 * np.eye(44, 1), np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=samples)
+        assert prediction_check.judged(found, rows, ('a/position', 'b/position')).status is said
 
 
 @pytest.mark.parametrize('seed', [3, 5])
