@@ -343,7 +343,7 @@ def test_a_defect_is_one_line_and_not_taken_for_bad_input(recording, capsys, mon
     def broken(*arguments: object) -> None:
         raise ZeroDivisionError('somewhere')
 
-    monkeypatch.setattr(pipeline, 'replay', broken)
+    monkeypatch.setattr(pipeline, 'absorb', broken)
     status, _, err = _run(capsys, recording, *SETTINGS)
     assert status == 1
     assert 'ZeroDivisionError: somewhere' in err
