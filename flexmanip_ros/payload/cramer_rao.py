@@ -125,7 +125,7 @@ def everything(
     model, m = _start(config, np.array(plant.initial_angles))
     n, size = model.motion.arm.stiffness.size, m.x.size
     body, caught = slice(model.payload, model.payload + model.body), free_object(plant)
-    model = model._replace(motion=model.motion._replace(scratch=np.zeros(6 * n * (size + 3))))
+    model = model._replace(motion=model.motion._replace(scratch=np.zeros(3 * n * (size + 3))))
     x, w = m.x, np.array([*caught.velocity, caught.spin])
     # rows of S: the state; rows of V: velocity and spin of the object, unknown too; columns: independent unknowns
     S, V = np.zeros((size, size + 3)), np.zeros((3, size + 3))

@@ -34,9 +34,6 @@ MISS_ERROR = 1e-4
 """Of what it misses there, a thousandth of the motion or less."""
 SPREAD_ERROR = 1e-4
 """Of the spread's: it weighs, and need not be exact."""
-FASTER = 1.1
-"""The fastest mode over that of a pinned link, of the stiffness that was told, at most: 1.025 on the default arms, and
-what a stiffness that is learned adds. Chebyshev's expansion grows quickly beyond the largest frequency."""
 STEP_ERRORS = 1e-7, 1e-6
 """Correction of a step of fourth and of fifth order, positions and rates times the sample time, over the length of
 link 1, beyond which the following ones are finer: a sample is then off by 4e-9. Steps that change from sample to
@@ -159,7 +156,7 @@ class ProcessModel(NamedTuple):
     Y: Array
     """(n, n) scratch."""
     scratch: Array
-    """(6 n c,) for square roots of at most c columns."""
+    """(3 n c,) for square roots of at most c columns."""
 
 
 @inlined
@@ -479,9 +476,8 @@ def predict(
             h = left / max(steps, 1.0)
             turn = max(STEP_ANGLE / motion.substeps, stiff)
             parameter_columns(motion, x, h)
-            if used > 0:
-                spread(motion.F, motion.G, motion.opened, S, used, motion.scratch, h,
-                       FASTER * STEP_ANGLE / motion.substeps, stiff)  # it weighs: the begin's linearization will do
+            if used > 0:  # it weighs: the begin's linearization will do
+                spread(motion.F, motion.G, motion.opened, S, used, motion.scratch, h, terms(turn * h, SPREAD_ERROR))
         fifth = fineness > 0 and pace == 1.0
         if not exponential_step(motion, x, h * fine, turn * h * fine, fifth):
             return 0
@@ -620,66 +616,36 @@ def series(motion: ProcessModel, h: float, first: int, count: int, c: float) -> 
                 sums[4 + part, i] += term[part, i]
 
 
-@inner
-def bessel(k: int, x: float) -> float:
-    """Return the Bessel function J_k(x) by its power series, for x up to some units."""
-    half, value, term = 0.5 * x, 0.0, 1.0
-    for i in range(1, k + 1):
-        term *= half / i
-    for i in range(1, MOST_TERMS):
-        value += term
-        term *= -half * half / (i * (i + k))
-    return value
-
-
 @kernel
 def spread(
-    flow: Array, G: Array, opened: NDArray[np.int64], S: Array, used: int, scratch: Array, h: float, fastest: float,
-    stiff: float,
+    flow: Array, G: Array, opened: NDArray[np.int64], S: Array, used: int, scratch: Array, h: float, count: int,
 ) -> None:
-    """S <- F S in its first ``used`` columns, F = exp(z) the flow of the linearization over h; z: h times its matrix.
+    """S <- F S in its first ``used`` columns, F the Taylor series of the linearised flow over h, ``count`` terms.
 
-    scratch: (6 n used,); fastest, stiff: largest frequency and rate of decay [1/s]. Chebyshev expansion (Tal-Ezer and
-    Kosloff 1984): with t = h ``fastest``, exp(z) = J_0(t) + 2 sum of J_k(t) U_k(z), U_k+1 = 2 z / t U_k + U_k-1,
-    U_1 = z / t. A vibration of the largest frequency takes six products, where Taylor's series takes nine.
+    flow: (n, 2 n) derivatives of the accelerations by q and q'; scratch: (3 n used,). The k-th derivative of q is the
+    one of q' before it, so each term is one product.
     """
-    n, half = flow.shape[0], flow.shape[1] * used
-    now, before = scratch[:half].reshape((2 * n, used)), scratch[half:2 * half].reshape((2 * n, used))
-    rates = scratch[2 * half:2 * half + n * used].reshape((n, used))
-    forced = scratch[2 * half + n * used:3 * half].reshape((n, used))
-    t = h * fastest
-    count, left = 0, 2.0
-    ratio = stiff / fastest + np.sqrt(1.0 + (stiff / fastest) ** 2)  # by which U_k grows where the motion decays
-    while left > SPREAD_ERROR and count < MOST_TERMS:
-        count += 1
-        left *= 0.5 * t * ratio / count
-    first = bessel(0, t)
+    n = flow.shape[0]
+    now = scratch[:2 * n * used].reshape((2 * n, used))
+    rates = scratch[2 * n * used:3 * n * used].reshape((n, used))
     for r in range(2 * n):
         for c in range(used):
             now[r, c] = S[r, c]
-            before[r, c] = 0.0
-            S[r, c] *= first
-    for r in range(n):
-        for c in range(used):
-            forced[r, c] = 0.0
-        for p in range(opened[0]):
-            g, row = G[r, p], S[2 * n + opened[1 + p]]
-            for c in range(used):
-                forced[r, c] += g * row[c]
-    factor = 1.0 / fastest
-    for k in range(1, count):
+    weight = 1.0
+    for order in range(1, count + 1):
         multiply(flow, now, rates)
-        weight = 2.0 * bessel(k, t)
+        if order == 1:
+            for r in range(n):
+                for p in range(opened[0]):
+                    g, row = G[r, p], S[2 * n + opened[1 + p]]
+                    for c in range(used):
+                        rates[r, c] += g * row[c]
+        weight *= h / order
         for r in range(n):
-            place, rate, acted = before[r], before[n + r], rates[r]
+            place, rate, following, last = S[r], S[n + r], rates[r], now[n + r]
             for c in range(used):
-                place[c] += factor * now[n + r, c]
-                rate[c] += factor * acted[c]
-            if k % 2 == 1:  # U_k of what is constant, p: it is p, 0, p, ..
-                for c in range(used):
-                    rate[c] += factor * forced[r, c]
+                place[c] += weight * last[c]
+                rate[c] += weight * following[c]
             for c in range(used):
-                S[r, c] += weight * place[c]
-                S[n + r, c] += weight * rate[c]
-        now, before = before, now
-        factor = 2.0 / fastest
+                now[r, c] = last[c]
+                last[c] = following[c]

@@ -98,11 +98,12 @@ def test_the_linearisation_is_the_derivative_of_the_motion(arm):
 @pytest.mark.parametrize('sticks', [0.0, 3000.0], ids=['vibrating', 'a joint sticks'])
 def test_the_spread_moves_as_the_matrix_exponential_says(arm, sticks):
     n = arm.arm.stiffness.size
-    x, h, fastest = bent(arm, n), arm.substeps, process_model.FASTER * process_model.STEP_ANGLE / arm.substeps
+    x, fastest = bent(arm, n), process_model.STEP_ANGLE / arm.substeps
     linearize(arm, x)
     arm.F[0, n] -= sticks
     stiff = -np.trace(arm.F[:, n:])
-    h = min(h, process_model.STIFF_STEP / stiff)
+    h = min(arm.substeps, process_model.STIFF_STEP / stiff)
+    count = process_model.terms(max(fastest, stiff) * h, process_model.SPREAD_ERROR)
     rng = np.random.default_rng(3)
     scale = np.repeat([1.0, fastest, 1.0], [n, n, arm.kind.size])[:, None]
     arm.G[:] = rng.normal(size=arm.G.shape) * fastest ** 2
@@ -110,7 +111,7 @@ def test_the_spread_moves_as_the_matrix_exponential_says(arm, sticks):
     flow[:n, n:2 * n], flow[n:2 * n, :2 * n], flow[n:2 * n, 2 * n:] = np.eye(n), arm.F, arm.G
     S = scale * rng.normal(size=(x.size, x.size))
     moved = S.copy()
-    process_model.spread(arm.F, arm.G, arm.opened, moved, x.size, arm.scratch, h, fastest, stiff)
+    process_model.spread(arm.F, arm.G, arm.opened, moved, x.size, arm.scratch, h, count)
     exact = scipy.linalg.expm(h * flow) @ S
     assert np.abs((moved - exact) / scale).max() < process_model.SPREAD_ERROR * np.abs(exact / scale).max()
 
