@@ -25,7 +25,7 @@ from flexmanip_ros.payload.block_extraction import masses
 from flexmanip_ros.payload.filter_state import FilterState, memory
 from flexmanip_ros.payload.interval import about_com
 from flexmanip_ros.payload.measurement_update import observe
-from flexmanip_ros.payload.process_model import Kind, predict, set_parameters
+from flexmanip_ros.payload.process_model import Kind, predict, set_parameters, spread_scratch
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.types import Array
 
@@ -125,7 +125,7 @@ def everything(
     model, m = _start(config, np.array(plant.initial_angles))
     n, size = model.motion.arm.stiffness.size, m.x.size
     body, caught = slice(model.payload, model.payload + model.body), free_object(plant)
-    model = model._replace(motion=model.motion._replace(scratch=np.zeros(3 * n * (size + 3))))
+    model = model._replace(motion=model.motion._replace(scratch=spread_scratch(n, size - 2 * n, size + 3)))
     x, w = m.x, np.array([*caught.velocity, caught.spin])
     # rows of S: the state; rows of V: velocity and spin of the object, unknown too; columns: independent unknowns
     S, V = np.zeros((size, size + 3)), np.zeros((3, size + 3))

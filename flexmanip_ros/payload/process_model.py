@@ -156,7 +156,7 @@ class ProcessModel(NamedTuple):
     Y: Array
     """(n, n) scratch."""
     scratch: Array
-    """(3 n c,) for square roots of at most c columns."""
+    """See ``spread_scratch``."""
 
 
 @inlined
@@ -622,30 +622,37 @@ def spread(
 ) -> None:
     """S <- F S in its first ``used`` columns, F the Taylor series of the linearised flow over h, ``count`` terms.
 
-    flow: (n, 2 n) derivatives of the accelerations by q and q'; scratch: (3 n used,). The k-th derivative of q is the
-    one of q' before it, so each term is one product.
+    By Horner's rule, each term one product with the derivatives of the accelerations: flow (n, 2 n) by q and q', and G
+    by the entries of p in ``opened``, which stay. scratch: see ``spread_scratch``.
     """
-    n = flow.shape[0]
-    now = scratch[:2 * n * used].reshape((2 * n, used))
-    rates = scratch[2 * n * used:3 * n * used].reshape((n, used))
-    for r in range(2 * n):
+    n, known = flow.shape[0], 2 * flow.shape[0]
+    wide = known + opened[0]
+    matrix = scratch[:n * wide].reshape((n, wide))
+    now = scratch[n * wide:n * wide + wide * used].reshape((wide, used))
+    rates = scratch[(n + used) * wide:(n + used) * wide + n * used].reshape((n, used))
+    for r in range(n):
+        for j in range(known):
+            matrix[r, j] = flow[r, j]
+        for p in range(opened[0]):
+            matrix[r, known + p] = G[r, p]
+    for r in range(wide):
+        row = S[r] if r < known else S[known + opened[1 + r - known]]
         for c in range(used):
-            now[r, c] = S[r, c]
-    weight = 1.0
-    for order in range(1, count + 1):
-        multiply(flow, now, rates)
-        if order == 1:
-            for r in range(n):
-                for p in range(opened[0]):
-                    g, row = G[r, p], S[2 * n + opened[1 + p]]
-                    for c in range(used):
-                        rates[r, c] += g * row[c]
-        weight *= h / order
+            now[r, c] = row[c]
+    for order in range(count, 0, -1):
+        multiply(matrix, now, rates)
+        weight = h / order
         for r in range(n):
-            place, rate, following, last = S[r], S[n + r], rates[r], now[n + r]
+            place, rate, moved, moving, following = S[r], S[n + r], now[r], now[n + r], rates[r]
             for c in range(used):
-                place[c] += weight * last[c]
-                rate[c] += weight * following[c]
-            for c in range(used):
-                now[r, c] = last[c]
-                last[c] = following[c]
+                moved[c] = place[c] + weight * moving[c]
+                moving[c] = rate[c] + weight * following[c]
+    for r in range(known):
+        for c in range(used):
+            S[r, c] = now[r, c]
+
+
+def spread_scratch(n: int, size: int, columns: int) -> Array:
+    """Allocate for n coordinates, ``size`` entries of p, and square roots of at most so many columns."""
+    wide = 2 * n + size
+    return np.zeros(n * wide + (wide + n) * columns)

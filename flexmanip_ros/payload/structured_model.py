@@ -18,7 +18,14 @@ from flexmanip_ros.numerics.square_root import allocate_bounds
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.measurement_update import MeasurementModel
-from flexmanip_ros.payload.process_model import STEP_ANGLE, Kind, ProcessModel, predict, set_parameters
+from flexmanip_ros.payload.process_model import (
+    STEP_ANGLE,
+    Kind,
+    ProcessModel,
+    predict,
+    set_parameters,
+    spread_scratch,
+)
 from flexmanip_ros.types import Array
 
 
@@ -222,7 +229,7 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         effort=np.zeros(links), gain=np.ones(links), late=np.zeros((links, 2)), slope=np.zeros((links, 2)),
         opened=np.array([size, *range(size)]), bounds=allocate_bounds(size, nx), p=np.zeros(size), a=np.zeros(n),
         k=np.zeros((19, n)), dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)), G=np.zeros((n, size)),
-        F=np.zeros((n, 2 * n)), X=np.zeros((2 * n, 2 * n)), Y=np.zeros((n, n)), scratch=np.zeros(3 * n * nx))
+        F=np.zeros((n, 2 * n)), X=np.zeros((2 * n, 2 * n)), Y=np.zeros((n, n)), scratch=spread_scratch(n, size, nx))
 
 
 def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Array) -> MeasurementModel:
