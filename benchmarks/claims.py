@@ -378,8 +378,12 @@ def plant_speed(rows: list[dict[str, Any]]) -> Claims:
 
 
 def replay_speed(result: dict[str, Any]) -> Claims:
-    """A replay takes at most 4 times what rosbags needs to read the recording; memory is constant."""
-    yield Claim('identify_bag over reading and deserializing by rosbags', result['ratio'], high=4.0)
+    """A replay takes at most 5 times what rosbags needs to read the recording; memory is constant.
+
+    4 times was the target before the payload learned the arm and models had every configuration, 5 is that with both.
+    """
+    yield Claim('identify_bag over reading and deserializing by rosbags', result['ratio'], high=5.0)
+    yield Claim('the same with a table of every estimate', result['ratio_table'], high=5.0)
     yield Claim('peak memory of four times the recording', result['memory_ratio'], high=1.1)
     yield Claim('identify_bag --help', result['help_s'], high=0.25, unit='s')
     yield Claim('import of identify_bag', result['import_s'], high=0.4, unit='s')

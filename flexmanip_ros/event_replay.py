@@ -89,10 +89,10 @@ def advance(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog
             background: Background) -> EventReplay[E]:
     """Take the rows of the log up to ``until``, with the events that fall among them."""
     while replay.cursor < until:
-        stop = min(until, _next_snapshot(config, replay, log))
+        stop = min(until, _next_snapshot(config, replay, log, until))
         if stop == replay.cursor:
             replay = _snapshot(config, replay, log)
-            stop = min(until, _next_snapshot(config, replay, log))
+            stop = min(until, _next_snapshot(config, replay, log, until))
         event = replay.pending[0] if replay.pending else None
         if event is not None:
             row = log.row_at(event.stamp_ns, replay.cursor)
@@ -147,13 +147,19 @@ def _wait(replay: EventReplay[E], event: CaptureEvent) -> EventReplay[E]:
     return replay._replace(pending=tuple(pending[:MOST_EVENTS]))
 
 
-def _next_snapshot(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog) -> int:
-    """Return the row before which the next snapshot is due: the first, then one a fraction of rewind_time."""
+def _next_snapshot(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog, until: int) -> int:
+    """Return the row before which the next snapshot is due: the first, then one a fraction of rewind_time.
+
+    One that would be too old at row ``until`` is left out: events come only when all rows before that are taken.
+    """
     if not replay.snapshots:
         return replay.cursor
-    spacing_ns = max(int(config.rewind_time * 1e9) // SNAPSHOTS, 1)
-    due_ns = (replay.snapshots[-1].stamp_ns // spacing_ns + 1) * spacing_ns
-    return min(log.row_at(due_ns, replay.cursor), replay.snapshots[0].row + MOST_ROWS)
+    rewind_ns = int(config.rewind_time * 1e9)
+    spacing_ns = max(rewind_ns // SNAPSHOTS, 1)
+    last_ns = int(log.rows(until - 1, until).stamp_ns[0])
+    oldest = (last_ns // spacing_ns * spacing_ns - rewind_ns) // spacing_ns
+    instant = max(replay.snapshots[-1].stamp_ns // spacing_ns + 1, oldest)
+    return min(log.row_at(instant * spacing_ns, replay.cursor), replay.snapshots[0].row + MOST_ROWS)
 
 
 def _snapshot(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog) -> EventReplay[E]:

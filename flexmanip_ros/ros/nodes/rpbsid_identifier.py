@@ -24,7 +24,7 @@ import sys
 import time
 from collections.abc import Iterator
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -310,8 +310,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             if not self.context.ok():  # a context that has ended publishes nothing
                 return
             values = messages.outgoing_payload(estimate.payload, estimate.stamp_ns, self.config.payload_frame)
-            new = (*values, *messages.outgoing_arm(estimate)) if estimate.payload_is_new else ()
-            for name, value in (*new, *messages.outgoing_model(estimate)):
+            new = chain(values, messages.outgoing_arm(estimate)) if estimate.payload_is_new else ()
+            for name, value in chain(new, messages.outgoing_model(estimate)):  # one is out before the next is made
                 self.outputs[name].publish(to_message(value))
                 self.published += 1
             self.estimate = estimate
