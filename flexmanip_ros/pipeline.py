@@ -38,8 +38,8 @@ HOPELESS = 2000
 REPLAY_GROUP = 2000
 """Rows that a replay takes at once at least: what Python adds to a row is then below a microsecond."""
 ABSORB_GROUP = 16_000
-"""The same where no estimate is made on the way: both estimators take some tenths of a second for them, so that the fits
-of one, which take up to 0.1 s each, seldom leave the other waiting."""
+"""The same where no estimate is made on the way: both estimators take some tenths of a second for them, so that fits,
+which take up to 0.1 s each, seldom leave the other one waiting."""
 EARLY_STAMP = 0.1
 """Share of the sample time by which the sample that an estimate is due with may seem to come before its instant.
 
