@@ -16,7 +16,7 @@ from flexmanip_ros.cli.console import Report, require_matplotlib
 from flexmanip_ros.errors import BagError, FlexmanipError, MissingSignalError, ModelError, ParameterError, SignalError
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.outputs import TableOutput, check_place, open_output, write_rows, write_text
-from flexmanip_ros.numerics.background import Threads, read_ahead
+from flexmanip_ros.numerics.background import REPLAY_THREADS, Threads, read_ahead
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import yaml_text
 from flexmanip_ros.payload import capture_detection
@@ -97,7 +97,8 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     kept: list[Estimate] = []
     state, interrupted = pipeline.init(), False
     output = None if request.output is None else open_output(request.output, request.config.payload_frame)
-    with output or nullcontext(), closing(Threads()) as background, closing(read_ahead(messages)) as items:
+    with (output or nullcontext(), closing(Threads(REPLAY_THREADS)) as background,
+          closing(read_ahead(messages)) as items):
         try:
             if output is None and request.report is None:  # the end alone is asked for
                 for now in pipeline.absorb(request.config, items, background):

@@ -42,9 +42,10 @@ class Inline:
 
 INLINE = Inline()
 
-THREADS = 3
-"""One for a fit, which takes up to a second, one for the models that are read meanwhile, each in 1 to 3 ms, and one for
-the payload of a replay."""
+THREADS = 2
+"""One for a fit, which takes up to a second, and one for the models that are read meanwhile, each in 1 to 3 ms."""
+REPLAY_THREADS = 3
+"""One more, for the payload."""
 KEPT = 8
 """Requests kept with their results. A late event rewinds 0.2 s, and the results of that time are wanted again: at most
 a fit and, where every estimate has a model of its own, those of the last few estimates."""
@@ -53,19 +54,22 @@ a fit and, where every estimate has a model of its own, those of the last few es
 class Threads:
     """Solves requests beside the samples, with the bits of ``INLINE``. A node or a program has it, not the core."""
 
-    def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(THREADS, 'background')
+    def __init__(self, threads: int = THREADS) -> None:
+        self._pool = ThreadPoolExecutor(threads, 'background')
         self._solved: dict[Request, Future[Any]] = {}
         self._closed = False
 
     def start(self, request: Request) -> None:
-        """Begin to solve a request; the oldest one solved is dropped beyond ``KEPT``. After ``close`` do nothing."""
+        """Begin to solve a request; the oldest one beyond ``KEPT`` that is not being solved is dropped.
+
+        After ``close`` do nothing.
+        """
         if self._closed:
             return
         self._solved[request] = self._pool.submit(request.solve)
         if len(self._solved) > KEPT:
-            for known in [known for known, future in self._solved.items() if future.done()][:1]:
-                del self._solved[known]
+            oldest = (known for known, future in self._solved.items() if future.done() or future.cancel())
+            self._solved.pop(next(oldest))
 
     def result(self, request: Request) -> Any:
         """Return the result of a request: wait for the thread that solves it, or solve it here if none does yet."""
