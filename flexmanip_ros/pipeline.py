@@ -56,7 +56,7 @@ class PendingModel(NamedTuple):
 
     request: estimator.ModelRequest
     payload: Payload | None
-    """The payload at that row."""
+    """The payload at that row; None where it rests on the model, and until it is estimated."""
     since_ns: int
     """Stamp of the last event before it [ns]."""
     instant: int
@@ -422,7 +422,7 @@ class ModelStep(NamedTuple):
 
     stamp_ns: int
     taken: list[Estimate]
-    """The model that was under way, with its payload."""
+    """The model that was under way, if there was one. One asked for at a row before it has no payload yet."""
     last: ModelEstimate | None
     """The last model."""
     asked: bool
