@@ -76,23 +76,35 @@ def _compiled(function: Function, **more: Any) -> Function:
 
 
 COMPILED = re.compile(r'^@(kernel|inlined|inner|merged|library)$', re.MULTILINE)
+IMPORT = re.compile(r'^ *from ([\w.]+) import (\([^)]*\)|.*)$', re.MULTILINE)
+CONSTANT = re.compile(r'\b[A-Z][A-Z_]+\b')
 
 
 def drop_stale(package: Path) -> int:
     """Delete compiled functions older than the newest source of any; return how many.
 
-    numba looks at the file of a function alone, not at those of the functions it calls: after an update one kernel in
-    two would be the old one, and numbers wrong. Raises OSError where the folder is read-only.
+    numba looks at the file of a function alone, not at those of the functions it calls or of the constants it reads:
+    after an update one kernel in two would be the old one, and numbers wrong. Raises OSError where the folder is
+    read-only.
     """
     compiled = {path: path.stat().st_mtime_ns for path in package.rglob('__pycache__/*.nb[ic]')}
     oldest = min(compiled.values(), default=0)
-    sources = ((path, path.stat().st_mtime_ns) for path in package.rglob('*.py'))
-    newest = max((age for path, age in sources if compiled and age > oldest  # most imports read no file
-                  and COMPILED.search(path.read_text(encoding='utf-8'))), default=0)
+    changed = {path: age for path in package.rglob('*.py') if compiled and (age := path.stat().st_mtime_ns) > oldest}
+    # most imports read no file
+    newest = max((changed[path] for path in _sources(package) & changed.keys()), default=0) if changed else 0
     stale = [path for path, age in compiled.items() if age < newest]
     for path in stale:
         path.unlink(missing_ok=True)
     return len(stale)
+
+
+def _sources(package: Path) -> set[Path]:
+    """Return the files of compiled functions, and those of which they import constants."""
+    texts = {path: path.read_text(encoding='utf-8') for path in package.rglob('*.py')}
+    found = {path: text for path, text in texts.items() if COMPILED.search(text)}
+    imported = (module for text in found.values() for module, names in IMPORT.findall(text) if CONSTANT.search(names))
+    modules = {package.parent / f'{module.replace(".", "/")}.py' for module in imported}
+    return found.keys() | (modules & texts.keys())
 
 
 with contextlib.suppress(OSError):  # numba keeps those of a read-only folder elsewhere

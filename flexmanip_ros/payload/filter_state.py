@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flexmanip_ros.types import Array
 
-HORIZON = 1024
+HORIZON = 4096
 """Samples after an event that the moving-horizon estimation reads again, at most."""
 ENOUGH = 512
 """It ends with so many once it has converged."""

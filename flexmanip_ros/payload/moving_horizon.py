@@ -49,7 +49,16 @@ from flexmanip_ros.payload.filter_state import (
     WHITE,
 )
 from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, misfit, observe
-from flexmanip_ros.payload.process_model import INERTIA, correction, gather_bounds, keep_inertia, predict
+from flexmanip_ros.payload.process_model import (
+    INERTIA,
+    MODE,
+    STEP_ANGLE,
+    STIFFNESS,
+    correction,
+    gather_bounds,
+    keep_inertia,
+    predict,
+)
 from flexmanip_ros.types import Array
 
 if TYPE_CHECKING:
@@ -63,8 +72,13 @@ FIRST_ITERATION = 8
 
 ROWS = 8
 """Rows that are read again for each new sample."""
-CLOSING = 16
-"""Times that all rows of the horizon are read again at most when it closes: a fit of an empty arm takes up to ten."""
+CLOSING = 16_384
+"""Rows that are read again at most when the horizon closes: a fit of an empty arm takes up to ten times all of them."""
+LATEST = 1024
+"""Samples by which a fit has come to rest, if it will: the horizon closes with so many otherwise."""
+LINEAR = 0.25
+"""Deviation of a phase [rad] up to which the motion is linear in it: its sine is, to 1 %. Beyond, the filter that goes
+on from the fit is too sure, and may follow a vibration by the wrong turn."""
 WORK = 4
 """Integration steps for each row that is read again, in the mean, over those of an arm without friction: a joint that
 sticks takes three, a wrong arm's hundreds."""
@@ -92,7 +106,7 @@ MOST_REFITS = 4
 """How often a fit is begun again after an event: an arm that is another one never fits."""
 STRAY, STRAY_EVERY = 3.0, 500
 """Power over white noise of every sensor with which the filter is begun again; samples between two looks."""
-FINEST = 3
+FINEST = 2
 """Of the steps, see ``process_model.predict``."""
 COARSER = 0.1
 """Correction, over what is allowed, below which a coarser step is tried."""
@@ -214,9 +228,36 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
         variance = dot(m.S[payload], m.S[payload])
         m.score[SHIFT] = abs(shift) / np.sqrt(max(variance, 1e-300))
         m.score[DOUBT] = np.sqrt(variance + shift * shift) / max(m.x[payload], 1e-300)
-        if m.counts[ITERATED] >= ENOUGH and gained < 0.5 * nx and m.score[SHIFT] < AT_REST:
+        if (m.counts[ITERATED] >= ENOUGH and gained < 0.5 * nx and m.score[SHIFT] < AT_REST
+                and phase_std(motion, m, sensors.period * m.counts[ITERATED]) < LINEAR):
             m.counts[STORED] = HORIZON
     return True
+
+
+@inner
+def phase_std(motion: ProcessModel, m: FilterState, duration: float) -> float:
+    """Standard deviation [rad] of the angle by which the fastest mode turns in a time [s], as far as stiffness tells.
+
+    An angle w T, w^2 in proportion to the stiffness, is uncertain by w T / 2 times the deviation of its logarithm, the
+    mass given: what both may be, for the same frequency, does not count. What is damped is forgotten after an angle of
+    one over the damping ratio.
+    """
+    first, links, k = m.x.size - motion.kind.size, motion.arm.length.size, motion.arm.kappa
+    square, ratio = 0.0, np.inf
+    for c in range(motion.kind.size):
+        if motion.kind[c] == STIFFNESS or motion.kind[c] == MODE:
+            told = dot(m.S[first + c], m.S[first]) ** 2 / max(dot(m.S[first], m.S[first]), 1e-300)
+            square = max(square, dot(m.S[first + c], m.S[first + c]) - told)
+    for i in range(links):
+        ratio = min(ratio, motion.arm.damping[links + i * k] / motion.damping[links + i * k])
+    angle: float = min(STEP_ANGLE / motion.substeps * duration, 1.0 / max(ratio, 1e-9))
+    return 0.5 * angle * np.sqrt(square)
+
+
+@inner
+def at_rest(m: FilterState) -> bool:
+    """Whether the last iteration that caught up with the filter hardly moved the payload."""
+    return bool(m.counts[BEFORE] >= ENOUGH and m.score[SHIFT] < AT_REST and m.counts[AGAIN] == 0)
 
 
 @inner
@@ -289,10 +330,17 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
     m.counts[STORED] = stored + 1
     if stored + 1 < FIRST_ITERATION:
         return True
-    last = stored + 1 == HORIZON
-    rows = CLOSING * HORIZON if last else ROWS
+    rests, last = at_rest(m), stored + 1 == HORIZON
+    if stored + 1 >= LATEST:
+        last |= not rests or phase_std(motion, m, sensors.period * m.counts[STORED]) < LINEAR
+    if last and rests:  # the filter goes on from there
+        m.counts[STORED] = HORIZON
+        return True
+    rows = CLOSING if last else ROWS
     work = WORK * rows * max(sensors.period / motion.substeps, 1.0)
     for _ in range(rows):
+        if m.counts[STORED] == HORIZON > stored + 1:  # it has closed
+            return True
         if work <= 0.0:
             break
         if m.counts[ITERATING] == 0:
@@ -322,7 +370,9 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
             for i in range(m.x.size):
                 for c in range(m.x.size):
                     m.S[i, c] *= wider
-        return not fails(m)
+        failed = fails(m)
+        m.counts[STORED] = HORIZON
+        return not failed
     return True
 
 
@@ -372,9 +422,9 @@ def strays(sensors: MeasurementModel, m: FilterState) -> bool:
 
 
 @inner
-def control_step(motion: ProcessModel, m: FilterState, duration: float) -> None:
+def control_step(motion: ProcessModel, m: FilterState) -> None:
     """Make the step finer where its correction is too large, coarser where it has long been small enough."""
-    size = correction(motion, duration, m.counts[FINENESS])
+    size = correction(motion)
     m.counts[CALM] += 1
     if size > 1.0 and m.counts[FINENESS] < FINEST:
         m.counts[FINENESS] += 1
@@ -431,7 +481,7 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     rows = table[k + 1 - sensors.reach:k + 1]
     if not predict(motion, m.x, m.S, m.counts[USED], rows, sensors.period, duration, m.counts[FINENESS]):
         return False
-    control_step(motion, m, duration)
+    control_step(motion, m)
     came = y[0] == y[0]
     if came:
         measure(sensors, m, y, motion.k[0])

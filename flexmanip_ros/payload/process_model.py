@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, acceleration, balance
+from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, acceleration, balance, solve
 from flexmanip_ros.arm.jacobian import add_body_forces, complete_jacobian, force_jacobian, solve_columns
 from flexmanip_ros.arm.late_torque import late_torque
 from flexmanip_ros.numerics.compiled import inlined, inner, kernel, merged
@@ -31,15 +31,14 @@ STEP_ANGLE = 2.0
 MOTION_ERROR = 1e-8
 """Share of the fastest mode that the motion's exponential leaves out in a step."""
 MISS_ERROR = 1e-4
-"""Of what it misses there, a thousandth of the motion or less."""
+"""Of what the linearization misses there, a thousandth of the motion or less."""
 SPREAD_ERROR = 1e-4
 """Of the spread's: it weighs, and need not be exact."""
-STEP_ERRORS = 1e-7, 1e-6
-"""Correction of a step of fourth and of fifth order, positions and rates times the sample time, over the length of
-link 1, beyond which the following ones are finer: a sample is then off by 4e-9. Steps that change from sample to
-sample let the energy of a vibration drift."""
-LATER = 0.9
-"""Where in a step of fifth order the motion is looked at a second time."""
+MIDPOINT_TERMS = 4
+"""Terms of what foretells the middle of a step: the next is 1e-3 of what turns by 0.7 rad until then."""
+STEP_ERROR = 1e-8
+"""Correction of a step, see ``correction``, over the length of link 1, beyond which the following ones are finer: a
+sample is then off by 3e-9. Steps that change from sample to sample let the energy of a vibration drift."""
 MOST_TERMS = 30
 """Terms of an exponential at most: more than ``STEP_ANGLE`` needs."""
 STIFF_STEP = 2.0
@@ -143,6 +142,8 @@ class ProcessModel(NamedTuple):
     """(np,) scratch."""
     a: Array
     k: Array
+    missed: Array
+    """(1,) see ``correction``."""
     dq: Array
     dqd: Array
     dp: Array
@@ -310,35 +311,35 @@ def linearize(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
 
 
 @inner
-def within_step(motion: ProcessModel, x: Array, h: float) -> None:
+def within_step(motion: ProcessModel, h: float) -> None:
     """Fill rows 4 to 6 of motion.k with q, q' and q'' at which ``parameter_columns`` is constant over a step h.
 
     A parameter acts through what vibrates: a stiffness through the bend, which turns by a radian within a sample. Of a
     motion exp(F t) the derivative by a parameter that commutes with F is h F_p exp(h F), and h phi_1(h F) G if G is
-    held. So G is taken at z with phi_1(h F) z = exp(h F) z(0): z = z(0) + h / 2 z'(0) + h^2 / 12 z''(0) + ..., the
-    series of Bernoulli's numbers. The next term, (h F)^4 / 720, is 0.5 % of what turns by 1.4 rad.
+    held. So G is taken at z with phi_1(h F) z = exp(h F / 2) z(h / 2): z = z(h / 2) - h^2 / 24 z''(h / 2) + ... The
+    next term, 7 (h F)^4 / 5760, is 0.5 % of what turns by 1.4 rad.
     """
     n = motion.arm.stiffness.size
-    qdd, held, jerk = motion.k[0], motion.k[4:7], motion.k[7]
-    first, second = 0.5 * h, h * h / 12.0
+    qdd, held, jerk, q, qd = motion.k[8], motion.k[4:7], motion.k[7], motion.k[16], motion.k[17]
+    second = -h * h / 24.0
     for r in range(n):
         jerk[r] = 0.0
         for j in range(n):
-            jerk[r] += motion.F[r, j] * x[n + j] + motion.F[r, n + j] * qdd[j]
+            jerk[r] += motion.F[r, j] * qd[j] + motion.F[r, n + j] * qdd[j]
     for r in range(n):
         snap = 0.0
         for j in range(n):
             snap += motion.F[r, j] * qdd[j] + motion.F[r, n + j] * jerk[j]
-        held[0, r] = x[r] + first * x[n + r] + second * qdd[r]
-        held[1, r] = x[n + r] + first * qdd[r] + second * jerk[r]
-        held[2, r] = qdd[r] + first * jerk[r] + second * snap
+        held[0, r] = q[r] + second * qdd[r]
+        held[1, r] = qd[r] + second * jerk[r]
+        held[2, r] = qdd[r] + second * snap
 
 
 @inner
-def parameter_columns(motion: ProcessModel, x: Array, h: float) -> None:
+def parameter_columns(motion: ProcessModel, h: float) -> None:
     """Fill motion.G with the derivative of the accelerations by what is not known of p, held over a step h.
 
-    Right after ``linearize`` at x. Friction of Coulomb is taken where the step begins.
+    Right after ``linearize`` at the midpoint. Friction of Coulomb is taken there.
     """
     n = motion.arm.stiffness.size
     arm, dp, net = motion.arm, motion.dp, motion.work.net
@@ -346,17 +347,17 @@ def parameter_columns(motion: ProcessModel, x: Array, h: float) -> None:
     G, opened = motion.G, motion.opened[0]
     if opened == 0:
         return
-    within_step(motion, x, h)
-    held, later = motion.k[4:7], motion.k[7]
+    within_step(motion, h)
+    held, later, q = motion.k[4:7], motion.k[7], motion.k[16]
     for r in range(n):
-        later[r] = held[2, r] - motion.k[0, r]
+        later[r] = held[2, r] - motion.k[8, r]
     if motion.frozen:
         for r in range(n):
             for p in range(4):
                 for c in range(n):
                     dp[r, p] += motion.Mp[p, r, c] * later[c]
     else:
-        add_body_forces(arm, x[:n], later, dp, motion.work)
+        add_body_forces(arm, q, later, dp, motion.work)
     # G first holds the derivative of M qdd + E + D qd + dV/dq - B tau
     for c in range(opened):
         kind, i = motion.kind[motion.opened[1 + c]], motion.link[motion.opened[1 + c]]
@@ -368,7 +369,7 @@ def parameter_columns(motion: ProcessModel, x: Array, h: float) -> None:
                 G[r, c] = dp[r, kind]
         elif kind == STIFFNESS:
             for j in range(k):
-                G[o + j, c] = motion.work.elastic[o + j] + arm.stiffness[o + j] * (held[0, o + j] - x[o + j])
+                G[o + j, c] = motion.work.elastic[o + j] + arm.stiffness[o + j] * (held[0, o + j] - q[o + j])
         elif kind == DAMPING:
             for j in range(k):
                 G[o + j, c] = motion.damping[o + j] * held[1, o + j]
@@ -402,17 +403,30 @@ def parameter_columns(motion: ProcessModel, x: Array, h: float) -> None:
 
 
 @inner
-def slower(motion: ProcessModel, duration: float) -> float:
-    """Return 1, or 0.5 where Coulomb friction may change its sign within a time [s]: it bends the motion."""
-    arm, qdd = motion.arm, motion.k[0]
+def friction_step(motion: ProcessModel, duration: float) -> float:
+    """Return the longest step [s] if Coulomb friction may change its sign within a time [s]: it bends the motion.
+
+    Right after ``accelerate``, to motion.k[0]. Infinite: it will not. A joint that sticks is a stiff damper, of which
+    the rate is the slope of its friction times b' M^-1 b, b its column of B.
+    """
+    arm, work, qdd, column = motion.arm, motion.work, motion.k[0], motion.k[9]
+    step: float = np.inf
     for i in range(arm.length.size):
-        if arm.coulomb[i] != 0.0:
-            change = 0.0
-            for r in range(qdd.size):
-                change += arm.joint[i, r] * qdd[r]
-            if abs(motion.work.net[1, i]) < 3.0 * STICTION_RATE + duration * abs(change):
-                return 0.5
-    return 1.0
+        if arm.coulomb[i] == 0.0:
+            continue
+        change = 0.0
+        for r in range(qdd.size):
+            change += arm.joint[i, r] * qdd[r]
+        if abs(work.net[1, i]) >= 3.0 * STICTION_RATE + duration * abs(change):
+            continue
+        for r in range(qdd.size):
+            column[r] = work.B[r, i]
+        solve(work.M, column)
+        mobility = 0.0
+        for r in range(qdd.size):
+            mobility += work.B[r, i] * column[r]
+        step = min(step, 0.5 * motion.substeps, STIFF_STEP / max(work.net[2, i] * mobility, 1e-9))
+    return step
 
 
 @inner
@@ -446,8 +460,8 @@ def predict(
 
     used: number of columns of S, the first ones, that are not zero; rows: (P, >= 1 + L) columns 1 to L of the last one
     are the efforts held meanwhile [N m], those before it are what the torque depends on too; period: their sample time
-    [s]; fineness: 0 steps of fourth order, 1 of fifth, 2 half as long, 3 a quarter. A time of zero only linearizes at
-    x: motion.k[0] and F.
+    [s]; fineness: how often steps are halved. motion.k[0] is then the acceleration at the end. A time of zero only
+    linearizes at x: motion.k[0] and F.
     """
     n, taken = motion.arm.stiffness.size, 0
     set_parameters(motion, x)
@@ -457,163 +471,163 @@ def predict(
         motion.effort[i] = motion.gain[i] * late_torque(rows, 1 + i, late[0], late[1], period, slope)
         slope[0] *= motion.gain[i]
         slope[1] *= motion.gain[i]
-    left, fine = duration, 0.5 ** max(fineness - 1, 0)
-    done, steps, h, turn, pace = 0.0, 1.0, 0.0, 0.0, 1.0
+    motion.missed[0] = 0.0
+    left, stiff = duration, 0.0
     while True:
-        if not linearize(motion, x[:n], x[n:2 * n], motion.k[0]):
+        if not accelerate(motion, x[:n], x[n:2 * n], motion.k[0]):
             return 0
-        if left <= 0.0:
+        friction = friction_step(motion, left)
+        longest = min(motion.substeps, friction) * 0.5 ** fineness
+        steps = max(np.ceil(left / min(longest, STIFF_STEP / max(stiff, 1e-9)) - 1e-9), 1.0)
+        if not (steps < MOST_STEPS and stiff * motion.substeps < STIFFEST * STIFF_STEP):
+            return 0
+        h = left / steps
+        midpoint(motion, x, 0.5 * h)
+        if not linearize(motion, motion.k[16], motion.k[17], motion.k[8]):
+            return 0
+        if duration <= 0.0:
             return 1
-        if done == 0.0:
-            stiff = 0.0
-            for r in range(n):
-                stiff -= motion.F[r, n + r]
-            pace = slower(motion, left)
-            longest = min(motion.substeps * pace, STIFF_STEP / max(stiff, 1e-9))
-            steps = np.ceil(left / longest - 1e-9)
-            if not (steps < MOST_STEPS and stiff * motion.substeps < STIFFEST * STIFF_STEP):
-                return 0
-            h = left / max(steps, 1.0)
-            turn = max(STEP_ANGLE / motion.substeps, stiff)
-            parameter_columns(motion, x, h)
-            if used > 0:  # it weighs: the begin's linearization will do
-                spread(motion.F, motion.G, motion.opened, S, used, motion.scratch, h, terms(turn * h, SPREAD_ERROR))
-        fifth = fineness > 0 and pace == 1.0
-        if not exponential_step(motion, x, h * fine, turn * h * fine, fifth):
+        stiff = 0.0
+        for r in range(n):
+            stiff -= motion.F[r, n + r]
+        if stiff * h > 1.1 * STIFF_STEP:
+            continue
+        turn = max(STEP_ANGLE / motion.substeps, stiff) * h
+        if used > 0:
+            parameter_columns(motion, h)
+            spread(motion.F, motion.G, motion.opened, S, used, motion.scratch, h, terms(turn, SPREAD_ERROR))
+        if not exponential_step(motion, x, h, turn, friction == np.inf):
             return 0
         taken += 1
-        done += fine
-        if done >= 1.0:
-            done = 0.0
-            left = left - h if steps > 1.0 else 0.0
-            if left <= 0.0:
-                return taken
+        if steps <= 1.0:
+            return taken
+        left -= h
 
 
 @inner
-def correction(motion: ProcessModel, duration: float, fineness: int) -> float:
-    """What the linearization missed in the last step, over ``STEP_ERRORS``; duration: of a sample [s].
+def midpoint(motion: ProcessModel, x: Array, half: float) -> None:
+    """Foretell q and q' in the middle of a step, rows 16 and 17 of motion.k; right after ``accelerate`` at x.
 
-    Where Coulomb friction may change its sign it is 0: a shorter step does not straighten that bend of the motion.
+    An exponential Euler step of which the linear part is stiffness, damping and friction: what vibrates fast turns by
+    half a radian in half a sample. Where the middle is missed, the flow is not symmetric in time, and the spread of a
+    vibration grows or shrinks over seconds.
     """
-    largest = 0.0
-    if not motion.frozen and slower(motion, duration) == 1.0:
-        for i in range(motion.k.shape[1]):
-            largest = max(largest, abs(motion.k[1, i]), duration * abs(motion.k[2, i]))
-    allowed: float = STEP_ERRORS[min(fineness, 1)] * motion.arm.length[0]
-    return largest / allowed
+    n, arm, work = motion.arm.stiffness.size, motion.arm, motion.work
+    qdd, place, rate, q, qd = motion.k[0], motion.k[9], motion.k[10], motion.k[16], motion.k[17]
+    for r in range(n):
+        place[r], rate[r] = half * x[n + r], half * qdd[r]
+        q[r], qd[r] = x[r] + place[r], x[n + r] + rate[r]
+    force = motion.k[11]
+    for order in range(2, MIDPOINT_TERMS + 1):
+        for r in range(n):
+            force[r] = -arm.stiffness[r] * place[r] - arm.damping[r] * rate[r]
+        for i in range(arm.length.size):
+            if work.net[2, i] != 0.0:
+                turned = 0.0
+                for r in range(n):
+                    turned += work.B[r, i] * rate[r]
+                for r in range(n):
+                    force[r] -= work.net[2, i] * turned * work.B[r, i]
+        solve(work.M, force)
+        for r in range(n):
+            place[r] = half / order * rate[r]
+            rate[r] = half / order * force[r]
+            q[r] += place[r]
+            qd[r] += rate[r]
 
 
 @merged
-def exponential_step(motion: ProcessModel, x: Array, h: float, turn: float, fifth: bool) -> bool:
-    """Advance x by h, exactly where the motion is linear; right after ``linearize`` at x.
+def exponential_step(motion: ProcessModel, x: Array, h: float, turn: float, smooth: bool) -> bool:
+    """Advance x by h, exactly where the motion is linear; right after ``linearize`` at its midpoint.
 
-    turn: of the fastest mode in the step [rad]; fifth: order of the step, else fourth. Not where Coulomb friction may
-    change its sign: the weights of D are larger in the fifth order, and multiply what no polynomial follows.
+    turn: of the fastest mode in the step [rad]; smooth: no friction changes its sign in it.
 
-    Exponential Rosenbrock methods: X = x + c h phi_1(c h F) f(x), and D is what f(X) - f(x) misses of F (X - x). Of
-    fourth order with c = 3/4 (exprb42, Luan, Applied Numerical Mathematics 112, 2017), of fifth with two X (exprb53s3,
-    Luan and Ostermann, Journal of Computational and Applied Mathematics 255, 2014). The vibration turns too far in one
-    sample for a step of Runge and Kutta: their damping of the fastest mode read as 0.3 % of the payload.
+    An exponential integrator (Hochbruck and Ostermann, Acta Numerica 19, 2010) about the midpoint: x' = g(x) + r, g the
+    linearization, r what it misses. r is of second order in the time from the midpoint, where it is zero as is its
+    derivative, so its values r0 and r1 at both ends give it as a cubic, with u the share of the step:
+    r = 4 (u - 1/2)^2 r0 + u (2 u - 1)^2 (r1 - r0), and the step is of fourth order. It is symmetric in time but for r1,
+    taken where the first term leads. The vibration turns too far in one sample for a step of Runge and Kutta: their
+    damping of the fastest mode read as 0.3 % of the payload.
     """
     n = motion.arm.stiffness.size
-    corrected, first, term, second = motion.k[1:3], motion.k[3], motion.k[4:6], motion.k[6]
-    sums, moved, later, whole = motion.k[7:13], motion.k[13:15], motion.k[15:17], motion.k[17:19]
-    c = 0.5 if fifth else 0.75
-    count, rough = terms(turn, MOTION_ERROR), terms(turn, MISS_ERROR)
+    qdd, middle, q, qd = motion.k[0], motion.k[8], motion.k[16], motion.k[17]
+    even, odd, place, rate, moved = motion.k[3], motion.k[15], motion.k[10], motion.k[11], motion.k[12:14]
     for i in range(n):
         for j in range(n):  # by columns, which ``series`` reads in a row
             motion.X[j, i], motion.Y[j, i] = motion.F[i, j], motion.F[i, n + j]
     for i in range(n):
-        term[0, i] = x[n + i]
-        term[1, i] = motion.k[0, i]
-    series(motion, h, 1, count, c)
-    for part in range(2):
-        for i in range(n):
-            moved[part, i] = c * h * sums[part, i]
-            later[part, i] = LATER * h * sums[2 + part, i]
-            whole[part, i] = h * sums[4 + part, i]
-    if not motion.frozen:
-        if not miss(motion, x, moved, first):
-            return False
-        for i in range(n):
-            term[0, i] = 0.0
-            term[1, i] = first[i] / 6.0
-        series(motion, h, 3, rough, c)
-        for part in range(2):
-            for i in range(n):
-                corrected[part, i] = 2.0 / (c * c) * h * sums[4 + part, i]
-                later[part, i] += h * (27.0 / 25.0 * sums[part, i] + 729.0 / 125.0 * sums[2 + part, i])
-        if fifth:
-            if not miss(motion, x, later, second):
-                return False
-            for i in range(n):  # phi_3(z) a + phi_4(z) b = a / 6 + phi_4(z) (z a + b)
-                whole[1, i] += h * (3.0 * first[i] - 125.0 / 243.0 * second[i])
-                term[0, i] = h * (18.0 * first[i] - 250.0 / 81.0 * second[i]) / 24.0
-                term[1, i] = (500.0 / 27.0 * second[i] - 60.0 * first[i]) / 24.0
-            for i in range(n):
-                for j in range(n):
-                    term[1, i] += motion.F[i, n + j] * term[0, j]
-            series(motion, h, 4, rough, c)
-        for part in range(2):
-            for i in range(n):
-                whole[part, i] += h * sums[4 + part, i] if fifth else corrected[part, i]
-    largest = 0.0
-    for part in range(2):
-        for i in range(n):
-            x[part * n + i] += whole[part, i]
-            largest += abs(x[part * n + i])
+        place[i] = x[n + i]
+        rate[i] = middle[i]
+        for j in range(n):
+            rate[i] += motion.F[i, j] * (x[j] - q[j]) + motion.F[i, n + j] * (x[n + j] - qd[j])
+        even[i] = qdd[i] - rate[i]
+        odd[i] = 0.0
+    series(motion, h, terms(turn, MOTION_ERROR))
+    end, ending = motion.k[18], motion.k[19]
+    for i in range(n):
+        end[i] = x[i] + moved[0, i]
+        ending[i] = x[n + i] + moved[1, i]
+    if not accelerate(motion, end, ending, qdd):
+        return False
+    for i in range(n):
+        missed = qdd[i] - middle[i]
+        for j in range(n):
+            missed -= motion.F[i, j] * (end[j] - q[j]) + motion.F[i, n + j] * (ending[j] - qd[j])
+        odd[i] = missed - even[i]
+    for i in range(n):
+        place[i], rate[i], even[i] = 0.0, 0.0, 0.0
+    series(motion, h, terms(turn, MISS_ERROR))
+    largest, correction = 0.0, 0.0
+    for i in range(n):
+        x[i] = end[i] + moved[0, i]
+        x[n + i] = ending[i] + moved[1, i]
+        largest += abs(x[i]) + abs(x[n + i])
+        correction = max(correction, abs(moved[0, i]), h * abs(moved[1, i]))
+    if smooth:  # a shorter step does not straighten the bend that Coulomb friction gives the motion
+        motion.missed[0] = max(motion.missed[0], correction)
     return largest < 1e6
 
 
-@merged
-def miss(motion: ProcessModel, x: Array, moved: Array, missed: Array) -> bool:
-    """Fill missed (n,) with what the linearization at x misses of the acceleration at x + moved (2, n)."""
-    n = missed.size
-    place = motion.k[7:9]
-    for part in range(2):
-        for i in range(n):
-            place[part, i] = x[part * n + i] + moved[part, i]
-    if not accelerate(motion, place[0], place[1], missed):
-        return False
+@inner
+def series(motion: ProcessModel, h: float, count: int) -> None:
+    """Fill rows 12 and 13 of motion.k with what a step h of x' = g + F x + r adds to x = 0, in ``count`` terms.
+
+    g stands in rows 10 and 11 (positions, rates), of r the factors of 4 (u - 1/2)^2 and u (2 u - 1)^2, u the share of
+    the step, in rows 3 and 15. u^k adds h k! phi_{k + 1}(h F), phi_l(z) the sum of z^j / (j + l)!. By Horner's rule;
+    the columns of motion.F are the rows of motion.X and Y.
+    """
+    n = motion.arm.stiffness.size
+    even, odd, place, rate, following = motion.k[3], motion.k[15], motion.k[10], motion.k[11], motion.k[14]
+    moved, moving = motion.k[12], motion.k[13]
+    weight = h
+    for j in range(1, count):
+        weight /= j + 1
     for i in range(n):
-        missed[i] -= motion.k[0, i]
-        for j in range(n):
-            missed[i] -= motion.F[i, j] * moved[0, j] + motion.F[i, n + j] * moved[1, j]
-    return True
+        moved[i], moving[i] = 0.0, 0.0
+    for j in range(count - 1, -1, -1):
+        for i in range(n):
+            following[i] = 0.0
+        if j < count - 1:
+            for c in range(n):
+                by_place, by_rate, at, going = motion.X[c], motion.Y[c], moved[c], moving[c]
+                for i in range(n):
+                    following[i] += by_place[i] * at + by_rate[i] * going
+        of_even = weight * (j * j + j + 2) / ((j + 2) * (j + 3))
+        of_odd = weight * (j * j - j + 4) / ((j + 2) * (j + 3) * (j + 4))
+        for i in range(n):
+            moved[i] = h * moving[i] + weight * place[i]
+            moving[i] = h * following[i] + weight * rate[i] + of_even * even[i] + of_odd * odd[i]
+        weight *= j + 1
 
 
 @inner
-def series(motion: ProcessModel, h: float, first: int, count: int, c: float) -> None:
-    """Fill rows 7 to 12 of motion.k with phi_first(z) v at z = c h F, LATER h F and h F, F the linearization.
+def correction(motion: ProcessModel) -> float:
+    """How far the unsymmetric part of what the linearization missed moved the last sample, over ``STEP_ERROR``.
 
-    phi_l(z) = sum of z^j / (j + l)!; v / first! stands in rows 4, 5 (positions, rates) and is used up. The columns of
-    motion.F are the rows of motion.X and Y.
+    Positions, and rates times the step. The error of a step is a fifth of it or less.
     """
-    n = motion.arm.stiffness.size
-    term, following, sums = motion.k[4:6], motion.k[6], motion.k[7:13]
-    for row in range(6):
-        for i in range(n):
-            sums[row, i] = term[row % 2, i]
-    near, far = 1.0, 1.0
-    for order in range(first + 1, first + count):
-        weight = h / order
-        near *= c
-        far *= LATER
-        for i in range(n):
-            following[i] = 0.0
-        for j in range(n):
-            place, rate, by_place, by_rate = term[0, j], term[1, j], motion.X[j], motion.Y[j]
-            for i in range(n):
-                following[i] += by_place[i] * place + by_rate[i] * rate
-        for i in range(n):
-            term[0, i] = weight * term[1, i]
-            term[1, i] = weight * following[i]
-        for part in range(2):
-            for i in range(n):
-                sums[part, i] += near * term[part, i]
-                sums[2 + part, i] += far * term[part, i]
-                sums[4 + part, i] += term[part, i]
+    allowed: float = STEP_ERROR * motion.arm.length[0]
+    return motion.missed[0] / allowed
 
 
 @kernel

@@ -20,3 +20,18 @@ def test_caches_older_than_a_kernel_are_dropped(tmp_path: Path) -> None:
     assert not old.exists()
     assert young.exists()
     assert drop_stale(tmp_path) == 0
+
+
+def test_caches_older_than_constants_that_a_kernel_reads_are_dropped(tmp_path: Path) -> None:
+    package = tmp_path / 'arms'
+    cache = package / '__pycache__'
+    cache.mkdir(parents=True)
+    texts = {'kernels.py': 'from arms.layout import (\n    WIDTH,\n)\nfrom arms.words import say\n@kernel', 'layout.py': '',
+             'words.py': '', '__pycache__/a.nbi': ''}
+    ages = {'kernels.py': 100, 'layout.py': 100, 'words.py': 300, '__pycache__/a.nbi': 200}
+    for name, text in texts.items():
+        (package / name).write_text(text)
+        os.utime(package / name, (ages[name], ages[name]))
+    assert drop_stale(package) == 0
+    os.utime(package / 'layout.py', (400, 400))
+    assert drop_stale(package) == 1
