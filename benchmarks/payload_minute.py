@@ -86,13 +86,14 @@ def main() -> None:
         tracking = np.concatenate([minute.tracking for minute in done])
         normalised = np.concatenate([minute.error / minute.std for minute in done])
         everywhere = np.concatenate(inside)
+        last = np.array([minute.error[-1] for minute in done])
         row = {
             'case': case.name, 'runs': runs, 'coverage': round(float(everywhere.mean()), 3),
             'coverage_of_the_worst_run': round(min(float(of_run.mean()) for of_run in inside), 3),
             'tracking': round(float(tracking.mean()), 3),
             'tracking_and_outside': round(float((tracking & ~everywhere).mean()), 4),
             'rms_normalised': round(float(trials.rms(normalised)), 2),
-            'rms_error_at_the_end_g': round(1e3 * float(trials.rms(np.array([minute.error[-1] for minute in done]))), 1)}
+            'rms_error_at_the_end_g': round(1e3 * float(trials.rms(last)), 1)}
         rows.append(row)
         print(row, flush=True)
     trials.write('payload_minute', rows)

@@ -17,15 +17,13 @@ from flexmanip_ros.payload.filter_state import (
     DOUBT,
     DRIFT,
     EFFECTIVE,
-    FLOOR,
     HORIZON,
     LEVEL,
     REFITS,
     SHIFT,
     STORED,
-    WHITE,
 )
-from flexmanip_ros.payload.measurement_update import MeasurementModel, misfit
+from flexmanip_ros.payload.measurement_update import MeasurementModel, misfit, white_variance
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import QUANTILE, Array, Payload, Status
 
@@ -162,9 +160,7 @@ def inertia_error(config: IdentifierParameters, model: Model, mass: float) -> fl
 
 def plain_misfit(sensors: MeasurementModel, m: mem.FilterState) -> float:
     """Innovation power over white noise of the sensors of displacements, before any tells of the payload."""
-    white = np.minimum(m.noise[:, mem.WHITE], m.noise[:, mem.LEVEL])
-    ratio = m.noise[:, mem.POWER] / np.maximum(white, m.noise[:, mem.FLOOR])
-    return float(np.median(ratio[~sensors.rate]))
+    return float(np.median([sensor[mem.POWER] / white_variance(sensor, LEVEL) for sensor in m.noise[~sensors.rate]]))
 
 
 Integers = NDArray[np.int64]
@@ -192,8 +188,7 @@ def misjudged(noise: Array, counts: Integers, block: int) -> float:
     least = most / math.sqrt(block)
     excess = 0.0
     for i in range(noise.shape[0]):
-        white = max(min(noise[i, WHITE], noise[i, LEVEL]), noise[i, FLOOR])
-        excess = max(excess, noise[i, EFFECTIVE] / white - 1.0)
+        excess = max(excess, noise[i, EFFECTIVE] / white_variance(noise[i], LEVEL) - 1.0)
     return min(max((excess - least) / (most - least), 0.0), 1.0)
 
 

@@ -274,6 +274,13 @@ def learn_noise(sensors: MeasurementModel, m: FilterState) -> None:
         row[EFFECTIVE] = max(row[POWER], row[SLOW] - doubt * row[POWER], row[FLOOR], 0.7 * row[EFFECTIVE])
 
 
+@inner
+def white_variance(sensor: Array, most: int) -> float:
+    """Return the variance of a sensor's white noise; sensor: (11,) its row, most: column above which it is not."""
+    variance: float = max(min(sensor[WHITE], sensor[most]), sensor[FLOOR])
+    return variance
+
+
 @inlined
 def misfit(noise: Array, rate: NDArray[np.bool_], most: int) -> float:
     """Innovation power over white noise, each sensor weighted by what it tells of the payload; nan: none yet.
@@ -285,7 +292,7 @@ def misfit(noise: Array, rate: NDArray[np.bool_], most: int) -> float:
     total = sum_of_weights = 0.0
     for i in range(noise.shape[0]):
         if not rate[i]:
-            total += noise[i, WEIGHT] * noise[i, POWER] / max(min(noise[i, WHITE], noise[i, most]), noise[i, FLOOR])
+            total += noise[i, WEIGHT] * noise[i, POWER] / white_variance(noise[i], most)
             sum_of_weights += noise[i, WEIGHT]
     return total / sum_of_weights if sum_of_weights > 0.0 else np.nan
 

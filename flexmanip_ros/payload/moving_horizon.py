@@ -26,7 +26,6 @@ from flexmanip_ros.payload.filter_state import (
     ENOUGH,
     FINENESS,
     FIT,
-    FLOOR,
     HELD,
     HORIZON,
     IN_A_ROW,
@@ -48,7 +47,14 @@ from flexmanip_ros.payload.filter_state import (
     USED,
     WHITE,
 )
-from flexmanip_ros.payload.measurement_update import judge_payload, learn_noise, measure, misfit, observe
+from flexmanip_ros.payload.measurement_update import (
+    judge_payload,
+    learn_noise,
+    measure,
+    misfit,
+    observe,
+    white_variance,
+)
 from flexmanip_ros.payload.process_model import (
     INERTIA,
     MODE,
@@ -250,8 +256,9 @@ def phase_std(motion: ProcessModel, m: FilterState, duration: float) -> float:
             square = max(square, dot(m.S[first + c], m.S[first + c]) - told)
     for i in range(links):
         ratio = min(ratio, motion.arm.damping[links + i * k] / motion.damping[links + i * k])
-    angle: float = min(STEP_ANGLE / motion.substeps * duration, 1.0 / max(ratio, 1e-9))
-    return 0.5 * angle * np.sqrt(square)
+    angle = min(STEP_ANGLE / motion.substeps * duration, 1.0 / max(ratio, 1e-9))
+    deviation: float = 0.5 * angle * np.sqrt(square)
+    return deviation
 
 
 @inner
@@ -415,7 +422,7 @@ def strays(sensors: MeasurementModel, m: FilterState) -> bool:
         return False
     least = STRAY
     for i in range(m.noise.shape[0]):
-        least = min(least, m.noise[i, POWER] / max(m.noise[i, WHITE], m.noise[i, FLOOR]))
+        least = min(least, m.noise[i, POWER] / white_variance(m.noise[i], WHITE))
     left = bool(least >= STRAY if m.counts[HELD] == 1 else misfit(m.noise, sensors.rate, WHITE) >= UNFIT)
     m.counts[REFITS] += left
     return left

@@ -626,8 +626,8 @@ def correction(motion: ProcessModel) -> float:
 
     Positions, and rates times the step. The error of a step is a fifth of it or less.
     """
-    allowed: float = STEP_ERROR * motion.arm.length[0]
-    return motion.missed[0] / allowed
+    share: float = motion.missed[0] / (STEP_ERROR * motion.arm.length[0])
+    return share
 
 
 @kernel

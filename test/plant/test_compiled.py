@@ -26,8 +26,8 @@ def test_caches_older_than_constants_that_a_kernel_reads_are_dropped(tmp_path: P
     package = tmp_path / 'arms'
     cache = package / '__pycache__'
     cache.mkdir(parents=True)
-    texts = {'kernels.py': 'from arms.layout import (\n    WIDTH,\n)\nfrom arms.words import say\n@kernel', 'layout.py': '',
-             'words.py': '', '__pycache__/a.nbi': ''}
+    kernels = 'from arms.layout import (\n    WIDTH,\n)\nfrom arms.words import say\n@kernel'
+    texts = {'kernels.py': kernels, 'layout.py': '', 'words.py': '', '__pycache__/a.nbi': ''}
     ages = {'kernels.py': 100, 'layout.py': 100, 'words.py': 300, '__pycache__/a.nbi': 200}
     for name, text in texts.items():
         (package / name).write_text(text)
