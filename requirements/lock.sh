@@ -2,11 +2,13 @@
 # lock.sh: write the *.txt locks (every version and hash, for Python 3.11 to 3.13) from the *.in lists.
 set -eu
 cd "$(dirname "$0")/.."
+# Extras stay: pip takes the newest coverage[toml] where coverage alone is locked, and fails without its hash.
 compile() {
     oldest=$1
     shift
     UV_PYTHON_DOWNLOADS=never uv pip compile --quiet --universal --python-version "$oldest" --fork-strategy fewest \
-        --generate-hashes --no-annotate --no-emit-index-url --custom-compile-command requirements/lock.sh "$@"
+        --generate-hashes --no-strip-extras --no-annotate --no-emit-index-url \
+        --custom-compile-command requirements/lock.sh "$@"
 }
 compile 3.11 requirements/runtime.in --output-file requirements/runtime.txt
 compile 3.11 requirements/development.in --constraints requirements/runtime.txt --output-file requirements/development.txt
