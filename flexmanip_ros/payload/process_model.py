@@ -38,7 +38,7 @@ MIDPOINT_TERMS = 4
 """Terms of what foretells the middle of a step: the next is 1e-3 of what turns by 0.7 rad until then."""
 STEP_ERROR = 1e-8
 """Correction of a step, see ``correction``, over the length of link 1, beyond which the following ones are finer: a
-sample is then off by 3e-9. Steps that change from sample to sample let the energy of a vibration drift."""
+sample is then off by 2e-9. Steps that change from sample to sample let the energy of a vibration drift."""
 MOST_TERMS = 30
 """Terms of an exponential at most: more than ``STEP_ANGLE`` needs."""
 STIFF_STEP = 2.0
