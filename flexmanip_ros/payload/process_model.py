@@ -509,7 +509,7 @@ def midpoint(motion: ProcessModel, x: Array, half: float) -> None:
     """Foretell q and q' in the middle of a step, rows 16 and 17 of motion.k; right after ``accelerate`` at x.
 
     An exponential Euler step of which the linear part is stiffness, damping and friction: what vibrates fast turns by
-    half a radian in half a sample. Where the middle is missed, the flow is not symmetric in time, and the spread of a
+    0.7 rad in half a sample. Where the middle is missed, the flow is not symmetric in time, and the spread of a
     vibration grows or shrinks over seconds.
     """
     n, arm, work = motion.arm.stiffness.size, motion.arm, motion.work

@@ -81,27 +81,28 @@ def test_a_step_of_one_sample_is_exact_to_a_hundredth_of_the_sensors_and_of_four
     np.testing.assert_allclose(error(arm, x, exact, n, 0.02, 2e-4, 1), halved, rtol=1e-3)  # fineness halves it
 
 
+def carried(arm, state: np.ndarray, spread: np.ndarray, rows: np.ndarray, samples: int, fineness: int) -> np.ndarray:
+    """q and q' so many samples of 1 ms later; spread is moved in place."""
+    state = state.copy()
+    for _ in range(samples):
+        assert process_model.predict(arm, state, spread, spread.shape[1], rows, 1e-3, 1e-3, fineness)
+    return state[:2 * arm.arm.stiffness.size]
+
+
 def test_a_tenth_of_a_second_later_the_spread_of_what_vibrates_is_the_derivative_of_the_motion():
     arm = motion(configure(IdentifierParameters, {}))
-    n, samples, sample = arm.arm.stiffness.size, 100, 1e-3
+    n, moment = arm.arm.stiffness.size, (np.array([[0.0, *TORQUE]]), 100, 0)
     x = bent(arm, n)
     x[2 * n:] = np.where(arm.kind == Kind.MASS, 20.0, 0.0)  # undamped: what the steps add or take stays
-    rows = np.array([[0.0, *TORQUE]])
-    size = np.repeat([1.0, sample], n)
-
-    def moved(state, spread):
-        state = state.copy()
-        for _ in range(samples):
-            assert process_model.predict(arm, state, spread, spread.shape[1], rows, sample, sample, 0)
-        return state[:2 * n]
-
+    size = np.repeat([1.0, 1e-3], n)
     spread, none = np.eye(x.size), np.zeros((x.size, 0))
-    moved(x, spread)
+    carried(arm, x, spread, *moment)
     for c in range(2 * n):
         found = size * spread[:2 * n, c]
         step = np.zeros(x.size)
         step[c] = 2e-7 / np.abs(found).max()
-        exact = size * (moved(x + step, none) - moved(x - step, none)) / (2.0 * step[c])
+        high, low = (carried(arm, state, none, *moment) for state in (x + step, x - step))
+        exact = size * (high - low) / (2.0 * step[c])
         # linearized where a sample begins, half a sample late, up to 2.4 %
         assert np.linalg.norm(found - exact) <= 0.005 * np.linalg.norm(exact), c
 
@@ -164,26 +165,20 @@ def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(arm):
     ids=['pinned', 'floating'])
 def test_what_is_learned_moves_a_vibration_that_turns_by_a_radian_in_a_sample_as_far_as_the_motion_does(base):
     arm = motion(configure(IdentifierParameters, base))
-    n, samples, sample = arm.arm.stiffness.size, 20, 1e-3
-    assert sample / arm.substeps > 0.5  # a step is at most two radians of the fastest mode
+    n = arm.arm.stiffness.size
+    assert 1e-3 / arm.substeps > 0.5  # a step is at most two radians of the fastest mode
     x = bent(arm, n)
-    rows = np.array([[0.0, *(TORQUE / arm.gain)]])
-
-    def moved(state, spread):
-        state = state.copy()
-        for _ in range(samples):
-            assert process_model.predict(arm, state, spread, spread.shape[1], rows, sample, sample, 3)
-        return state[:2 * n]
-
+    moment = np.array([[0.0, *(TORQUE / arm.gain)]]), 20, 3
     spread, none = np.eye(x.size), np.zeros((x.size, 0))
-    moved(x, spread)
+    carried(arm, x, spread, *moment)
     size = np.abs(spread[:2 * n, :2 * n]).max(axis=1)  # of what each state can become
     for c in range(arm.kind.size):
         if arm.kind[c] in (Kind.BEND_GAIN, Kind.BEND_OFFSET):  # of the sensors
             continue
         step = np.zeros(x.size)
         step[2 * n + c] = 1e-4
-        exact = (moved(x + step, none) - moved(x - step, none)) / 2e-4 / size
+        high, low = (carried(arm, state, none, *moment) for state in (x + step, x - step))
+        exact = (high - low) / 2e-4 / size
         found = spread[:2 * n, 2 * n + c] / size
         # held at the begin of a sample, a stiffness is 50 % off, a damping 70 %
         assert np.linalg.norm(found - exact) <= 0.04 * np.linalg.norm(exact), Kind(arm.kind[c]).name
