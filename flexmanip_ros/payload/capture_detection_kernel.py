@@ -20,7 +20,6 @@ from flexmanip_ros.payload.filter_state import (
     AGAIN,
     BEFORE,
     EFFECTIVE,
-    FINENESS,
     HORIZON,
     REJECTED,
     STORED,
@@ -321,7 +320,7 @@ def advance(
         if clock[SINCE_TRACES] == 0:
             # linearizes there; literal numbers would compile it once more
             rows = table[k + 1 - sensors.reach:k + 1]
-            predict(motion, m.x, m.S, m.counts[USED], rows, sensors.period, 0.0, m.counts[FINENESS])
+            predict(motion, m.x, m.S, m.counts[USED], rows, sensors.period, 0.0)
             traces(motion, sensors, m, glr, prior, dt)
         clock[SINCE_TRACES] = (clock[SINCE_TRACES] + 1) % REFRESH
         update_glr(m, glr, scratch)

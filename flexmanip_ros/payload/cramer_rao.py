@@ -186,7 +186,7 @@ def _gathered(
             F[i] /= deviation
         information += F.T @ F
         rows[:, 1:] = padded[k:k + seen.reach]
-        if not predict(model.motion, x, S, columns, rows, dt, dt, 0):
+        if not predict(model.motion, x, S, columns, rows, dt, dt):
             raise ModelError('the arm diverges under these torques', 'use smaller torques')
     yield len(efforts), information
 

@@ -24,7 +24,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
 # Elements of ``counts``.
 (HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN, BEFORE,
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
- FINENESS, CALM, IN_SPECTRUM, SPECTRA) = range(24)
+ IN_SPECTRUM, SPECTRA) = range(22)
 # Elements of ``score``.
 MOVE, VARIANCE, SHIFT, DOUBT, DRIFT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA = range(11)
 
@@ -44,10 +44,9 @@ class FilterState(NamedTuple):
     """(m, 3, TONES) of its fourth differences: both states of Goertzel's filter, mean power over that of white noise
     of unit variance."""
     counts: NDArray[np.int64]
-    """(24,) counters; USED: number of columns of S and S0, the first ones, that are not zero; IN_A_ROW: samples since
+    """(22,) counters; USED: number of columns of S and S0, the first ones, that are not zero; IN_A_ROW: samples since
     the last one that was missing; MEASURED: samples of this iteration that were not; TRIED: iterations that did
-    not fit, over the same samples; FINENESS: how fine a step of the motion is; CALM: samples since a coarser one
-    was too coarse; IN_SPECTRUM: samples of the present spectrum; SPECTRA: those in the mean power."""
+    not fit, over the same samples; IN_SPECTRUM: samples of the present spectrum; SPECTRA: those in the mean power."""
     score: Array
     """(11,) MOVE: sum of the payload's updates in this batch, VARIANCE: the variance they should have; SHIFT: by how
     many standard deviations the last iteration moved the payload, DOUBT: root of the sum of the squares of that step
@@ -85,7 +84,7 @@ def memory(nx: int, m: int) -> FilterState:
     """Allocate for nx states and m sensors."""
     return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)),
-        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(24, dtype=np.int64), score=np.zeros(11), x0=np.zeros(nx),
+        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(22, dtype=np.int64), score=np.zeros(11), x0=np.zeros(nx),
         S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx), normal=np.zeros((nx, nx)),
         gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)), g=np.zeros(nx),
         innovation=np.zeros((m, 2)), power=np.ones(m))

@@ -18,13 +18,11 @@ from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, fact
 from flexmanip_ros.payload.filter_state import (
     AGAIN,
     BEFORE,
-    CALM,
     COST,
     COST_BEFORE,
     DOUBT,
     EFFECTIVE,
     ENOUGH,
-    FINENESS,
     FIT,
     HELD,
     HORIZON,
@@ -60,7 +58,6 @@ from flexmanip_ros.payload.process_model import (
     MODE,
     STEP_ANGLE,
     STIFFNESS,
-    correction,
     gather_bounds,
     keep_inertia,
     predict,
@@ -112,12 +109,6 @@ MOST_REFITS = 4
 """How often a fit is begun again after an event: an arm that is another one never fits."""
 STRAY, STRAY_EVERY = 3.0, 500
 """Power over white noise of every sensor with which the filter is begun again; samples between two looks."""
-FINEST = 2
-"""Of the steps, see ``process_model.predict``."""
-COARSER = 0.1
-"""Correction, over what is allowed, below which a coarser step is tried."""
-CALM_SAMPLES = 1000
-"""For so many samples, several periods of the slowest vibration."""
 SLACK = 1.0
 """A step is accepted though it raises the cost, by so much at most: less than the estimate can tell."""
 LEVENBERG = 1.0
@@ -166,7 +157,7 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
     n, nx, used = sensors.H.shape[1], m.x.size, m.counts[USED]
     links, f = motion.effort.size, sensors.f[:used]
     rows = table[k + 1 - sensors.reach:k + 1]
-    steps = predict(motion, m.xr, m.Sr, used, rows, sensors.period, sample[0], m.counts[FINENESS])
+    steps = predict(motion, m.xr, m.Sr, used, rows, sensors.period, sample[0])
     if steps == 0:
         return 0
     measured = sample[1 + links] == sample[1 + links]
@@ -429,21 +420,6 @@ def strays(sensors: MeasurementModel, m: FilterState) -> bool:
 
 
 @inner
-def control_step(motion: ProcessModel, m: FilterState) -> None:
-    """Make the step finer where its correction is too large, coarser where it has long been small enough."""
-    size = correction(motion)
-    m.counts[CALM] += 1
-    if size > 1.0 and m.counts[FINENESS] < FINEST:
-        m.counts[FINENESS] += 1
-        m.counts[CALM] = 0
-    elif size > COARSER or m.counts[FINENESS] == 0:
-        m.counts[CALM] = 0
-    elif m.counts[CALM] >= CALM_SAMPLES:
-        m.counts[FINENESS] -= 1
-        m.counts[CALM] = 0
-
-
-@inner
 def keep_possible(motion: ProcessModel, m: FilterState, chance: float) -> None:
     """Move the state to the most likely one whose p is possible (inequality-constrained filter, Simon and Chia 2002).
 
@@ -486,9 +462,8 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     links = motion.effort.size
     duration, y = table[k, 0], table[k, 1 + links:]
     rows = table[k + 1 - sensors.reach:k + 1]
-    if not predict(motion, m.x, m.S, m.counts[USED], rows, sensors.period, duration, m.counts[FINENESS]):
+    if not predict(motion, m.x, m.S, m.counts[USED], rows, sensors.period, duration):
         return False
-    control_step(motion, m)
     came = y[0] == y[0]
     if came:
         measure(sensors, m, y, motion.k[0])

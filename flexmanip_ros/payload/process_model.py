@@ -30,15 +30,12 @@ STEP_ANGLE = 2.0
 """Largest angle [rad] the fastest mode may turn in an integration step."""
 MOTION_ERROR = 1e-8
 """Share of the fastest mode that the motion's exponential leaves out in a step."""
-MISS_ERROR = 1e-4
-"""Of what the linearization misses there, a thousandth of the motion or less."""
+MISS_ERROR = 1e-2
+"""Of what the difference of the remainders adds, some 1e-8 of link 1 in a sample."""
 SPREAD_ERROR = 1e-4
 """Of the spread's: it weighs, and need not be exact."""
-MIDPOINT_TERMS = 4
-"""Terms of what foretells the middle of a step: the next is 1e-3 of what turns by 0.7 rad until then."""
-STEP_ERROR = 1e-8
-"""Correction of a step, see ``correction``, over the length of link 1, beyond which the following ones are finer: a
-sample is then off by 2e-9. Steps that change from sample to sample let the energy of a vibration drift."""
+AVERAGE_TERMS = 6
+"""Terms of what foretells the mean over a step: the next is 3e-4 of what turns by 1.4 rad."""
 MOST_TERMS = 30
 """Terms of an exponential at most: more than ``STEP_ANGLE`` needs."""
 STIFF_STEP = 2.0
@@ -142,14 +139,12 @@ class ProcessModel(NamedTuple):
     """(np,) scratch."""
     a: Array
     k: Array
-    missed: Array
-    """(1,) see ``correction``."""
     dq: Array
     dqd: Array
     dp: Array
     G: Array
-    """(n, np) derivative of the accelerations by the entries of p that are not taken as known, in this order, as it is
-    held over a step."""
+    """(n, 2 np) derivatives of the accelerations by the entries of p that are not taken as known, in this order: means
+    over a step, then slopes; see ``parameter_columns``."""
     F: Array
     """(n, 2 n) derivative of the accelerations by q and q'."""
     X: Array
@@ -311,86 +306,113 @@ def linearize(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
 
 
 @inner
-def within_step(motion: ProcessModel, h: float) -> None:
-    """Fill rows 4 to 6 of motion.k with q, q' and q'' at which ``parameter_columns`` is constant over a step h.
-
-    A parameter acts through what vibrates: a stiffness through the bend, which turns by a radian within a sample. Of a
-    motion exp(F t) the derivative by a parameter that commutes with F is h F_p exp(h F), and h phi_1(h F) G if G is
-    held. So G is taken at z with phi_1(h F) z = exp(h F / 2) z(h / 2): z = z(h / 2) - h^2 / 24 z''(h / 2) + ... The
-    next term, 7 (h F)^4 / 5760, is 0.5 % of what turns by 1.4 rad.
-    """
-    n = motion.arm.stiffness.size
-    qdd, held, jerk, q, qd = motion.k[8], motion.k[4:7], motion.k[7], motion.k[16], motion.k[17]
-    second = -h * h / 24.0
+def differentiate(motion: ProcessModel, qd: Array, qdd: Array, jerk: Array) -> None:
+    """Fill jerk (n,) with the rate of the accelerations, by the linearization."""
+    n = qd.size
     for r in range(n):
         jerk[r] = 0.0
         for j in range(n):
             jerk[r] += motion.F[r, j] * qd[j] + motion.F[r, n + j] * qdd[j]
+
+
+@inner
+def within_step(motion: ProcessModel, h: float) -> None:
+    """Fill rows 4 to 6 of motion.k with the slopes of q, q' and q'' over a step h, by s from -1 to 1 in it.
+
+    Those of the lines through their values at Gauss's two points, s^2 = 1/3, whose mean is that over the step but for
+    1e-3 of what turns by 1.4 rad: h / 2 z' + h^3 / 144 z^(3) + ...
+    """
+    n = motion.arm.stiffness.size
+    qd, qdd, slope = motion.k[17], motion.k[8], motion.k[4:7]
+    jerk, fourth, fifth = motion.k[9], motion.k[10], motion.k[11]
+    differentiate(motion, qd, qdd, jerk)
+    differentiate(motion, qdd, jerk, fourth)
+    differentiate(motion, jerk, fourth, fifth)
+    first, third = h / 2.0, h ** 3 / 144.0
     for r in range(n):
-        snap = 0.0
-        for j in range(n):
-            snap += motion.F[r, j] * qdd[j] + motion.F[r, n + j] * jerk[j]
-        held[0, r] = q[r] + second * qdd[r]
-        held[1, r] = qd[r] + second * jerk[r]
-        held[2, r] = qdd[r] + second * snap
+        slope[0, r] = first * qd[r] + third * jerk[r]
+        slope[1, r] = first * qdd[r] + third * fourth[r]
+        slope[2, r] = first * jerk[r] + third * fifth[r]
 
 
 @inner
 def parameter_columns(motion: ProcessModel, h: float) -> None:
-    """Fill motion.G with the derivative of the accelerations by what is not known of p, held over a step h.
+    """Fill motion.G with the derivatives of the accelerations by what is not known of p, as lines over a step h.
 
-    Right after ``linearize`` at the midpoint. Friction of Coulomb is taken there.
+    Their means come first, in ``motion.opened`` columns, then their slopes, by s from -1 to 1 in the step. A parameter
+    acts through what vibrates: a stiffness through the bend, which turns by a radian within a sample. Right after
+    ``linearize`` at the mean state. Of Coulomb friction the mean alone is taken.
     """
-    n = motion.arm.stiffness.size
-    arm, dp, net = motion.arm, motion.dp, motion.work.net
-    k, links = arm.kappa, arm.length.size
-    G, opened = motion.G, motion.opened[0]
+    n, opened = motion.arm.stiffness.size, motion.opened[0]
     if opened == 0:
         return
     within_step(motion, h)
-    held, later, q = motion.k[4:7], motion.k[7], motion.k[16]
+    balance_columns(motion, motion.k[16], motion.k[17], motion.k[8], 0)
     for r in range(n):
-        later[r] = held[2, r] - motion.k[8, r]
-    if motion.frozen:
-        for r in range(n):
-            for p in range(4):
-                for c in range(n):
-                    dp[r, p] += motion.Mp[p, r, c] * later[c]
-    else:
-        add_body_forces(arm, q, later, dp, motion.work)
-    # G first holds the derivative of M qdd + E + D qd + dV/dq - B tau
-    for c in range(opened):
+        for p in range(4):
+            motion.dp[r, p] = 0.0
+    add_payload_columns(motion, motion.k[6])
+    balance_columns(motion, motion.k[4], motion.k[5], motion.k[6], opened)
+    solve_columns(motion.work.M, motion.G, 2 * opened)
+
+
+@inner
+def add_payload_columns(motion: ProcessModel, qdd: Array) -> None:
+    """Add to motion.dp (n, 4), the derivative of the forces by the payload's parameters, that of accelerations qdd."""
+    if not motion.frozen:
+        add_body_forces(motion.arm, motion.k[16], qdd, motion.dp, motion.work)
+        return
+    for r in range(qdd.size):
+        for p in range(4):
+            for c in range(qdd.size):
+                motion.dp[r, p] += motion.Mp[p, r, c] * qdd[c]
+
+
+@inner
+def balance_columns(motion: ProcessModel, q: Array, qd: Array, qdd: Array, first: int) -> None:
+    """Fill columns ``first``... of motion.G with derivatives of M qdd + E + D qd + dV/dq - B tau by p, motion.dp known.
+
+    first: 0 for the values at q (n,), the mean, otherwise for their slopes, where q, qd and qdd are slopes.
+    """
+    arm, net, G = motion.arm, motion.work.net, motion.G
+    n, k, links = arm.stiffness.size, arm.kappa, arm.length.size
+    for c in range(motion.opened[0]):
         kind, i = motion.kind[motion.opened[1 + c]], motion.link[motion.opened[1 + c]]
-        o = links + i * k
+        o, at = links + i * k, first + c
         for r in range(n):
-            G[r, c] = 0.0
+            G[r, at] = 0.0
         if kind <= INERTIA:
             for r in range(n):
-                G[r, c] = dp[r, kind]
+                G[r, at] = motion.dp[r, kind]
         elif kind == STIFFNESS:
             for j in range(k):
-                G[o + j, c] = motion.work.elastic[o + j] + arm.stiffness[o + j] * (held[0, o + j] - q[o + j])
+                G[o + j, at] = motion.work.elastic[o + j] if first == 0 else arm.stiffness[o + j] * q[o + j]
         elif kind == DAMPING:
             for j in range(k):
-                G[o + j, c] = motion.damping[o + j] * held[1, o + j]
+                G[o + j, at] = motion.damping[o + j] * qd[o + j]
         elif kind == MODE:
-            G[links + i, c] = arm.stiffness[links + i] * held[0, links + i]
+            G[links + i, at] = arm.stiffness[links + i] * q[links + i]
         elif kind == ROTOR:
             turn = 0.0
             for r in range(n):
-                turn += arm.joint[i, r] * held[2, r]
+                turn += arm.joint[i, r] * qdd[r]
             for r in range(n):
-                G[r, c] = arm.joint[i, r] * turn
+                G[r, at] = arm.joint[i, r] * turn
+        elif kind == VISCOUS:
+            rate = 0.0
+            for r in range(n):
+                rate += motion.work.B[r, i] * qd[r]
+            for r in range(n):
+                G[r, at] = rate * motion.work.B[r, i]
+        elif first > 0:
+            continue
         elif kind == TORQUE_DELAY:
             for joint in range(links):
                 for r in range(n):
-                    G[r, c] -= motion.slope[joint, 0] * motion.work.B[r, joint]
+                    G[r, at] -= motion.slope[joint, 0] * motion.work.B[r, joint]
         else:
             force = 0.0
-            if kind == VISCOUS:
-                for r in range(n):
-                    force += motion.work.B[r, i] * held[1, r]
-            elif kind == COULOMB:
+            if kind == COULOMB:
                 force = np.tanh(net[1, i] / STICTION_RATE)
             elif kind == TORQUE_GAIN:
                 force = -motion.effort[i]
@@ -398,8 +420,7 @@ def parameter_columns(motion: ProcessModel, h: float) -> None:
                 force = -motion.slope[i, 1]
             if force != 0.0:
                 for r in range(n):
-                    G[r, c] = force * motion.work.B[r, i]
-    solve_columns(motion.work.M, G, opened)
+                    G[r, at] = force * motion.work.B[r, i]
 
 
 @inner
@@ -454,14 +475,13 @@ def note_opened(motion: ProcessModel, S: Array, used: int) -> None:
 
 @kernel
 def predict(
-    motion: ProcessModel, x: Array, S: Array, used: int, rows: Array, period: float, duration: float, fineness: int,
+    motion: ProcessModel, x: Array, S: Array, used: int, rows: Array, period: float, duration: float,
 ) -> int:
     """Carry x and S over a time [s] with the torque held. Return in how many steps; 0: numbers left the finite range.
 
     used: number of columns of S, the first ones, that are not zero; rows: (P, >= 1 + L) columns 1 to L of the last one
     are the efforts held meanwhile [N m], those before it are what the torque depends on too; period: their sample time
-    [s]; fineness: how often steps are halved. motion.k[0] is then the acceleration at the end. A time of zero only
-    linearizes at x: motion.k[0] and F.
+    [s]. motion.k[0] is then the acceleration at the end. A time of zero only linearizes at x: motion.k[0] and F.
     """
     n, taken = motion.arm.stiffness.size, 0
     set_parameters(motion, x)
@@ -471,18 +491,16 @@ def predict(
         motion.effort[i] = motion.gain[i] * late_torque(rows, 1 + i, late[0], late[1], period, slope)
         slope[0] *= motion.gain[i]
         slope[1] *= motion.gain[i]
-    motion.missed[0] = 0.0
     left, stiff = duration, 0.0
     while True:
         if not accelerate(motion, x[:n], x[n:2 * n], motion.k[0]):
             return 0
-        friction = friction_step(motion, left)
-        longest = min(motion.substeps, friction) * 0.5 ** fineness
-        steps = max(np.ceil(left / min(longest, STIFF_STEP / max(stiff, 1e-9)) - 1e-9), 1.0)
+        longest = min(motion.substeps, friction_step(motion, left), STIFF_STEP / max(stiff, 1e-9))
+        steps = max(np.ceil(left / longest - 1e-9), 1.0)
         if not (steps < MOST_STEPS and stiff * motion.substeps < STIFFEST * STIFF_STEP):
             return 0
         h = left / steps
-        midpoint(motion, x, 0.5 * h)
+        average(motion, x, h)
         if not linearize(motion, motion.k[16], motion.k[17], motion.k[8]):
             return 0
         if duration <= 0.0:
@@ -496,7 +514,7 @@ def predict(
         if used > 0:
             parameter_columns(motion, h)
             spread(motion.F, motion.G, motion.opened, S, used, motion.scratch, h, terms(turn, SPREAD_ERROR))
-        if not exponential_step(motion, x, h, turn, friction == np.inf):
+        if not exponential_step(motion, x, h, turn):
             return 0
         taken += 1
         if steps <= 1.0:
@@ -505,20 +523,20 @@ def predict(
 
 
 @inner
-def midpoint(motion: ProcessModel, x: Array, half: float) -> None:
-    """Foretell q and q' in the middle of a step, rows 16 and 17 of motion.k; right after ``accelerate`` at x.
+def average(motion: ProcessModel, x: Array, h: float) -> None:
+    """Foretell the means of q and q' over a step, rows 16 and 17 of motion.k; right after ``accelerate`` at x.
 
-    An exponential Euler step of which the linear part is stiffness, damping and friction: what vibrates fast turns by
-    0.7 rad in half a sample. Where the middle is missed, the flow is not symmetric in time, and the spread of a
-    vibration grows or shrinks over seconds.
+    By an exponential Euler step of which the linear part is stiffness, damping and friction: what vibrates fast turns
+    by 1.4 rad in a sample. The Jacobian is nearly linear in q and q', so that its mean is that at their means: with it
+    the spread is as exact over seconds as with two steps linearized at their midpoints.
     """
     n, arm, work = motion.arm.stiffness.size, motion.arm, motion.work
     qdd, place, rate, q, qd = motion.k[0], motion.k[9], motion.k[10], motion.k[16], motion.k[17]
     for r in range(n):
-        place[r], rate[r] = half * x[n + r], half * qdd[r]
-        q[r], qd[r] = x[r] + place[r], x[n + r] + rate[r]
+        place[r], rate[r] = h * x[n + r], h * qdd[r]
+        q[r], qd[r] = x[r] + 0.5 * place[r], x[n + r] + 0.5 * rate[r]
     force = motion.k[11]
-    for order in range(2, MIDPOINT_TERMS + 1):
+    for order in range(2, AVERAGE_TERMS + 1):
         for r in range(n):
             force[r] = -arm.stiffness[r] * place[r] - arm.damping[r] * rate[r]
         for i in range(arm.length.size):
@@ -530,38 +548,46 @@ def midpoint(motion: ProcessModel, x: Array, half: float) -> None:
                     force[r] -= work.net[2, i] * turned * work.B[r, i]
         solve(work.M, force)
         for r in range(n):
-            place[r] = half / order * rate[r]
-            rate[r] = half / order * force[r]
-            q[r] += place[r]
-            qd[r] += rate[r]
+            place[r] = h / order * rate[r]
+            rate[r] = h / order * force[r]
+            q[r] += place[r] / (order + 1)
+            qd[r] += rate[r] / (order + 1)
+
+
+@inner
+def remainder(motion: ProcessModel, q: Array, qd: Array, qdd: Array, lacks: Array) -> None:
+    """Fill lacks (n,) with what the linearization misses of the acceleration qdd at q and q'."""
+    n = motion.arm.stiffness.size
+    middle, about, rate = motion.k[8], motion.k[16], motion.k[17]
+    for i in range(n):
+        lacks[i] = qdd[i] - middle[i]
+        for j in range(n):
+            lacks[i] -= motion.F[i, j] * (q[j] - about[j]) + motion.F[i, n + j] * (qd[j] - rate[j])
 
 
 @merged
-def exponential_step(motion: ProcessModel, x: Array, h: float, turn: float, smooth: bool) -> bool:
-    """Advance x by h, exactly where the motion is linear; right after ``linearize`` at its midpoint.
+def exponential_step(motion: ProcessModel, x: Array, h: float, turn: float) -> bool:
+    """Advance x by h, exactly where the motion is linear; right after ``linearize`` at its mean.
 
-    turn: of the fastest mode in the step [rad]; smooth: no friction changes its sign in it.
+    turn: of the fastest mode in the step [rad].
 
-    An exponential integrator (Hochbruck and Ostermann, Acta Numerica 19, 2010) about the midpoint: x' = g(x) + r, g the
-    linearization, r what it misses. r is of second order in the time from the midpoint, where it is zero as is its
-    derivative, so its values r0 and r1 at both ends give it as a cubic, with u the share of the step:
-    r = 4 (u - 1/2)^2 r0 + u (2 u - 1)^2 (r1 - r0), and the step is of fourth order. It is symmetric in time but for r1,
-    taken where the first term leads. The vibration turns too far in one sample for a step of Runge and Kutta: their
+    An exponential integrator (Hochbruck and Ostermann, Acta Numerica 19, 2010) about the mean state: x' = g(x) + r, g
+    the linearization, r its remainder. With s from -1 to 1 in the step, x less its mean is a s + b (s^2 - 1/3) + ..., so
+    r, of second order in it, is even in s^2 and odd in s^3 - s / 3. Its values r0 and r1 at both ends tell how much:
+    r = s^2 (r0 + r1) / 2 + (3 s^3 - s) / 2 (r1 - r0) / 2, and the step is of fourth order. It is symmetric in time but
+    for r1, taken where r0 alone leads. The vibration turns too far in one sample for a step of Runge and Kutta: their
     damping of the fastest mode read as 0.3 % of the payload.
     """
     n = motion.arm.stiffness.size
-    qdd, middle, q, qd = motion.k[0], motion.k[8], motion.k[16], motion.k[17]
-    even, odd, place, rate, moved = motion.k[3], motion.k[15], motion.k[10], motion.k[11], motion.k[12:14]
+    qdd, first, difference = motion.k[0], motion.k[3], motion.k[15]
+    place, rate, moved = motion.k[10], motion.k[11], motion.k[12:14]
     for i in range(n):
         for j in range(n):  # by columns, which ``series`` reads in a row
             motion.X[j, i], motion.Y[j, i] = motion.F[i, j], motion.F[i, n + j]
+    remainder(motion, x[:n], x[n:2 * n], qdd, first)
     for i in range(n):
-        place[i] = x[n + i]
-        rate[i] = middle[i]
-        for j in range(n):
-            rate[i] += motion.F[i, j] * (x[j] - q[j]) + motion.F[i, n + j] * (x[n + j] - qd[j])
-        even[i] = qdd[i] - rate[i]
-        odd[i] = 0.0
+        place[i], rate[i] = x[n + i], qdd[i] - first[i]
+        difference[i] = 0.0
     series(motion, h, terms(turn, MOTION_ERROR))
     end, ending = motion.k[18], motion.k[19]
     for i in range(n):
@@ -569,22 +595,16 @@ def exponential_step(motion: ProcessModel, x: Array, h: float, turn: float, smoo
         ending[i] = x[n + i] + moved[1, i]
     if not accelerate(motion, end, ending, qdd):
         return False
+    remainder(motion, end, ending, qdd, difference)
     for i in range(n):
-        missed = qdd[i] - middle[i]
-        for j in range(n):
-            missed -= motion.F[i, j] * (end[j] - q[j]) + motion.F[i, n + j] * (ending[j] - qd[j])
-        odd[i] = missed - even[i]
-    for i in range(n):
-        place[i], rate[i], even[i] = 0.0, 0.0, 0.0
+        difference[i] -= first[i]
+        place[i], rate[i], first[i] = 0.0, 0.0, 0.0
     series(motion, h, terms(turn, MISS_ERROR))
-    largest, correction = 0.0, 0.0
+    largest = 0.0
     for i in range(n):
         x[i] = end[i] + moved[0, i]
         x[n + i] = ending[i] + moved[1, i]
         largest += abs(x[i]) + abs(x[n + i])
-        correction = max(correction, abs(moved[0, i]), h * abs(moved[1, i]))
-    if smooth:  # a shorter step does not straighten the bend that Coulomb friction gives the motion
-        motion.missed[0] = max(motion.missed[0], correction)
     return largest < 1e6
 
 
@@ -592,9 +612,9 @@ def exponential_step(motion: ProcessModel, x: Array, h: float, turn: float, smoo
 def series(motion: ProcessModel, h: float, count: int) -> None:
     """Fill rows 12 and 13 of motion.k with what a step h of x' = g + F x + r adds to x = 0, in ``count`` terms.
 
-    g stands in rows 10 and 11 (positions, rates), of r the factors of 4 (u - 1/2)^2 and u (2 u - 1)^2, u the share of
-    the step, in rows 3 and 15. u^k adds h k! phi_{k + 1}(h F), phi_l(z) the sum of z^j / (j + l)!. By Horner's rule;
-    the columns of motion.F are the rows of motion.X and Y.
+    g stands in rows 10 and 11 (positions, rates), of r the factors of s^2 and s^2 / 2 + (3 s^3 - s) / 4 =
+    6 u^3 - 7 u^2 + 2 u, u = (1 + s) / 2 the share of the step, in rows 3 and 15. u^k adds h k! phi_{k + 1}(h F),
+    phi_l(z) the sum of z^j / (j + l)!. By Horner's rule; the columns of motion.F are the rows of motion.X and Y.
     """
     n = motion.arm.stiffness.size
     even, odd, place, rate, following = motion.k[3], motion.k[15], motion.k[10], motion.k[11], motion.k[14]
@@ -613,21 +633,11 @@ def series(motion: ProcessModel, h: float, count: int) -> None:
                 for i in range(n):
                     following[i] += by_place[i] * at + by_rate[i] * going
         of_even = weight * (j * j + j + 2) / ((j + 2) * (j + 3))
-        of_odd = weight * (j * j - j + 4) / ((j + 2) * (j + 3) * (j + 4))
+        of_odd = weight * (2 * j * j + 4) / ((j + 2) * (j + 3) * (j + 4))
         for i in range(n):
             moved[i] = h * moving[i] + weight * place[i]
             moving[i] = h * following[i] + weight * rate[i] + of_even * even[i] + of_odd * odd[i]
         weight *= j + 1
-
-
-@inner
-def correction(motion: ProcessModel) -> float:
-    """How far the unsymmetric part of what the linearization missed moved the last sample, over ``STEP_ERROR``.
-
-    Positions, and rates times the step. The error of a step is a fifth of it or less.
-    """
-    share: float = motion.missed[0] / (STEP_ERROR * motion.arm.length[0])
-    return share
 
 
 @kernel
@@ -636,31 +646,41 @@ def spread(
 ) -> None:
     """S <- F S in its first ``used`` columns, F the Taylor series of the linearised flow over h, ``count`` terms.
 
-    By Horner's rule, each term one product with the derivatives of the accelerations: flow (n, 2 n) by q and q', and G
-    by the entries of p in ``opened``, which stay. scratch: see ``spread_scratch``.
+    By Horner's rule, each term one product with the derivatives of the accelerations by q and q', flow (n, 2 n). G:
+    those by the entries of p in ``opened``, which stay, see ``parameter_columns``; of s = 2 u - 1, u the share of the
+    step, term j takes -j / (j + 2). scratch: see ``spread_scratch``.
     """
-    n, known = flow.shape[0], 2 * flow.shape[0]
-    wide = known + opened[0]
-    matrix = scratch[:n * wide].reshape((n, wide))
-    now = scratch[n * wide:n * wide + wide * used].reshape((wide, used))
-    rates = scratch[(n + used) * wide:(n + used) * wide + n * used].reshape((n, used))
-    for r in range(n):
-        for j in range(known):
-            matrix[r, j] = flow[r, j]
-        for p in range(opened[0]):
-            matrix[r, known + p] = G[r, p]
-    for r in range(wide):
-        row = S[r] if r < known else S[known + opened[1 + r - known]]
+    n, known, count_p = flow.shape[0], 2 * flow.shape[0], opened[0]
+    size = n * used
+    now = scratch[:2 * size].reshape((known, used))
+    rates, mean, slope = (scratch[2 * size:3 * size].reshape((n, used)), scratch[3 * size:4 * size].reshape((n, used)),
+                          scratch[4 * size:5 * size].reshape((n, used)))
+    parameters = scratch[5 * size:5 * size + count_p * used].reshape((count_p, used))
+    columns = scratch[5 * size + count_p * used:5 * size + count_p * (used + n)].reshape((n, count_p))
+    for c in range(used):
+        for r in range(known):
+            now[r, c] = S[r, c]
+    for p in range(count_p):
         for c in range(used):
-            now[r, c] = row[c]
+            parameters[p, c] = S[known + opened[1 + p], c]
+    for part in range(2):
+        product = mean if part == 0 else slope
+        for r in range(n):
+            for p in range(count_p):
+                columns[r, p] = G[r, part * count_p + p]
+            for c in range(used):
+                product[r, c] = 0.0
+        if count_p > 0:
+            multiply(columns, parameters, product)
     for order in range(count, 0, -1):
-        multiply(matrix, now, rates)
-        weight = h / order
+        multiply(flow, now, rates)
+        weight, moment = h / order, (1.0 - order) / (order + 1.0)
         for r in range(n):
             place, rate, moved, moving, following = S[r], S[n + r], now[r], now[n + r], rates[r]
+            by_mean, by_slope = mean[r], slope[r]
             for c in range(used):
                 moved[c] = place[c] + weight * moving[c]
-                moving[c] = rate[c] + weight * following[c]
+                moving[c] = rate[c] + weight * (following[c] + by_mean[c] + moment * by_slope[c])
     for r in range(known):
         for c in range(used):
             S[r, c] = now[r, c]
@@ -668,5 +688,4 @@ def spread(
 
 def spread_scratch(n: int, size: int, columns: int) -> Array:
     """Allocate for n coordinates, ``size`` entries of p, and square roots of at most so many columns."""
-    wide = 2 * n + size
-    return np.zeros(n * wide + (wide + n) * columns)
+    return np.zeros(5 * n * columns + size * (columns + n))

@@ -122,8 +122,7 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     assert state.sensors is not None
     ahead = max(event.stamp_ns - state.last_ns, 0)
     rows = np.pad(state.efforts, ((0, 0), (1, 0)))
-    predict(state.model.motion, m.x, m.S, m.x.size, rows, state.sensors.period, min(ahead * 1e-9, LONGEST_S),
-            m.counts[mem.FINENESS])
+    predict(state.model.motion, m.x, m.S, m.x.size, rows, state.sensors.period, min(ahead * 1e-9, LONGEST_S))
     _change(config, state.model, m, event)
     last_ns = state.last_ns + ahead
     return state._replace(memory=m, last_ns=last_ns, horizon=Horizon(state.cursor, last_ns, state.efforts))

@@ -228,8 +228,8 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         least_rotor=_least_rotor(nominal), substeps=STEP_ANGLE / fastest_mode(config.arm), payload=np.zeros(4),
         effort=np.zeros(links), gain=np.ones(links), late=np.zeros((links, 2)), slope=np.zeros((links, 2)),
         opened=np.array([size, *range(size)]), bounds=allocate_bounds(size, nx), p=np.zeros(size), a=np.zeros(n),
-        missed=np.zeros(1), k=np.zeros((20, n)), dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)),
-        G=np.zeros((n, size)), F=np.zeros((n, 2 * n)), X=np.zeros((2 * n, 2 * n)), Y=np.zeros((n, n)),
+        k=np.zeros((20, n)), dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)),
+        G=np.zeros((n, 2 * size)), F=np.zeros((n, 2 * n)), X=np.zeros((2 * n, 2 * n)), Y=np.zeros((n, n)),
         scratch=spread_scratch(n, size, nx))
 
 
@@ -497,7 +497,7 @@ def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, 
     """
     motion = model.motion
     n = motion.arm.stiffness.size
-    predict(motion, m.x, m.S, 0, np.zeros((1, 1 + change.size)), dt, 0.0, 0)
+    predict(motion, m.x, m.S, 0, np.zeros((1, 1 + change.size)), dt, 0.0)
     flow = np.zeros((2 * n + change.size, 2 * n + change.size))
     flow[:n, n:2 * n], flow[n:2 * n, :2 * n] = np.eye(n), motion.F
     M = motion.M0 + np.tensordot(motion.payload, motion.Mp, 1) if motion.frozen \
