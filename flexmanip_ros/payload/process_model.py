@@ -491,9 +491,10 @@ def predict(
         motion.effort[i] = motion.gain[i] * late_torque(rows, 1 + i, late[0], late[1], period, slope)
         slope[0] *= motion.gain[i]
         slope[1] *= motion.gain[i]
-    left, stiff = duration, 0.0
+    left, stiff, begun = duration, 0.0, False
     while True:
-        if not accelerate(motion, x[:n], x[n:2 * n], motion.k[0]):
+        # a step that follows another begins where that one ended
+        if not begun and not accelerate(motion, x[:n], x[n:2 * n], motion.k[0]):
             return 0
         longest = min(motion.substeps, friction_step(motion, left), STIFF_STEP / max(stiff, 1e-9))
         steps = max(np.ceil(left / longest - 1e-9), 1.0)
@@ -508,7 +509,8 @@ def predict(
         stiff = 0.0
         for r in range(n):
             stiff -= motion.F[r, n + r]
-        if stiff * h > 1.1 * STIFF_STEP:
+        begun = stiff * h <= 1.1 * STIFF_STEP
+        if not begun:
             continue
         turn = max(STEP_ANGLE / motion.substeps, stiff) * h
         if used > 0:
