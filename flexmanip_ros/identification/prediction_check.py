@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import scipy.special
+import scipy  # its parts are loaded where they are first used
 from numba import njit
 from numpy.typing import NDArray
 

@@ -574,8 +574,8 @@ def exponential_step(motion: ProcessModel, x: Array, h: float, turn: float) -> b
     turn: of the fastest mode in the step [rad].
 
     An exponential integrator (Hochbruck and Ostermann, Acta Numerica 19, 2010) about the mean state: x' = g(x) + r, g
-    the linearization, r its remainder. With s from -1 to 1 in the step, x less its mean is a s + b (s^2 - 1/3) + ..., so
-    r, of second order in it, is even in s^2 and odd in s^3 - s / 3. Its values r0 and r1 at both ends tell how much:
+    the linearization, r its remainder. With s from -1 to 1 in the step, x is its mean and a s + b (s^2 - 1/3) + ...;
+    r, of second order in that, is even in s^2 and odd in s^3 - s / 3. Its values r0 and r1 at both ends tell how much:
     r = s^2 (r0 + r1) / 2 + (3 s^3 - s) / 2 (r1 - r0) / 2, and the step is of fourth order. It is symmetric in time but
     for r1, taken where r0 alone leads. The vibration turns too far in one sample for a step of Runge and Kutta: their
     damping of the fastest mode read as 0.3 % of the payload.

@@ -95,6 +95,8 @@ def warm_up(config: IdentifierParameters) -> None:
 
     Raises ParameterError when the configuration cannot work at all, before any message comes.
     """
+    import scipy.special  # noqa: F401  the check of the frequencies would load it while messages come
+
     try:
         for _ in pipeline.run(config, _made_up(config)):
             pass
