@@ -133,10 +133,10 @@ def test_the_spread_moves_as_the_matrix_exponential_says(arm, sticks):
     scale = np.repeat([1.0, fastest, 1.0], [n, n, arm.kind.size])[:, None]
     arm.G[:] = rng.normal(size=arm.G.shape) * fastest ** 2
     # behind the state stands p s, s from -1 to 1 in the step, which the slopes multiply
-    np_ = arm.kind.size
-    flow = np.zeros((x.size + np_, x.size + np_))
+    parameters = arm.kind.size
+    flow = np.zeros((x.size + parameters, x.size + parameters))
     flow[:n, n:2 * n], flow[n:2 * n, :2 * n], flow[n:2 * n, 2 * n:] = np.eye(n), arm.F, arm.G
-    flow[x.size:, 2 * n:x.size] = 2.0 / h * np.eye(np_)
+    flow[x.size:, 2 * n:x.size] = 2.0 / h * np.eye(parameters)
     S = scale * rng.normal(size=(x.size, x.size))
     moved = S.copy()
     process_model.spread(arm.F, arm.G, arm.opened, moved, x.size, arm.scratch, h, count)
