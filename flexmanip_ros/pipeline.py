@@ -142,20 +142,27 @@ def absorb(config: IdentifierParameters, items: Iterable[Item], background: Back
 
     The last one has the bits of ``replay``. Raises SignalError when no message can be used.
     """
-    state = init()
+    state, ahead = init(), None
     for item in items:
         if isinstance(item, CaptureEvent):
+            state, ahead = _joined(state, ahead, background), None
             state = _insert(state, item, background)
             continue
         taken, count = 0, _length(item)
         while taken < count:
             state, some = _push(config, state, item, taken, background)
             taken += some
-        if state.payload is not None and state.log.end - state.payload.cursor >= ABSORB_GROUP:
-            state = _advance(state, state.log.end, background)
+        if ahead is not None and ahead.request.replay is not state.payload:  # the log began anew
+            ahead = None
+        if state.payload is not None:
+            begun = state.payload.cursor if ahead is None else ahead.request.until
+            if state.log.end - begun >= ABSORB_GROUP:
+                state = _joined(state, ahead, background)
+                ahead = _ahead(state, state.log.end, background)
         yield state
         if _hopeless(state):
             break
+    state = _joined(state, ahead, background)
     if state.config is not None:
         state = _sampled(config, state, sampling.flush(config, state.clock, state.log), background)
     if state.payload is not None:
@@ -355,15 +362,35 @@ def _running(state: State) -> tuple[IdentifierParameters, EventReplay[PayloadEst
     return state.config, state.payload, state.identifier
 
 
-def _advance(state: State, until: int, background: Background) -> State:
-    """Let both estimators take the rows up to ``until``, in a replay beside each other."""
+class Ahead(NamedTuple):
+    """Rows that both estimators take while further rows come into the log."""
+
+    request: estimator.PayloadRequest
+    """What the payload's takes, in a replay in the background."""
+    identifier: EventReplay[ModelEstimator]
+    """The identifier after them."""
+
+
+def _ahead(state: State, until: int, background: Background) -> Ahead:
+    """Let both estimators begin with the rows up to ``until``, in a replay beside each other."""
     config, payload, identifier = _running(state)
     request = estimator.PayloadRequest(config, payload, state.log, until)
     if until - payload.cursor >= REPLAY_GROUP:
         background.start(request)
-    identifier = event_replay.advance(config, identifier, state.log, until, background)
-    payload, _, _ = background.result(request)
-    return _without_old_rows(state._replace(payload=payload, identifier=identifier))
+    return Ahead(request, event_replay.advance(config, identifier, state.log, until, background))
+
+
+def _joined(state: State, ahead: Ahead | None, background: Background) -> State:
+    """Return the state with the rows taken that both estimators have begun with."""
+    if ahead is None:
+        return state
+    payload, _, _ = background.result(ahead.request)
+    return _without_old_rows(state._replace(payload=payload, identifier=ahead.identifier))
+
+
+def _advance(state: State, until: int, background: Background) -> State:
+    """Let both estimators take the rows up to ``until``."""
+    return _joined(state, _ahead(state, until, background), background)
 
 
 def _without_old_rows(state: State) -> State:
