@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.numerics.compiled import inner, kernel
+from flexmanip_ros.numerics.compiled import inlined, inner
 
 if TYPE_CHECKING:
     from flexmanip_ros.arm.manipulator import Manipulator, Workspace
@@ -20,6 +20,18 @@ if TYPE_CHECKING:
 
 STICTION_RATE = 2e-3
 """Rate [rad/s] at which the Coulomb friction reaches 76 % of its value: F tanh(rate / STICTION_RATE)."""
+
+
+@inner
+def shortening_gradient(G: Array, eta: Array, product: Array) -> None:
+    """Fill product (P, k) with G eta, the gradient of the shortening up to each point; G: (k, P, k), eta: (k,)."""
+    rows, found = G.reshape((eta.size, product.size)), product.reshape(product.size)
+    for c in range(found.size):
+        found[c] = 0.0
+    for j in range(eta.size):
+        row, amplitude = rows[j], eta[j]
+        for c in range(found.size):
+            found[c] += row[c] * amplitude
 
 
 @inner
@@ -42,14 +54,13 @@ def assemble_link(
         for t in range(k + 1):
             block[r, t] = 0.0
     total, fe, fn = 0.0, 0.0, 0.0
+    shortening_gradient(G, eta, work.gradient[0])
+    shortening_gradient(G, etad, work.gradient[1])
     for p in range(arm.mass.shape[1]):
-        m = arm.mass[i, p]
+        m, by_eta, by_rate = arm.mass[i, p], work.gradient[0, p], work.gradient[1, p]
         x, y, xd, yd, xdd = arm.place[i, p], 0.0, 0.0, 0.0, 0.0
         for j in range(k):
-            g, h = 0.0, 0.0
-            for t in range(k):
-                g += G[p, j, t] * eta[t]
-                h += G[p, j, t] * etad[t]
+            g, h = by_eta[j], by_rate[j]
             x -= 0.5 * g * eta[j]
             xd -= g * etad[j]
             xdd -= h * etad[j]
@@ -83,11 +94,12 @@ def assemble_link(
         for t in range(r + 1):
             M[row, i if t == 0 else o + t - 1] += block[r, t]
     fx, fy = c * fe - s * fn, s * fe + c * fn
-    for r in range(n):
+    for r in range(n if i > 0 or arm.floating else 0):  # J = 0 where joint 1 is pinned
         E[r] += J[0, r] * fx + J[1, r] * fy
         for t in range(r + 1):
             M[r, t] += (total * (J[0, r] * J[0, t] + J[1, r] * J[1, t])
                         + J[0, r] * S[0, t] + J[1, r] * S[1, t] + S[0, r] * J[0, t] + S[1, r] * J[1, t])
+    for r in range(n):
         work.P[0, r] += total * J[0, r] + S[0, r]
         work.P[1, r] += total * J[1, r] + S[1, r]
     work.F[0] += fx
@@ -152,7 +164,7 @@ def assemble_payload(arm: Manipulator, payload: Array, q: Array, qd: Array, M: A
     work.F[2] += m
 
 
-@kernel
+@inlined
 def assemble(
     arm: Manipulator, payload: Array, q: Array, qd: Array, M: Array, E: Array, work: Workspace,
 ) -> None:
@@ -354,7 +366,7 @@ def balance(arm: Manipulator, q: Array, qd: Array, effort: Array, qdd: Array, wo
     return True
 
 
-@kernel
+@inlined
 def acceleration(
     arm: Manipulator, payload: Array, q: Array, qd: Array, effort: Array, qdd: Array, work: Workspace,
 ) -> bool:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flexmanip_ros.arm.equations_of_motion import curvature_and_slope
+from flexmanip_ros.arm.equations_of_motion import curvature_and_slope, shortening_gradient
 from flexmanip_ros.numerics.compiled import inner
 
 if TYPE_CHECKING:
@@ -204,15 +204,15 @@ def link_jacobian(
         Se[r], Sn[r] = 0.0, 0.0
         feq[r], fnq[r], fev[r], fnv[r] = 0.0, 0.0, 0.0, 0.0
     total, fe, fn = 0.0, 0.0, 0.0
+    shortening_gradient(shortening, eta, work.gradient[0])
+    shortening_gradient(shortening, etad, work.gradient[1])
+    shortening_gradient(shortening, etadd, work.gradient[2])
     for p in range(arm.mass.shape[1]):
         m = arm.mass[i, p]
+        by_eta, by_rate, by_acceleration = work.gradient[0, p], work.gradient[1, p], work.gradient[2, p]
         x, y, xd, yd, xdd, ydd = arm.place[i, p], 0.0, 0.0, 0.0, 0.0, 0.0
         for j in range(k):
-            G, h, gdd = 0.0, 0.0, 0.0
-            for t in range(k):
-                G += shortening[p, j, t] * eta[t]
-                h += shortening[p, j, t] * etad[t]
-                gdd += shortening[p, j, t] * etadd[t]
+            G, h, gdd = by_eta[j], by_rate[j], by_acceleration[j]
             shape = phi[p, j]
             x -= 0.5 * G * eta[j]
             xd -= G * etad[j]
@@ -254,10 +254,12 @@ def link_jacobian(
             shape, G = phi[p, j], g[1 + j]
             by_q, by_v = left[o + j, o:o + k], right[o + j, o:o + k]
             for t in range(k):
-                by_q[t] += shape * nq[1 + t] - G * eq[1 + t] - shortening[p, j, t] * Ae
+                by_q[t] += shape * nq[1 + t] - G * eq[1 + t] - shortening[j, p, t] * Ae
                 by_v[t] += shape * nv[1 + t] - G * ev[1 + t]
     # the root's acceleration, in the frame, moves all points alike
     for r in range(n):
+        if i == 0 and r != i and not arm.floating:
+            continue  # a pinned root is not accelerated
         e = c * Aq[0, r] + s * Aq[1, r]
         f = c * Aq[1, r] - s * Aq[0, r]
         if r == i:

@@ -128,7 +128,8 @@ class Manipulator(NamedTuple):
     phi: Array
     """(L, P, k) shapes there."""
     G: Array
-    """(L, P, k, k) integral of phi' phi'^T from 0 to x; zero without shortening."""
+    """(L, k, P, k) integral of phi' phi'^T from 0 to x, the points between its rows and columns; zero without
+    shortening."""
     slope: Array
     """(L, P, k) phi'."""
     curvature: Array
@@ -184,6 +185,8 @@ class Workspace(NamedTuple):
     """(12, k + 1) scratch of one link."""
     block: Array
     """(k + 1, k + 1) scratch of one link."""
+    gradient: Array
+    """(3, P, k) scratch of one link: G eta at each point, and the same with eta' and eta''."""
     elastic: Array
     tangent: Array
     """(k, k) scratch: derivative of a link's elastic forces of fourth order."""
@@ -212,7 +215,8 @@ def workspace(arm: Manipulator) -> Workspace:
     return Workspace(
         M=np.zeros((n, n)), E=np.zeros(n), J=np.zeros((links + 1, 2, n)), a=np.zeros((links + 1, 2)),
         P=np.zeros((2, n)), F=np.zeros(3), first=np.zeros((links, 2, n)), own=np.zeros((12, k + 1)),
-        block=np.zeros((k + 1, k + 1)), elastic=np.zeros(n), tangent=np.zeros((k, k)),
+        block=np.zeros((k + 1, k + 1)), gradient=np.zeros((3, arm.mass.shape[1], k)), elastic=np.zeros(n),
+        tangent=np.zeros((k, k)),
         A=np.zeros((links + 1, 2)), Aq=np.zeros((links + 1, 2, n)), Av=np.zeros((links + 1, 2, n)),
         Fq=np.zeros((2, n)), Fv=np.zeros((2, n)), frame=np.zeros((4, n)), B=np.zeros((n, links)),
         net=np.zeros((3, links)), held=np.zeros((2, n)))
@@ -262,7 +266,7 @@ def manipulator(arm: ArmParameters, kappa: int | None = None, points: int | None
     scale = length[:, None, None]
     made = Manipulator(
         kappa=k, floating=bool(arm.base_mass), length=length.copy(), mass=mass, place=x * length[:, None],
-        phi=phi, G=G / scale[..., None], slope=slope / scale,
+        phi=phi, G=np.moveaxis(G / scale[..., None], 2, 1), slope=slope / scale,
         curvature=curvature / scale ** 2, along=weight * length[:, None] * arm.shortening,
         tip_shortening=G[-1] / scale, root_slope=root, tip_slope=tip,
         rotary=_rotary(arm, shapes, root, tip, joint), stiffness=stiffness, damping=_damping(arm, shapes, stiffness),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexmanip_ros.numerics.compiled import inner, kernel, library
 from flexmanip_ros.types import Array
@@ -46,13 +47,18 @@ def dot(a: Array, b: Array) -> float:
 
 
 @inner
-def absorb_measurement(x: Array, S: Array, f: Array, e: float, r: float, variance: float) -> None:
-    """Potter's update: innovation e of variance = f'f + r, r the noise variance, f = S' H' where that is not zero."""
+def absorb_measurement(
+    x: Array, S: Array, opened: NDArray[np.int64], f: Array, e: float, r: float, variance: float,
+) -> None:
+    """Potter's update: innovation e of variance = f'f + r, r the noise variance, f = S' H' where that is not zero.
+
+    opened: (1 + np,) how many of the last np states are not taken as known, then which these are.
+    """
     gamma = 1.0 / (1.0 + np.sqrt(r / variance))
-    for i in range(x.size):
+    first = x.size - opened.size + 1
+    for k in range(first + opened[0]):
+        i = k if k < first else first + opened[1 + k - first]
         gain = dot(f, S[i]) / variance
-        if gain == 0.0:  # taken as known
-            continue
         x[i] += gain * e
         gain *= gamma
         for c in range(f.size):

@@ -144,10 +144,10 @@ def observe(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Ar
 
 
 @inner
-def measure(sensors: MeasurementModel, m: FilterState, y: Array, qdd: Array) -> None:
+def measure(sensors: MeasurementModel, m: FilterState, y: Array, qdd: Array, opened: NDArray[np.int64]) -> None:
     """Update the filter with one sample and gather what its innovations say of noise and payload.
 
-    qdd: (n,) accelerations.
+    qdd: (n,) accelerations; opened: see ``ProcessModel``.
     """
     x, S, f = m.x, m.S, sensors.f[:m.counts[USED]]
     n = sensors.H.shape[1]
@@ -170,7 +170,7 @@ def measure(sensors: MeasurementModel, m: FilterState, y: Array, qdd: Array) -> 
         m.score[MOVE] += gain * e
         m.score[VARIANCE] += gain * gain * variance
         m.noise[i, WEIGHT] += gain * gain * variance
-        absorb_measurement(x, S, f, e, r, variance)
+        absorb_measurement(x, S, opened, f, e, r, variance)
         white_noise(m, i, y[i])
     count_spectrum(m)
     m.counts[SEEN] = min(m.counts[SEEN] + 1, 2000)

@@ -466,7 +466,7 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
         return False
     came = y[0] == y[0]
     if came:
-        measure(sensors, m, y, motion.k[0])
+        measure(sensors, m, y, motion.k[0], motion.opened)
         keep_possible(motion, m, CHANCE)
         if not abs(m.x[2 * sensors.H.shape[1]]) < 1e9:
             return False

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, acceleration, balance, solve
 from flexmanip_ros.arm.jacobian import add_body_forces, complete_jacobian, force_jacobian, solve_columns
 from flexmanip_ros.arm.late_torque import late_torque
-from flexmanip_ros.numerics.compiled import inlined, inner, kernel, merged
+from flexmanip_ros.numerics.compiled import inlined, inner, kernel
 from flexmanip_ros.numerics.square_root import dot, multiply
 from flexmanip_ros.types import Array
 
@@ -42,6 +42,8 @@ STIFF_STEP = 2.0
 """Longest step over the time constant of the stiffest damper: the series of the exponential converges quickly there."""
 
 
+BEGIN, MEAN, END = range(3)
+"""Places in a step."""
 MOST_STEPS = 2000.0
 """Steps from a sample to the next: an arm that needs more is none."""
 STIFFEST = 200.0
@@ -270,7 +272,7 @@ def constant_mass(motion: ProcessModel) -> None:
                 M[r, c] += motion.payload[p] * motion.Mp[p, r, c]
 
 
-@kernel
+@inlined
 def accelerate(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
     """Fill qdd (n,) under motion.effort; leaves the factor of M in work.M."""
     if not motion.frozen:
@@ -292,17 +294,14 @@ def constant_mass_jacobian(motion: ProcessModel, qdd: Array) -> None:
                 motion.dp[r, p] += motion.Mp[p, r, c] * qdd[c]
 
 
-@merged
-def linearize(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
-    """Fill qdd under motion.effort and motion.F (n, 2 n), its derivatives by q and q'."""
-    if not accelerate(motion, q, qd, qdd):
-        return False
+@inner
+def linearize(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> None:
+    """Fill motion.F (n, 2 n), the derivatives of the accelerations by q and q'; right after ``accelerate`` there."""
     if motion.frozen:
         constant_mass_jacobian(motion, qdd)
     else:
         force_jacobian(motion.arm, motion.payload, q, qd, qdd, motion.dq, motion.dqd, motion.dp, motion.work)
     complete_jacobian(motion.arm, q, qd, motion.dq, motion.dqd, motion.F, motion.work)
-    return True
 
 
 @inner
@@ -491,37 +490,43 @@ def predict(
         motion.effort[i] = motion.gain[i] * late_torque(rows, 1 + i, late[0], late[1], period, slope)
         slope[0] *= motion.gain[i]
         slope[1] *= motion.gain[i]
-    left, stiff, begun = duration, 0.0, False
+    left, stiff, h, steps, turn, place = duration, 0.0, 0.0, 0.0, 0.0, BEGIN
+    q, qd, qdd = x[:n], x[n:2 * n], motion.k[0]
     while True:
-        # a step that follows another begins where that one ended
-        if not begun and not accelerate(motion, x[:n], x[n:2 * n], motion.k[0]):
+        # the only call: the equations of motion are compiled into this loop
+        if not accelerate(motion, q, qd, qdd):
             return 0
+        if place == MEAN:
+            linearize(motion, q, qd, qdd)
+            if duration <= 0.0:
+                return 1
+            stiff = 0.0
+            for r in range(n):
+                stiff -= motion.F[r, n + r]
+            if stiff * h > 1.1 * STIFF_STEP:
+                q, qd, qdd, place = x[:n], x[n:2 * n], motion.k[0], BEGIN
+                continue
+            turn = max(STEP_ANGLE / motion.substeps, stiff) * h
+            if used > 0:
+                parameter_columns(motion, h)
+                spread(motion.F, motion.G, motion.opened, S, used, motion.scratch, h, terms(turn, SPREAD_ERROR))
+            lead(motion, x, h, turn)
+            q, qd, qdd, place = motion.k[18], motion.k[19], motion.k[0], END
+            continue
+        if place == END:
+            if not arrive(motion, x, h, turn):
+                return 0
+            taken += 1
+            if steps <= 1.0:
+                return taken
+            left -= h
         longest = min(motion.substeps, friction_step(motion, left), STIFF_STEP / max(stiff, 1e-9))
         steps = max(np.ceil(left / longest - 1e-9), 1.0)
         if not (steps < MOST_STEPS and stiff * motion.substeps < STIFFEST * STIFF_STEP):
             return 0
         h = left / steps
         average(motion, x, h)
-        if not linearize(motion, motion.k[16], motion.k[17], motion.k[8]):
-            return 0
-        if duration <= 0.0:
-            return 1
-        stiff = 0.0
-        for r in range(n):
-            stiff -= motion.F[r, n + r]
-        begun = stiff * h <= 1.1 * STIFF_STEP
-        if not begun:
-            continue
-        turn = max(STEP_ANGLE / motion.substeps, stiff) * h
-        if used > 0:
-            parameter_columns(motion, h)
-            spread(motion.F, motion.G, motion.opened, S, used, motion.scratch, h, terms(turn, SPREAD_ERROR))
-        if not exponential_step(motion, x, h, turn):
-            return 0
-        taken += 1
-        if steps <= 1.0:
-            return taken
-        left -= h
+        q, qd, qdd, place = motion.k[16], motion.k[17], motion.k[8], MEAN
 
 
 @inner
@@ -567,9 +572,9 @@ def remainder(motion: ProcessModel, q: Array, qd: Array, qdd: Array, lacks: Arra
             lacks[i] -= motion.F[i, j] * (q[j] - about[j]) + motion.F[i, n + j] * (qd[j] - rate[j])
 
 
-@merged
-def exponential_step(motion: ProcessModel, x: Array, h: float, turn: float) -> bool:
-    """Advance x by h, exactly where the motion is linear; right after ``linearize`` at its mean.
+@inner
+def lead(motion: ProcessModel, x: Array, h: float, turn: float) -> None:
+    """Fill rows 18 and 19 of motion.k with where r0 alone leads in a step h; right after ``linearize`` at its mean.
 
     turn: of the fastest mode in the step [rad].
 
@@ -595,9 +600,15 @@ def exponential_step(motion: ProcessModel, x: Array, h: float, turn: float) -> b
     for i in range(n):
         end[i] = x[i] + moved[0, i]
         ending[i] = x[n + i] + moved[1, i]
-    if not accelerate(motion, end, ending, qdd):
-        return False
-    remainder(motion, end, ending, qdd, difference)
+
+
+@inner
+def arrive(motion: ProcessModel, x: Array, h: float, turn: float) -> bool:
+    """Put x where r0 and r1 lead; right after ``accelerate`` where ``lead`` led."""
+    n = motion.arm.stiffness.size
+    first, difference, end, ending = motion.k[3], motion.k[15], motion.k[18], motion.k[19]
+    place, rate, moved = motion.k[10], motion.k[11], motion.k[12:14]
+    remainder(motion, end, ending, motion.k[0], difference)
     for i in range(n):
         difference[i] -= first[i]
         place[i], rate[i], first[i] = 0.0, 0.0, 0.0
@@ -654,14 +665,14 @@ def spread(
     """
     n, known, count_p = flow.shape[0], 2 * flow.shape[0], opened[0]
     size = n * used
-    now = scratch[:2 * size].reshape((known, used))
-    rates, mean, slope = (scratch[2 * size:3 * size].reshape((n, used)), scratch[3 * size:4 * size].reshape((n, used)),
-                          scratch[4 * size:5 * size].reshape((n, used)))
-    parameters = scratch[5 * size:5 * size + count_p * used].reshape((count_p, used))
-    columns = scratch[5 * size + count_p * used:5 * size + count_p * (used + n)].reshape((n, count_p))
-    for c in range(used):
-        for r in range(known):
-            now[r, c] = S[r, c]
+    start, now, rates = scratch[:2 * size], scratch[2 * size:4 * size], scratch[4 * size:5 * size]
+    mean, slope, rest = scratch[5 * size:6 * size], scratch[6 * size:7 * size], scratch[7 * size:]
+    parameters = rest[:count_p * used].reshape((count_p, used))
+    columns = rest[count_p * used:count_p * (used + n)].reshape((n, count_p))
+    for r in range(known):
+        for c in range(used):
+            start[r * used + c] = S[r, c]
+            now[r * used + c] = S[r, c]
     for p in range(count_p):
         for c in range(used):
             parameters[p, c] = S[known + opened[1 + p], c]
@@ -670,24 +681,23 @@ def spread(
         for r in range(n):
             for p in range(count_p):
                 columns[r, p] = G[r, part * count_p + p]
-            for c in range(used):
-                product[r, c] = 0.0
+        for c in range(size):
+            product[c] = 0.0
         if count_p > 0:
-            multiply(columns, parameters, product)
+            multiply(columns, parameters, product.reshape((n, used)))
+    place, rate, moved, moving = start[:size], start[size:], now[:size], now[size:]
     for order in range(count, 0, -1):
-        multiply(flow, now, rates)
+        multiply(flow, now.reshape((known, used)), rates.reshape((n, used)))
         weight, moment = h / order, (1.0 - order) / (order + 1.0)
-        for r in range(n):
-            place, rate, moved, moving, following = S[r], S[n + r], now[r], now[n + r], rates[r]
-            by_mean, by_slope = mean[r], slope[r]
-            for c in range(used):
-                moved[c] = place[c] + weight * moving[c]
-                moving[c] = rate[c] + weight * (following[c] + by_mean[c] + moment * by_slope[c])
+        for c in range(size):
+            moved[c] = place[c] + weight * moving[c]
+        for c in range(size):
+            moving[c] = rate[c] + weight * (rates[c] + mean[c] + moment * slope[c])
     for r in range(known):
         for c in range(used):
-            S[r, c] = now[r, c]
+            S[r, c] = now[r * used + c]
 
 
 def spread_scratch(n: int, size: int, columns: int) -> Array:
     """Allocate for n coordinates, ``size`` entries of p, and square roots of at most so many columns."""
-    return np.zeros(5 * n * columns + size * (columns + n))
+    return np.zeros(7 * n * columns + size * (columns + n))

@@ -40,7 +40,7 @@ def bodies(arm: simulator.PlantState, q: Array, holds: bool) -> list[tuple[float
     for i in range(2):
         bend = q[2 + i * k:2 + (i + 1) * k]
         for p, mass in enumerate(made.mass[i]):
-            along = made.place[i, p] - bend @ made.G[i, p] @ bend / 2.0
+            along = made.place[i, p] - bend @ made.G[i, :, p] @ bend / 2.0
             place = root + along * unit(q[i]) + (made.phi[i, p] @ bend) * left(q[i])
             found.append((float(mass), 0.0, place, q[i]))
         root = found[-1][2]
