@@ -207,6 +207,14 @@ def eliminate_translation(M: Array, E: Array, work: Workspace) -> None:
 
 
 @inner
+def inertial_forces(arm: Manipulator, payload: Array, q: Array, qd: Array, work: Workspace) -> None:
+    """Fill work.M and work.E, the translation of a floating base left out."""
+    assemble(arm, payload, q, qd, work.M, work.E, work)
+    if arm.floating:
+        eliminate_translation(work.M, work.E, work)
+
+
+@inner
 def curvature_and_slope(curvature: Array, slopes: Array, eta: Array) -> tuple[float, float]:
     """Return curvature w'' and slope w' of a link where its shapes have phi'' and phi' (k,); eta: (k,)."""
     bend, slope = 0.0, 0.0
@@ -375,7 +383,5 @@ def acceleration(
     Leaves the Cholesky factor of M in work.M, E, ``torque_matrix`` in work.B and ``net_torques`` in work.net. False
     when M is not positive definite (numbers left the finite range).
     """
-    assemble(arm, payload, q, qd, work.M, work.E, work)
-    if arm.floating:
-        eliminate_translation(work.M, work.E, work)
+    inertial_forces(arm, payload, q, qd, work)
     return balance(arm, q, qd, effort, qdd, work)

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, acceleration, balance, solve
+from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, balance, inertial_forces, solve
 from flexmanip_ros.arm.jacobian import add_body_forces, complete_jacobian, force_jacobian, solve_columns
 from flexmanip_ros.arm.late_torque import late_torque
-from flexmanip_ros.numerics.compiled import inlined, inner, kernel
+from flexmanip_ros.numerics.compiled import inner, kernel
 from flexmanip_ros.numerics.square_root import dot, multiply
 from flexmanip_ros.types import Array
 
@@ -157,7 +157,7 @@ class ProcessModel(NamedTuple):
     """See ``spread_scratch``."""
 
 
-@inlined
+@inner
 def set_parameters(motion: ProcessModel, x: Array) -> None:
     """Write what the state holds of payload and arm into motion."""
     arm, payload = motion.arm, motion.payload
@@ -272,12 +272,13 @@ def constant_mass(motion: ProcessModel) -> None:
                 M[r, c] += motion.payload[p] * motion.Mp[p, r, c]
 
 
-@inlined
+@inner
 def accelerate(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
     """Fill qdd (n,) under motion.effort; leaves the factor of M in work.M."""
-    if not motion.frozen:
-        return acceleration(motion.arm, motion.payload, q, qd, motion.effort, qdd, motion.work)
-    constant_mass(motion)
+    if motion.frozen:
+        constant_mass(motion)
+    else:
+        inertial_forces(motion.arm, motion.payload, q, qd, motion.work)
     return balance(motion.arm, q, qd, motion.effort, qdd, motion.work)
 
 
