@@ -520,7 +520,7 @@ def predict(
             taken += 1
             if steps <= 1.0:
                 return taken
-            left -= h
+            left -= h  # the next step begins with the acceleration at the end of this one
         longest = min(motion.substeps, friction_step(motion, left), STIFF_STEP / max(stiff, 1e-9))
         steps = max(np.ceil(left / longest - 1e-9), 1.0)
         if not (steps < MOST_STEPS and stiff * motion.substeps < STIFFEST * STIFF_STEP):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import closing
 
 import numpy as np
+import pytest
 from estimates import one_a_stamp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -117,6 +118,23 @@ def test_blocks_of_messages_give_the_bits_of_single_messages(
     for last in (blocks[-1][0], ended):
         assert single[-1][0].counters == last.counters
         assert _bits(pipeline.current(single[-1][0])) == _bits(pipeline.current(last))
+
+
+@pytest.mark.parametrize('again', [False, True], ids=['once', 'and anew: its stamps jump back'])
+def test_what_is_read_while_the_payload_takes_its_rows_changes_no_bit(
+        monkeypatch: pytest.MonkeyPatch, again: bool) -> None:
+    items = _arrivals([(90, 'lost'), (301, 'nan')], [(260, 250, EventKind.CAPTURE)])
+    if again:
+        later = [item._replace(stamp_ns=item.stamp_ns + 100_000 * MS) for item in items]
+        items = [*later, *RECORDS[:150]]
+    *_, (last, _) = pipeline.replay(CONFIG, items)
+    monkeypatch.setattr(pipeline, 'ABSORB_GROUP', 60)
+    monkeypatch.setattr(pipeline, 'REPLAY_GROUP', 50)
+    with closing(Threads()) as beside:
+        *_, ended = pipeline.absorb(CONFIG, _in_blocks(items, 25), beside)
+    assert last.counters == ended.counters
+    assert last.counters.resets == again
+    assert _bits(pipeline.current(last)) == _bits(pipeline.current(ended))
 
 
 def test_every_fit_after_a_capture_gives_the_same_bits_live_and_replayed() -> None:
