@@ -28,7 +28,7 @@ from flexmanip_ros import pipeline
 from flexmanip_ros.errors import CheckpointError
 from flexmanip_ros.parameters import IdentifierParameters, flatten, leaves
 
-NAME, FORMAT = b'flexmanip_ros checkpoint ', b'15\n'
+NAME, FORMAT = b'flexmanip_ros checkpoint ', b'16\n'
 """The format changes with what a state holds, and with the place of a class."""
 CHECKSUM = hashlib.sha256().digest_size
 PACKAGE = 'flexmanip_ros.'
