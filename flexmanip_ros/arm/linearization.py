@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from flexmanip_ros.arm.equations_of_motion import assemble, eliminate_translation
+from flexmanip_ros.arm.equations_of_motion import assemble, inertial_forces
 from flexmanip_ros.arm.manipulator import Manipulator, Workspace, manipulator, payload_array, workspace
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
@@ -17,9 +17,8 @@ from flexmanip_ros.types import Array
 
 def mass_matrix(arm: Manipulator, payload: Array, q: Array) -> Array:
     """Return M(q), (n, n); of a floating base without its translation, which keeps the momentum."""
-    work = _assembled(arm, payload, q)
-    if arm.floating:
-        eliminate_translation(work.M, work.E, work)
+    work, q = workspace(arm), np.asarray(q, float)
+    inertial_forces(arm, payload, q, np.zeros_like(q), work)
     lower = np.tril(work.M)
     return lower + np.tril(lower, -1).T
 

@@ -40,10 +40,8 @@ MOST_TERMS = 30
 """Terms of an exponential at most: more than ``STEP_ANGLE`` needs."""
 STIFF_STEP = 2.0
 """Longest step over the time constant of the stiffest damper: the series of the exponential converges quickly there."""
-
-
 BEGIN, MEAN, END = range(3)
-"""Places in a step."""
+"""Stages of a step, by where the accelerations are evaluated: where it begins, at its mean state, where it ends."""
 MOST_STEPS = 2000.0
 """Steps from a sample to the next: an arm that needs more is none."""
 STIFFEST = 200.0
@@ -491,13 +489,13 @@ def predict(
         motion.effort[i] = motion.gain[i] * late_torque(rows, 1 + i, late[0], late[1], period, slope)
         slope[0] *= motion.gain[i]
         slope[1] *= motion.gain[i]
-    left, stiff, h, steps, turn, place = duration, 0.0, 0.0, 0.0, 0.0, BEGIN
+    left, stiff, h, steps, turn, stage = duration, 0.0, 0.0, 0.0, 0.0, BEGIN
     q, qd, qdd = x[:n], x[n:2 * n], motion.k[0]
     while True:
         # the only call: the equations of motion are compiled into this loop
         if not accelerate(motion, q, qd, qdd):
             return 0
-        if place == MEAN:
+        if stage == MEAN:
             linearize(motion, q, qd, qdd)
             if duration <= 0.0:
                 return 1
@@ -505,16 +503,16 @@ def predict(
             for r in range(n):
                 stiff -= motion.F[r, n + r]
             if stiff * h > 1.1 * STIFF_STEP:
-                q, qd, qdd, place = x[:n], x[n:2 * n], motion.k[0], BEGIN
+                q, qd, qdd, stage = x[:n], x[n:2 * n], motion.k[0], BEGIN
                 continue
             turn = max(STEP_ANGLE / motion.substeps, stiff) * h
             if used > 0:
                 parameter_columns(motion, h)
                 spread(motion.F, motion.G, motion.opened, S, used, motion.scratch, h, terms(turn, SPREAD_ERROR))
             lead(motion, x, h, turn)
-            q, qd, qdd, place = motion.k[18], motion.k[19], motion.k[0], END
+            q, qd, qdd, stage = motion.k[18], motion.k[19], motion.k[0], END
             continue
-        if place == END:
+        if stage == END:
             if not arrive(motion, x, h, turn):
                 return 0
             taken += 1
@@ -527,7 +525,7 @@ def predict(
             return 0
         h = left / steps
         average(motion, x, h)
-        q, qd, qdd, place = motion.k[16], motion.k[17], motion.k[8], MEAN
+        q, qd, qdd, stage = motion.k[16], motion.k[17], motion.k[8], MEAN
 
 
 @inner
