@@ -19,16 +19,16 @@ from flexmanip_ros.samples.sample_log import Rows, SampleLog
 from flexmanip_ros.types import DATING_STD_S, Array, CaptureEvent, EventKind, JointBlock, JointRecord
 
 SETTLE = 0.5
-"""Seconds after the start or an event before the next can be told."""
+"""Time after the start or an event within which no event is reported [s]."""
 CONFIRM = 0.01
-"""Seconds from an alarm to its report: they date the onset."""
+"""Time from an alarm to its report [s]; the samples in it serve to date the onset."""
 PEAK_MEMORY = 20.0
-"""Seconds in which a peak of the statistic is forgotten."""
+"""Time in which a peak of the statistic is forgotten [s]."""
 INDEPENDENT = 0.5
-"""Samples a look that is as good as independent, over all onsets of the window (for the false alarms)."""
+"""Samples for each test that counts as independent, for the false alarms; a test is over all onsets of the window."""
 SPEED, ACCELERATION, JERK = 0.3, 5.0, 200.0
-"""Prior deviations of what the tip's light mass would gain: impulse [m/s], step [m/s^2], ramp [m/s^3]. Of a moment: as
-much, at the radius of gyration that a body is thought to have."""
+"""Prior deviations of what a force gives the mass at the empty tip: impulse [m/s], step [m/s^2], ramp [m/s^3]. A moment
+has the same, at the prior radius of gyration of a body."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +38,11 @@ class DetectionState:
     identifier: IdentifierParameters
     filter: structured.StructuredState
     kept: tuple[int, ...]
-    """Outputs that are looked at."""
+    """Indices of the outputs that are used: displacements, where there are any."""
     glr: kernel.GlrState | None = None
     dt: float = 0.0
     since: int | None = None
-    """Row of the sample log with which it started, or after the last gap; an onset is not dated before it."""
+    """Row of the sample log at the start or after the last gap; no onset is dated before it."""
 
 
 def init(config: TriggerParameters) -> DetectionState:
@@ -95,10 +95,10 @@ def statistic(state: DetectionState) -> tuple[float, float]:
 
 
 def threshold(config: TriggerParameters, dt: float) -> float:
-    """Return what the statistic exceeds by chance as rarely as the parameters allow.
+    """Return the threshold that the statistic exceeds by chance ``false_alarms_per_hour`` times an hour.
 
-    Under no event it is chi-square with as many degrees of freedom as there are causes tested; an hour holds so many
-    independent looks, each at every onset of the window.
+    Without an event the statistic is chi-square with one degree of freedom for each cause that is tested. An hour has
+    one independent test for each ``INDEPENDENT`` samples.
     """
     looks = 3600.0 / dt / INDEPENDENT
     chance = min(0.5, config.false_alarms_per_hour / looks)
@@ -106,12 +106,12 @@ def threshold(config: TriggerParameters, dt: float) -> float:
 
 
 def onset(glr: kernel.GlrState, variance: Array, longest: int) -> float:
-    """Return the mean of how many samples ago the force at the tip began, each onset as likely as another before.
+    """Return the posterior mean of the number of samples since the force at the tip began, with a uniform prior.
 
-    variance: (m,) of the white noise [rad^2 or m^2]: the one that the filter takes grows with the event. longest:
-    samples since the last gap. An onset has the likelihood exp(s' P s / 2) / sqrt(det(I + N)), its nine causes
-    integrated over: s their score, N their information, P the inverse of I + N. An early onset has more freedom to
-    fit what a later one explains; the determinant is the price of it.
+    variance: (m,) of the white noise [rad^2 or m^2], as the filter's own grows with the event. longest: samples since
+    the last gap. The nine causes are integrated out: an onset has the likelihood exp(s' P s / 2) / sqrt(det(I + N))
+    with s their score, N their information and P the inverse of I + N. The determinant is the price of an early onset,
+    which can fit what a later one explains.
     """
     w, newest = glr.trace.shape[0], int(glr.clock[kernel.NEWEST])
     lags = np.arange(min(int(glr.clock[kernel.FILLED]), longest + 1, w))
@@ -128,7 +128,7 @@ def onset(glr: kernel.GlrState, variance: Array, longest: int) -> float:
 
 
 def _start(config: TriggerParameters, state: DetectionState, row: Rows) -> DetectionState:
-    """Let the filter start; then, if there is none yet, allocate the watch for its sample time."""
+    """Let the filter take its first rows; once it has started, allocate the test for its sample time."""
     since = row.first if state.since is None else state.since
     state = replace(state, filter=structured.advance(state.identifier, state.filter, row), since=since)
     if state.filter.memory is None or state.filter.model is None or state.glr is not None:
@@ -186,7 +186,7 @@ def _watch(
 
 
 def _after(state: DetectionState, event: CaptureEvent) -> DetectionState:
-    """Apply the event to the filter, and restart its motion: the samples since the onset misled it."""
+    """Apply the event to the filter, and restart its motion, which the samples since the onset made wrong."""
     assert state.glr is not None
     now = event._replace(stamp_ns=state.filter.last_ns)
     filtered = structured.event(state.identifier, state.filter, now)
@@ -202,7 +202,7 @@ def _resume(state: DetectionState, row: Rows) -> DetectionState:
 
 
 def _quiet(glr: kernel.GlrState) -> kernel.GlrState:
-    """Forget what was gathered; wait before the next alarm. What the model always misses stays known."""
+    """Begin the test again after a pause. The recent peak, which errors of the model cause, is kept."""
     fresh = kernel.GlrState._make(part.copy() for part in glr)
     fresh.clock[:] = 0
     fresh.level[kernel.STATISTIC] = 0.0
@@ -213,7 +213,7 @@ def _quiet(glr: kernel.GlrState) -> kernel.GlrState:
 
 Item = JointRecord | JointBlock | CaptureEvent
 PIECE = 256
-"""Messages of a block that are looked at together. Where an event is in them, they are looked at one by one."""
+"""Messages of a block that are tested together; where an event is found in them, they are tested one by one."""
 
 
 class Watch(NamedTuple):

@@ -35,23 +35,25 @@ if TYPE_CHECKING:
     from flexmanip_ros.payload.process_model import ProcessModel
 
 DIRECTIONS = 3
-"""Of what acts on the tip: force along x and y, moment."""
+"""Number of components of what acts on the tip: force along x and y, moment."""
 CAUSES = 3 * DIRECTIONS
-"""Impulse, step and ramp of each direction in turn."""
+"""Number of causes: impulse, step and ramp of each component in turn."""
 TESTED = 6
-"""Causes that are tested, the first ones, those of the force: whatever is caught pushes with one. Three more degrees of
-freedom find a capture 2 ms later, and one at rest 9 ms."""
+"""Number of causes that are tested, the first ones, those of the force, which every capture exerts. With the three of
+the moment as well a capture is found 2 ms later, and one at rest 9 ms later."""
 SHORTEST = 3
-"""Samples after the onset before it can be told."""
+"""Least number of samples from the onset to an alarm."""
 REFRESH = 16
 """Samples between computations of the traces."""
 CALM = 3.0
-"""The statistic must exceed this times its own recent peaks: what the model always misses is no event. A capture by an
-arm as it is reaches 10 to 1000 times them within 0.1 s; with 2 three runs of 48 had a false alarm, with 3 none."""
+"""Factor by which the statistic must exceed its own recent peaks, which errors of the model cause. At a capture it
+reaches 10 to 1000 times these peaks within 0.1 s. With a factor of 2 three of 48 runs had a false alarm, with 3
+none."""
 CAUSED = 0.25
-"""Share of the largest energy below which a peak is not taken for the torque's doing: chance has peaks as well."""
+"""Share of the largest energy of the torque below which a peak is not ascribed to the torque: chance has peaks as
+well."""
 MOST_HALVINGS = 20
-"""Halvings of a sample time in the exponential: the linearization of an arm that needs more is none."""
+"""Largest number of halvings of a sample time in the matrix exponential: no real arm needs more."""
 
 # elements of ``clock``
 NEWEST, FILLED, SINCE_TRACES, QUIET, HISTORY, ALARMED = range(6)
@@ -69,18 +71,18 @@ class GlrState(NamedTuple):
     factors: Array
     """(w, 6, 6) Cholesky factor of I + information at each lag."""
     scores: Array
-    """(w, 6) gathered for each onset, a ring."""
+    """(w, 6) score of each onset, a ring buffer."""
     past: Array
-    """(w, m) innovations over their variance then, limited to five deviations, a ring."""
+    """(w, m) innovations over their variance at the time, limited to five deviations, a ring buffer."""
     innovations: Array
-    """(w, m) innovations as they are [rad or m], a ring."""
+    """(w, m) innovations [rad or m], a ring buffer."""
     clock: NDArray[np.int64]
     """(6,) counters."""
     level: Array
     """(3,) statistic, recent peak, threshold."""
     history: Array
-    """(2, 2 w) statistics of the last samples and the energies of the torque's changes then: they count once they are
-    older than these."""
+    """(2, 2 w) statistics of the last 2 w samples and energies of the torque's changes; a peak counts once it is
+    older."""
     torques: Array
     """(L,) the last torques [N m]."""
     drive: Array
@@ -93,7 +95,7 @@ class GlrState(NamedTuple):
 
 @inner
 def transition(motion: ProcessModel, flow: Array, state: Array, dt: float) -> None:
-    """Fill flow (n2, n2) with exp(A dt) by scaling and squaring; right after ``predict``, whose X it uses."""
+    """Fill flow (n2, n2) with exp(A dt) by scaling and squaring, right after ``predict``. Scratch: motion.X."""
     n = motion.arm.stiffness.size
     fastest = STEP_ANGLE / motion.substeps
     for r in range(n):
@@ -133,7 +135,7 @@ def transition(motion: ProcessModel, flow: Array, state: Array, dt: float) -> No
 @inner
 def traces(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr: GlrState, prior: Array, dt: float
            ) -> None:
-    """Compute the traces of an onset from the linearization; prior: (3, 3) deviations by order and direction."""
+    """Compute the traces of an onset from the linearization; prior: (3, 3) deviations by order and component."""
     n, links, k = motion.arm.stiffness.size, motion.arm.length.size, motion.arm.kappa
     w, sensors_count = glr.trace.shape[0], glr.trace.shape[1]
     flow, state = glr.flow, glr.state
@@ -181,7 +183,7 @@ def traces(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr:
 
 @inner
 def rescore(glr: GlrState) -> None:
-    """Compute every onset's score again: scores and information must come from the same traces."""
+    """Compute the score of every onset again, as scores and information must come from the same traces."""
     w = glr.trace.shape[0]
     newest = glr.clock[NEWEST]
     for lag in range(glr.clock[FILLED]):
@@ -212,7 +214,7 @@ def information(m: FilterState, glr: GlrState) -> None:
             for b in range(a + 1):
                 glr.factors[lag, a, b] += glr.factors[lag - 1, a, b]
     for lag in range(glr.trace.shape[0]):
-        if not factor_information(glr.factors[lag]):  # an arm that is none: nothing can be told of an onset
+        if not factor_information(glr.factors[lag]):  # no real arm: no onset can be found
             for a in range(TESTED):
                 for b in range(a + 1):
                     glr.factors[lag, a, b] = 1e150 if a == b else 0.0
@@ -254,7 +256,7 @@ def update_glr(m: FilterState, glr: GlrState, scratch: Array) -> None:
 
 @inner
 def note_torques(glr: GlrState, torques: Array) -> None:
-    """Take the torques held before the sample: the energy of their changes fades over the window."""
+    """Add the change of the torques before a sample to its energy, which fades over the window."""
     glr.drive[ENERGY] -= glr.drive[ENERGY] / glr.trace.shape[0]
     for i in range(torques.size):
         change = torques[i] - glr.torques[i]
@@ -264,10 +266,11 @@ def note_torques(glr: GlrState, torques: Array) -> None:
 
 @inner
 def limit(glr: GlrState) -> float:
-    """Return what the statistic must exceed: the threshold, or more where the model always misses something.
+    """Return the limit of the statistic: the threshold, or ``CALM`` times its recent peak, whichever is larger.
 
-    A change of the torque sets modes going that the model leaves out. What they add to the innovations is proportional
-    to it, and the statistic is quadratic: the recent peak is taken in proportion to the energy of the changes.
+    A change of the torque excites modes that the model leaves out. Their part in the innovations is proportional to
+    that change, and the statistic is quadratic in it. So the recent peak is scaled with the energy of the torque's
+    changes.
     """
     drive = glr.drive
     larger = drive[ENERGY] / max(drive[AT_PEAK], CAUSED * drive[LARGEST], 1e-300)
@@ -277,7 +280,7 @@ def limit(glr: GlrState) -> float:
 
 @inner
 def remember(glr: GlrState, fade: float) -> None:
-    """Let a statistic that is older than the window become the recent peak: the largest over its energy."""
+    """Make a statistic that is older than the window the recent peak if it is the largest over its energy."""
     clock, history, drive = glr.clock, glr.history, glr.drive
     clock[HISTORY] = (clock[HISTORY] + 1) % history.shape[1]
     old, energy = history[0, clock[HISTORY]], history[1, clock[HISTORY]]
@@ -302,7 +305,7 @@ def advance(
     motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr: GlrState, prior: Array, dt: float,
     fade: float, hold: int, confirm: int, table: Array, first: int, scratch: Array, watching: bool,
 ) -> int:
-    """Run the filter over the rows of the table from ``first`` on, and the test too if watching; return the next row.
+    """Run the filter, and if watching the test, over the rows of the table from ``first`` on; return the next row.
 
     table: (N, 1 + L + m) duration since the sample before, torques held meanwhile, measurements (NaN: missing). While
     the horizon is open (fewer than ``HORIZON`` samples since the event), it begins with the first sample after it. The
@@ -324,7 +327,7 @@ def advance(
             traces(motion, sensors, m, glr, prior, dt)
         clock[SINCE_TRACES] = (clock[SINCE_TRACES] + 1) % REFRESH
         update_glr(m, glr, scratch)
-        # while the moving-horizon estimation is on its way, innovations tell nothing
+        # until the moving-horizon estimation has converged, innovations tell nothing of an event
         clock[QUIET] = clock[QUIET] + 1 if settled(m) else 0
         if clock[ALARMED] > 0:
             clock[ALARMED] += 1
@@ -348,7 +351,7 @@ UNWATCHED = GlrState(
     innovations=np.zeros((0, 0)),
     clock=np.zeros(0, dtype=np.int64), level=np.zeros(0), history=np.zeros((0, 0)), torques=np.zeros(0),
     drive=np.zeros(0), flow=np.zeros((0, 0)), state=np.zeros((0, 0, 0)))
-"""In the place of a test that is not run."""
+"""Stands for a test that is not run."""
 
 
 def filtered(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array, first: int) -> int:

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from flexmanip_ros.types import Array
 
 HORIZON = 4096
-"""Samples after an event that the moving-horizon estimation reads again, at most."""
+"""Largest number of samples after an event that the moving-horizon estimation reads again."""
 ENOUGH = 512
-"""It ends with so many once it has converged."""
+"""Samples after which it ends once it has converged."""
 TONES = 32
 """Frequencies at which the spectrum of each sensor is taken."""
 
@@ -44,32 +44,39 @@ class FilterState(NamedTuple):
     """(m, 3, TONES) of its fourth differences: both states of Goertzel's filter, mean power over that of white noise
     of unit variance."""
     counts: NDArray[np.int64]
-    """(22,) counters; USED: number of columns of S and S0, the first ones, that are not zero; IN_A_ROW: samples since
-    the last one that was missing; MEASURED: samples of this iteration that were not; TRIED: iterations that did
-    not fit, over the same samples; IN_SPECTRUM: samples of the present spectrum; SPECTRA: those in the mean power."""
+    """(22,) counters and flags (1: yes).
+
+    Filter: HELD: the arm holds something; LEARNED: it was seen empty before; SEEN: samples measured, at most 2000;
+    SINCE_EVENT: those since the last event; IN_A_ROW: those since the last one that was missing; SINCE_NOISE: samples
+    since process noise was added; USED: number of the first columns of S and S0, beyond which they are zero. Noise:
+    IN_BLOCK, IN_BATCH, IN_SPECTRUM: samples of the present block, batch, spectrum; BLOCKS, BATCHES, SPECTRA: how many
+    are in the means. Fit: STORED: samples in the horizon, ``HORIZON`` once it has closed; ITERATING: an iteration is
+    under way; ITERATED, MEASURED: samples that it has read, and those of them that were not missing; BEFORE: samples of
+    the last accepted iteration; REJECTED: steps rejected since then; AGAIN: the next one reads the same samples, as it
+    has not converged; TRIED: iterations over the same samples so far; REFITS: fits begun again since the event."""
     score: Array
-    """(11,) MOVE: sum of the payload's updates in this batch, VARIANCE: the variance they should have; SHIFT: by how
-    many standard deviations the last iteration moved the payload, DOUBT: root of the sum of the squares of that step
-    and of the deviation, over the payload; DRIFT: mean of MOVE^2 / VARIANCE; NOW: time since process noise was added
-    [s]; EMPTY_ARM_BIAS: payload of the arm before the event, when it was empty, in standard deviations, EXCESS_BIAS:
-    in those left with the inertia error allowed for; COST: of the samples in this iteration, COST_BEFORE: of the first
-    BEFORE samples in the last one; LAMBDA: damping of Levenberg and Marquardt."""
+    """(11,) MOVE: sum of the payload's updates in this batch, VARIANCE: its variance if the model is right; DRIFT: mean
+    of MOVE^2 / VARIANCE; SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the
+    sum of the squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
+    EMPTY_ARM_BIAS: payload that the arm seemed to hold before the event, when it was empty, in standard deviations;
+    EXCESS_BIAS: the same with the error of the inertia in the deviation; COST: of the samples read in this iteration,
+    COST_BEFORE: of the last accepted one; LAMBDA: damping of Levenberg and Marquardt."""
     x0: Array
     """(nx,) mean just after the last event."""
     S0: Array
-    """(nx, nx) its square root."""
+    """(nx, nx) square root of its covariance."""
     xi: Array
     """(nx,) fitted departure from x0 in units of S0."""
     accepted: Array
-    """(nx,) xi of the last iteration that did not raise the cost."""
+    """(nx,) xi of the last accepted iteration, which did not raise the cost."""
     normal: Array
-    """(nx, nx) N gathered there."""
+    """(nx, nx) information N at that xi."""
     gradient: Array
-    """(nx,) gradient there."""
+    """(nx,) gradient at that xi."""
     xr: Array
-    """(nx,) reference trajectory of the present Gauss-Newton iteration."""
+    """(nx,) present state of the trajectory about which the Gauss-Newton iteration linearizes."""
     Sr: Array
-    """(nx, nx) its sensitivity to xi."""
+    """(nx, nx) its derivative by xi."""
     N: Array
     """(nx, nx) information gathered in the iteration."""
     g: Array

@@ -28,23 +28,24 @@ from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import QUANTILE, Array, Payload, Status
 
 UNKNOWN_STD = 0.3
-"""Relative standard deviation above which the payload counts as unknown: its own is then at least that of the prior."""
+"""Relative standard deviation above which the payload counts as unknown; the prior's is then published at least."""
 FEW = 50
 """Samples after an event before anything is claimed."""
 POWER_LIMIT = 2.0
 """Innovation power over white noise beyond which the model does not fit."""
 UNKNOWN_POWER = 4.0
-"""Beyond this most of the residuals is no noise: the fit may stand in any minimum, and the object weigh anything. After
-a fit that was given up, so it is beyond ``POWER_LIMIT``."""
+"""Innovation power over white noise beyond which the object may weigh anything: most of the residuals are no noise, so
+the fit may be in a wrong minimum. After a fit that was given up, ``POWER_LIMIT`` takes its place."""
 WIDENING_LIMIT = 4.0
-"""Factor by which the payload's moves and the misfit widen its deviation, beyond which the model does not fit."""
+"""Factor on the payload's deviation, by its moves and the misfit, beyond which the model does not fit."""
 FREE_BIAS = 2.0
-"""Standard deviations that an empty arm may seem to hold without a doubt of the model."""
+"""Standard deviations that an empty arm may seem to hold before the interval is widened."""
 MOST_BIAS = 3.0
-"""Standard deviations that an arm may seem to hold while it is empty, the error of its inertia allowed for. Beyond them
-(by chance 1 in 370) it is not the arm that was told or learned, and what it catches is not read right either."""
+"""Standard deviations, with the error of its inertia among them, that an empty arm may seem to hold. Chance exceeds
+them 1 time in 370. Beyond them the arm is not the one that was described or learned, and what it catches is estimated
+wrong."""
 SETTLED = 1000
-"""Samples after which a restart is forgotten."""
+"""Samples after a restart until the status is no longer DIVERGED."""
 
 
 def judge(config: IdentifierParameters, model: Model | None, sensors: MeasurementModel | None,
@@ -138,10 +139,10 @@ def about_com(body: Array) -> Array:
 def empty(seeming: float, std: float, considered: float, consistency: float, status: Status) -> Payload:
     """Return the payload of an arm that should be empty and seems to hold ``seeming`` kg.
 
-    An arm that does not move as an empty one may hold anything: nobody said so, or it is another arm. After minutes std
-    is a thousandth of what any arm's inertia is known to. So what it seems to hold is tested against the consider
-    covariance (Schmidt), in which a parameter that is not estimated, the error of the inertia, has its deviation
-    ``considered`` [kg].
+    An arm that does not move as an empty one may hold anything: a capture was not announced, or it is another arm.
+    After minutes std is far below the error to which the inertia of any arm is known. So what the arm seems to hold is
+    tested against the consider covariance (Schmidt): the error of the inertia, which is not estimated, adds its
+    deviation ``considered`` [kg].
     """
     if status in (Status.INCONSISTENT, Status.DIVERGED):
         return Payload(0.0, math.inf, 0.0, math.inf, consistency, status)
@@ -154,12 +155,12 @@ def empty(seeming: float, std: float, considered: float, consistency: float, sta
 
 
 def inertia_error(config: IdentifierParameters, model: Model, mass: float) -> float:
-    """Deviation [kg] of a payload by ``model_error`` of everything at the tip."""
+    """Return the deviation [kg] of a payload of a mass [kg] by the error ``model_error`` of all inertia at the tip."""
     return config.payload.model_error * (mass + model.motion.scale)
 
 
 def plain_misfit(sensors: MeasurementModel, m: mem.FilterState) -> float:
-    """Innovation power over white noise of the sensors of displacements, before any tells of the payload."""
+    """Innovation power over white noise of the displacements, their median, before a sensor tells of the payload."""
     return float(np.median([sensor[mem.POWER] / white_variance(sensor, LEVEL) for sensor in m.noise[~sensors.rate]]))
 
 
@@ -168,7 +169,7 @@ Integers = NDArray[np.int64]
 
 @kernel
 def drift(score: Array, counts: Integers) -> float:
-    """Factor on the payload's variance: how much farther it moved than it should, beyond chance."""
+    """Factor on the payload's variance: the square of its moves over their variance, less what chance explains."""
     if counts[BATCHES] == 0:
         return 1.0
     # a mean of N squared standard normals is 1 +- sqrt(2 / N)
@@ -178,10 +179,10 @@ def drift(score: Array, counts: Integers) -> float:
 
 @kernel
 def misjudged(noise: Array, counts: Integers, block: int) -> float:
-    """Share of the model-error allowance that the interval carries, 0 to 1; block: samples in one.
+    """Share of ``model_error`` that the interval carries, 0 to 1; block: samples in a block.
 
-    It grows with the power of the innovations over the white noise, of the sensor where that is most: from what chance
-    explains if each sample counts, to what it explains if each block counts as one.
+    It grows linearly with the innovation power over white noise of the sensor with the most. It is 0 up to what chance
+    explains if the samples are independent, and 1 from what chance explains if only blocks are independent.
     """
     # a mean of N squares scatters by sqrt(2 / N); 2.5 times that is exceeded by chance in 0.6 % of the blocks
     most = 2.5 * math.sqrt(2.0 / max(counts[BLOCKS], 1))

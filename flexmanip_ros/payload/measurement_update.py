@@ -42,18 +42,19 @@ if TYPE_CHECKING:
     from flexmanip_ros.payload.filter_state import FilterState
 
 OUTLIER = 4.0
-"""Innovations beyond this many standard deviations count less (Huber)."""
+"""Standard deviations beyond which an innovation has less weight (Huber)."""
 BLOCK_MEMORY = 120
-"""Blocks over which the noise of a sensor is averaged."""
+"""Number of blocks over which the noise of a sensor is averaged."""
 BATCH_MEMORY = 20
-"""Batches over which the moves of the payload are averaged."""
+"""Number of batches over which the moves of the payload are averaged."""
 SPECTRUM = 128
-"""Samples of one spectrum. Hann's window of that length is as wide, 1.44 / 128, as ``TONE`` are apart."""
+"""Samples of one spectrum. Hann's window of that length is 1.44 / 128 wide, the distance of the frequencies
+``TONE``."""
 SPECTRUM_MEMORY = 16
-"""Spectra over which the power at each frequency is averaged: as many samples as the fourth differences."""
+"""Spectra over which the power at each frequency is averaged: 2048 samples, as for the fourth differences."""
 TONE = 0.16 + 0.01 * np.arange(TONES)
-"""Frequencies of the spectrum, in those of the samples. Slow motion and what a step of the torque leaves in fourth
-differences are below the first; the window keeps the mirror images above one half from the last."""
+"""Frequencies of the spectrum over the sample rate. Slow motion and the trace of a torque step in fourth differences
+are below the first; the window keeps the mirror images above one half from the last."""
 TURN = 2.0 * np.cos(2.0 * np.pi * TONE)
 """Coefficient of Goertzel's filter at each."""
 HANN = np.sin(np.pi * (np.arange(SPECTRUM) + 0.5) / SPECTRUM) ** 2
@@ -84,7 +85,8 @@ class MeasurementModel(NamedTuple):
     block: int
     """Samples in a block: a tenth of the slowest vibration."""
     noise_every: int
-    """Samples between additions of process noise: a hundredth of ``memory_time``. One takes three samples' time."""
+    """Samples between additions of process noise, a hundredth of ``memory_time``: one costs as much as three
+    samples."""
     diffusion: Array
     """(nx,) standard deviation that each state gains in the square root of a second."""
     deviation: Array
@@ -99,7 +101,7 @@ class MeasurementModel(NamedTuple):
 
 @inner
 def look_back(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Array, qdd: Array) -> float:
-    """Return how far a late sensor is behind, by Taylor's series to second order, and add that to f."""
+    """Return the change of a late sensor's reading by its delay, a Taylor series to second order; add it to f."""
     row = S[sensors.delay[i]]
     delay: float = x[sensors.delay[i]]
     opened = delay != 0.0
@@ -123,9 +125,9 @@ def look_back(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: 
 
 @inner
 def observe(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Array, qdd: Array) -> float:
-    """Return what sensor i should read and fill f (nx,) with the spread of that, S' times its derivative.
+    """Return the predicted reading of sensor i; fill f (nx,) with S' h, h its derivative by the state.
 
-    qdd: (n,) accelerations, of which a late sensor takes note.
+    qdd: (n,) accelerations, used where the sensor is late.
     """
     predicted = project(x, S, sensors.H[i], n if sensors.rate[i] else 0, f)
     gain, offset = sensors.gain[i], sensors.offset[i]
@@ -145,7 +147,7 @@ def observe(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Ar
 
 @inner
 def measure(sensors: MeasurementModel, m: FilterState, y: Array, qdd: Array, opened: NDArray[np.int64]) -> None:
-    """Update the filter with one sample and gather what its innovations say of noise and payload.
+    """Update the filter with one sample; gather the power of its innovations and the moves of the payload.
 
     qdd: (n,) accelerations; opened: see ``ProcessModel``.
     """
@@ -179,7 +181,7 @@ def measure(sensors: MeasurementModel, m: FilterState, y: Array, qdd: Array, ope
 
 @inner
 def white_noise(m: FilterState, i: int, y: float) -> None:
-    """Variance of sensor i's white noise, from fourth differences, in which slow motion has no part."""
+    """Update the variance of sensor i's white noise by a fourth difference, in which slow motion has no part."""
     recent = m.recent[i]
     if m.counts[IN_A_ROW] >= 4:
         difference = y - 4.0 * recent[0] + 6.0 * recent[1] - 4.0 * recent[2] + recent[3]
@@ -198,11 +200,12 @@ def white_noise(m: FilterState, i: int, y: float) -> None:
 
 @inner
 def take_spectrum(m: FilterState, i: int, difference: float) -> None:
-    """Take a fourth difference of sensor i into its spectrum; with the last one, bound the white noise by its median.
+    """Take a fourth difference of sensor i into its spectrum; after the last, bound its white noise by the median.
 
-    Undamped modes that turn fast enter the fourth differences as noise does. In the spectrum they are lines, and white
-    noise is what stands between them. The median over the frequencies is that, while lines fill less than half of them.
-    Power by Goertzel's filter with Hann's window, its mean over ``SPECTRUM_MEMORY`` spectra by Welch's method.
+    Fast undamped modes enter the fourth differences as noise does. In the spectrum they are lines with white noise
+    between them. The median over the frequencies is the power of that noise while lines fill less than half of the
+    frequencies. Power by Goertzel's filter with Hann's window, its mean over ``SPECTRUM_MEMORY`` spectra by Welch's
+    method.
     """
     first, second, power = m.spectrum[i, 0], m.spectrum[i, 1], m.spectrum[i, 2]
     k = m.counts[IN_SPECTRUM]
@@ -247,9 +250,9 @@ def count_spectrum(m: FilterState) -> None:
 
 @inner
 def learn_noise(sensors: MeasurementModel, m: FilterState) -> None:
-    """At the end of a block: the variance of each sensor, and its slow part when that is not white.
+    """At the end of a block update the variance of each sensor, larger where the innovations are not white.
 
-    While the horizon is open the moving-horizon estimation tells it: the filter may be on its way.
+    While the horizon is open the moving-horizon estimation does so instead, as the filter may not have converged.
     """
     m.counts[IN_BLOCK] += 1
     if m.counts[STORED] < HORIZON:
@@ -283,11 +286,11 @@ def white_variance(sensor: Array, most: int) -> float:
 
 @inlined
 def misfit(noise: Array, rate: NDArray[np.bool_], most: int) -> float:
-    """Innovation power over white noise, each sensor weighted by what it tells of the payload; nan: none yet.
+    """Innovation power over white noise, sensors weighted by their information on the payload; nan: there is none yet.
 
-    noise: (m, 11), see ``filter_state``; rate: (m,) whether a sensor is one of rates. Those are left out where there
-    are displacements: they show the modes that the model leaves out, and have been given a larger noise. most: column
-    above which white noise is not, WHITE or LEVEL.
+    noise: (m, 11), see ``filter_state``; rate: (m,) whether a sensor measures a rate. Rates are left out: they show the
+    modes that the model leaves out, and have a larger noise for that. most: the column that bounds the white noise from
+    above, WHITE or LEVEL.
     """
     total = sum_of_weights = 0.0
     for i in range(noise.shape[0]):
@@ -299,9 +302,9 @@ def misfit(noise: Array, rate: NDArray[np.bool_], most: int) -> float:
 
 @inner
 def judge_payload(sensors: MeasurementModel, m: FilterState) -> None:
-    """At the end of a batch: see whether the payload moved farther than its variance allows.
+    """At the end of a batch compare the payload's move with its variance.
 
-    While the horizon is open the step of the last iteration tells it (SHIFT): the filter is replaced by the fit.
+    While the horizon is open the step of the last iteration (SHIFT) says this instead, as the fit replaces the filter.
     """
     m.counts[IN_BATCH] += 1
     fitting = m.counts[STORED] < HORIZON

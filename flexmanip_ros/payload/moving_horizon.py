@@ -78,57 +78,62 @@ ROWS = 8
 CLOSING = 16_384
 """Rows that are read again at most when the horizon closes: a fit of an empty arm takes up to ten times all of them."""
 LATEST = 1024
-"""Samples by which a fit has come to rest, if it will: the horizon closes with so many otherwise."""
+"""Samples after which the horizon closes although the fit has not come to rest: by then those have that ever will."""
 LINEAR = 0.25
-"""Deviation of a phase [rad] up to which the motion is linear in it: its sine is, to 1 %. Beyond, the filter that goes
-on from the fit is too sure, and may follow a vibration by the wrong turn."""
+"""Standard deviation of a mode's phase [rad] up to which the motion is linear in the phase: its sine is, to 1 %.
+Beyond, the filter that goes on from the fit underestimates its covariance, and may lock on to a phase that is off by 2
+pi."""
 WORK = 4
-"""Integration steps for each row that is read again, in the mean, over those of an arm without friction: a joint that
-sticks takes three, a wrong arm's hundreds."""
+"""Largest mean number of integration steps for each row that is read again, over that of an arm without friction: a
+joint that sticks takes three, wrong parameters may take hundreds."""
 GROWTH = 4
-"""A converged fit is repeated once the horizon has a quarter more samples: fewer hardly move it."""
+"""One over the share by which the horizon must grow before a converged fit is repeated: a quarter; less hardly moves
+it."""
 AT_REST = 0.5
 """A fit has converged when its last step moved the payload by less than this share of its standard deviation."""
 CONVERGED = 0.02
-"""A step that lowers the cost by less, for each sample, has converged: the horizon may grow."""
+"""Decrease of the cost for each sample below which a step counts as converged, and the horizon may grow."""
 FITS = 1.5
-"""Or one whose cost is at most this times what white noise costs."""
+"""Cost over that of white noise up to which a step counts as converged, too."""
 LOST = 1e4
-"""A trajectory that costs more, for each measurement, says nothing of the arm."""
+"""Cost for each measurement beyond which a trajectory is given up: it says nothing of the arm."""
 TRUSTED = 2.0
 """Standard deviations by which a step of the moving-horizon estimation moves the filter's state at most."""
 TELLS = 50
-"""Samples whose cost tells a fit from none: the cost of white noise varies by 0.1 of itself."""
+"""Samples after which the cost tells whether a fit is one: that of white noise then varies by 0.1 of itself."""
 UNFIT = 2.0
-"""A fit is rejected whose cost is more than this times what white noise costs."""
+"""Cost over that of white noise beyond which a fit is rejected."""
 TRIALS = 10
-"""Iterations over the same samples after which a fit is not expected to come: those that come take three to nine."""
+"""Iterations over the same samples after which a fit is given up: those that converge take three to nine."""
 STARTS = 2
-"""Fits of what was caught from the event on, given up as soon as they converge without fitting: a point, a body."""
+"""Fits from the event on that are given up as soon as they converge without fitting: of a point, then of a body."""
 MOST_REFITS = 4
-"""How often a fit is begun again after an event: an arm that is another one never fits."""
+"""Largest number of times that a fit is begun again after an event: with the parameters of another arm none ever
+fits."""
 STRAY, STRAY_EVERY = 3.0, 500
-"""Power over white noise of every sensor with which the filter is begun again; samples between two looks."""
+"""Innovation power over white noise, of every sensor, at which the filter is begun again; samples between two
+checks."""
 SLACK = 1.0
-"""A step is accepted though it raises the cost, by so much at most: less than the estimate can tell."""
+"""Increase of the cost up to which a step is accepted: one is a change of the estimate by one standard deviation."""
 LEVENBERG = 1.0
-"""Damping with which a rejected step is taken again after a capture: as much as the arrival cost. What is held lies
-along a narrow valley that bends, and damping in proportion to the information hardly lets a step go along it."""
+"""Damping with which a rejected step is taken again after a capture: that of the arrival cost. The cost of what is held
+has a narrow valley that bends, and damping in proportion to the information hardly lets a step go along it."""
 MARQUARDT = 1e-3
-"""The same for an empty arm, in proportion to the information: its priors are rough."""
+"""The same for an empty arm, in proportion to the information, as its priors are rough."""
 FADING, FADED = 8.0, 1e-3
-"""Factor by which a rejected step raises the damping, and an accepted one lowers it (Marquardt 1963); share of the
-damping above, below which it is zero: that one hardly shortens a step. At zero at once, every second step of a fit in a
-valley that bends is rejected."""
+"""Factor by which a rejected step raises the damping and an accepted one lowers it (Marquardt 1963); share of the first
+damping below which it is set to zero, where it hardly shortens a step. Were it zero after the first accepted step,
+every second step of a fit in a valley that bends would be rejected."""
 CHANCE = 3.0
-"""Standard deviations by which the filter may put what is nonnegative below zero: more is no noise."""
+"""Standard deviations by which the filter may estimate a nonnegative parameter below zero: noise hardly explains
+more."""
 REJECTIONS = 8
-"""How often a step is shortened that raises the cost."""
+"""Number of times that a step that raises the cost is shortened."""
 
 
 @inner
 def begin_iteration(m: FilterState) -> None:
-    """Start a Gauss-Newton iteration at the event, from the trajectory of the last one."""
+    """Start a Gauss-Newton iteration at the event, linearized at the estimate of the last one."""
     nx = m.x.size
     m.score[COST] = 0.0
     for i in range(nx):
@@ -150,7 +155,8 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
     """Take one sample since the event into the iteration: N += f f' / r, g += f e / r.
 
     table: (N, 1 + L + m), the rows before the event that a late torque needs, then the first sample after it. The cost
-    is the sum of e^2 / r. Return how many integration steps that took; 0: the step of the iteration was too long.
+    is the sum of e^2 / r. Return the number of integration steps; 0: this trajectory is given up, the step was too
+    long.
     """
     k = m.counts[ITERATED] + sensors.reach - 1
     sample = table[k]
@@ -185,7 +191,7 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
 
 @inner
 def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
-    """Accept the iteration and step on; hand state and spread to the filter if it has caught up with it."""
+    """Accept the iteration and take the next step. Where it has read all samples, the filter goes on from there."""
     nx = m.x.size
     for i in range(nx):
         m.accepted[i] = m.xi[i]
@@ -235,9 +241,9 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
 def phase_std(motion: ProcessModel, m: FilterState, duration: float) -> float:
     """Standard deviation [rad] of the angle by which the fastest mode turns in a time [s], as far as stiffness tells.
 
-    An angle w T, w^2 in proportion to the stiffness, is uncertain by w T / 2 times the deviation of its logarithm, the
-    mass given: what both may be, for the same frequency, does not count. What is damped is forgotten after an angle of
-    one over the damping ratio.
+    The angle is w T, with w^2 in proportion to the stiffness, so its deviation is w T / 2 times that of the stiffness's
+    logarithm, given the mass: changes of both that leave the frequency as it is do not count. A damped mode forgets its
+    phase after an angle of one over the damping ratio.
     """
     first, links, k = m.x.size - motion.kind.size, motion.arm.length.size, motion.arm.kappa
     square, ratio = 0.0, np.inf
@@ -254,22 +260,22 @@ def phase_std(motion: ProcessModel, m: FilterState, duration: float) -> float:
 
 @inner
 def at_rest(m: FilterState) -> bool:
-    """Whether the last iteration that caught up with the filter hardly moved the payload."""
+    """Whether the last iteration over all samples so far hardly moved the payload."""
     return bool(m.counts[BEFORE] >= ENOUGH and m.score[SHIFT] < AT_REST and m.counts[AGAIN] == 0)
 
 
 @inner
 def first_damping(m: FilterState) -> float:
-    """Return the damping with which a rejected step is taken again first."""
+    """Return the damping after the first rejected step."""
     return LEVENBERG if m.counts[HELD] == 1 else MARQUARDT
 
 
 @inner
 def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
-    """Set xi to the accepted one and a step of Levenberg and Marquardt, m.g; what p holds stays possible.
+    """Set xi to the accepted one plus a step of Levenberg and Marquardt, m.g, within the bounds of p.
 
-    Where it would leave the bounds it ends where the quadratic cost is least within them: ``least_distance`` in the
-    metric of that cost. Inertia, whose bound is curved, is moved alone.
+    Where the step would leave the bounds it ends at the least quadratic cost within them (``least_distance`` in the
+    metric of that cost). The inertia is moved by itself afterwards, as its bound is curved.
     """
     nx = m.xi.size
     L, p = sensors.L, motion.p
@@ -321,7 +327,7 @@ def reject_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
 
 @merged
 def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array) -> bool:
-    """Let the Gauss-Newton iteration take up to ``ROWS`` samples; when the horizon closes, until it converges."""
+    """Let the Gauss-Newton iteration take ``ROWS`` samples at most; when the horizon closes, until it converges."""
     stored = m.counts[STORED]
     if stored >= HORIZON:
         return True
@@ -363,7 +369,7 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
         elif m.counts[ITERATED] >= until and (not finish_iteration(motion, sensors, m) or misfits(motion, m)):
             return False
     if last:
-        if m.counts[HELD] == 1 and m.score[SHIFT] >= AT_REST:  # what was linearized on the way tells too much
+        if m.counts[HELD] == 1 and m.score[SHIFT] >= AT_REST:  # linearized before it converged: too sure
             wider = np.sqrt(1.0 + m.score[SHIFT] * m.score[SHIFT])
             for i in range(m.x.size):
                 for c in range(m.x.size):
@@ -391,7 +397,7 @@ def misfits(motion: ProcessModel, m: FilterState) -> bool:
 
 @inner
 def fails(m: FilterState) -> bool:
-    """Whether the fit at the end of the horizon is none: it costs far more than white noise, or lacks some samples."""
+    """Whether the fit failed at the end of the horizon: it costs far more than white noise, or lacks some samples."""
     if m.counts[REFITS] >= MOST_REFITS:
         return False
     expected = m.xi.size + m.noise.shape[0] * m.counts[BEFORE]
@@ -402,10 +408,10 @@ def fails(m: FilterState) -> bool:
 
 @inner
 def strays(sensors: MeasurementModel, m: FilterState) -> bool:
-    """Whether the filter left the arm after all: sensors show far more than their noise, block after block.
+    """Whether the filter has diverged after a fit: the sensors show far more than their white noise.
 
-    Of an arm that holds something all must: a fit is begun again at a cost. Of an empty arm those must in the mean that
-    tell of its inertia.
+    While the arm holds something, every sensor must show it, as a fit that is begun again costs time. Of an empty arm
+    the mean must, weighted by what each sensor tells of the payload.
     """
     if m.counts[REFITS] >= MOST_REFITS or (m.counts[HELD] == 1 and m.counts[LEARNED] == 0):
         return False
@@ -421,11 +427,11 @@ def strays(sensors: MeasurementModel, m: FilterState) -> bool:
 
 @inner
 def keep_possible(motion: ProcessModel, m: FilterState, chance: float) -> None:
-    """Move the state to the most likely one whose p is possible (inequality-constrained filter, Simon and Chia 2002).
+    """Move the state to the most likely one within the bounds of p (constrained filter of Simon and Chia, 2002).
 
-    An entry of p that is moved alone would be a ratchet: of each step across its bound the other states would keep
-    their part. A damping, a friction or a delay may be ``chance`` standard deviations below zero: of an arm without
-    them half the noise puts it there, and an estimate that is kept from it is biased.
+    All states move with an entry of p that is put back: otherwise each step across a bound would leave a bias in those
+    that are correlated with it. A damping, a friction or a delay may be ``chance`` standard deviations below zero: for
+    an arm without them noise puts half of the estimates there, and an estimate that may not go there is biased.
     """
     first = m.x.size - motion.kind.size
     count = gather_bounds(motion, m.x[first:], m.S, chance)
@@ -437,7 +443,7 @@ def keep_possible(motion: ProcessModel, m: FilterState, chance: float) -> None:
 
 @inner
 def diffuse(sensors: MeasurementModel, m: FilterState, duration: float) -> None:
-    """Add the process noise of a while, so that the memory stays finite."""
+    """Add the process noise of the samples since it was last added, so that the memory stays finite."""
     m.score[NOW] += duration
     m.counts[SINCE_NOISE] += 1
     if m.counts[SINCE_NOISE] < sensors.noise_every or m.counts[STORED] < HORIZON:

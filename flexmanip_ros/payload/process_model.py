@@ -1,8 +1,8 @@
 """Process model of the structured filter: the arm's equations carry the mean, their Jacobian the covariance.
 
-The state is x = [q (n), qd (n), p]. p: what is not known of payload and arm, each entry of a ``Kind`` and a link (see
-``ProcessModel.kind``); kinds that are not estimated stay at the value of the parameters. The covariance is S S' with
-the square root S (nx, nx), which moves as S <- F S, F the Jacobian of the flow.
+The state is x = [q (n), qd (n), p]. p holds what is not known of payload and arm; each entry has a ``Kind`` and a link
+(``ProcessModel.kind``). What is not estimated keeps the value of its parameter. The covariance is S S' with the square
+root S (nx, nx). Over a step S becomes F S, with F the derivative of the new state by the old one.
 """
 
 from __future__ import annotations
@@ -25,32 +25,32 @@ if TYPE_CHECKING:
     from flexmanip_ros.numerics.square_root import Bounds
 
 SERIES = 12
-"""Terms of an exponential whose error does not matter: 1e-9 of what turns by one radian."""
+"""Terms of the exponential series where its cost does not matter: the rest is 1e-9 for a mode that turns by 1 rad."""
 STEP_ANGLE = 2.0
-"""Largest angle [rad] the fastest mode may turn in an integration step."""
+"""Largest angle [rad] by which the fastest mode may turn in an integration step."""
 MOTION_ERROR = 1e-8
-"""Share of the fastest mode that the motion's exponential leaves out in a step."""
+"""Relative error of the fastest mode in a step, by the truncated exponential series of the motion."""
 MISS_ERROR = 1e-2
-"""Of what the difference of the remainders adds, some 1e-8 of link 1 in a sample."""
+"""The same for what the change of the remainder adds (``arrive``), which is some 1e-8 of link 1's motion a sample."""
 SPREAD_ERROR = 1e-4
-"""Of the spread's: it weighs, and need not be exact."""
+"""The same for the square root of the covariance, which only weighs measurements and may be less exact."""
 AVERAGE_TERMS = 6
-"""Terms of what foretells the mean over a step: the next is 3e-4 of what turns by 1.4 rad."""
+"""Terms of the series that predicts the mean state of a step; the next is 3e-4 for a mode that turns by 1.4 rad."""
 MOST_TERMS = 30
-"""Terms of an exponential at most: more than ``STEP_ANGLE`` needs."""
+"""Largest number of terms of an exponential series: more than ``STEP_ANGLE`` needs."""
 STIFF_STEP = 2.0
-"""Longest step over the time constant of the stiffest damper: the series of the exponential converges quickly there."""
+"""Longest step over the time constant of the stiffest damper: up to there the exponential series converges quickly."""
 BEGIN, MEAN, END = range(3)
 """Stages of a step, by where the accelerations are evaluated: where it begins, at its mean state, where it ends."""
 MOST_STEPS = 2000.0
-"""Steps from a sample to the next: an arm that needs more is none."""
+"""Largest number of steps from a sample to the next: parameters that need more belong to no real arm."""
 STIFFEST = 200.0
-"""Rate of the stiffest damper over that of the fastest mode: an arm of which more is learned is none. A joint that
-sticks in an arm as it is has five."""
+"""Largest rate of the stiffest damper over that of the fastest mode: beyond it the learned parameters belong to no real
+arm. The friction of a joint that sticks reaches five."""
 
 
 class Kind(IntEnum):
-    """What an entry of p is. The body's come first, then those of a link or joint."""
+    """What an entry of p is: first the inertial parameters of the payload, then those of a link or joint."""
 
     MASS = 0
     """Mass of the payload [kg]."""
@@ -92,14 +92,14 @@ class Kind(IntEnum):
 
 
 class ProcessModel(NamedTuple):
-    """The arm as the filter integrates it; what the state holds is written into ``arm`` before each use."""
+    """The arm that the filter integrates; ``set_parameters`` writes the state's entries p into it before each use."""
 
     arm: Manipulator
     work: Workspace
     kind: NDArray[np.int64]
     """(np,) what each entry of p is."""
     link: NDArray[np.int64]
-    """(np,) of which link or joint."""
+    """(np,) number of the link or joint that each entry of p belongs to."""
     frozen: bool
     """Keep the mass matrix of the working point (a linear plant) instead of following the configuration."""
     M0: Array
@@ -113,12 +113,12 @@ class ProcessModel(NamedTuple):
     rotary: Array
     """(n, n) nominal ``Manipulator.rotary``."""
     scale: float
-    """Mass [kg] that the empty arm has at its tip."""
+    """Mass [kg] at the tip of the empty arm: that of the tip and a third of the last link."""
     least: Array
-    """(2,) mass m_a [kg] and inertia I_a [kg m^2] below zero: a payload with (m - m_a) (I - I_a) >= |h|^2,
-    m >= m_a / 2, keeps the mass matrix positive; h: its first moments."""
+    """(2,) mass m_a [kg] and inertia I_a [kg m^2], both negative. The mass matrix stays positive for every payload with
+    (m - m_a) (I - I_a) >= |h|^2 and m >= m_a / 2, h its first moments."""
     least_rotor: Array
-    """(L,) least rotor inertia [kg m^2], for the same reason."""
+    """(L,) least rotor inertia [kg m^2] with which the mass matrix stays positive."""
     substeps: float
     """Longest integration step [s]."""
     payload: Array
@@ -130,11 +130,11 @@ class ProcessModel(NamedTuple):
     late: Array
     """(L, 2) dead time and lag of the torques [s]."""
     slope: Array
-    """(L, 2) derivatives of the torques by these."""
+    """(L, 2) derivatives of the torques by dead time and lag."""
     opened: NDArray[np.int64]
-    """(1 + np,) how many entries of p are not taken as known, then which these are."""
+    """(1 + np,) number of the entries of p that are uncertain, then their indices."""
     bounds: Bounds
-    """Scratch for what p can be."""
+    """Scratch for the bounds of p."""
     p: Array
     """(np,) scratch."""
     a: Array
@@ -143,8 +143,8 @@ class ProcessModel(NamedTuple):
     dqd: Array
     dp: Array
     G: Array
-    """(n, 2 np) derivatives of the accelerations by the entries of p that are not taken as known, in this order: means
-    over a step, then slopes; see ``parameter_columns``."""
+    """(n, 2 np) derivatives of the accelerations by the uncertain entries of p, lines over a step: first their means,
+    then their slopes; see ``parameter_columns``."""
     F: Array
     """(n, 2 n) derivative of the accelerations by q and q'."""
     X: Array
@@ -201,13 +201,13 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
 
 @inner
 def nonnegative(motion: ProcessModel, c: int) -> bool:
-    """Whether entry c of p cannot be below zero: it takes energy away, or a torque would come before its effort."""
+    """Whether entry c of p is at least zero: below it friction would add energy, or a torque precede its effort."""
     return motion.kind[c] in (DAMPING, VISCOUS, COULOMB, TORQUE_DELAY, TORQUE_LAG)
 
 
 @inner
 def lower_bound(motion: ProcessModel, c: int) -> float:
-    """Return the least that entry c of p can be: the mass matrix is positive, no damping or friction below zero."""
+    """Return the lower bound of entry c of p: the mass matrix stays positive, damping and friction at least zero."""
     kind = motion.kind[c]
     low: float = -np.inf
     if kind == MASS:
@@ -221,10 +221,11 @@ def lower_bound(motion: ProcessModel, c: int) -> float:
 
 @inner
 def gather_bounds(motion: ProcessModel, p: Array, S: Array, chance: float) -> int:
-    """Write into motion.bounds by how much each bound is above p (np,), and the row of S that moves it.
+    """Write into motion.bounds how far each bound is above p (np,), below zero where p keeps it, and its row of S.
 
-    Returns the number of bounds; 0: p keeps them all. Those of zero are lower by ``chance`` standard deviations. What
-    is taken as known has none. S: square root of the covariance, its last np rows are those of p.
+    Return the number of bounds, 0 if p violates none. A bound of zero is lowered by ``chance`` standard deviations of
+    its entry. Entries that are taken as known have no bound. S: square root of the covariance; its last np rows are
+    p's.
     """
     first, count, violated = S.shape[0] - p.size, 0, False
     for c in range(p.size):
@@ -249,7 +250,7 @@ def gather_bounds(motion: ProcessModel, p: Array, S: Array, chance: float) -> in
 
 @inner
 def keep_inertia(motion: ProcessModel, p: Array) -> float:
-    """Raise the inertia in p (np,) to the least that mass and first moments leave; return by how much [kg m^2]."""
+    """Raise the inertia in p (np,) to the least that its mass and first moments allow; return the change [kg m^2]."""
     if p.size <= INERTIA or motion.kind[INERTIA] != INERTIA:
         return 0.0
     moment = p[FIRST_X] * p[FIRST_X] + p[FIRST_Y] * p[FIRST_Y]
@@ -260,7 +261,7 @@ def keep_inertia(motion: ProcessModel, p: Array) -> float:
 
 @inner
 def constant_mass(motion: ProcessModel) -> None:
-    """Fill work.M with a mass matrix that stays, and work.E with zero."""
+    """Fill work.M with the mass matrix of the working point, and work.E with zero."""
     M = motion.work.M
     for r in range(M.shape[0]):
         motion.work.E[r] = 0.0
@@ -282,7 +283,7 @@ def accelerate(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
 
 @inner
 def constant_mass_jacobian(motion: ProcessModel, qdd: Array) -> None:
-    """The same as ``force_jacobian`` for a mass matrix that stays."""
+    """Do what ``force_jacobian`` does, for the mass matrix of the working point."""
     for r in range(qdd.size):
         for c in range(qdd.size):
             motion.dq[r, c] = 0.0
@@ -295,7 +296,7 @@ def constant_mass_jacobian(motion: ProcessModel, qdd: Array) -> None:
 
 @inner
 def linearize(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> None:
-    """Fill motion.F (n, 2 n), the derivatives of the accelerations by q and q'; right after ``accelerate`` there."""
+    """Fill motion.F (n, 2 n), the derivatives of the accelerations by q and q', right after ``accelerate`` there."""
     if motion.frozen:
         constant_mass_jacobian(motion, qdd)
     else:
@@ -305,7 +306,7 @@ def linearize(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> None:
 
 @inner
 def differentiate(motion: ProcessModel, qd: Array, qdd: Array, jerk: Array) -> None:
-    """Fill jerk (n,) with the rate of the accelerations, by the linearization."""
+    """Fill jerk (n,) with the time derivative of the accelerations, by the linearization motion.F."""
     n = qd.size
     for r in range(n):
         jerk[r] = 0.0
@@ -315,10 +316,10 @@ def differentiate(motion: ProcessModel, qd: Array, qdd: Array, jerk: Array) -> N
 
 @inner
 def within_step(motion: ProcessModel, h: float) -> None:
-    """Fill rows 4 to 6 of motion.k with the slopes of q, q' and q'' over a step h, by s from -1 to 1 in it.
+    """Fill rows 4 to 6 of motion.k with the slopes of q, q' and q'' over a step h, by s, which runs from -1 to 1 in it.
 
-    Those of the lines through their values at Gauss's two points, s^2 = 1/3, whose mean is that over the step but for
-    1e-3 of what turns by 1.4 rad: h / 2 z' + h^3 / 144 z^(3) + ...
+    The lines go through the values at Gauss's two points, s^2 = 1/3. Their slope is h / 2 z' + h^3 / 144 z^(3) + ...
+    Their mean is that of the step to 1e-3 for a mode that turns by 1.4 rad.
     """
     n = motion.arm.stiffness.size
     qd, qdd, slope = motion.k[17], motion.k[8], motion.k[4:7]
@@ -335,11 +336,12 @@ def within_step(motion: ProcessModel, h: float) -> None:
 
 @inner
 def parameter_columns(motion: ProcessModel, h: float) -> None:
-    """Fill motion.G with the derivatives of the accelerations by what is not known of p, as lines over a step h.
+    """Fill motion.G with the derivatives of the accelerations by the uncertain entries of p, as lines over a step h.
 
-    Their means come first, in ``motion.opened`` columns, then their slopes, by s from -1 to 1 in the step. A parameter
-    acts through what vibrates: a stiffness through the bend, which turns by a radian within a sample. Right after
-    ``linearize`` at the mean state. Of Coulomb friction the mean alone is taken.
+    The first ``motion.opened[0]`` columns are their means, the next ones their slopes by s, which runs from -1 to 1 in
+    the step. The derivatives vary within it: that by a stiffness is in proportion to a bend, and a mode of bending
+    turns by a radian in a sample. Of Coulomb friction the mean alone is taken. ``linearize`` was just called at the
+    mean state.
     """
     n, opened = motion.arm.stiffness.size, motion.opened[0]
     if opened == 0:
@@ -356,7 +358,7 @@ def parameter_columns(motion: ProcessModel, h: float) -> None:
 
 @inner
 def add_payload_columns(motion: ProcessModel, qdd: Array) -> None:
-    """Add to motion.dp (n, 4), the derivative of the forces by the payload's parameters, that of accelerations qdd."""
+    """Add to motion.dp (n, 4), the derivatives of the forces by the payload's parameters, the part of qdd (n,)."""
     if not motion.frozen:
         add_body_forces(motion.arm, motion.k[16], qdd, motion.dp, motion.work)
         return
@@ -368,9 +370,10 @@ def add_payload_columns(motion: ProcessModel, qdd: Array) -> None:
 
 @inner
 def balance_columns(motion: ProcessModel, q: Array, qd: Array, qdd: Array, first: int) -> None:
-    """Fill columns ``first``... of motion.G with derivatives of M qdd + E + D qd + dV/dq - B tau by p, motion.dp known.
+    """Fill columns of motion.G, from number ``first`` on, with derivatives of M qdd + E + D qd + dV/dq - B tau by p.
 
-    first: 0 for the values at q (n,), the mean, otherwise for their slopes, where q, qd and qdd are slopes.
+    motion.dp holds those by the payload's parameters. first: 0 for the values at the mean state q, qd, qdd (n,); beyond
+    0 q, qd and qdd are slopes over the step, and so are the derivatives.
     """
     arm, net, G = motion.arm, motion.work.net, motion.G
     n, k, links = arm.stiffness.size, arm.kappa, arm.length.size
@@ -423,10 +426,10 @@ def balance_columns(motion: ProcessModel, q: Array, qd: Array, qdd: Array, first
 
 @inner
 def friction_step(motion: ProcessModel, duration: float) -> float:
-    """Return the longest step [s] if Coulomb friction may change its sign within a time [s]: it bends the motion.
+    """Return the longest step [s] where Coulomb friction may change its sign within ``duration`` [s], else infinity.
 
-    Right after ``accelerate``, to motion.k[0]. Infinite: it will not. A joint that sticks is a stiff damper, of which
-    the rate is the slope of its friction times b' M^-1 b, b its column of B.
+    A change of sign bends the motion. A joint that sticks is a stiff damper; its rate is the slope of its friction
+    times b' M^-1 b, b its column of B. ``accelerate`` was just called and filled motion.k[0].
     """
     arm, work, qdd, column = motion.arm, motion.work, motion.k[0], motion.k[9]
     step: float = np.inf
@@ -450,7 +453,7 @@ def friction_step(motion: ProcessModel, duration: float) -> float:
 
 @inner
 def terms(angle: float, error: float) -> int:
-    """Return how many terms of an exponential leave out less than an error: angle^k / k! < error."""
+    """Return the number k of terms of an exponential series whose rest is below an error: angle^k / k! < error."""
     k, left = 1, angle
     while left > error and k < MOST_TERMS:
         k += 1
@@ -460,7 +463,7 @@ def terms(angle: float, error: float) -> int:
 
 @inner
 def note_opened(motion: ProcessModel, S: Array, used: int) -> None:
-    """Write into motion which entries of p are not taken as known: their rows of S are not zero."""
+    """Write into motion.opened which entries of p are uncertain: their rows of S are not zero."""
     count, first = 0, S.shape[0] - motion.kind.size
     for p in range(motion.kind.size):
         for c in range(used):
@@ -475,11 +478,12 @@ def note_opened(motion: ProcessModel, S: Array, used: int) -> None:
 def predict(
     motion: ProcessModel, x: Array, S: Array, used: int, rows: Array, period: float, duration: float,
 ) -> int:
-    """Carry x and S over a time [s] with the torque held. Return in how many steps; 0: numbers left the finite range.
+    """Carry x and S over ``duration`` [s] under held torques. Return the number of steps; 0: a number was not finite.
 
-    used: number of columns of S, the first ones, that are not zero; rows: (P, >= 1 + L) columns 1 to L of the last one
-    are the efforts held meanwhile [N m], those before it are what the torque depends on too; period: their sample time
-    [s]. motion.k[0] is then the acceleration at the end. A time of zero only linearizes at x: motion.k[0] and F.
+    used: number of the first columns of S, beyond which they are zero; rows: (P, >= 1 + L) with efforts [N m] in
+    columns 1 to L, those held meanwhile in the last row and, for late torques, those before it; period: their sample
+    time [s]. Afterwards motion.k[0] is the acceleration at the end. A duration of zero fills motion.k[0] and motion.F
+    at x alone.
     """
     n, taken = motion.arm.stiffness.size, 0
     set_parameters(motion, x)
@@ -530,11 +534,12 @@ def predict(
 
 @inner
 def average(motion: ProcessModel, x: Array, h: float) -> None:
-    """Foretell the means of q and q' over a step, rows 16 and 17 of motion.k; right after ``accelerate`` at x.
+    """Fill rows 16 and 17 of motion.k with a prediction of the means of q and q' over a step h from x.
 
-    By an exponential Euler step of which the linear part is stiffness, damping and friction: what vibrates fast turns
-    by 1.4 rad in a sample. The Jacobian is nearly linear in q and q', so that its mean is that at their means: with it
-    the spread is as exact over seconds as with two steps linearized at their midpoints.
+    It is an exponential Euler step whose linear part is stiffness, damping and friction, as the fastest mode turns by
+    1.4 rad in a sample. The Jacobian is nearly linear in q and q', so its mean over the step is its value at their
+    means. With it the covariance is as exact over seconds as with two steps linearized at their midpoints.
+    ``accelerate`` was just called at x.
     """
     n, arm, work = motion.arm.stiffness.size, motion.arm, motion.work
     qdd, place, rate, q, qd = motion.k[0], motion.k[9], motion.k[10], motion.k[16], motion.k[17]
@@ -562,7 +567,7 @@ def average(motion: ProcessModel, x: Array, h: float) -> None:
 
 @inner
 def remainder(motion: ProcessModel, q: Array, qd: Array, qdd: Array, lacks: Array) -> None:
-    """Fill lacks (n,) with what the linearization misses of the acceleration qdd at q and q'."""
+    """Fill lacks (n,) with the remainder of the linearization at q and q', where the acceleration is qdd."""
     n = motion.arm.stiffness.size
     middle, about, rate = motion.k[8], motion.k[16], motion.k[17]
     for i in range(n):
@@ -573,16 +578,16 @@ def remainder(motion: ProcessModel, q: Array, qd: Array, qdd: Array, lacks: Arra
 
 @inner
 def lead(motion: ProcessModel, x: Array, h: float, turn: float) -> None:
-    """Fill rows 18 and 19 of motion.k with where r0 alone leads in a step h; right after ``linearize`` at its mean.
+    """Fill rows 18 and 19 of motion.k with the state after a step h in which the remainder is r0 s^2.
 
-    turn: of the fastest mode in the step [rad].
+    turn: angle by which the fastest mode turns in the step [rad]. ``linearize`` was just called at the mean state.
 
     An exponential integrator (Hochbruck and Ostermann, Acta Numerica 19, 2010) about the mean state: x' = g(x) + r, g
-    the linearization, r its remainder. With s from -1 to 1 in the step, x is its mean and a s + b (s^2 - 1/3) + ...;
-    r, of second order in that, is even in s^2 and odd in s^3 - s / 3. Its values r0 and r1 at both ends tell how much:
-    r = s^2 (r0 + r1) / 2 + (3 s^3 - s) / 2 (r1 - r0) / 2, and the step is of fourth order. It is symmetric in time but
-    for r1, taken where r0 alone leads. The vibration turns too far in one sample for a step of Runge and Kutta: their
-    damping of the fastest mode read as 0.3 % of the payload.
+    the linearization, r its remainder. With s from -1 to 1 in the step, x is its mean and a s + b (s^2 - 1/3) + ...; r
+    is of second order in that, so its even part goes with s^2 and its odd part with s^3 - s / 3. Its values r0 and r1
+    at both ends give their sizes: r = s^2 (r0 + r1) / 2 + (3 s^3 - s) / 2 (r1 - r0) / 2, and the step is of fourth
+    order. ``arrive`` adds r1, evaluated at the state found here. A step of Runge and Kutta is not exact enough: the
+    fastest mode turns too far in a sample, and the damping that such a step adds to it changed the payload by 0.3 %.
     """
     n = motion.arm.stiffness.size
     qdd, first, difference = motion.k[0], motion.k[3], motion.k[15]
@@ -603,7 +608,7 @@ def lead(motion: ProcessModel, x: Array, h: float, turn: float) -> None:
 
 @inner
 def arrive(motion: ProcessModel, x: Array, h: float, turn: float) -> bool:
-    """Put x where r0 and r1 lead; right after ``accelerate`` where ``lead`` led."""
+    """Set x to the state after the step, with r0 and r1 (``lead``). ``accelerate`` was just called where that led."""
     n = motion.arm.stiffness.size
     first, difference, end, ending = motion.k[3], motion.k[15], motion.k[18], motion.k[19]
     place, rate, moved = motion.k[10], motion.k[11], motion.k[12:14]
@@ -622,11 +627,12 @@ def arrive(motion: ProcessModel, x: Array, h: float, turn: float) -> bool:
 
 @inner
 def series(motion: ProcessModel, h: float, count: int) -> None:
-    """Fill rows 12 and 13 of motion.k with what a step h of x' = g + F x + r adds to x = 0, in ``count`` terms.
+    """Fill rows 12 and 13 of motion.k with the solution after a step h of x' = g + F x + r from x = 0, ``count`` terms.
 
-    g stands in rows 10 and 11 (positions, rates), of r the factors of s^2 and s^2 / 2 + (3 s^3 - s) / 4 =
-    6 u^3 - 7 u^2 + 2 u, u = (1 + s) / 2 the share of the step, in rows 3 and 15. u^k adds h k! phi_{k + 1}(h F),
-    phi_l(z) the sum of z^j / (j + l)!. By Horner's rule; the columns of motion.F are the rows of motion.X and Y.
+    g stands in rows 10 and 11 (positions, rates). Rows 3 and 15 hold the two parts of r: the factors of s^2 and
+    of s^2 / 2 + (3 s^3 - s) / 4 = 6 u^3 - 7 u^2 + 2 u, u = (1 + s) / 2 the share of the step. A forcing u^k gives
+    h k! phi_{k + 1}(h F), phi_l(z) the sum of z^j / (j + l)!. Evaluated by Horner's rule; motion.X and Y hold the
+    columns of motion.F as rows.
     """
     n = motion.arm.stiffness.size
     even, odd, place, rate, following = motion.k[3], motion.k[15], motion.k[10], motion.k[11], motion.k[14]
@@ -656,11 +662,11 @@ def series(motion: ProcessModel, h: float, count: int) -> None:
 def spread(
     flow: Array, G: Array, opened: NDArray[np.int64], S: Array, used: int, scratch: Array, h: float, count: int,
 ) -> None:
-    """S <- F S in its first ``used`` columns, F the Taylor series of the linearised flow over h, ``count`` terms.
+    """Replace the first ``used`` columns of S by F S, F the linearized flow over h, a Taylor series of ``count`` terms.
 
-    By Horner's rule, each term one product with the derivatives of the accelerations by q and q', flow (n, 2 n). G:
-    those by the entries of p in ``opened``, which stay, see ``parameter_columns``; of s = 2 u - 1, u the share of the
-    step, term j takes -j / (j + 2). scratch: see ``spread_scratch``.
+    Evaluated by Horner's rule: a term is one product with flow (n, 2 n), the derivatives of the accelerations by q and
+    q'. G (n, 2 np): those by the entries of p in ``opened``, as means and slopes over the step (``parameter_columns``);
+    term j takes -j / (j + 2) of a slope. p itself stays. scratch: see ``spread_scratch``.
     """
     n, known, count_p = flow.shape[0], 2 * flow.shape[0], opened[0]
     size = n * used
@@ -698,5 +704,5 @@ def spread(
 
 
 def spread_scratch(n: int, size: int, columns: int) -> Array:
-    """Allocate for n coordinates, ``size`` entries of p, and square roots of at most so many columns."""
+    """Allocate for n coordinates, ``size`` entries of p, and square roots with at most ``columns`` columns."""
     return np.zeros(7 * n * columns + size * (columns + n))

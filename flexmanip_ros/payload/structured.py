@@ -25,11 +25,11 @@ from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, Payload
 
 FIRST_LOOK = 24
-"""Samples looked at before the filter starts: they tell its noise."""
+"""Samples before the filter starts; the first guess of the noise is made from them."""
 UNTAUGHT = 100
-"""An arm that catches something within so many samples was not seen empty: it keeps the parameters that it is given."""
+"""Samples within which a capture comes too early to learn the empty arm, which then keeps its given parameters."""
 LONGEST_S = 10.0
-"""An event this long after the last sample [s]: the motion is unknown by then, and the next sample starts it again."""
+"""Longest time from the last sample to an event over which the motion is predicted [s]; beyond it is unknown anyway."""
 
 
 class StructuredState(NamedTuple):
@@ -61,7 +61,7 @@ class StructuredState(NamedTuple):
     refits: int = 0
     """How often the empty arm's fit was begun again."""
     white: Array = np.empty(0)
-    """(m, 2) variance of each measurement's white noise, as far as it was known then, and its bound by the spectrum."""
+    """(m, 2) variance of each measurement's white noise at the last restart, and its bound by the spectrum."""
 
 
 class Horizon(NamedTuple):
@@ -134,7 +134,7 @@ def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
 
 
 def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, event: CaptureEvent) -> None:
-    """Reopen what an event changes: the rates, and what is held."""
+    """Make uncertain what an event changes: the rates, and what is held."""
     payload, kind = model.payload, event.kind
     held = bool(m.counts[mem.HELD])
     before = max(float(m.x[payload]), 0.0) if held else 0.0
@@ -163,7 +163,7 @@ def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, even
 
 
 def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterState) -> None:
-    """Condition an empty arm on holding exactly nothing; drop what is known of a payload that is let go."""
+    """Condition an empty arm on a payload of zero; forget a payload that is let go."""
     payload = model.payload
     if not m.counts[mem.HELD]:
         f = m.S[payload].copy()
@@ -182,7 +182,7 @@ def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterSta
 
 
 def _set_arrival_cost(model: Model, m: mem.FilterState) -> None:
-    """An event: the present state is the arrival cost, and what was gathered of its consistency is void."""
+    """Begin a horizon at an event: the present state is its arrival cost, and the consistency figures start again."""
     _begin_horizon(model, m)
     for counter in (mem.SINCE_EVENT, mem.BATCHES):
         m.counts[counter] = 0
@@ -195,10 +195,10 @@ def _set_arrival_cost(model: Model, m: mem.FilterState) -> None:
 
 
 def _open_body(config: IdentifierParameters, model: Model, m: mem.FilterState) -> None:
-    """What was caught is no point: fit a body to the samples since the event, from the state just before it.
+    """Fit a rigid body to the samples since the event, from the state just before it, as no point mass fits.
 
-    If that was tried, the fit ended in a wrong minimum: it begins anew with the centre of mass on the other side. The
-    filter goes on as it is until the fit takes its place.
+    If a body was fitted before, that fit ended in a wrong minimum: begin again with the centre of mass on the other
+    side. The filter goes on as it is until the fit replaces its state.
     """
     body = slice(model.payload, model.payload + model.body)
     if m.S0[body][1:].any():
@@ -230,7 +230,7 @@ def _begin_horizon(model: Model, m: mem.FilterState) -> None:
 
 
 def _refit(m: mem.FilterState) -> None:
-    """Begin the iterations again, with the first samples of the horizon."""
+    """Begin the iterations of the fit again, at the first samples of the horizon."""
     m.counts[mem.USED] = int(m.S0.any(axis=1).sum())
     m.xi[:] = 0.0
     for counter in (mem.ITERATED, mem.ITERATING, mem.SINCE_NOISE, mem.IN_BATCH, mem.BEFORE, mem.REJECTED, mem.AGAIN,
@@ -296,7 +296,7 @@ def latest(sensors: MeasurementModel, efforts: Array, before: Array | None = Non
 
 
 def _bridge(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
-    """The torque changed, nobody knows when, while samples were missing: open the state by what that may have done."""
+    """Widen the covariance by what torques may have done that changed at an unknown time while samples were missing."""
     assert state.model is not None
     assert state.memory is not None
     assert state.efforts is not None
@@ -311,12 +311,12 @@ def _bridge(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
 
 
 UNKNOWN_TORQUE = 0.1
-"""Change of a torque over missing samples, over its peak, times their number, that is too small to matter: it leaves
-some 1e-4 of what a step of the whole torque does."""
+"""Change of a torque over missing samples, over its peak, times their number, below which it is neglected: its effect
+is some 1e-4 of that of a step of the whole torque."""
 
 
 def _parts(state: StructuredState, rows: Rows) -> list[tuple[bool, Rows]]:
-    """Return the rows in pieces, and whether a gap or an unknown change of torque is before the first of each."""
+    """Return the rows in pieces, each with whether a gap or an unknown change of torque precedes its first row."""
     if not len(rows):
         return []
     if not state.missing and not rows.gap.any() and not rows.missing.any():  # as nearly always
@@ -334,10 +334,11 @@ def _parts(state: StructuredState, rows: Rows) -> list[tuple[bool, Rows]]:
 
 
 def _unforeseen(step: Array, slope: Array, missing: int | Array) -> Array:
-    """Change of torques by which their path over missing samples is unknown [N m].
+    """Return the change of the torques over missing samples that nothing foretold [N m].
 
-    step: their change from one of these to the next, interpolated; slope: over the last sample before. A torque that
-    goes on as before is foreseen, and so is one that does not change.
+    step: their change from one missing sample to the next, interpolated; slope: their change over the last sample
+    before. A torque that keeps its value is foretold, and so is one that keeps its slope; the smaller difference
+    counts.
     """
     change = (missing + 1) * step
     beyond = change - (missing + 1) * slope
@@ -353,7 +354,7 @@ def _peaks(state: StructuredState, rows: Rows) -> Array:
 def reopen(
     config: IdentifierParameters, state: StructuredState, y: Array | None = None,
 ) -> StructuredState:
-    """Keep what is known of arm, payload and noise; start the motion again from measurements y (m,)."""
+    """Start the motion again from measurements y (m,), and keep what is known of arm, payload and noise."""
     assert state.model is not None
     assert state.memory is not None
     m = mem.copy(state.memory)
@@ -429,11 +430,11 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
             ) -> StructuredState:
     """Begin again after the last row, at which numbers left the finite range or a fit failed.
 
-    before: the state before the rows that were taken with it.
+    before: the state before these rows.
 
-    The first fit estimates few parameters of the arm and a point mass; later ones all of ``payload.learn``, and a rigid
-    body. The object begins with its prior; the arm with what was learned before the event, or as given if that fails at
-    once.
+    The first fit estimates few parameters of the arm and a point mass; later ones all of ``payload.learn`` and a rigid
+    body. The object begins with its prior. The arm begins with what was learned before the event, or, if that fails
+    within ``FIRST_LOOK`` samples, with its given parameters.
     """
     assert before.memory is not None
     assert state.model is not None

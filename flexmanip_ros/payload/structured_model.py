@@ -124,30 +124,30 @@ def _in_order_of_links(names: tuple[str, ...], links: int) -> tuple[str, ...] | 
 
 
 class Model(NamedTuple):
-    """Constants of the estimator; what ends up as scratch inside holds nothing between calls."""
+    """Constants of the estimator. Its scratch arrays hold nothing between calls."""
 
     motion: ProcessModel
     roles: tuple[Role, ...]
-    """Of every measurement: of the outputs, then the angles that are not among them."""
+    """Role of every measurement: the kept outputs, then the angles that are not among the outputs."""
     kept: tuple[int, ...]
-    """Which outputs are measurements: the rate of what is measured itself is none."""
+    """Indices of the outputs that are measurements; the rate of a quantity that is measured itself is left out."""
     extra: tuple[int, ...]
-    """Which of the angles are appended to the outputs."""
+    """Indices of the angles that are appended to the outputs."""
     slowest: float
     """Lowest pinned frequency of a link [Hz]."""
     prior: Array
     """(np,) prior standard deviation of each entry of p."""
     given: Array
-    """(np,) its prior mean."""
+    """(np,) prior mean of each."""
 
     @property
     def payload(self) -> int:
-        """Which state is the payload; the rest of the body follows it."""
+        """Index of the payload's mass in the state; first moments and inertia of a body follow it."""
         return 2 * self.motion.arm.stiffness.size
 
     @property
     def body(self) -> int:
-        """How many states describe the payload: 1 a point, 4 a body."""
+        """Number of states that describe the payload: 1 for a point mass, 4 for a rigid body."""
         return int(np.count_nonzero(self.motion.kind <= int(Kind.INERTIA)))
 
 
@@ -184,7 +184,7 @@ LEARNED = {
 
 
 def learned(config: IdentifierParameters) -> tuple[tuple[Kind, int], ...]:
-    """Return what each entry of p is, and of which link: the body, then what the arm teaches."""
+    """Return kind and link of each entry of p: first the payload, then what is learned of the arm."""
     body = (Kind.MASS,) if config.payload.object == 'point' else (Kind.MASS, Kind.FIRST_X, Kind.FIRST_Y, Kind.INERTIA)
     known = signals(config)
     bends = {role.link for role in known.outputs if role.quantity in (Quantity.BEND, Quantity.BEND_RATE)} \
@@ -207,7 +207,7 @@ def learned(config: IdentifierParameters) -> tuple[tuple[Kind, int], ...]:
 
 
 def motion(config: IdentifierParameters) -> ProcessModel:
-    """Allocate the arm for the compiled functions; its mass matrices are set at the working point later."""
+    """Allocate the arm for the compiled functions; ``freeze`` sets the mass matrices of a working point later."""
     nominal = manipulator(config.arm)
     n, links = nominal.torque.shape
     kinds = learned(config)
@@ -265,7 +265,7 @@ def torque_reach(model: Model, dt: float) -> int:
 
 
 def _state(motion: ProcessModel, kind: Kind, link: int) -> int:
-    """Return which state that is; -1: none."""
+    """Return the index of the state of this kind and link; -1: there is none."""
     found = np.flatnonzero((motion.kind == kind) & (motion.link == link))
     return 2 * motion.arm.stiffness.size + int(found[0]) if found.size else -1
 
@@ -278,47 +278,47 @@ def inertias(arm: Manipulator) -> Array:
 
 
 DRIFT_SHARE = 3e-3
-"""Part of its prior deviation by which a parameter of the arm may drift in the square root of a second, over T."""
+"""Drift of a parameter of the arm in the square root of a second, over its prior deviation and over 1 / T."""
 CERTAIN = 1e-9
-"""Standard deviation of what is taken as known."""
+"""Standard deviation of a coordinate that is taken as known."""
 EMPTY_STD = 0.05
-"""Standard deviation of what an empty arm seems to hold, over its lightest tip mass."""
+"""Standard deviation of the payload of an empty arm, over the mass at its tip (``ProcessModel.scale``)."""
 PAYLOAD_STD = 3.0
-"""Standard deviation of an unknown payload, over the same mass; it is thought to weigh as much as that."""
+"""Standard deviation of an unknown payload, over the mass at the tip, which is its prior mean."""
 COM_STD = 0.1
-"""Of its centre of mass and its radius of gyration, over the length of the last link."""
+"""The same of its centre of mass and of its radius of gyration, over the length of the last link."""
 ROTOR_STD = 0.003
-"""Of a rotor inertia, over the inertia of the straight empty arm beyond its joint."""
+"""Prior deviation of a rotor inertia, over the inertia of the straight empty arm beyond its joint."""
 VISCOUS_STD = 0.02
-"""Of a viscous friction: the rate [1/s] at which it alone would slow down that inertia."""
+"""Prior deviation of a viscous friction, as the rate [1/s] at which it alone would slow down that inertia."""
 COULOMB_STD = 0.005
-"""Of a Coulomb friction: the deceleration [rad/s^2] that it alone would give that inertia."""
+"""Prior deviation of a Coulomb friction, as the deceleration [rad/s^2] that it alone would give that inertia."""
 GAIN_STD = 0.03
-"""Of the logarithm of the gains of torques and bends: calibrated to a few percent."""
+"""Prior deviation of the logarithm of the gains of torques and bends, which are calibrated to a few percent."""
 LATE_STD = 2e-3
-"""Of delays and lags [s]: of a few samples of a bus, and of drives."""
+"""Prior deviation of delays and lags [s]: a few samples of a bus, the lag of a drive."""
 MOST_EFFORTS = 1000
-"""Efforts that a torque depends on at most; what was before them, is taken for constant."""
+"""Largest number of efforts that a torque depends on; before them the effort is taken as constant."""
 OFFSET_STD = 1e-3
-"""Of the offset of a bend, over the length of its link."""
+"""Prior deviation of the offset of a bend, over the length of its link."""
 BASE_RATE_STD = 0.05
-"""Of the rate of a floating base before the first sample [rad/s]: it rests nearly."""
+"""Prior deviation of the rate of a floating base before the first sample [rad/s]: it is nearly at rest."""
 SPIN = 0.3
 """Expected spin of the object relative to the tip at a capture [rad/s]."""
 ANGLE_STD, RATE_STD = 0.03, 1.0
-"""Chords [rad] and their rates [rad/s] before the first sample."""
+"""Prior deviations of the chords [rad] and of their rates [rad/s] before the first sample."""
 BEND_STD = 0.01
-"""Bending over the length of the link before the first sample."""
+"""Prior deviation of the bending before the first sample, over the length of the link."""
 OTHER_JUMP = 0.01
-"""Part of the rate jump at a capture that an impulse at the tip does not explain: the shape functions are few."""
+"""Share of the rate jump at a capture that an impulse at the tip does not explain, as the shape functions are few."""
 RATE_NOISE = 10.0
-"""Variance of rates over their white noise before they are known: rates show what the modes left out do."""
+"""Variance of rates over their white noise, as long as none is measured: rates show the modes that are left out."""
 FLOORS = {Quantity.ANGLE: 1e-6, Quantity.ANGLE_RATE: 1e-5, Quantity.BEND: 1e-7, Quantity.BEND_RATE: 1e-6}
-"""Least standard deviations of a sensor [rad, rad/s, m, m/s]: no signal is exact."""
+"""Least standard deviations of a sensor [rad, rad/s, m, m/s], as no signal is exact."""
 
 
 def priors(config: IdentifierParameters, motion: ProcessModel) -> Array:
-    """Return the prior standard deviation (np,) of each entry of p; of the body, as an empty arm has it."""
+    """Return the prior standard deviation (np,) of each entry of p; of the payload that of an empty arm."""
     J, L = inertias(motion.arm), np.array(config.arm.link_length)
     alike = {Kind.MASS: EMPTY_STD * motion.scale, Kind.STIFFNESS: config.payload.stiffness_std,
              Kind.DAMPING: config.payload.damping_std, Kind.TORQUE_GAIN: GAIN_STD, Kind.BEND_GAIN: GAIN_STD,
@@ -351,7 +351,7 @@ def body_std(config: IdentifierParameters, model: Model) -> Array:
 
 
 def body_mean(config: IdentifierParameters, model: Model) -> Array:
-    """Return the prior mean (4,) of a captured body: a point is at the edge of what is possible, so not there."""
+    """Return the prior mean (4,) of a captured body; its inertia is above zero, as a point mass is on the bound."""
     mass, _, _, inertia = body_std(config, model) / PAYLOAD_STD
     return np.array([mass, 0.0, 0.0, inertia])
 
@@ -370,7 +370,7 @@ def _least_rotor(arm: Manipulator) -> Array:
 
 
 def noise(model: Model, Y: Array) -> Array:
-    """First guess of every sensor's noise from its first samples Y (N, m), as ``FilterState.noise``."""
+    """Return a first guess of every sensor's noise, as ``FilterState.noise``, from its first samples Y (N, m)."""
     differences = np.diff(Y, n=4, axis=0)
     white = (1.4826 * np.median(np.abs(differences), axis=0)) ** 2 / 70
     rows = np.zeros((len(model.roles), 11))
@@ -382,7 +382,7 @@ def noise(model: Model, Y: Array) -> Array:
 
 
 def guess_noise(model: Model, rows: Array) -> None:
-    """Let the variance of every sensor be twice its white noise, of rates more: they show the modes left out."""
+    """Set the variance of every sensor to twice its white noise, of rates to ``RATE_NOISE`` times it."""
     rates = [role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE) for role in model.roles]
     guess = np.maximum(rows[:, mem.WHITE], rows[:, mem.FLOOR]) * np.where(rates, RATE_NOISE, 2.0)
     for column in (mem.POWER, mem.SLOW, mem.EFFECTIVE, mem.AT_EVENT):
@@ -390,7 +390,7 @@ def guess_noise(model: Model, rows: Array) -> None:
 
 
 def first(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Array) -> None:
-    """Fill x and S from the first measurement; the arm is empty and may move."""
+    """Fill x and S from the first measurement of an empty arm that may move."""
     arm = model.motion.arm
     n, k, links = arm.stiffness.size, arm.kappa, arm.length.size
     m.x[:] = 0.0
@@ -418,7 +418,7 @@ def first(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Arr
 
 
 def take_as_known(model: Model, m: mem.FilterState, beyond: Kind = Kind.DAMPING) -> None:
-    """Take what p holds beyond a kind as given: an unknown object hides it. Modes are never exact."""
+    """Take the entries of p beyond a kind as given, where an unknown object hides them; modes stay uncertain."""
     n = model.motion.arm.stiffness.size
     for c, kind in enumerate(model.motion.kind):
         if kind > beyond and kind != Kind.MODE:
@@ -427,7 +427,7 @@ def take_as_known(model: Model, m: mem.FilterState, beyond: Kind = Kind.DAMPING)
 
 
 def freeze(config: IdentifierParameters, model: Model, angles: Array) -> None:
-    """Set the mass matrices of a linear plant at its working point, given or as measured (L,), unbent."""
+    """Set the mass matrices of a linear plant at its unbent working point, given or at the measured angles (L,)."""
     nominal = manipulator(config.arm)
     rest = np.zeros(nominal.stiffness.size)
     rest[:len(angles)] = config.payload.working_point or chords(config.arm, angles)
@@ -442,9 +442,9 @@ def widen(S: Array, columns: Array) -> Array:
 
 
 def triangular(S: Array) -> Array:
-    """Return the square root of S S' (nx, nx) whose columns are zero from the rank on, each row's last one its own.
+    """Return the lower triangular square root of S S' (nx, nx), without the columns of states that are taken as known.
 
-    A state that is taken as known is a row of zeros, and has no column.
+    The row of such a state is zero. The columns from the rank on are zero.
     """
     unknown = S.any(axis=1)
     rank = int(unknown.sum())
@@ -454,12 +454,12 @@ def triangular(S: Array) -> Array:
 
 
 def jump(config: IdentifierParameters, model: Model, m: mem.FilterState, instant_std: float) -> Array:
-    """Columns (nx, c) of the rate jump at an event: an impulse at the tip, force and moment, and what it leaves open.
+    """Return columns (nx, c) by which an event widens the rates: an impulse at the tip (force, moment), and the rest.
 
-    Whatever a body of unknown mass does to the rates, it does through such an impulse p on the arm as it was: q'
-    jumps by M^-1 J' p, p the expected mass times the expected speed, and a moment likewise. Where that is later than
-    the stamp by t, q lacks t M^-1 J' p. t is independent of p, so the variance is the product, instant_std [s] squared
-    times that of the rates.
+    A body of unknown mass changes the rates by an impulse p at the tip of the arm as it was: q' jumps by M^-1 J' p,
+    with p the expected mass times the expected speed, and the moment likewise. If the impulse is later than the stamp
+    by t, q is off by t M^-1 J' p. t and p are independent, so the variance of q is that of the rates times
+    instant_std^2 [s^2].
     """
     motion = model.motion
     n, links = motion.arm.stiffness.size, motion.arm.length.size
@@ -488,12 +488,12 @@ def jump(config: IdentifierParameters, model: Model, m: mem.FilterState, instant
 
 
 def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, dt: float) -> Array:
-    """Columns (nx, c) by which torques that change by ``change`` (L,) [N m] in ``count`` samples leave the state open.
+    """Return columns (nx, c) by which torques widen the state that change by ``change`` (L,) [N m] over a gap.
 
-    Each torque jumped at a sample as likely as any other, and was interpolated linearly: in interval i of ``count`` the
-    difference has the covariance of a Brownian bridge, change^2 (min(p, q) - p q) with p, q = i / (count + 1). A column
-    is what one of its principal components (Karhunen and Loeve) does to the arm as it is now. The last interval ends
-    at the sample that follows the state, so columns are carried back over it.
+    Each torque jumped at one of the ``count`` missing samples, all equally likely, and was interpolated linearly. The
+    difference in interval i has the covariance of a Brownian bridge, change^2 (min(p, q) - p q) with p, q = i / (count
+    + 1). A column is the effect of one of its principal components (Karhunen and Loeve) on the arm at its present
+    state. The last interval ends at the sample that follows the state, so the columns are carried back over it.
     """
     motion = model.motion
     n = motion.arm.stiffness.size
@@ -519,14 +519,14 @@ def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, 
 
 
 def shake(model: Model, m: mem.FilterState) -> None:
-    """An event rings vibrations that no few shape functions have, and rates show them."""
+    """Raise the noise of the rates at an event: it excites vibrations beyond the shape functions, which rates show."""
     for i, role in enumerate(model.roles):
         if role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE):
             m.noise[i, mem.EFFECTIVE] = max(m.noise[i, mem.EFFECTIVE], RATE_NOISE * m.noise[i, mem.WHITE])
 
 
 def diffusion(config: IdentifierParameters, model: Model, m: mem.FilterState) -> Array:
-    """Standard deviation (nx,) each state gains in the square root of a second, so that memory is finite."""
+    """Return the standard deviation (nx,) that process noise adds in the square root of a second: memory is finite."""
     arm = model.motion.arm
     n, links = arm.stiffness.size, arm.length.size
     T = config.payload.memory_time
