@@ -1,4 +1,4 @@
-"""The two estimators, payload and model, each a cursor into the sample log, and what is read out of them."""
+"""The estimators of payload and model, each with its own cursor into the sample log, and their estimates."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ NO_ANGLES: Array = np.empty(0)
 
 
 class PayloadEstimator(NamedTuple):
-    """The payload where it does not rest on the model: ``event_replay.Estimator``; constant in size."""
+    """Estimator of a payload that is not read from the model: ``event_replay.Estimator``; constant in size."""
 
     structured: structured.StructuredState | None
-    """None where the payload is read out of the model, or not at all."""
+    """None where the payload is read from the model, or not estimated."""
     since_ns: int = 0
     """Stamp of the last event; 0 before the first."""
 
@@ -42,12 +42,12 @@ class PayloadEstimator(NamedTuple):
         return self._replace(structured=structured.advance(config, self.structured, rows))
 
     def event(self, config: IdentifierParameters, event: CaptureEvent, background: Background) -> PayloadEstimator:
-        """The arm caught or let go of something before the next row."""
+        """Take an event: the arm caught or released an object before the next row."""
         held = self.structured if self.structured is None else structured.event(config, self.structured, event)
         return PayloadEstimator(held, event.stamp_ns)
 
     def restart(self, config: IdentifierParameters, events: Sequence[CaptureEvent]) -> PayloadEstimator:
-        """Begin again, after events from before every sample."""
+        """Begin again from the cursor, with events from before the first sample."""
         if self.structured is None:
             return self
         held = structured.init(config)._replace(cursor=self.structured.cursor)
@@ -63,7 +63,7 @@ class ModelEstimator(NamedTuple):
     angles: Array = NO_ANGLES
     """The latest measured configuration: (2,) [rad], or (0,) when there is none."""
     configuration_range: Array = NO_ANGLES
-    """What the configuration went through since the last event, see ``block_extraction.extend_range``."""
+    """Range of the configuration since the last event, see ``block_extraction.extend_range``."""
     since_ns: int = 0
     """Stamp of the last event; 0 before the first."""
 
@@ -77,47 +77,47 @@ class ModelEstimator(NamedTuple):
                               block_extraction.extend_range(config, self.configuration_range, rows), self.since_ns)
 
     def event(self, config: IdentifierParameters, event: CaptureEvent, background: Background) -> ModelEstimator:
-        """The arm caught or let go of something before the next row."""
+        """Take an event: the arm caught or released an object before the next row."""
         return self._replace(rpbsid=rpbsid.restart(config, self.rpbsid, background), configuration_range=NO_ANGLES,
                              since_ns=event.stamp_ns)
 
     def restart(self, config: IdentifierParameters, events: Sequence[CaptureEvent]) -> ModelEstimator:
-        """Go on: every sample came after these events, so the model is of what the arm holds now."""
+        """Keep the model: every sample came after these events, so it is that of the arm with its present payload."""
         return self._replace(since_ns=events[-1].stamp_ns)
 
     @property
     def outliers(self) -> int:
-        """How many samples were rejected: values that cannot be, or far outside all before."""
+        """Number of rejected samples: a value was not finite, or far beyond all earlier ones."""
         return int(self.rpbsid.counts[REJECTED])
 
 
 def init(config: IdentifierParameters) -> tuple[PayloadEstimator, ModelEstimator]:
-    """Start with nothing known. ``config.outputs`` are those the messages really carry."""
+    """Start with empty estimators. ``config.outputs`` are those that the messages contain."""
     wanted = config.payload_method == 'structured'
     return PayloadEstimator(structured.init(config) if wanted else None), ModelEstimator(rpbsid.init(config))
 
 
 def payload(config: IdentifierParameters, state: PayloadEstimator) -> Payload | None:
-    """Return the payload where it does not rest on the model; else None."""
+    """Return the payload where it is not read from the model; else None."""
     return None if state.structured is None else structured.estimate(config, state.structured)
 
 
 def arm_parameters(config: IdentifierParameters, state: PayloadEstimator) -> tuple[ArmParameter, ...]:
-    """Return what the arm taught; empty where the payload rests on the model."""
+    """Return the arm parameters learnt by the payload's estimator; empty where the payload is read from the model."""
     return taught(config, state.structured)
 
 
 class PayloadReading(NamedTuple):
-    """What the payload's estimator says at a row."""
+    """Result of the payload's estimator at a row."""
 
     payload: Payload | None
-    """None where it rests on the model."""
+    """None where it is read from the model."""
     arm_parameters: tuple[ArmParameter, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class PayloadRequest:
-    """Rows that the payload's estimator is to take; ``background.Request``."""
+    """Request to advance the payload's estimator over rows; ``background.Request``."""
 
     config: IdentifierParameters
     replay: EventReplay[PayloadEstimator]
@@ -127,12 +127,12 @@ class PayloadRequest:
     rows: Sequence[int] = ()
     """Rows at which an estimate is due."""
     seconds: Sequence[int] = ()
-    """The second, counted from the first stamp on, of each."""
+    """For each of ``rows`` the second, counted from the first stamp."""
     told: int = -1
-    """The last second in which the arm's parameters were told."""
+    """The last second for which the arm's parameters were returned."""
 
     def solve(self) -> tuple[EventReplay[PayloadEstimator], list[PayloadReading], int]:
-        """Return the estimator before ``until``, what it says at each row, and the last second told."""
+        """Return the estimator before ``until``, its reading at each of ``rows``, and the last second told."""
         now, told, readings = self.replay, self.told, []
         for row, second in zip(self.rows, self.seconds, strict=True):
             now = event_replay.advance(self.config, now, self.log, row + 1, INLINE)
@@ -144,7 +144,7 @@ class PayloadRequest:
 
 @dataclass(frozen=True, eq=False)
 class ModelRequest:
-    """A model to be read out of the identifier; ``background.Request``."""
+    """Request to read a model from the identifier; ``background.Request``."""
 
     config: IdentifierParameters
     identifier: ModelEstimator
@@ -154,7 +154,7 @@ class ModelRequest:
     """The latest samples, on which the model is judged."""
 
     def solve(self) -> Estimate:
-        """Return the estimate with model and modes, and with the payload where it rests on them."""
+        """Return the estimate with model and modes, and with the payload where it is read from them."""
         config, identifier = self.config, self.identifier
         payload: Payload | None = None
         found, without = _identified(config, identifier.rpbsid, self.dt, self.rows)
@@ -174,7 +174,7 @@ class ModelRequest:
 
 
 def with_payload(config: IdentifierParameters, estimate: Estimate, payload: Payload | None) -> Estimate:
-    """Return the estimate of a model with the payload of the same sample, where that does not rest on the model."""
+    """Return the estimate of a model with the payload of the same sample; None: the payload is read from the model."""
     if payload is None:
         return estimate
     status = estimate.status if estimate.model is None else _overall(config, estimate.model_status, payload)
@@ -183,7 +183,7 @@ def with_payload(config: IdentifierParameters, estimate: Estimate, payload: Payl
 
 def with_model_of(config: IdentifierParameters, stamp_ns: int, last: Estimate, payload: Payload | None
                   ) -> Estimate:
-    """Return an estimate with the model of the last one, and the payload if that stands by itself."""
+    """Return an estimate with the model of the last one, and with ``payload``, or where it is None the last one."""
     payload = last.payload if payload is None else payload
     return last._replace(stamp_ns=stamp_ns, payload=payload, model_is_new=False,
                          status=_overall(config, last.model_status, payload))
@@ -197,7 +197,7 @@ def without_model(config: IdentifierParameters, stamp_ns: int, payload: Payload)
 
 
 def _overall(config: IdentifierParameters, model: Status, payload: Payload | None) -> Status:
-    """Return the status of both: of the payload where it does not rest on the model, else of the weaker."""
+    """Return the joint status: the payload's where it is not read from the model, else the weaker of the two."""
     if payload is not None and (model is Status.TRACKING or config.payload_method == 'structured'):
         return payload.status
     return model
@@ -205,10 +205,13 @@ def _overall(config: IdentifierParameters, model: Status, payload: Payload | Non
 
 def _identified(config: IdentifierParameters, state: rpbsid.RpbsidState, dt: float, rows: Rows
                 ) -> tuple[Identified | None, Status]:
-    """Return the model, and the status while there is none: too few samples, or signals that stand still."""
+    """Return the model, and the status to publish while there is none.
+
+    WARMING_UP: there are too few samples. POORLY_EXCITED: the signals are constant, or the regression is singular.
+    """
     try:
         found = rpbsid.identified(config, state, dt, rows)
-    except np.linalg.LinAlgError:  # signals that barely move, or in one direction only
+    except np.linalg.LinAlgError:  # signals that are almost constant, or vary in one direction only
         return None, Status.POORLY_EXCITED
     parameters = config.past_window * (len(config.inputs) + len(config.outputs)) + len(config.inputs)
     enough = state.counts[FILLED] > 2 * parameters + config.past_window

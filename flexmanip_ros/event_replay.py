@@ -1,9 +1,9 @@
-"""Events at their own stamps, whatever the order of their arrival.
+"""Apply events at their own stamps, whatever the order of their arrival.
 
 An event that arrives early waits for its stamp. One that arrives late is applied at its own stamp: the estimator goes
-back to a snapshot before the event and takes the rows of the log again. From its arrival on, the result depends on
-stamps alone. An event older than ``rewind_time`` is applied at once and counted. One from before the first sample
-(latched, received only now) was true all along: the payload begins again with it.
+back to a snapshot before the event and takes the rows of the log again. Once the event has arrived, the result depends
+on stamps alone. An event older than ``rewind_time`` is applied at once and counted. An event from before the first
+sample (latched, received only now) holds for all samples: the payload's estimator begins again with it.
 """
 
 from __future__ import annotations
@@ -18,36 +18,39 @@ from flexmanip_ros.samples.sample_log import Rows, SampleLog
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 BEFORE_ALL = -(1 << 63)
-"""Stamp of the row before the first one."""
+"""Stamp that stands for the row before the first one [ns]."""
 SNAPSHOTS = 2
-"""Snapshots within ``rewind_time``. One more is kept, so that the whole of it can be taken again."""
+"""Number of snapshots within ``rewind_time``. One older snapshot is kept, so a rewind can go back all this time."""
 MOST_EVENTS = 100
-"""Events that wait for their stamps at most, the earliest ones."""
+"""Largest number of events that wait for their stamps; beyond it the latest ones are dropped."""
 MOST_ROWS = 20_000
-"""Rows kept for a rewind at most. At rates (or with stamps) that need more the time to go back is shorter."""
+"""Largest number of rows kept for a rewind. Where ``rewind_time`` has more rows, a rewind goes back less far."""
 
 
 class Estimator(Protocol):
-    """A value that takes rows of the sample log, and events between them."""
+    """An immutable estimator that takes rows of the sample log, and events between them."""
 
     def first_needed(self, cursor: int) -> int:
-        """Return the first row that will be read again; cursor: the row it takes next."""
+        """Return the first row that the estimator will read again; cursor: the row that it takes next."""
 
     def advance(self, config: IdentifierParameters, rows: Rows, background: Background) -> Self:
         """Take the next rows."""
 
     def event(self, config: IdentifierParameters, event: CaptureEvent, background: Background) -> Self:
-        """The arm caught or let go of something before the next row."""
+        """Take an event: the arm caught or released an object before the next row."""
 
     def restart(self, config: IdentifierParameters, events: Sequence[CaptureEvent]) -> Self:
-        """Take account of events that turn out to be from before the first row."""
+        """Take account of events from before the first row, which arrived late."""
 
 
 E = TypeVar('E', bound=Estimator)
 
 
 class Snapshot(NamedTuple, Generic[E]):
-    """The estimator before a row at ``stamp_ns`` and its events, after the row at ``before_ns``."""
+    """The estimator before the row ``row`` and the events at it.
+
+    stamp_ns: stamp of that row [ns]; before_ns: stamp of the row before it [ns].
+    """
 
     row: int
     stamp_ns: int
@@ -56,13 +59,13 @@ class Snapshot(NamedTuple, Generic[E]):
 
 
 class EventReplay(NamedTuple, Generic[E]):
-    """The estimator now, and what is needed to go back."""
+    """The present estimator, with the snapshots and events that a rewind needs."""
 
     estimator: E
     cursor: int = 0
     """Row of the sample log that is taken next."""
     last_ns: int = BEFORE_ALL
-    """Stamp of the row before it [ns]."""
+    """Stamp of the row before ``cursor`` [ns]."""
     snapshots: tuple[Snapshot[E], ...] = ()
     applied: tuple[tuple[int, CaptureEvent], ...] = ()
     """Events at or after the oldest snapshot, each with the row before which it was applied."""
@@ -111,7 +114,7 @@ def advance(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog
 
 def insert(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog, event: CaptureEvent,
            first_ns: int, background: Background) -> EventReplay[E]:
-    """Take an event: let it wait, go back for it, or (too old to go back) apply it now.
+    """Take an event: let it wait for its stamp, rewind to it, or apply it now where it is too old for a rewind.
 
     first_ns: stamp of the first sample [ns].
     """
@@ -131,14 +134,14 @@ def insert(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog,
 
 
 def _restart(config: IdentifierParameters, replay: EventReplay[E]) -> EventReplay[E]:
-    """Every sample came after the events: forget what was estimated without them."""
+    """Restart the estimator with the events, as every sample came after them; drop the older snapshots."""
     estimator = replay.estimator.restart(config, sorted(replay.latest, key=_order))
     only = Snapshot(replay.cursor, replay.last_ns + 1, replay.last_ns, estimator)
     return replay._replace(estimator=estimator, snapshots=(only,), applied=())
 
 
 def _order(event: CaptureEvent) -> tuple[int, bool]:
-    """By stamp, whatever the order of arrival; with the same stamp the arm lets go before it catches."""
+    """Sort key of events: the stamp, and at the same stamp a release before a capture."""
     return event.stamp_ns, event.kind is EventKind.CAPTURE
 
 
@@ -148,9 +151,10 @@ def _wait(replay: EventReplay[E], event: CaptureEvent) -> EventReplay[E]:
 
 
 def _next_snapshot(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog, until: int) -> int:
-    """Return the row before which the next snapshot is due: the first, then one a fraction of rewind_time.
+    """Return the row before which the next snapshot is due: the first row, then one each rewind_time / SNAPSHOTS.
 
-    One that would be too old at row ``until`` is left out: events come only when all rows before that are taken.
+    A snapshot that would be too old for a rewind at row ``until`` is left out. Events are inserted only after all rows
+    before ``until`` are taken.
     """
     if not replay.snapshots:
         return replay.cursor
@@ -163,7 +167,7 @@ def _next_snapshot(config: IdentifierParameters, replay: EventReplay[E], log: Sa
 
 
 def _snapshot(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog) -> EventReplay[E]:
-    """Remember the estimator as it is before the next row; forget what is too old."""
+    """Keep a snapshot of the estimator before the next row; drop snapshots and events that are too old."""
     stamp_ns = int(log.rows(replay.cursor, replay.cursor + 1).stamp_ns[0])
     kept = (*replay.snapshots, Snapshot(replay.cursor, stamp_ns, replay.last_ns, replay.estimator))
     oldest_needed = stamp_ns - int(config.rewind_time * 1e9)
@@ -176,7 +180,7 @@ def _snapshot(config: IdentifierParameters, replay: EventReplay[E], log: SampleL
 
 def _rewind(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog, event: CaptureEvent,
             background: Background) -> EventReplay[E]:
-    """Go back to the last snapshot not after the event, and take rows and events again from there."""
+    """Go back to the last snapshot not after the event, and take the rows and events again from there."""
     kept = tuple(one for one in replay.snapshots if one.before_ns < event.stamp_ns)
     back = kept[-1]
     again = sorted((*(e for row, e in replay.applied if row >= back.row), *replay.pending, event), key=_order)

@@ -1,9 +1,9 @@
-"""What taking an object does: bodies joined at the tip, momentum conserved.
+"""Capture of an object: a body is joined to the tip, and momentum is conserved.
 
-An impulse at the tip leaves the momentum of arm and object together unchanged: (M + J' W J) v+ = M v- + J' W v_o,
-W = diag(m, m, I_c), v_o the object's velocity and spin, J (3, n) the Jacobian of its centre of mass and angle.
-Inelastic: afterwards the object moves with the tip. A floating base takes its part: its translation is two more
-coordinates here. Velocities are then those seen from the centre of mass of the arm and its base.
+An impulse at the tip leaves the momentum of arm and object together unchanged: (M + J^T W J) v+ = M v- + J^T W v_o,
+W = diag(m, m, I_c), v_o the object's velocity and spin, J (3, n) the Jacobian of its centre of mass and angle. The
+impact is inelastic: afterwards the object moves with the tip. The translation of a floating base is two more
+coordinates here. Velocities are then relative to the centre of mass of the arm and its base.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def free_object(config: PlantParameters) -> Body:
 def tip_jacobian(arm: Manipulator, payload: Array, q: Array) -> Array:
     """Jacobian (3, n) of the tip: inertial x, y [m] and angle of its cross-section [rad].
 
-    Of a floating base relative to the centre of mass of base, arm and payload.
+    With a floating base, x and y are relative to the centre of mass of base, arm and payload.
     """
     work = workspace(arm)
     assemble(arm, payload, np.asarray(q, float), np.zeros_like(q), work.M, work.E, work)
@@ -72,12 +72,12 @@ def modal_of(arm: Manipulator, link: int) -> slice:
 def rates_after(M: Array, J: Array, qd: Array, body: Body, mass: float = np.inf, held: Array | None = None) -> Array:
     """Rates (n,) just after the body is caught; M (n, n) is the mass matrix before.
 
-    J: (3, n) of the body's centre and angle; mass: of all that floats together before [kg] (inf: the base is fixed); of
-    a floating base M and J are those relative to its centre of mass. held: (m, n) rows of locked joints, whose reaction
-    takes part of the impulse.
+    J: (3, n) Jacobian of the body's centre of mass and angle; mass: total mass of all that floats before the capture
+    [kg], inf where the base is fixed. With a floating base, M and J are relative to the centre of mass of all that
+    floats. held: (m, n) rows of locked joints, whose reaction takes part of the impulse.
     """
     slip = np.array([*body.velocity, body.spin]) - J @ qd
-    # the body meets the arm's mobility J M^-1 J' at its centre, and that of all as one mass
+    # mobility at the body's centre: J M^-1 J^T of the arm, plus 1 / mass for the translation of a floating base
     free = np.eye(qd.size) if held is None or not len(held) else scipy.linalg.null_space(held)
     response = free @ scipy.linalg.cho_solve(scipy.linalg.cho_factor(free.T @ M @ free), (J @ free).T)
     yielding = J @ response + np.diag([1.0 / mass, 1.0 / mass, 0.0])

@@ -1,9 +1,9 @@
 """Equations of motion of the arm: mass matrix, forces, accelerations (paper eqs. 1-19; symbols in docs/notation.md).
 
 A link is a set of point masses (``Manipulator.mass``). In the frame of its chord, point p is at
-(a, b) = (x - eta' G(x) eta / 2, phi(x)' eta). With its Jacobian J and its acceleration A = J q'' + a(q, q'), the
-forces of inertia are the sum of m J' A: M collects m J' J, E collects m J' a. Inertial quantities of the next link
-follow from its root, the tip of the link before.
+(x - eta^T G(x) eta / 2, phi(x)^T eta). With its Jacobian J and its acceleration A = J q'' + a(q, q'), the inertial
+forces are the sum of m J^T A: M collects m J^T J, E collects m J^T a. The root of a link is the tip of the link before,
+whose J and a in inertial axes it takes over.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from flexmanip_ros.types import Array
 
 STICTION_RATE = 2e-3
-"""Rate [rad/s] at which the Coulomb friction reaches 76 % of its value: F tanh(rate / STICTION_RATE)."""
+"""Joint rate [rad/s] at which the Coulomb friction F tanh(rate / STICTION_RATE) reaches 76 % of its value F."""
 
 
 @inner
@@ -129,7 +129,7 @@ def assemble_link(
 @inner
 def assemble_payload(arm: Manipulator, payload: Array, q: Array, qd: Array, M: Array, E: Array, work: Workspace
                      ) -> None:
-    """Add the body that is held at the tip."""
+    """Add the payload, a rigid body held at the tip, to M, E, work.P and work.F."""
     k = arm.kappa
     links = arm.length.size
     n = q.size
@@ -197,7 +197,7 @@ def assemble(
 
 @inner
 def eliminate_translation(M: Array, E: Array, work: Workspace) -> None:
-    """Leave out the translation of a floating base, which keeps the momentum: Schur complement of its mass."""
+    """Eliminate the translation of a floating base by conservation of momentum: Schur complement of the total mass."""
     mass = work.F[2]
     for r in range(E.size):
         x, y = work.P[0, r] / mass, work.P[1, r] / mass
@@ -208,7 +208,7 @@ def eliminate_translation(M: Array, E: Array, work: Workspace) -> None:
 
 @inner
 def inertial_forces(arm: Manipulator, payload: Array, q: Array, qd: Array, work: Workspace) -> None:
-    """Fill work.M and work.E, the translation of a floating base left out."""
+    """Fill work.M and work.E; the translation of a floating base is eliminated."""
     assemble(arm, payload, q, qd, work.M, work.E, work)
     if arm.floating:
         eliminate_translation(work.M, work.E, work)
@@ -216,7 +216,7 @@ def inertial_forces(arm: Manipulator, payload: Array, q: Array, qd: Array, work:
 
 @inner
 def curvature_and_slope(curvature: Array, slopes: Array, eta: Array) -> tuple[float, float]:
-    """Return curvature w'' and slope w' of a link where its shapes have phi'' and phi' (k,); eta: (k,)."""
+    """Return curvature w'' and slope w' of a link at a point, from phi'' and phi' (k,) at that point and eta (k,)."""
     bend, slope = 0.0, 0.0
     for j in range(eta.size):
         bend += curvature[j] * eta[j]
@@ -228,8 +228,8 @@ def curvature_and_slope(curvature: Array, slopes: Array, eta: Array) -> tuple[fl
 def elastic(arm: Manipulator, q: Array, work: Workspace) -> None:
     """Fill work.elastic (n,) with dV/dq.
 
-    V = K q^2 / 2 + V4, V4 the integral of EI w''^2 w'^2 / 2: the curvature of an inextensible beam is
-    w'' (1 + w'^2 / 2). EI is read back from arm.stiffness, so that an estimated one counts.
+    V = q^T K q / 2 + V4, V4 the integral of EI w''^2 w'^2 / 2: the curvature of an inextensible beam is
+    w'' (1 + w'^2 / 2). EI is computed from arm.stiffness, so that an estimated stiffness takes effect in V4 too.
     """
     k = arm.kappa
     links = arm.length.size
@@ -321,7 +321,7 @@ def hold(L: Array, held: Array, qdd: Array, columns: Array) -> None:
 
 @inner
 def net_torques(B: Array, arm: Manipulator, qd: Array, effort: Array, net: Array) -> None:
-    """Fill net (3, L): torques less friction, rates of the joints, derivative of the friction by them; B (n, L)."""
+    """Fill net (3, L): joint torques less friction, joint rates, derivative of the friction by the rates; B: (n, L)."""
     for i in range(arm.length.size):
         rate = 0.0
         for r in range(qd.size):
@@ -334,10 +334,10 @@ def net_torques(B: Array, arm: Manipulator, qd: Array, effort: Array, net: Array
 
 @inner
 def torque_matrix(arm: Manipulator, q: Array, B: Array) -> None:
-    """Fill B (n, L), generalized forces of unit torques at q.
+    """Fill B (n, L), the generalized forces of unit joint torques at q.
 
-    Where a link is steep, a joint turns by the angle asin(w') of the tangent, so that its torque works on eta through
-    w' (1 + w'^2 / 2), of the order of V4. Nothing in the paper's convention, whose torques bend nothing.
+    A joint turns by the angle asin(w') of the link's tangent. So the generalized force on eta is that of the slope w'
+    times 1 + w'^2 / 2, a correction of the order of V4. In the paper's convention torques bend nothing, B is constant.
     """
     k = arm.kappa
     links = arm.length.size
@@ -360,7 +360,7 @@ def torque_matrix(arm: Manipulator, q: Array, B: Array) -> None:
 
 @inner
 def balance(arm: Manipulator, q: Array, qd: Array, effort: Array, qdd: Array, work: Workspace) -> bool:
-    """Fill qdd (n,) from work.M and work.E. Leaves the factor of M in work.M, and work.elastic, B and net."""
+    """Fill qdd (n,) from work.M and work.E. Leaves the factor of M in work.M, and fills work.elastic, B and net."""
     elastic(arm, q, work)
     if not factor(work.M):
         return False
@@ -380,8 +380,8 @@ def acceleration(
 ) -> bool:
     """Fill qdd (n,) for joint torques effort (L,) [N m]; payload: (4,) inertial parameters.
 
-    Leaves the Cholesky factor of M in work.M, E, ``torque_matrix`` in work.B and ``net_torques`` in work.net. False
-    when M is not positive definite (numbers left the finite range).
+    Leaves the Cholesky factor of M in work.M, E in work.E, ``torque_matrix`` in work.B and ``net_torques`` in work.net.
+    Returns False when M is not positive definite (numbers left the finite range).
     """
     inertial_forces(arm, payload, q, qd, work)
     return balance(arm, q, qd, effort, qdd, work)

@@ -1,8 +1,8 @@
 """Derivatives of the equations of motion by q, q' and the payload's inertial parameters (see ``equations_of_motion``).
 
-The forces of inertia are the sum of m J' A over all points, A = J q'' + a(q, q'). Their derivative at fixed q'' is
-the sum of m (dJ' A + J' dA), gathered link by link from the tip to the base: a link passes on the force F on its root
-with the derivatives Fq, Fv, which acts on the tip of the link before.
+The inertial forces are the sum of m J^T A over all points, A = J q'' + a(q, q'). Their derivative at fixed q'' is the
+sum of m (dJ^T A + J^T dA). It is gathered link by link from the tip to the base: each link passes the force F at its
+root, and the derivatives Fq (by q) and Fv (by q') of F, to the tip of the link before.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def payload_jacobian(
     arm: Manipulator, payload: Array, q: Array, qd: Array, qdd: Array, left: Array, right: Array, dp: Array,
     work: Workspace,
 ) -> None:
-    """Add the payload to left and right, set F, Fq, Fv to its force at the tip, and dp (n, 4) by its parameters."""
+    """Add the payload to left and right; set F, Fq, Fv to its force at the tip, dp (n, 4) to d(forces)/d(payload)."""
     k = arm.kappa
     links = arm.length.size
     n = q.size
@@ -81,7 +81,7 @@ def payload_jacobian(
         accelerated += g[o + j] * qdd[o + j]
     tx, ty = np.cos(turn), np.sin(turn)
     J, A, Aq, Av = work.J[links], work.A[links], work.Aq[links], work.Av[links]
-    # force by m c_x and m c_y: n psi'' - t psi'^2 and -(t psi'' + n psi'^2), n = (-ty, tx)
+    # force per m c_x: n psi'' - t psi'^2, per m c_y: -(t psi'' + n psi'^2); psi: tip angle, n = (-ty, tx)
     xx, xy = -ty * accelerated - tx * spin * spin, tx * accelerated - ty * spin * spin
     yx, yy = -tx * accelerated + ty * spin * spin, -ty * accelerated - tx * spin * spin
     along, across = tx * A[0] + ty * A[1], tx * A[1] - ty * A[0]
@@ -101,7 +101,7 @@ def payload_jacobian(
     F[0] = m * A[0] + hx * xx + hy * yx
     F[1] = m * A[1] + hx * xy + hy * yy
     dx, dy = -hx * ty - hy * tx, hx * tx - hy * ty
-    # by psi: d turns to -(hx t + hy n); by psi': -2 psi' (hx t + hy n)
+    # derivative of d = hx n - hy t by psi: -(hx t + hy n); of the force by psi': -2 psi' (hx t + hy n)
     qx, qy = hx * -xy + hy * -yy, hx * xx + hy * yx
     vx, vy = -2.0 * spin * dy, 2.0 * spin * dx
     moment = -(hx * along + hy * across)
@@ -121,9 +121,9 @@ def payload_jacobian(
 
 @inner
 def add_body_forces(arm: Manipulator, q: Array, qdd: Array, dp: Array, work: Workspace) -> None:
-    """Add to dp (n, 4), the derivative of the forces by the payload's parameters, that of more accelerations qdd (n,).
+    """Add to dp (n, 4), the derivative of the forces by the payload's parameters, the part of additional qdd (n,).
 
-    Right after ``force_jacobian``, whose work.frame, work.J and work.P it reads.
+    Call it right after ``force_jacobian``: it reads work.frame, work.J and work.P of that call.
     """
     n = q.size
     g, J, mass = work.frame[0], work.J[arm.length.size], work.F[2]
@@ -133,7 +133,7 @@ def add_body_forces(arm: Manipulator, q: Array, qdd: Array, dp: Array, work: Wor
         x += J[0, r] * qdd[r]
         y += J[1, r] * qdd[r]
         turn += g[r] * q[r]
-        if arm.floating:  # the translation that keeps the momentum
+        if arm.floating:  # the translation of the base, from conservation of momentum
             x -= work.P[0, r] / mass * qdd[r]
             y -= work.P[1, r] / mass * qdd[r]
     tx, ty = np.cos(turn), np.sin(turn)
@@ -151,7 +151,7 @@ def add_body_forces(arm: Manipulator, q: Array, qdd: Array, dp: Array, work: Wor
 
 @inner
 def tip_load_jacobian(arm: Manipulator, i: int, q: Array, left: Array, right: Array, work: Workspace) -> None:
-    """Add the force work.F at the tip of link i, with its derivatives Fq and Fv, to the link's own rows."""
+    """Add the force work.F at the tip of link i, with its derivatives Fq and Fv, to its rows of left and right."""
     k = arm.kappa
     o = arm.length.size + i * k
     c, s = np.cos(q[i]), np.sin(q[i])
@@ -188,7 +188,7 @@ def tip_load_jacobian(arm: Manipulator, i: int, q: Array, left: Array, right: Ar
 def link_jacobian(
     arm: Manipulator, i: int, q: Array, qd: Array, qdd: Array, left: Array, right: Array, work: Workspace,
 ) -> None:
-    """Add the points of link i to left and right, and their force to work.F, Fq and Fv."""
+    """Add the inertial forces of link i's points to left and right, and their sum to work.F, Fq and Fv."""
     k = arm.kappa
     n = q.size
     o = arm.length.size + i * k
@@ -256,7 +256,7 @@ def link_jacobian(
             for t in range(k):
                 by_q[t] += shape * nq[1 + t] - G * eq[1 + t] - shortening[j, p, t] * Ae
                 by_v[t] += shape * nv[1 + t] - G * ev[1 + t]
-    # the root's acceleration, in the frame, moves all points alike
+    # the root's acceleration, in the link's frame, is the same at all points
     for r in range(n):
         if i == 0 and r != i and not arm.floating:
             continue  # a pinned root is not accelerated
@@ -276,7 +276,7 @@ def link_jacobian(
         for side in range(2):
             work.Fq[side, r] += total * Aq[side, r]
             work.Fv[side, r] += total * Av[side, r]
-    feq[0], fnq[0] = -fn, fe  # the frame turns
+    feq[0], fnq[0] = -fn, fe  # the link's frame turns with q[i]
     for r in range(k + 1):
         row = i if r == 0 else o + r - 1
         work.Fq[0, row] += c * feq[r] - s * fnq[r]
@@ -294,9 +294,9 @@ def force_jacobian(
     arm: Manipulator, payload: Array, q: Array, qd: Array, qdd: Array, left: Array, right: Array, dp: Array,
     work: Workspace,
 ) -> None:
-    """Fill left = d(M qdd + E)/dq, right = dE/dqd (n, n) and dp (n, 4) by the payload's inertial parameters, qdd fixed.
+    """Fill left = d(M qdd + E)/dq, right = dE/dqd (n, n) and dp = d(M qdd + E)/d(payload) (n, 4), at fixed qdd.
 
-    Right after ``assemble``, whose work.J, work.P and work.F it reads.
+    payload: (4,) inertial parameters. Call it right after ``assemble``: it reads work.J, work.P and work.F.
     """
     n = q.size
     links = arm.length.size
@@ -316,7 +316,7 @@ def force_jacobian(
         along, across = -y * turn - x * spin * spin, x * turn - y * spin * spin
         work.Aq[0, 0, n - 1], work.Aq[0, 1, n - 1] = -across, along
         work.Av[0, 0, n - 1], work.Av[0, 1, n - 1] = -2.0 * x * spin, -2.0 * y * spin
-        # the translation that keeps the momentum
+        # the translation of the base, from conservation of momentum
         tx, ty = -work.F[0] / total, -work.F[1] / total
         for r in range(n):
             tx -= work.P[0, r] * qdd[r] / total
@@ -386,7 +386,7 @@ def torque_jacobian(arm: Manipulator, q: Array, qd: Array, work: Workspace, dq: 
                 slope += slopes[j] * q[o + j]
                 rate += arm.torque[o + j, joint] * qd[o + j]
             for t in range(k):
-                # the slope turns the torque into force, and the rates of the shapes into a rate of the joint
+                # B depends on the slope: so do the generalized force and, through B^T q', the joint rate and friction
                 turned = slope * slopes[t]
                 for j in range(k):
                     dq[o + j, o + t] -= arm.torque[o + j, joint] * turned * net[0, joint]
@@ -426,7 +426,7 @@ def elastic_jacobian(arm: Manipulator, q: Array, dq: Array, work: Workspace) -> 
 
 @inner
 def damping_jacobian(arm: Manipulator, work: Workspace, dqd: Array) -> None:
-    """Add damping and the derivative of the friction to dqd (n, n); right after ``acceleration``."""
+    """Add damping and the derivative of the friction to dqd (n, n); call it right after ``acceleration``."""
     for r in range(dqd.shape[0]):
         dqd[r, r] += arm.damping[r]
     for i in range(arm.length.size):
@@ -441,10 +441,11 @@ def damping_jacobian(arm: Manipulator, work: Workspace, dqd: Array) -> None:
 @inner
 def complete_jacobian(arm: Manipulator, q: Array, qd: Array, dq: Array, dqd: Array, flow: Array, work: Workspace
                       ) -> None:
-    """Fill flow (n, 2 n), derivatives of the accelerations by q and q', from ``force_jacobian`` in dq and dqd (n, n).
+    """Fill flow (n, 2 n), the derivatives of the accelerations by q and q', from the result of ``force_jacobian``.
 
-    Right after ``acceleration``, whose factor of M it reads in work.M: for any parameter on which the forces f (n,) of
-    the equations depend, dqdd = M^-1 df. Completes dq and dqd to derivatives of f.
+    dq, dqd: (n, n) left and right of ``force_jacobian``; they are completed to derivatives of f. For any parameter on
+    which f = M q'' + E + D q' + dV/dq - B tau depends, dqdd = -M^-1 df. Call it right after ``acceleration``: it reads
+    the factor of M in work.M.
     """
     n = q.size
     elastic_jacobian(arm, q, dq, work)

@@ -1,7 +1,7 @@
-"""Torque that follows the effort in a message late: after a dead time, and through a first-order lag.
+"""Torque that follows the effort in a message after a dead time and through a first-order lag.
 
-A step of the effort shows at the joint as 1 - exp(-(t - delay) / lag), t > delay. The arm is integrated with torques
-that are held over a sample, so what is wanted is the mean of the torque over it.
+The torque's response to a unit step of the effort is 1 - exp(-(t - delay) / lag), t > delay. The arm is integrated with
+torques that are held over a sample, so the functions below give the mean torque over each sample.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from flexmanip_ros.numerics.compiled import inner, kernel
 from flexmanip_ros.types import Array
 
 SETTLED = 9.0
-"""Lags after which a step of the effort counts as done: 1e-4 of it is left."""
+"""Number of lags after which the response to a step of the effort counts as settled: 1e-4 of the step is left."""
 
 
 @inner
 def integrated_step(t: float, delay: float, lag: float) -> tuple[float, float, float]:
-    """Return the integral up to t of a step that came late, and its derivatives by delay and lag."""
+    """Return the integral of the step response up to t, and the derivatives of the integral by delay and lag."""
     since = t - delay
     if since <= 0.0:
         return 0.0, 0.0, 0.0
@@ -34,9 +34,10 @@ def integrated_step(t: float, delay: float, lag: float) -> tuple[float, float, f
 def late_torque(efforts: Array, i: int, delay: float, lag: float, period: float, slope: Array) -> float:
     """Return the mean torque of a joint over the latest sample; slope (2,): its derivatives by delay and lag.
 
-    efforts: (P, >= i + 1), column i: the effort held over it, and those over the samples before it, newest last. What a
-    delay below zero needs of the future is extrapolated. For a given delay + lag the torque is even in the lag up to
-    second order; so it is continued to a lag below zero, where noise may put that of a torque which is not late.
+    efforts: (P, >= i + 1); column i has the efforts held over the latest sample and those before it, newest last. The
+    future effort that a delay below zero needs is extrapolated. At fixed delay + lag the torque is an even function of
+    the lag up to second order. This symmetry defines the torque at a lag below zero, which noise may give as the
+    estimate for a torque that is not late.
     """
     newest = efforts.shape[0] - 1
     mirrored = lag < 0.0
@@ -65,7 +66,7 @@ def late_torque(efforts: Array, i: int, delay: float, lag: float, period: float,
 
 @kernel
 def late_torques(efforts: Array, delay: float, lag: Array, period: float, slope: Array, torques: Array) -> None:
-    """Fill torques (N, L) of the last N of efforts (P - 1 + N, L); slope: (2,) scratch."""
+    """Fill torques (N, L), the mean torques over the last N samples of efforts (P - 1 + N, L); slope: (2,) scratch."""
     before = efforts.shape[0] - torques.shape[0]
     for k in range(torques.shape[0]):
         for i in range(torques.shape[1]):

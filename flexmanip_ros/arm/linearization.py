@@ -16,7 +16,7 @@ from flexmanip_ros.types import Array
 
 
 def mass_matrix(arm: Manipulator, payload: Array, q: Array) -> Array:
-    """Return M(q), (n, n); of a floating base without its translation, which keeps the momentum."""
+    """Return M(q), (n, n); the translation of a floating base is eliminated by conservation of momentum."""
     work, q = workspace(arm), np.asarray(q, float)
     inertial_forces(arm, payload, q, np.zeros_like(q), work)
     lower = np.tril(work.M)
@@ -29,7 +29,7 @@ def gravity_forces(arm: Manipulator, payload: Array, q: Array) -> Array:
 
 
 def momentum(arm: Manipulator, payload: Array, q: Array) -> tuple[Array, float]:
-    """Return P (2, n), linear momentum by the rates where the base does not translate, and the mass of all [kg]."""
+    """Return P (2, n), P q' the linear momentum where the base does not translate, and the total mass [kg]."""
     work = _assembled(arm, payload, q)
     return work.P, float(work.F[2])
 
@@ -66,18 +66,19 @@ class Blocks(NamedTuple):
 def blocks(arm: ArmParameters, theta: Array, payload: float | Array = 0.0, kappa: int | None = None) -> Blocks:
     """Return the block matrices at chord angles theta (L,) [rad], eta = 0.
 
-    payload: a point mass [kg], or the inertial parameters (4,) of a body. With the arm's own shape functions, or kappa
-    sines a link. A floating base counts as fixed; ``floating_blocks`` lets it float.
+    payload: a point mass [kg], or the inertial parameters (4,) of a body. The shape functions are the arm's
+    own, or kappa sines a link. A floating base counts as fixed; ``floating_blocks`` lets it float.
     Raises ModelError when theta or the payload is not finite or kappa is below 1.
     """
     return floating_blocks(replace(arm, base_mass=0.0) if arm.base_mass else arm, theta, payload, kappa)
 
 
 def floating_blocks(arm: ArmParameters, theta: Array, payload: float | Array = 0.0, kappa: int | None = None) -> Blocks:
-    """Return the same where the base floats if it can; theta, the chords, are then relative to the base.
+    """Return the matrices of ``blocks`` with a floating base, where the arm has one; theta is relative to the base.
 
-    The angle phi of the base is cyclic: nothing turns it back. So its own equation is solved for phi'' and put into the
-    others (with chords theta + phi the motion of phi is a turn of all), as exact as they are where all turns slowly.
+    The angle phi of the base is cyclic: no stiffness acts on it, and with chord angles theta + phi it turns the whole
+    arm. Its equation is solved for phi'' and substituted into the others. The result is as exact as they are while the
+    whole turns slowly.
     """
     theta, payload = _checked(arm, theta, payload)
     own = manipulator(arm, kappa)
@@ -95,7 +96,7 @@ def floating_blocks(arm: ArmParameters, theta: Array, payload: float | Array = 0
 def vibration_model(
     arm: ArmParameters, theta: Array, payload: float | Array = 0.0, kappa: int | None = None,
 ) -> tuple[Array, Array]:
-    """Return (Ac (2 L k, 2 L k), Bc (2 L k, L)), x = [eta; eta'], chords and base free, damped (paper eqs. 19-21)."""
+    """Return (Ac (2 L k, 2 L k), Bc (2 L k, L)) of x = [eta; eta'], damped, chords and base free (paper eqs. 19-21)."""
     b = floating_blocks(arm, theta, payload, kappa)
     h = len(b.Mc)
     solved = scipy.linalg.cho_solve(scipy.linalg.cho_factor(b.Ma), np.hstack([b.Mb, b.B_theta]))

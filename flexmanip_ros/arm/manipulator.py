@@ -10,13 +10,14 @@ The compiled functions of ``equations_of_motion`` and ``jacobian`` take a ``Mani
 Python. Outputs are linear: positions = ``arm.output @ q``, rates = ``arm.output @ qd``, (2 L,) joint angles, then
 bends.
 
-The shape functions of a link are those of the pinned link. ``sines``: phi_j = sin(j pi x / L). ``component_modes``
-(Craig and Bampton): beside them the static shapes of moments at the ends, since sines have no curvature at the ends,
-where the torques act, and of a uniform load, to which a link bends as its middle is accelerated (a residual vector:
-what the sines beyond the last would add). The shapes are combined to the modes of the pinned link, so that mass and
-stiffness matrix of a link alone stay diagonal; a sine stays what it is. The last mode has the load's shape less all
-others. It would be two to four times as fast as they are, and far faster than its load. So it gets more inertia, which
-makes it as fast as the fastest would be without the load's shape (mass scaling, Olovsson et al. 2005).
+The shape functions of a link are those of a pinned link. ``sines``: phi_j = sin(j pi x / L). ``component_modes``
+(Craig and Bampton): the sines and three static shapes. Two are the shapes of moments at the ends, since sines have no
+curvature there, where the torques act. The third is that of a uniform load: a link bends like it when its middle is
+accelerated (a residual vector: what the sines beyond the last would add). The shapes are combined into the modes of
+the pinned link, so that mass and stiffness matrix of a single link are diagonal; each sine remains a mode. The last
+mode is what the load's shape adds to the others. Its frequency would be two to four times theirs and far above that of
+its load. So its inertia is increased until its frequency is the highest one of the link without the load's shape (mass
+scaling, Olovsson et al. 2005).
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
 MOMENTS, STATIC = 2, 3
-"""Static shapes of a link: of moments at its ends, and with that of a uniform load."""
+"""Number of static shapes of a link: 2 for moments at its ends, 3 with that of a uniform load."""
 
 
 class ShapeFunctions(NamedTuple):
@@ -41,11 +42,11 @@ class ShapeFunctions(NamedTuple):
     sines: int
     """Number of sines."""
     combination: Array
-    """(k, k) shapes out of the sines and x (1 - x), x (1 - x) (1 - 2 x), (x (1 - x))^2."""
+    """(k, k) coefficients of each shape (row) on the sines, then x (1 - x), x (1 - x) (1 - 2 x), (x (1 - x))^2."""
     stiffness: Array
-    """(k,) integral of phi''^2: times EI / L^3 the stiffness of the mode [N/m]."""
+    """(k,) integral of phi''^2; the stiffness of a mode is EI / L^3 times this [N/m]."""
     inertia: Array
-    """(k,) mean of phi^2, and for the last what is added to it: times rho L that of the mode [kg]."""
+    """(k,) mean of phi^2, the last one with mass scaling; the inertia of a mode is rho L times this [kg]."""
 
     def at(self, x: Array) -> tuple[Array, Array, Array]:
         """Return phi, phi' and phi'' at x (N,) of a link of length 1, (k, N) each."""
@@ -66,7 +67,7 @@ def count(arm: ArmParameters) -> int:
 
 
 def fastest_mode(arm: ArmParameters) -> float:
-    """Return the largest frequency of a pinned link [rad/s]."""
+    """Return the highest modal frequency of the links, each pinned at both ends [rad/s]."""
     shapes = shape_functions(arm.modes, arm.shape_functions == 'component_modes')
     square = np.max(shapes.stiffness / shapes.inertia)
     return max(float(np.sqrt(square * EI / rho)) / L ** 2 for EI, rho, L in zip(
@@ -95,13 +96,13 @@ def _pinned_modes(sines: int, static: int) -> ShapeFunctions:
 
 
 def quadrature(points: int) -> tuple[Array, Array]:
-    """Return nodes and weights (points,) of Gauss and Legendre on [0, 1]."""
+    """Return nodes and weights (points,) of the Gauss-Legendre quadrature on [0, 1]."""
     nodes, weights = np.polynomial.legendre.leggauss(points)
     return (nodes + 1.0) / 2.0, weights / 2.0
 
 
 def slope_products(shapes: ShapeFunctions, x: Array) -> Array:
-    """G(x) (N, k, k), the integral of phi' phi'^T from 0 to x (N,): the link shortens by eta' G(x) eta / 2."""
+    """Return G(x) (N, k, k), the integral of phi' phi'^T from 0 to x (N,): the link shortens by eta^T G(x) eta / 2."""
     nodes, weights = quadrature(20 + 4 * shapes.sines)
     inner = x[:, None] * nodes
     slope = shapes.at(inner.ravel())[1].reshape(-1, *inner.shape)
@@ -110,50 +111,50 @@ def slope_products(shapes: ShapeFunctions, x: Array) -> Array:
 
 
 POINTS = 5
-"""Points of a link, beside two for each sine: frequencies are then right to 1e-9, accelerations to 1e-5."""
+"""Quadrature points of a link, plus two for each sine: frequencies are accurate to 1e-9, accelerations to 1e-5."""
 
 
 class Manipulator(NamedTuple):
-    """Constants of the arm for the compiled functions; link index first, P points on a link, SI units."""
+    """Constants of the arm for the compiled functions: link index first, P point masses on a link, SI units."""
 
     kappa: int
     floating: bool
     """The base floats: phi is the last coordinate, and the translation is eliminated (momentum is constant)."""
     length: Array
-    """(L,)."""
+    """(L,) length of each link."""
     mass: Array
-    """(L, P) masses: the link's own by Gauss-Legendre quadrature, and last what is mounted at its end."""
+    """(L, P) point masses: those of the link by Gauss-Legendre quadrature, and last the mass mounted at its end."""
     place: Array
-    """(L, P) x of each."""
+    """(L, P) coordinate x of each point mass along the undeformed link."""
     phi: Array
-    """(L, P, k) shapes there."""
+    """(L, P, k) shape functions at these points."""
     G: Array
-    """(L, k, P, k) integral of phi' phi'^T from 0 to x, the points between its rows and columns; zero without
+    """(L, k, P, k) integral of phi' phi'^T from 0 to x, indexed by link, row, point and column; zero without
     shortening."""
     slope: Array
-    """(L, P, k) phi'."""
+    """(L, P, k) phi' at the points."""
     curvature: Array
-    """(L, P, k) phi''."""
+    """(L, P, k) phi'' at the points."""
     along: Array
-    """(L, P) weights of the quadrature [m]; 0 at the end, everywhere without shortening."""
+    """(L, P) quadrature weights [m]; 0 at the end of the link, and 0 at every point without shortening."""
     tip_shortening: Array
-    """(L, k, k) G(L)."""
+    """(L, k, k) G at the end of the link."""
     root_slope: Array
     """(L, k) phi'(0)."""
     tip_slope: Array
     """(L, k) phi'(L)."""
     rotary: Array
-    """(n, n) hubs, rotors and bodies that turn with a slope, the base, and what is added to the last modes."""
+    """(n, n) constant part of M: hubs, rotors, bodies that turn with a slope, base, mass scaling of the last modes."""
     stiffness: Array
     """(n,) diagonal of K."""
     damping: Array
     """(n,) diagonal of D."""
     unit_stiffness: Array
-    """(n,) derivative of the stiffness by its link's EI."""
+    """(n,) derivative of ``stiffness`` with respect to the EI of its link."""
     torque: Array
-    """(n, L) B."""
+    """(n, L) torque matrix B of straight links."""
     joint: Array
-    """(L, n) joint angles between link and link (or base), through the slopes: rotors turn with them."""
+    """(L, n) joint angles from q, between the slopes of adjacent links (or the base); rotors turn with them."""
     output: Array
     """(2 L, n) joint angles and bends from q."""
     viscous: Array
@@ -161,9 +162,9 @@ class Manipulator(NamedTuple):
     coulomb: Array
     """(L,) Coulomb friction of the joints [N m]."""
     base: Array
-    """(3,) mass of a floating base [kg], place of joint 1 from its centre of mass, x and y [m]."""
+    """(3,) mass of a floating base [kg]; x and y of joint 1, seen from the centre of mass of the base [m]."""
     gravity: Array
-    """(2,) [m/s^2]."""
+    """(2,) gravity along x and y [m/s^2]."""
 
 
 class Workspace(NamedTuple):
@@ -174,13 +175,13 @@ class Workspace(NamedTuple):
     J: Array
     """(L + 1, 2, n) Jacobians of the stations."""
     a: Array
-    """(L + 1, 2) their accelerations at qdd = 0."""
+    """(L + 1, 2) accelerations of the stations at qdd = 0."""
     P: Array
-    """(2, n) linear momentum of all that moves with the base, by the rates."""
+    """(2, n) linear momentum of all that moves with the base, per rate: the momentum is P q'."""
     F: Array
-    """(3,) force on it at qdd = 0, and its mass."""
+    """(3,) sum of mass times acceleration of all that moves with the base at qdd = 0, and the mass of all."""
     first: Array
-    """(L, 2, n) first moments of a link times the rates of its own coordinates, inertial."""
+    """(L, 2, n) sum of mass times Jacobian over a link's points, by the link's own coordinates, inertial axes."""
     own: Array
     """(12, k + 1) scratch of one link."""
     block: Array
@@ -189,22 +190,22 @@ class Workspace(NamedTuple):
     """(3, P, k) scratch of one link: G eta at each point, and the same with eta' and eta''."""
     elastic: Array
     tangent: Array
-    """(k, k) scratch: derivative of a link's elastic forces of fourth order."""
+    """(k, k) scratch: derivative of a link's elastic forces from V4, see ``equations_of_motion.elastic``."""
     A: Array
     """(L + 1, 2) accelerations of the stations."""
     Aq: Array
-    """(L + 1, 2, n) their derivatives by q."""
+    """(L + 1, 2, n) derivatives of A with respect to q."""
     Av: Array
-    """(L + 1, 2, n) and by q'."""
+    """(L + 1, 2, n) derivatives of A with respect to q'."""
     Fq: Array
-    """(2, n) derivative by q of the force that a link passes on to the one before."""
+    """(2, n) derivative with respect to q of the force that a link passes on to the link before."""
     Fv: Array
     frame: Array
     """(4, n) scratch: derivatives in the frame of a link."""
     B: Array
     """(n, L) torque matrix."""
     net: Array
-    """(3, L) torques less friction, rates of the joints, and derivative of the friction by them."""
+    """(3, L) joint torques less friction, joint rates, and derivative of the friction by the rates."""
     held: Array
     """(2, n) scratch of the constraints."""
 
@@ -223,7 +224,7 @@ def workspace(arm: Manipulator) -> Workspace:
 
 
 def payload_array(mass: float = 0.0, inertia: float = 0.0, com: tuple[float, float] = (0.0, 0.0)) -> Array:
-    """Inertial parameters (4,) of a body: mass [kg], inertia about its centre of mass [kg m^2], its place [m].
+    """Return inertial parameters (4,) from mass [kg], inertia about the centre of mass [kg m^2] and its place com [m].
 
     Raises ModelError when it is not a physical body.
     """
@@ -239,7 +240,7 @@ def payload_array(mass: float = 0.0, inertia: float = 0.0, com: tuple[float, flo
 def manipulator(arm: ArmParameters, kappa: int | None = None, points: int | None = None) -> Manipulator:
     """Return the constants of an arm with its own shape functions, or with kappa sines a link. Do not write to them.
 
-    points: of the quadrature over a link, by default ``POINTS`` and two for each sine.
+    points: number of quadrature points over a link, by default ``POINTS`` plus two for each sine.
     Raises ModelError for kappa below 1.
     """
     if kappa is not None and kappa < 1:
@@ -274,7 +275,7 @@ def manipulator(arm: ArmParameters, kappa: int | None = None, points: int | None
         output=_output_matrix(arm, shapes, joint),
         viscous=np.array(arm.joint_viscous_friction), coulomb=np.array(arm.joint_coulomb_friction),
         base=np.array([arm.base_mass, *arm.base_joint_offset]), gravity=np.array(arm.gravity))
-    # kernels are compiled for one memory layout, which a checkpoint keeps
+    # kernels are compiled for one memory layout, C-contiguous arrays, which a checkpoint preserves
     contiguous: dict[str, Any] = {
         name: np.ascontiguousarray(part) for name, part in made._asdict().items() if isinstance(part, np.ndarray)}
     return made._replace(**contiguous)
@@ -287,7 +288,7 @@ def modal(arm: ArmParameters, kappa: int, link: int) -> slice:
 
 
 def joint_rows(arm: ArmParameters, root: Array, tip: Array, n: int) -> Array:
-    """Angle of each joint through the slopes of the shapes, (L, n): what an encoder reads and a motor turns."""
+    """Return (L, n) joint angles from q, slopes of the shapes included: what an encoder reads and a motor turns."""
     links, k = root.shape
     rows = np.zeros((links, n))
     for i in range(links):
@@ -302,7 +303,7 @@ def joint_rows(arm: ArmParameters, root: Array, tip: Array, n: int) -> Array:
 
 
 def _rotary(arm: ArmParameters, shapes: ShapeFunctions, root: Array, tip: Array, joint: Array) -> Array:
-    """Constant mass of bodies whose angle is a chord plus a slope, rotors, the base, and what is added to a mode."""
+    """Constant part (n, n) of M: bodies whose angle is a chord plus a slope, rotors, base, mass scaling of a mode."""
     links, k = root.shape
     R = np.zeros((joint.shape[1], joint.shape[1]))
     for i in range(links):
@@ -334,10 +335,10 @@ def _damping(arm: ArmParameters, shapes: ShapeFunctions, stiffness: Array) -> Ar
 
 
 def _torque_matrix(arm: ArmParameters, joint: Array) -> Array:
-    """Generalized force of the joint torques, (n, L).
+    """Matrix (n, L) from joint torques to generalized forces.
 
-    ``paper``: each torque acts on its link's chord alone. ``joint``: it reacts on the end of the link before (or on
-    the base) and does work through the slopes of the shapes.
+    ``paper``: each torque acts on its link's chord alone. ``joint``: it also reacts on the end of the link before
+    (or on the base), and it does work through the slopes of the shapes.
     """
     if arm.torque_convention == 'joint':
         return joint.T.copy()
@@ -345,7 +346,7 @@ def _torque_matrix(arm: ArmParameters, joint: Array) -> Array:
 
 
 def _output_matrix(arm: ArmParameters, shapes: ShapeFunctions, joint: Array) -> Array:
-    """Joint angles (by the arm's convention) and sensor deflections from q, (2 L, n)."""
+    """Matrix (2 L, n) from q to joint angles (by the arm's convention) and sensor deflections."""
     links, n = joint.shape
     k = len(shapes.combination)
     C = np.zeros((2 * links, n))

@@ -1,15 +1,16 @@
 """The regulator: its design at a configuration with a payload, its path to a setpoint, and its work over time.
 
 ``step`` takes a sample and gives the torques, ``estimate`` takes a payload estimate, ``goto`` a new setpoint. The gains
-follow configuration and trusted payload, a body with mass, centre of mass and inertia, without a bump in the torque.
+are scheduled on the configuration and on the trusted payload, a body with mass, centre of mass and inertia. The torque
+does not jump when they change.
 
-x = [theta, eta, theta', eta'] (2n,), n = L (1 + kappa): chord angles theta [rad], relative to a base that floats, and
-modal coordinates eta [m] of the arm's shape functions (with one mode alone the second and third of a real link are
-driven unstable). Under gravity they count from the rest of the arm that hangs in its joints, which the torques of that
-rest keep there (``hold``). The arm is at rest where the model says so: the regulator has no integrator.
+x = [theta, eta, theta', eta'] (2n,), n = L (1 + kappa): chord angles theta [rad], relative to the base where it floats,
+and modal coordinates eta [m] of the arm's shape functions. (A regulator with one mode a link makes the second and third
+mode of a real link unstable.) Under gravity, x counts from the static equilibrium that the torques of ``hold``
+maintain. The regulator has no integrator: the arm comes to rest where the model predicts it.
 
-The path is a polynomial of fifth degree (minimum jerk: Flash and Hogan, J. Neuroscience 5, 1985) whose duration follows
-from what the arm must bear on it, hence from the payload: a heavier arm is moved more slowly.
+The path is a polynomial of fifth degree (minimum jerk: Flash and Hogan, J. Neuroscience 5, 1985). Its duration follows
+from the limits on rate, torque and bend, hence from the payload: a heavier arm is moved more slowly.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ from flexmanip_ros.parameters import ControllerParameters
 from flexmanip_ros.types import Array
 
 RATE_SCALE = 8.0
-"""A rate [1/s] costs as much as the deviation that is RATE_SCALE times smaller."""
+"""Rate over deviation of equal cost [1/s]: a rate costs as much as a deviation that is RATE_SCALE times smaller."""
 FLOOR = 1e-6
-"""Process noise on every state, so that the filter never stops to listen."""
+"""Process noise on every state, over the trace of the disturbance covariance: no measurement is ever ignored."""
 BODY_SIZE = 0.1
-"""Least size of a body over the length of the last link: first moments and inertia, divided by the size and its square,
-change the arm's motion about as much as so many kg do."""
+"""Least size of a body in ``_weight``, over the length of the last link. First moments divided by the size, and the
+inertia divided by its square, change the arm's motion about as much as that many kg do."""
 
 
 def observation(config: ControllerParameters) -> Array:
@@ -51,7 +52,7 @@ def reference(config: ControllerParameters, angles: Array) -> Array:
 
 
 def model(config: ControllerParameters, theta: Array, payload: float | Array) -> tuple[Array, Array]:
-    """Return (A (2n, 2n), B (2n, L)) of one sample at chords theta (L,) [rad].
+    """Return the discrete model (A (2n, 2n), B (2n, L)) of one sample at chord angles theta (L,) [rad].
 
     payload: a mass [kg], or inertial parameters (4,).
     """
@@ -67,9 +68,10 @@ def model(config: ControllerParameters, theta: Array, payload: float | Array) ->
 
 
 def configuration(config: ControllerParameters, theta: Array) -> Array:
-    """Return chord angles (L,) [rad] at which the arm moves equally, the same for all of those.
+    """Return one representative (L,) [rad] of all the chord angles at which the arm has the same dynamics as at theta.
 
-    They differ by a turn of the whole arm, unless joint 1 is beside the centre of mass of a floating base.
+    These differ by a turn of the whole arm, unless joint 1 is beside the centre of mass of a floating base: then there
+    is theta alone.
     """
     beside = config.arm.base_mass and any(config.arm.base_joint_offset)
     return np.array(theta) if beside else np.asarray(theta) - theta[0]
@@ -87,9 +89,9 @@ def feedforward(config: ControllerParameters, theta: Array, payload: float | Arr
 
 
 def hold(config: ControllerParameters, theta: Array, payload: Array) -> tuple[Array, Array]:
-    """Return torques (L,) that hold the arm at chords theta (L,) against gravity, and what sensors (2 L,) then show.
+    """Return torques (L,) that hold chords theta (L,) against gravity, and what the bending adds to sensors (2 L,).
 
-    payload: inertial parameters (4,). In two iterations, as the bends move what is held.
+    payload: inertial parameters (4,). Two iterations, because the bending changes the gravity forces.
     """
     links = len(theta)
     if not any(config.arm.gravity) or config.arm.base_mass:
@@ -104,11 +106,11 @@ def hold(config: ControllerParameters, theta: Array, payload: Array) -> tuple[Ar
 
 
 class Design(NamedTuple):
-    """Everything made for one configuration and payload.
+    """Model, regulator, filter and feedforward for one configuration and payload.
 
-    A (2n, 2n), B (2n, L): one sample; G (L, 2n): torque = -G (x - x_ref); L (2n, 4 L): weight of the innovation
-    of [positions, rates]; the stationary linear quadratic regulator and Kalman filter. F (L, L): torque that
-    accelerates the chords (L,) without vibration, E (L kappa, L): modal coordinates that go with it.
+    A (2n, 2n), B (2n, L): discrete model of one sample; G (L, 2n): gain of the stationary linear quadratic regulator,
+    torque = -G (x - x_ref); L (2n, 4 L): gain of the stationary Kalman filter on the innovation of [positions, rates];
+    F (L, L), E (L kappa, L): torques, modal coordinates per acceleration of the chords (L,) without vibration.
     """
 
     A: Array
@@ -143,15 +145,15 @@ def design(config: ControllerParameters, theta: Array, payload: float | Array) -
 
 
 PEAK_RATE, PEAK_ACCELERATION = 15.0 / 8.0, 10.0 / math.sqrt(3.0)
-"""Of a move by 1 in 1 s from rest to rest."""
+"""Peak rate and peak acceleration of a path by 1 in 1 s from rest to rest."""
 BRAKING = 4.0
-"""Peak acceleration of coming to rest within 1 s from a rate of 1, where one is."""
+"""Peak acceleration of a path that starts at a rate of 1 and comes to rest at its starting point after 1 s."""
 SHORTEST = 1e-3
 """Duration of the shortest move [s]."""
 
 
 class Path(NamedTuple):
-    """Coefficients (6, L) of the time since the start over the duration [s], and how old it is [s]."""
+    """Polynomial path: coefficients (6, L) of the powers of age / duration; both [s], age: time since the start."""
 
     coefficients: Array
     duration: float
@@ -159,7 +161,7 @@ class Path(NamedTuple):
 
     @property
     def goal(self) -> Array:
-        """Where it ends, (L,)."""
+        """Position (L,) at the end of the path."""
         end: Array = self.coefficients.sum(axis=0)
         return end
 
@@ -187,14 +189,14 @@ class Path(NamedTuple):
 
 
 def rest(position: Array) -> Path:
-    """Stay."""
+    """Return the path that stays at a position (L,)."""
     coefficients = np.zeros((6, len(position)))
     coefficients[0] = position
     return Path(coefficients, SHORTEST, SHORTEST)
 
 
 def plan(before: Path, goal: Array, duration: float) -> Path:
-    """Leave a path where it is now, with the rate and acceleration it has, to be at rest at the goal (L,)."""
+    """Return a path from the present position, rate and acceleration of ``before`` to rest at the goal (L,)."""
     position, rate, acceleration, _ = before.now()
     a0, a1, a2 = position, rate * duration, acceleration * duration**2 / 2.0
     d = np.asarray(goal) - a0 - a1 - a2
@@ -206,8 +208,8 @@ def plan(before: Path, goal: Array, duration: float) -> Path:
 def duration(distance: Array, rate: Array, fastest: float, loads: Array, limits: Array) -> float:
     """Return the duration [s] of a move by ``distance`` (L,) that begins with ``rate`` (L,).
 
-    fastest: the largest rate; loads (r, L): what each acceleration costs (torques, bends); limits (r,): what
-    they may. From rest it is the shortest that keeps to all of them.
+    fastest: the largest rate; loads (r, L): torques and bends per acceleration of each chord; limits (r,): largest
+    torques and bends. From rest it is the shortest duration within all limits.
     """
     by_rate = PEAK_RATE * float(np.abs(distance).max()) / fastest
     by_load = PEAK_ACCELERATION * float((np.abs(loads @ distance) / limits).max())
@@ -216,7 +218,7 @@ def duration(distance: Array, rate: Array, fastest: float, loads: Array, limits:
 
 
 SPARE = 0.1
-"""Part of the torque limits that a move counts on, however much gravity asks for."""
+"""Least share of the torque limits that a move may use, however large the torques against gravity are."""
 
 
 class Measured(NamedTuple):
@@ -228,18 +230,18 @@ class Measured(NamedTuple):
 
 
 class ControllerState(NamedTuple):
-    """What is believed of the arm, gains in use and to come, and what they were made for."""
+    """Estimated state, path, gains in use, and the configuration and payload they were designed for."""
 
     C: Array
     now: Design
     old: Design
     """The design that ``now`` takes over from."""
     payload: Array
-    """Inertial parameters (4,) scheduled on, see ``manipulator.payload_array``; they follow ``trusted``."""
+    """Inertial parameters (4,) that the gains are scheduled on, see ``payload_array``; they follow ``trusted``."""
     trusted: Array
     designed_payload: Array
     designed_at: Array
-    """Chords (L,), see ``configuration``."""
+    """Chord angles (L,) of the latest design, see ``configuration``."""
     x: Array | None = None
     """Predicted state (2n,) at the next sample; None before the first."""
     way: Path | None = None
@@ -250,18 +252,18 @@ class ControllerState(NamedTuple):
     blend: float = 1.0
     """0: the old gains, 1: the new ones."""
     verdict: Verdict | None = None
-    """What became of the latest estimate."""
+    """Verdict on the latest payload estimate."""
     designs: int = 0
     failed_designs: int = 0
     """How often there was no regulator for a configuration and payload."""
 
     @property
     def gain(self) -> Array:
-        """Gains (2, 2n) in use."""
+        """Gains (L, 2n) in use."""
         return self.between(self.old.G, self.now.G)
 
     def between(self, old: Array, now: Array) -> Array:
-        """Return what is in use while one design takes over from another."""
+        """Return the blend of an old and a new matrix that is in use while one design takes over from another."""
         return old + self.blend * (now - old)
 
 
@@ -277,7 +279,7 @@ def init(config: ControllerParameters) -> ControllerState:
 
 
 def goto(state: ControllerState, angles: Array) -> ControllerState:
-    """Move to other encoder angles (L,) [rad], as fast as rate, torque and bend may be."""
+    """Set new encoder angles (L,) [rad] to move to, as fast as the limits on rate, torque and bend allow."""
     if state.setpoint is not None and np.array_equal(state.setpoint, angles):
         return state
     return state._replace(setpoint=np.asarray(angles, dtype=np.float64))
@@ -311,7 +313,7 @@ def step(config: ControllerParameters, state: ControllerState, measured: Measure
 
 
 def _filtered(config: ControllerParameters, state: ControllerState, measured: Measured, sag: Array) -> Array:
-    """Correct the prediction by the sample; at the first one the arm is at rest. sag: (2 L,) what gravity shows."""
+    """Correct the predicted state by a sample; at the first the arm counts as at rest. sag (2 L,): of ``hold``."""
     if state.x is None:
         first = np.zeros(len(state.now.A))
         links = len(measured.position) // 2
@@ -326,7 +328,7 @@ def _filtered(config: ControllerParameters, state: ControllerState, measured: Me
 
 
 def _onward(config: ControllerParameters, state: ControllerState, present: Array, holding: Array) -> Path:
-    """Stay at the first angles, go towards the setpoint when there is another one; holding (L,): torques of gravity."""
+    """Return the path: it stays at the first angles until the setpoint is new; holding (L,): torques of ``hold``."""
     way = rest(present) if state.way is None else state.way.after(1.0 / config.rate)
     if state.setpoint is None or state.setpoint is state.goal:
         return way
@@ -374,12 +376,12 @@ def _scheduled(config: ControllerParameters, state: ControllerState, theta: Arra
     state = state._replace(designed_payload=payload, designed_at=theta)
     try:
         wanted = design(config, theta, payload)
-    except ModelError:  # the gains in use go on
+    except ModelError:  # the gains in use stay
         return state._replace(failed_designs=state.failed_designs + 1)
     return state._replace(old=state.now, now=wanted, blend=0.0, designs=state.designs + 1)
 
 
 def _weight(config: ControllerParameters, body: Array, change: Array) -> float:
-    """Return how many kg a change of the inertial parameters (4,) of a body like this is worth."""
+    """Return the mass [kg] that changes the motion as much as a change of a body's inertial parameters (4,)."""
     size = max(BODY_SIZE * config.arm.link_length[-1], math.sqrt(body[3] / body[0]) if body[0] > 0.0 else 0.0)
     return float(np.abs(change / (1.0, size, size, size * size)).max())

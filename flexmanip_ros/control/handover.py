@@ -1,4 +1,4 @@
-"""From one payload estimate to the next: which estimates a controller may use, and a smooth change between them."""
+"""From one payload estimate to the next: which estimates a controller may use, and when one is sent to a driver."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flexmanip_ros.types import Payload
 
 
 class PayloadEstimate(NamedTuple):
-    """What ``~/payload_estimate`` says: mass, standard deviation, 95 % interval [kg], residual power; and the body."""
+    """Estimate of ``~/payload_estimate``: mass, standard deviation, 95 % interval [kg], residual power, body."""
 
     mass: float
     std: float
@@ -22,7 +22,7 @@ class PayloadEstimate(NamedTuple):
     com: tuple[float, float] = (0.0, 0.0)
     """Centre of mass in the frame of the tip [m]; a point at the tip where nothing else is known."""
     inertia: float = 0.0
-    """About the centre of mass [kg m^2]."""
+    """Inertia about the centre of mass [kg m^2]."""
 
     @classmethod
     def of(cls, payload: Payload) -> PayloadEstimate:
@@ -30,10 +30,10 @@ class PayloadEstimate(NamedTuple):
         return cls(*payload[:5], payload.com[:2], payload.inertia[5])
 
     def having(self, body: Sequence[float]) -> PayloadEstimate | None:
-        """Return it with the body (20,) that ``~/payload_body`` tells; None where that is of another time.
+        """Return the estimate with the body (20,) of ``~/payload_body``; None where that is of another time.
 
-        body: mass, centre of mass x, y, inertia about it, then their covariance. The two are at most a few samples
-        apart, and so are their masses.
+        body: mass, centre of mass x, y, inertia about it, then their covariance. Messages that belong together are at
+        most a few samples apart, so their masses are close.
         """
         near = abs(body[0] - self.mass) <= max(3.0 * self.std, 1e-3 * abs(self.mass))
         if not near or not all(map(math.isfinite, body)):
@@ -42,7 +42,7 @@ class PayloadEstimate(NamedTuple):
 
 
 class Verdict(Enum):
-    """Trusted, or why not."""
+    """Result of the check of an estimate: trusted, or the reason why not."""
 
     TRUSTED = 'trusted'
     NOT_FINITE = 'the estimate is not finite'
@@ -54,7 +54,7 @@ class Verdict(Enum):
 def judge(config: ControllerParameters, estimate: PayloadEstimate) -> Verdict:
     """Say whether an estimate may change the gains.
 
-    A payload just above zero with an interval below it is range enough: the interval, not the sign, decides.
+    A mass near zero whose interval reaches below zero is in range: the interval, not the sign of the mass, decides.
     """
     if not all(map(math.isfinite, (*estimate[:4], *estimate.com, estimate.inertia))):
         return Verdict.NOT_FINITE
@@ -110,10 +110,10 @@ def gyration(body: PayloadEstimate) -> float:
 
 
 def accepted(state: HandoverState, sent: PayloadEstimate, now: float) -> HandoverState:
-    """The driver accepted a payload."""
+    """Note that the driver accepted a payload."""
     return state._replace(sent=sent, sent_at=now)
 
 
 def rejected(state: HandoverState, now: float) -> HandoverState:
-    """The driver did not accept it: it is sent again after ``min_period``."""
+    """Note that the driver did not accept the payload: it is sent again after ``min_period``."""
     return state._replace(sent_at=now)

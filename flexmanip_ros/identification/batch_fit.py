@@ -1,4 +1,4 @@
-"""The prediction-error fit of a whole stretch: attempts, noise model, what the result is worth."""
+"""The prediction-error fit of a whole stretch: starting points, noise model, and uncertainty of the result."""
 
 from __future__ import annotations
 
@@ -27,25 +27,27 @@ from flexmanip_ros.types import Array, StateSpace
 
 ITERATIONS = 12
 BLOCK = 256
-"""Samples of a recursive update; a multiple of refinement.CHUNK."""
+"""Samples of a recursive update; a multiple of ``recursive_fit.CHUNK``."""
 LIGHT = 0.005
-"""Largest damping ratio of a second start: a short past makes modes seem damped, and fits start lost."""
+"""Largest damping ratio in a second starting model. The subspace model of a short past window has too much damping, and
+a fit that starts from it may fail."""
 CLEAN = 1e-20
-"""Relative innovation power below which the subspace model has no bias worth removing; the least assumed."""
+"""Innovation power, as a share of the outputs' power, below which the subspace model has no bias worth removing. The
+innovation covariance of a recursion is raised by the same share."""
 UNEXPLAINED = 0.5
-"""Share of the outputs' power that a fit with K = 0 may leave before it is taken not to simulate at all."""
+"""Largest share of the outputs' power that a fit with K = 0 may leave; a fit that leaves more simulates nothing."""
 
 
 class Recursion(NamedTuple):
-    """A fit that goes on.
+    """A fit that further blocks update.
 
-    scale: (r + m,) of its signals; root: (k, k) S with S S' the covariance of the coordinates P (d, k) and
-    the state; covariance: (m, m) of the innovations, worth ``weight`` samples; widening: factor on standard
-    deviations from the scatter of the gradients; gain: (n, m) published K, theta's own unless that is held;
-    singular_values, condition: of the subspace model the fit began with; lost: the state is unknown;
-    drift: logarithm of the factor by which variances grow from block to block, as the plant itself moves;
-    trend: (k,) mean step of the coordinates in a block, over the last blocks; trend_share: the part of it that chance
-    does not explain (0 to 1); trend_lag: steps of ``trend`` by which the fit may lag behind the arm.
+    scale: (r + m,) factors on the signals; P: (d, k) coordinates, see ``Fit``; root: (k, k) S with S S' the covariance
+    of these coordinates, the state last; covariance: (m, m) of the innovations, estimated from ``weight`` samples;
+    widening: factor on standard deviations, see ``_widening``; strikes: bad blocks in a row; gain: (n, m) published K,
+    theta's own unless that is held; singular_values, condition: of the subspace model that the fit started from; lost:
+    the state is unknown; drift: logarithm of the factor by which the variances grow in a block because the plant
+    changes; trend: (k,) mean step of the coordinates in a block, over the last blocks; trend_share: the part of it that
+    chance does not explain (0 to 1); trend_lag: steps of ``trend`` by which the fit may lag behind the arm.
     """
 
     theta: Theta
@@ -68,7 +70,11 @@ class Recursion(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """A fit from one starting point. cost: penalized, in the units of the samples; begin: its first K."""
+    """A fit from one starting point.
+
+    cost: penalized log det of the innovation covariance in the units of the samples; wants_gain: a score test asks for
+    K; begin: K of the starting point.
+    """
 
     fit: Fit
     structure: Structure
@@ -82,14 +88,15 @@ def fit_stretch(
     samples: Array, starts: list[Realized], fits: list[Recursion], scale: Array, feedthrough: bool,
     noise: str,
 ) -> Recursion | None:
-    """Fit samples (N, r + m) from subspace models, from means and from fits before; the best one is kept.
+    """Fit samples (N, r + m) from several starting points and keep the fit of least cost.
 
-    scale: (r + m,) of the subspace models' signals; noise: ``sensor`` holds K = 0 while the system is fitted,
-    ``any`` frees it where that is the better model. None where nothing simulates the stretch.
+    starts: subspace models, each also tried with little damping; fits: earlier fits; a batch model of averaged samples
+    is another starting point. scale: (r + m,) of the subspace models' signals; noise: ``sensor`` holds K = 0 while the
+    system is fitted, ``any`` frees K where that is the better model. None where no fit simulates the stretch.
     """
     m = starts[0].C.shape[0] if starts else 0
     if starts and not np.all(np.nanmax(samples[:, -m:], axis=0) > np.nanmin(samples[:, -m:], axis=0)):
-        return None  # a silent output tells nothing
+        return None  # a constant output carries no information
     power = np.nansum((samples[:, -m:] * scale[-m:]) ** 2, axis=0)
     floor, found = -np.inf, []
     for realized in starts:
@@ -112,7 +119,7 @@ def fit_stretch(
     for k, old in enumerate(fits):
         best = min((attempt.cost for attempt in found if attempt is not None), default=np.inf)
         if k > 0 and best + 2.0 * float(np.sum(np.log(scale[-m:]))) < floor:
-            break  # as good as the long regression: nothing is missed
+            break  # below the cost of the long regression (VARX): good enough
         begin = old.theta._replace(x=np.zeros_like(old.theta.x), K=old.gain)
         own = floor + 2.0 * float(np.sum(np.log(old.scale[-m:] / scale[-m:]))) if starts else floor
         found.append(_attempt(samples, begin, old.structure, old.scale, noise, own))
@@ -141,7 +148,7 @@ def interpolated(samples: Array) -> Array:
 
 
 def unexplained(covariance: Array, Y: Array) -> float:
-    """Share of power of Y (N, m) in residuals of a covariance (m, m), the mean over the outputs."""
+    """Share of the power of Y (N, m) in residuals of this covariance (m, m), the mean over the outputs."""
     power = np.nanmean(Y ** 2, axis=0)
     return float(np.mean(np.diag(covariance) / np.where(power > 0.0, power, np.inf)))
 
@@ -153,12 +160,12 @@ def _signals(samples: Array, scale: Array, r: int) -> tuple[Array, Array]:
 def _attempt(
     samples: Array, begin: Theta, structure: Structure, scale: Array, noise: str, floor: float,
 ) -> Attempt | None:
-    """Fit from one starting point.
+    """Fit from one starting point; None where the fit does not simulate the samples.
 
-    With K = 0 first: that is the maximum likelihood for sensor noise, and for any noise a model that
-    simulates well. A free gain takes its place only where it raises the likelihood beyond its price and the
-    order suffices, judged by the long regression (floor, its penalized cost): a model of too low an order
-    with a free gain would predict the next sample at the expense of everything slower.
+    The first fit has K = 0. It is the maximum-likelihood fit for sensor noise, and simulates well with any noise. With
+    ``noise`` = ``any`` a fit with free K replaces it where the likelihood gains more than the price of K. If the first
+    fit simulates, the order must also suffice: a cost below ``floor``, the penalized cost of the long regression
+    (VARX). With too low an order a free K improves the next sample's prediction at the expense of all slower motion.
     """
     n, r = begin.B.shape
     U, Y = _signals(samples, scale, r)
@@ -184,9 +191,10 @@ def _attempt(
 
 
 def _with_direct(samples: Array, attempt: Attempt) -> Attempt:
-    """Free D where the likelihood pays for it: modes above those of the order bend with the input at once.
+    """Free D where the likelihood gains more than the price of D.
 
-    Left out, that compliance is made up for by the modes that are there, and they are off.
+    Modes above the model's order follow the input at once, as a compliance in D. Without D the modes of the model
+    represent this compliance and are biased.
     """
     fit, structure = attempt.fit, attempt.structure
     if structure.free_direct:
@@ -200,12 +208,12 @@ def _with_direct(samples: Array, attempt: Attempt) -> Attempt:
 
 
 def _price(parameters: int, count: int) -> float:
-    """What further parameters must bring in log-likelihood a sample (Schwarz)."""
+    """Return the decrease of the cost, ln det of the residuals' covariance, that pays for parameters (Schwarz)."""
     return parameters * float(np.log(count)) / count
 
 
 def _recursion(samples: Array, attempt: Attempt) -> Recursion:
-    """What goes on from the best attempt; a gain asked for is fitted last, to the system as it is."""
+    """Start the recursion from the best attempt; where a score test asks for K, K is fitted with the system held."""
     fit, structure = attempt.fit, attempt.structure
     U, Y = _signals(samples, attempt.scale, fit.theta.B.shape[1])
     gain = None
@@ -216,7 +224,7 @@ def _recursion(samples: Array, attempt: Attempt) -> Recursion:
     trend, trend_share = np.zeros(fit.directions.shape[1]), 0.0
     widening = _widening(U, Y, fit, structure)
     drift = drift_of(U, Y, fit, structure, widening)
-    if drift is not None:  # the fit is of an earlier arm
+    if drift is not None:  # the fit is that of the arm at an earlier time
         root = triangle(np.hstack([root, drift.ahead[:, None]]).T).T
         trend, trend_share = drift.rate / blocks, 1.0
     return Recursion(
@@ -228,21 +236,21 @@ def _recursion(samples: Array, attempt: Attempt) -> Recursion:
 
 
 def _gain_alone(U: Array, Y: Array, theta: Theta, begin: Array, structure: Structure) -> Array | None:
-    """K (n, m) of the best predictor for a system that is held, from two starting points."""
+    """K (n, m) of the best predictor with the system held, from two starting points; None where none forgets."""
     tried = [descend(U, Y, theta._replace(K=K), structure, ITERATIONS) for K in (begin, np.zeros_like(begin))]
     done = [fit for fit in tried if fit is not None and forgets(fit.theta, len(U))]
     return min(done, key=lambda fit: fit.cost).theta.K if done else None
 
 
 def arrive(root: Array, arrival: Array) -> Array:
-    """Covariance root of [coordinates; state at the end] from that with the state at the start."""
+    """Covariance root of [coordinates; state at the end] from that of [coordinates; state at the start]."""
     n = arrival.shape[0]
     moved_root: Array = np.vstack([root[:root.shape[0] - n], arrival @ root])
     return moved_root
 
 
 def _gain_asked_for(U: Array, Y: Array, fit: Fit, structure: Structure, penalty: float) -> bool:
-    """Score test of K = 0 at the fit: whether a gain would raise the likelihood by more than it costs."""
+    """Score test of K = 0 at the fit: whether a free K would raise the likelihood by more than its price."""
     full = structure._replace(free_gain=True)
     P = directions(fit.theta, full)
     information, gradient, _, _, _ = derivatives(U, Y, fit.theta, full, fit.covariance, P)
@@ -254,10 +262,10 @@ def _gain_asked_for(U: Array, Y: Array, fit: Fit, structure: Structure, penalty:
 
 
 def _widening(U: Array, Y: Array, fit: Fit, structure: Structure, pieces: int = 16) -> float:
-    """Scatter of the gradient over pieces of the stretch, as a factor on its standard deviation, >= 1.
+    """Scatter of the gradient over pieces of the stretch, as a factor >= 1 on its standard deviation.
 
-    With white innovations the gradients of the pieces scatter as the information says; correlated or
-    swelling residuals make them scatter more.
+    With white innovations the gradients of the pieces scatter as the information matrix predicts. Correlated or growing
+    residuals make them scatter more.
     """
     theta = fit.theta
     root = covariance_root(fit.information)

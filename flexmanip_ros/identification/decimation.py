@@ -1,7 +1,7 @@
-"""Fewer samples a second for the identifier: one anti-alias filter for every signal, then every D-th sample.
+"""Decimation for the identifier: one anti-alias filter for every signal, then every D-th sample is kept.
 
-Inputs and outputs go through the same linear-phase filter, so the linear relation between them stays as it
-was; only the course of the input between the kept samples is lost (a direct term takes up most of that).
+Inputs and outputs pass the same linear-phase filter, so the linear relation between them is preserved. Only the input
+between the kept samples is lost; a direct term takes up most of its effect.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from flexmanip_ros.types import Array
 TAPS = 8
 """Length of the filter in kept sample times."""
 LAG = TAPS // 2
-"""Kept sample times from the instant that a filtered sample describes to the last sample that it is made of."""
+"""Delay of the filter in kept sample times, from the instant of a filtered sample to the last sample it depends on."""
 
 
 class Decimator(NamedTuple):
@@ -37,15 +37,14 @@ def start(factor: int, width: int) -> Decimator:
 
 
 def restart(decimator: Decimator) -> Decimator:
-    """Forget the samples: nothing is filtered across a gap or an event."""
+    """Empty the filter, so that no filtered sample depends on samples from before a gap or an event."""
     return decimator._replace(seen=0)
 
 
 def decimate(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimator, Array, list[int]]:
-    """Take samples (k, r + m); return the filtered ones (0.., r + m), and which sample each is due with.
+    """Filter samples (k, r + m); return the kept ones (j, r + m), and for each the index of the sample it ends with.
 
-    A sample that is not finite restarts the filter and is handed on as it is, so that the identifier
-    sees the break.
+    A sample that is not finite restarts the filter and is passed on unfiltered, so the identifier sees the gap.
     """
     kept: list[Array] = []
     at: list[int] = []
@@ -66,7 +65,7 @@ def decimate(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimat
 def whole(samples: Array, factor: int) -> tuple[Array, NDArray[np.int64]]:
     """Filter one stretch (N, w) at once; return the kept samples (k, w) and the row (k,) that each describes.
 
-    factor 1: the samples themselves. The last row that kept sample i is made of is LAG * factor rows later.
+    factor 1: the samples themselves. The last row on which kept sample i depends is LAG * factor rows later.
     """
     if factor == 1:
         return samples, np.arange(len(samples))
@@ -75,11 +74,11 @@ def whole(samples: Array, factor: int) -> tuple[Array, NDArray[np.int64]]:
 
 
 def _run(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimator, Array, list[int]]:
-    """Filter finite samples of one stretch."""
+    """Filter finite samples of one stretch without a gap."""
     taps, history, seen = decimator
     joint = np.vstack([history, samples])
     order = len(taps) - 1
-    # joint[order + i] has number seen + i + 1 since the gap; kept when the filter is full and it is due
+    # joint[order + i] is sample number seen + i + 1 since the gap; it is kept where the filter is full, every factor-th
     numbers = seen + 1 + np.arange(len(samples))
     due = np.flatnonzero((numbers > order) & ((numbers - order - 1) % factor == 0))
     out = np.empty((len(due), samples.shape[1]))

@@ -11,38 +11,38 @@ from numpy.typing import NDArray
 from flexmanip_ros.types import Array
 
 WEIGHT, WEIGHT2, PRIOR, ENERGY, LATELY, POWER, GAMMA, OPEN = 0, 1, 2, 3, 4, 5, 6, 7
-"""Sum of weights, sum of squared weights, weight left of the prior, variation of the signals as
-remembered and lately (unit: squared peaks), innovation power, last conversion factor, how far the last
-sample counted (0: not)."""
+"""Indices into ``scalars``: sum of the weights, sum of the squared weights, remaining weight of the prior, remembered
+and recent variation of the signals (unit: squared peaks), innovation power, last conversion factor, and share with
+which the last sample counted (0: not at all)."""
 SCALARS = 8
 FILLED, USED, SEEN, REJECTED, ODD = 0, 1, 2, 3, 4
-"""Samples in a row without a gap, regressions since the restart, samples since reset, samples refused, and
-samples in a row that stand out."""
+"""Indices into ``counts``: samples in a row without a gap, regressions since the restart, samples since the reset,
+samples rejected, and outliers in a row."""
 COUNTS = 5
 
 CONSTANT, EXCITATION, INNOVATION = 0, 1, 2
 """Modes of forgetting, see ``memory``."""
 
 STILL, LIVELY = 0.005, 0.05
-"""Relative variation of the signals below which nothing is learnt or forgotten, above which forgetting is
+"""Ratio of recent to remembered variation below which no sample is learnt or forgotten, and above which forgetting is
 full."""
 LARGEST = 1e100
-"""Numbers are brought to about 1 by the first value of their channel; beyond this the sample is refused."""
+"""Largest scaled value; a sample beyond it is rejected. The scale brings the first value of a channel to about 1."""
 OUTLIER, PATIENCE, SETTLED = 20.0, 2, 50
-"""A value this many times the largest of its channel so far is a sensor's mistake and refused, unless more
-than so many come in a row; looked for from that many regressions on."""
+"""Multiple of its channel's largest value so far above which a value is an outlier; largest number of outliers in a row
+that are rejected; and number of regressions from which on outliers are looked for."""
 POWER_RATE = 0.02
-"""Share of a sample in the innovation power, a mean over the latest ones."""
+"""Weight of a sample in the innovation power, which is an exponential average."""
 EXPECTED, SURPRISE = 1.5, 3.0
-"""Innovation power below which the model fits, above which the plant is taken to have changed."""
+"""Innovation power up to which the model fits, and from which on the plant counts as changed."""
 
 
 @njit(cache=True)
 def accept(u: Array, y: Array, new: Array, scale: Array, mean: Array, counts: Array) -> bool:
-    """Scale one sample into ``new`` (r + m,); a number that cannot be breaks the window instead.
+    """Scale one sample into ``new`` (r + m,); return False and empty the window where a number is rejected.
 
-    The scale of a channel is the power of two next to its first value that is not zero: exact, so
-    nothing of it is seen outside, and squares neither overflow nor vanish inside.
+    The scale of a channel brings its first non-zero value to about 1. It is a power of two, so scaling is exact and
+    does not change the results, and squares neither overflow nor underflow.
     """
     r = u.shape[0]
     counts[SEEN] += 1
@@ -72,7 +72,7 @@ def accept(u: Array, y: Array, new: Array, scale: Array, mean: Array, counts: Ar
 
 @njit(cache=True)
 def push(z: Array, new: Array) -> None:
-    """Move the past window z (p (r + m),) on by one sample (r + m,)."""
+    """Shift the past window z (p (r + m),) by one sample (r + m,)."""
     width = new.shape[0]
     past = z.shape[0]
     for i in range(past - width):
@@ -83,12 +83,12 @@ def push(z: Array, new: Array) -> None:
 
 @njit(cache=True)
 def remember(new: Array, mean: Array, scalars: Array, counts: Array, p: int) -> None:
-    """Follow the variation of the signals: mean (2, r + m) holds slow means and running peaks.
+    """Update the recent variation of the signals; mean (2, r + m) holds slow means and running peaks.
 
-    The means start at the first sample: a signal that stands still has no variation, whatever its level.
+    The means start at the first sample, so a constant signal has no variation at any level.
     """
     if counts[SEEN] - counts[REJECTED] == 1:
-        for i in range(new.shape[0]):  # a slice would compile for seconds
+        for i in range(new.shape[0]):  # a slice would take seconds to compile
             mean[0, i] = new[i]
     rate = 1.0 / (20.0 * p)
     energy = 0.0
@@ -107,10 +107,10 @@ def remember(new: Array, mean: Array, scalars: Array, counts: Array, p: int) -> 
 def memory(scalars: Array, counts: Array, beta: float, mode: int) -> float:
     """Return the forgetting factor of this sample.
 
-    Old information is let go only as far as new information comes in: with signals that vary less
-    than half a percent of what is remembered (silence, saturation, a constant torque) nothing is forgotten,
-    and nothing learnt: a sensor at its stop says something false about the dynamics.
-    Mode INNOVATION forgets only while the innovations are larger than the model expects.
+    Old information is forgotten only as fast as new information comes in. While the variation of the signals is below
+    half a percent of the remembered one (silence, saturation, a constant torque), no sample is forgotten and none is
+    learnt: a sensor at its stop gives false information about the dynamics. Mode INNOVATION forgets only while the
+    innovations are larger than the model expects.
     """
     b = beta
     if mode == INNOVATION:
@@ -118,12 +118,12 @@ def memory(scalars: Array, counts: Array, beta: float, mode: int) -> float:
         b = 1.0 - (1.0 - beta) * min(max(surprise, 0.0), 1.0)
     quiet = STILL
     lively = LIVELY
-    if mode == CONSTANT:  # as the paper has it; only what would end in 0/0 is kept out
+    if mode == CONSTANT:  # the paper's; the tiny limits only prevent 0/0
         quiet = 1e-12
         lively = 1e-11
     if scalars[ENERGY] > 0.0:  # noqa: SIM108
         ratio = scalars[LATELY] / scalars[ENERGY]
-    else:  # the first sample: signals that have stood still since the start say nothing
+    else:  # no variation is remembered yet: signals constant since the start carry no information
         ratio = 1.0 if scalars[LATELY] > 0.0 else 0.0
     open_ = min(max((ratio - quiet) / (lively - quiet), 0.0), 1.0)
     rate = max(1.0 - b, 1.0 / (counts[USED] + 1.0)) * open_
@@ -152,10 +152,10 @@ Outcomes = NDArray[np.int8]
 __all__ = ['COUNTS', 'SCALARS', 'advance_factor', 'rotate']
 
 LEARNT_ROW, REJECTED_ROW, QUIET_ROW = 0, 1, 2
-"""What became of a sample. One that only fills the past window counts as learnt."""
+"""Outcome of a sample. A sample that only fills the past window counts as learnt."""
 
 GROWTH = 1.25
-"""A regressor that exceeds its peak by this factor re-states the prior of its coefficient."""
+"""Factor by which a regressor must exceed its peak before the prior of its coefficient is renewed."""
 
 
 @njit(cache=True)
@@ -198,10 +198,10 @@ def state_prior(
     R: Array, row: Array, scratch: Array, peaks: Array, prior: Array, regressors: int, m: int,
     alpha: float, weight: float,
 ) -> None:
-    """Keep the prior worth alpha on signals of unit peak: add what is missing where a peak grew.
+    """Keep the prior worth alpha on signals of unit peak: add the missing part to R where a peak grew.
 
-    Least squares does not feel the scale of its regressors except through the prior, so following
-    the peaks this way is the internal scaling to unit peak, without a look ahead.
+    The scale of the regressors changes a least-squares solution through the prior alone. So this is equivalent to
+    scaling the signals to unit peak, without knowing the peaks in advance.
     """
     q = R.shape[1]
     for i in range(regressors):
@@ -225,9 +225,9 @@ def advance_factor(
     scale: Array, mean: Array, variance: Array, scalars: Array, counts: Array,
     p: int, feedthrough: int, alpha: float, beta: float, mode: int, missing: NDArray[np.int64], outcome: Outcomes,
 ) -> None:
-    """Run N samples. U: (N, r), Y: (N, m) in outside units; every other array is state, overwritten.
+    """Run N samples. U: (N, r), Y: (N, m) in JointState units; every other array is state, overwritten.
 
-    missing: (N,) not 0: the sample never came, and no window holds it. outcome: (N,) is written: LEARNT_ROW,
+    missing: (N,) not 0: the sample never came and empties the past window. outcome: (N,) is filled with LEARNT_ROW,
     REJECTED_ROW or QUIET_ROW.
     """
     r = U.shape[1]

@@ -1,4 +1,4 @@
-"""Whether the frequencies of an arm drift along a stretch that a fit takes for that of one model."""
+"""Score test for a drift of the arm's frequencies along a stretch that was fitted with one constant model."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from flexmanip_ros.types import Array
 @njit(cache=True, nogil=True)
 def sway(U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, turns: Array, x: Array, X: Array,
          E: Array, S: Array) -> None:
-    """Simulate x+ = A x + B u, and its derivatives by rates at which A moves along ``turns`` (g, n, n).
+    """Simulate x+ = A x + B u, y = C x + D u, and the derivatives by drifts of A along ``turns`` (g, n, n).
 
-    Fills residuals E (L, m) = Y - y and S (g, L, m), the derivative of y where A(t) = A + w(t) turn and w
-    goes from -1/2 to 1/2 over the stretch. x (n,) is the state at the start, and on return at the end; X
-    (g, n) is its derivative there, zero at first.
+    Drift g is A(t) = A + rate w(t) turns[g], where w goes from -1/2 to 1/2 over the stretch. Fills the residuals E
+    (L, m) = Y - y and S (g, L, m), the derivative of y by the rate of each drift. x (n,) is the state at the start, and
+    on return at the end; X (g, n) is its derivative by the rates, zero at first.
     """
     length, n = U.shape[0], A.shape[0]
     after, silent = np.empty(n), np.zeros((n, 0))
@@ -53,19 +53,21 @@ def sway(U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, turns: Arra
 
 
 SURPRISE = 4.0
-"""Standard deviations beyond which a drift is no chance."""
+"""Number of standard deviations above which a drift rate does not count as chance."""
 PERIODS = 5.0
-"""Of a mode in the stretch at least: over few of them, whatever else the model lacks looks like a drift."""
+"""Least number of periods of a mode in the stretch. Over fewer periods any other error of the model looks like a
+drift."""
 APART = 1e-4
-"""Share of what a drift does that the parameters of the fit must not be able to do as well."""
+"""Least share of the information on a drift rate that is left after the parameters of the fit have taken up theirs."""
 MOST_SKEW = 1e8
-"""Condition of the eigenvectors of an A that is as good as defective."""
+"""Condition number of the eigenvectors of A above which A counts as defective."""
 
 
 class Drift(NamedTuple):
-    """What the residuals say of a steady drift, in the coordinates of the fit and the state at the end.
+    """A steady drift estimated from the residuals, in the coordinates of the fit and the state at the end.
 
-    ahead: (k,) from the fit to the arm at the end of the stretch; rate: (k,) further in as much time again.
+    ahead: (k,) step from the fit to the arm at the end of the stretch; rate: (k,) step of the arm in a time as long as
+    the stretch.
     """
 
     ahead: Array
@@ -73,9 +75,9 @@ class Drift(NamedTuple):
 
 
 def turns(A: Array, least: float = 0.0) -> Array:
-    """Return dA (g, n, n) by the angle that each oscillation turns in a step [rad]; none of a defective A.
+    """Return the derivative of A (g, n, n) by the angle of each oscillating pole [rad]; g = 0 for a defective A.
 
-    least: angle [rad] below which an oscillation is left out.
+    least: angle [rad] below which a pole is left out.
     """
     values, vectors = np.linalg.eig(A)
     if not np.linalg.cond(vectors) < MOST_SKEW:
@@ -87,7 +89,7 @@ def turns(A: Array, least: float = 0.0) -> Array:
 
 
 def drift_of(U: Array, Y: Array, fit: Fit, structure: Structure, widening: float = 1.0) -> Drift | None:
-    """Return the drift of a fit, see ``drifting``; None, too, where the numbers do not allow to tell."""
+    """Return the drift of a fit, see ``drifting``; None also where a matrix decomposition fails."""
     try:
         return drifting(U, Y, fit, structure, widening)
     except np.linalg.LinAlgError:  # the fit itself is sound
@@ -95,12 +97,13 @@ def drift_of(U: Array, Y: Array, fit: Fit, structure: Structure, widening: float
 
 
 def drifting(U: Array, Y: Array, fit: Fit, structure: Structure, widening: float = 1.0) -> Drift | None:
-    """Return the drift of a fit with K = 0 to U (N, r), Y (N, m), None where it may be chance.
+    """Return the drift of a fit with K = 0 to U (N, r), Y (N, m); None where it may be chance.
 
-    widening: factor on standard deviations from what else is wrong with the residuals.
+    widening: factor on standard deviations from other errors of the residuals, see ``batch_fit``; its square multiplies
+    the limit ``SURPRISE``.
     """
     theta = fit.theta
-    if theta.K.any():  # then the prediction rests on the outputs too
+    if theta.K.any():  # with a gain the prediction depends on the outputs too
         return None
     n = theta.A.shape[0]
     moving = turns(theta.A, 2.0 * np.pi * PERIODS / len(U))
@@ -114,7 +117,7 @@ def drifting(U: Array, Y: Array, fit: Fit, structure: Structure, widening: float
     lower = np.linalg.cholesky(fit.covariance)
     e, *s = (scipy.linalg.solve_triangular(lower, part.T, lower=True, check_finite=False).ravel() for part in (E, *S))
     own = np.array(s)
-    # what the parameters of the fit can take up: derivatives of the prediction against those by the drift
+    # products of the derivatives by the drift rates with those by the parameters of the fit, which can take up a part
     shared = np.array([_gradient(U, Y - E + part, fit, structure) for part in S]).T
     root = covariance_root(fit.information)
     taken = root.T @ shared
@@ -130,7 +133,7 @@ def drifting(U: Array, Y: Array, fit: Fit, structure: Structure, widening: float
     k = fit.directions.shape[1]
     flat = np.zeros(fit.directions.shape[0])
     flat[:n * n] = np.einsum('g,gij->ij', rho, moving).ravel()
-    rate = fit.directions.T @ flat  # a change of basis in it is dropped; the state's share of that is small
+    rate = fit.directions.T @ flat  # drops the part that changes the basis; the state's share of it is small
     other = root @ (taken @ rho)
     ahead = 0.5 * rate - other
     ahead[k - n:] = X.T @ rho - fit.arrival @ other
@@ -138,7 +141,7 @@ def drifting(U: Array, Y: Array, fit: Fit, structure: Structure, widening: float
 
 
 def _beyond_chance(information: Array, gradient: Array, least: float) -> Array:
-    """Return rates (g,) of this information (g, g) and gradient: 0, and left out, where it may be chance."""
+    """Return the drift rates (g,) from information (g, g) and gradient (g,); rates within chance are 0 and left out."""
     left = np.arange(len(gradient))
     rates = np.zeros(len(gradient))
     while left.size:

@@ -1,4 +1,4 @@
-"""From the estimator's memory to a published model: units, basis, uncertainty, what it is worth."""
+"""From the estimator's memory to a published model: units, basis, uncertainty and status."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.types import Array, StateSpace, Status
 
 LARGEST_SPREAD = 4_000_000
-"""Elements beyond which no covariance is computed (very long windows with many outputs and states)."""
+"""Largest number of elements of the spread; beyond it (very long windows with many outputs and states) none is
+computed."""
 UNEXPLAINED = 0.9
-"""Share of the outputs' power left to the innovations above which there is nothing to identify."""
+"""Share of an output's power in the innovations; if every output exceeds it, the model is POORLY_EXCITED."""
 WORST_CONDITION = 1e12
 NEGLECTED = 0.005
-"""Share of an innovation's variance that the order may leave out before the order is called too low."""
+"""Largest share of an innovation's variance that may come from the limited order; beyond it the order is too low."""
 SIGNIFICANT = 25.0
-"""Likelihood ratio (doubled logarithm) beyond which what is left out is no chance."""
+"""Twice the logarithm of the likelihood ratio above which the variance from the limited order is not chance."""
 
 
 def from_factor(config: IdentifierParameters, R: Array, scale: Array) -> tuple[Realized | None, Array, Array]:
-    """Solve the method from the factor R of the moments: model, factor and scale of signals of unit power."""
+    """Compute the model from the factor R of the moments; return it with R and scale for signals of unit power."""
     r, m = len(config.inputs), len(config.outputs)
     width = r + m
     power = np.linalg.norm(R[:, -width:], axis=0)
@@ -45,9 +46,9 @@ def from_factor(config: IdentifierParameters, R: Array, scale: Array) -> tuple[R
 def from_recursion(
     config: IdentifierParameters, memory: tuple[Array, ...], peaks: Array,
 ) -> tuple[Realized | None, Array]:
-    """Read the model off the paper's three recursions; the moments are the inverse of their covariance.
+    """Form the model from the paper's three recursions, and the factor of the moments from their covariance.
 
-    peaks: (f m,) of the outputs, by which a tracked state selection was scaled.
+    peaks: (f m,) of the outputs. A tracked state selection was scaled by them.
     """
     S1, xi, _, _, _, theta_x, _, _, theta_y, _, W = memory[:11]
     if config.state_basis == 'tracked':
@@ -82,7 +83,7 @@ def from_recursion(
 def from_fit(
     config: IdentifierParameters, recursion: Recursion, scalars: Array, excited: float, dt: float,
 ) -> Identified:
-    """Publish the prediction-error fit with its own covariance."""
+    """Return the model of the prediction-error fit with the covariance of that fit."""
     r, m, n = len(config.inputs), len(config.outputs), config.order
     theta, structure, P = recursion.theta, recursion.structure, recursion.P
     su, sy = recursion.scale[:r], recursion.scale[r:]
@@ -112,7 +113,7 @@ def publish(
     config: IdentifierParameters, realized: Realized, R: Array, scale: Array, scalars: Array, variance: Array,
     used: int, d: int, dt: float,
 ) -> Identified | None:
-    """Model, tangent and status in JointState units. scale: (r + m,) of the signals, 0 where silent."""
+    """Model, spread and status in JointState units. scale: (r + m,) of the signals, 0 for a silent signal."""
     r, m = len(config.inputs), len(config.outputs)
     su = np.where(scale[:r] > 0.0, scale[:r], 1.0)
     sy = np.where(scale[r:] > 0.0, scale[r:], 1.0)
@@ -136,7 +137,7 @@ def publish(
     spread = along.flat() if along is not None else np.zeros((entries, 0))
     ratio = float(effective * np.log1p(realized.neglected).sum())
     too_low = ratio > SIGNIFICANT and float(realized.neglected.max()) > NEGLECTED
-    if too_low:  # a model that misses dynamics is off by more than its noise
+    if too_low:  # the error from missing dynamics exceeds that from noise
         spread = spread * np.sqrt(ratio)
     condition = float(np.linalg.cond(realized.state / np.linalg.norm(realized.state, axis=0)))
     power = float(scalars[POWER])
@@ -152,14 +153,14 @@ def publish(
 def _in_units(
     A: Array, B: Array, C: Array, D: Array, K: Array, su: Array, sy: Array,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Matrices of scaled signals su u, sy y (or stacks of them) in outside units."""
+    """Convert matrices (or stacks of them) for scaled signals su u, sy y to matrices for u, y."""
     return A, B * su, C / sy[:, None], D * su / sy[:, None], K * sy
 
 
 def based(model: StateSpace, along: Tangent | None, stable: bool = False) -> tuple[StateSpace, Tangent | None]:
     """Bring model and tangent to the published basis: y = C x with the known C, else balanced.
 
-    stable: poles outside the unit circle are drawn back onto it.
+    stable: poles outside the unit circle are moved onto it.
     """
     if stable:
         model = replace(model, A=realization.stabilized(model.A))
@@ -175,7 +176,7 @@ def based(model: StateSpace, along: Tangent | None, stable: bool = False) -> tup
 
 
 def judge(used: int, parameters: int, condition: float, unexplained: float, too_low: bool) -> Status:
-    """Name what the model is worth."""
+    """Return the status of the model."""
     if used < 2 * parameters:
         return Status.WARMING_UP
     if not condition < WORST_CONDITION:
@@ -190,7 +191,7 @@ def judge(used: int, parameters: int, condition: float, unexplained: float, too_
 def excitation(regression: Array) -> float:
     """Smallest over largest eigenvalue of the regressors' information, each regressor at unit power.
 
-    A few steps of power and inverse iteration on the triangular factor (d, d); to 10 % or so.
+    Computed to about 10 % by four steps of power and inverse iteration on the triangular factor (d, d).
     """
     length: Array = np.sqrt(np.einsum('ij,ij->j', regression, regression))
     if not np.all(length > 0.0) or not np.all(np.diag(regression)) or not np.all(np.isfinite(length)):
@@ -211,7 +212,7 @@ def excitation(regression: Array) -> float:
 
 @cache
 def _anywhere(size: int) -> Array:
-    """Return a direction (size,) with something of every other one, always the same."""
+    """Return the constant random start vector (size,) of these iterations."""
     direction: Array = np.random.default_rng(0).standard_normal((size,))
     direction.flags.writeable = False
     return direction

@@ -1,9 +1,9 @@
-"""The model as a function of second moments: predictor-based subspace identification from one factor.
+"""Predictor-based subspace identification from one triangular factor of the data's second moments.
 
-Every quantity of the method is linear in phi(k) = [z(k); u(k); y(k)], so its least-squares problems
-need the moments of phi only. With an upper triangular R, R'R = sum of weights x phi phi', a signal
-s(k) = M phi(k) has the moments of the columns of R M'. The recursion equals the batch solution with the
-same weights to round-off, and no state is ever stale.
+Every signal of the method is linear in phi(k) = [z(k); u(k); y(k)], so its least-squares problems need the moments of
+phi only. Let R be upper triangular with R'R = sum of weight(k) phi(k) phi(k)'. Then signals s(k) = M phi(k) have the
+moments (R M')' (R M'), so R M' takes the place of their data matrix. The recursive solution equals the batch solution
+with the same weights to round-off: no state comes from an earlier estimate of the parameters.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from flexmanip_ros.identification.varx import observability_controllability, ope
 from flexmanip_ros.types import Array
 
 RIDGE = 1e-8
-"""Relative ridge that picks the solution of least norm where the data leave a direction free."""
+"""Relative ridge that selects the solution of least norm where the data leave a direction undetermined."""
 
 
 class Realized(NamedTuple):
-    """A model in the basis of the state sequence x = T z, with what uncertainty needs. Scaled signals."""
+    """A model of scaled signals in the basis of the state x = T z, with the quantities that its uncertainty needs."""
 
     A: Array
     B: Array
@@ -34,18 +34,18 @@ class Realized(NamedTuple):
     xi_u: Array
     """(m, r) direct term of the VARX."""
     S: Array
-    """(n, f m) selection of the state from the observability of the predictor x controllability."""
+    """(n, f m) selection of the state: x = S (observability of the predictor x controllability) z."""
     T: Array
     """(n, p (r + m)) = S x predictor observability x controllability."""
     state: Array
-    """(q, n) columns with the moments of x."""
+    """(q, n) R T', whose columns have the moments of x."""
     residual: Array
     """(m, m) square root E with E'E = innovation moments."""
     regression: Array
     """(d, d) upper triangular factor of the regressors' moments, ridge included."""
     singular_values: Array
     neglected: Array
-    """(m,) innovation variance that the order leaves out, over that of the VARX (0: nothing is left out)."""
+    """(m,) innovation variance due to the limited order, relative to that of the VARX (0: none)."""
 
 
 def triangle(tall: Array) -> Array:
@@ -63,12 +63,12 @@ def solved(upper: Array, target: Array, trans: int = 0) -> Array:
 
 
 def regress(regressor: Array, target: Array) -> Array:
-    """Least squares: the (k, d) matrix M of least norm with target ~ regressor M'. (q, d), (q, k)."""
+    """Least-squares solution M (k, d) of least norm of regressor M' = target. regressor: (q, d), target: (q, k)."""
     return np.asarray(np.linalg.lstsq(regressor, target, rcond=1e-13)[0].T, dtype=np.float64)
 
 
 def solve_regressor(R: Array, d: int, m: int) -> tuple[Array, Array]:
-    """VARX parameters (m, d) and the factor (d, d) they were solved with."""
+    """VARX parameters (m, d) and the factor (d, d) of the regressors' moments that gave them."""
     head = R[:d, :d]
     size = np.sqrt(np.einsum('ij,ij->j', head, head))
     size[size == 0.0] = 1.0
@@ -87,12 +87,12 @@ def solve_regressor(R: Array, d: int, m: int) -> tuple[Array, Array]:
 def row_whitening(
     data: Array, head: Array, residual: Array, power: float, f: int, width: int,
 ) -> Array:
-    """(f m, f m): brings the errors that the rows of G z take over from the VARX parameters to one size.
+    """(f m, f m) weight that gives equal size to the errors of the rows of G z from the VARX parameters.
 
-    Row block i is Xi on a window shifted by i samples and filled with zeros. Such a window lies off the
-    data, where the parameters are loose: unweighted, the later rows would spoil the state.
-    data: (past, past), data'data = moments of z; head: factor Xi was solved with; residual: (m, m)
-    moments of the innovations; power: root of the moments of the outputs, for a floor under the residual.
+    Row block i of G z is Xi times the window shifted by i samples and filled with zeros. Such windows do not occur in
+    the data, which determine Xi poorly for them: without the weight the later rows spoil the state. data: (past, past),
+    data'data = moments of z; head: factor that gave Xi; residual: (m, m) root of the innovations' moments; power: root
+    of the outputs' moments, for a lower bound on the residual.
     """
     past, m, d = data.shape[0], residual.shape[0], head.shape[0]
     moved = np.zeros((f, d, past))
@@ -129,11 +129,11 @@ def realize(
     R: Array, r: int, m: int, n: int, f: int, *, feedthrough: bool, weighted: bool, fixed: bool = False,
     riccati: bool = False,
 ) -> Realized | None:
-    """Model of order n from the factor R (q, q) of [z; u; y]; None when the moments carry no state.
+    """Model of order n from the factor R (q, q) of [z; u; y]; None when the moments have a rank below n.
 
-    fixed: the state is the first n rows of observability x controllability (S = [I 0]); otherwise the
-    leading n left singular vectors of their product with the data. riccati: the gain K solves the Riccati
-    equation of the residuals, which makes the predictor stable; otherwise it is regressed like A and B.
+    fixed: S = [I 0], so the state is the first n rows of (observability x controllability) z; otherwise S holds the
+    leading n left singular vectors of the whitened product of that matrix with the data. riccati: the gain K solves the
+    Riccati equation of the residuals, which makes the predictor stable; otherwise K is regressed like A and B.
     """
     return realize_orders(
         R, r, m, (n,), f, feedthrough=feedthrough, weighted=weighted, fixed=fixed, riccati=riccati)[0]
@@ -143,7 +143,7 @@ def realize_orders(
     R: Array, r: int, m: int, orders: Sequence[int], f: int, *, feedthrough: bool, weighted: bool,
     fixed: bool = False, riccati: bool = False,
 ) -> list[Realized | None]:
-    """Models of several orders from one factor, see ``realize``: regression and decomposition are made once."""
+    """Models of several orders from one factor, see ``realize``, with one regression and one decomposition for all."""
     width = r + m
     past = R.shape[0] - width
     d = past + r if feedthrough else past

@@ -1,4 +1,4 @@
-"""Compiled kernel of the paper's recursion: three recursive least squares, one feeding the next."""
+"""Compiled kernel of the paper's recursion: three recursive least-squares estimators in series."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from flexmanip_ros.identification.factor import (
 from flexmanip_ros.types import Array
 
 LIMIT = 1e30
-"""The covariance of a coefficient is not let grow beyond this many times its prior."""
+"""Largest covariance of a coefficient, in units of its prior one; at this limit nothing is forgotten."""
 
 
 @njit(cache=True)
@@ -71,7 +71,7 @@ def least_squares(
     S: Array, theta: Array, prior: Array, peaks: Array, phi: Array, target: Array, unit: Array, f: Array,
     error: Array, alpha: float, beta: float, weight: float,
 ) -> float:
-    """State the prior on regressors of unit peak where a peak grew, then do one step."""
+    """Renew the prior, which holds for regressors of unit peak, where a peak grew; then do one step of ``potter``."""
     d = phi.shape[0]
     for i in range(d):
         size = abs(phi[i])
@@ -124,7 +124,7 @@ def track(W: Array, P: Array, h: Array, x: Array, beta: float) -> None:
 
 @njit(cache=True)
 def observe(xi: Array, z: Array, h: Array, f: int, r: int, m: int, weighted: int) -> None:
-    """Form h = (observability x controllability) z (eqs. 33-35), f blocks of m, not forming the matrix."""
+    """Compute h = (observability x controllability) z (eqs. 33-35), f blocks of m, without forming the matrix."""
     width = r + m
     past = z.shape[0]
     for block in range(f):
@@ -133,7 +133,7 @@ def observe(xi: Array, z: Array, h: Array, f: int, r: int, m: int, weighted: int
             total = 0.0
             for j in range(past - shift):
                 total += xi[o, j] * z[j + shift]
-            if weighted:  # outputs that have not come yet are replaced by their predictions
+            if weighted:  # future outputs are replaced by their predictions
                 for b in range(block):
                     at = past - (block - b) * width + r
                     for i in range(m):
@@ -150,7 +150,7 @@ def advance_paper(
 ) -> None:
     """Run N samples of steps (a)-(d) of paper section 3.1; every array but U, Y is state, overwritten.
 
-    last: (n + r + m + 1,) is [x; u; e] of the sample before and whether there was one.
+    last: (n + r + m + 1,) holds [x; u; e] of the previous sample, and 1 if there was one, else 0.
     """
     r = U.shape[1]
     m = Y.shape[1]
@@ -198,10 +198,10 @@ def advance_paper(
             judge(e1, variance, scalars, counts, b, d1)
             observe(xi, z, h, future, r, m, weighted)
             if tracked:
-                for i in range(h.shape[0]):  # a tracked subspace depends on scale: peaks of one
+                for i in range(h.shape[0]):  # tracking depends on the scale: scale to unit peak
                     peak = mean[1, r + i % m]
                     h[i] = h[i] / peak if peak > 0.0 else 0.0
-                if counts[USED] > 2 * d1:  # before, the parameters have not settled
+                if counts[USED] > 2 * d1:  # before that the parameters have not converged
                     track(W, P, h, x, 1.0 - (1.0 - beta[0]) * share)
                 else:
                     select(W, h, x)

@@ -1,14 +1,14 @@
 """The model as a function of the configuration: a recursive output-error fit that goes on while the arm moves.
 
-In the basis x = [w; w'] of the measured displacements no change of coordinates is needed as the arm turns:
+The state is x = [w; w'] with the measured displacements w, so its basis stays the same as the arm turns:
 
     w'' = -(1 - mu a) G(c) w - D w' + H(c) tau,   y = w + E(c) tau + F tau'' + b,   c = cos(theta2 - theta1)
 
-G, H and E are linear in three functions of c (``varying_kernel.basis``). a is the square of the angle through which the
-links swing, mu the softening with it; the published model is that of small vibrations, a = 0. D holds two terms with
-the rates of the links, b is a slow offset, F and E stand for the modes above those of the model. Samples pass one
-low-pass filter above the modes; blocks of ``BLOCK`` of them update parameters and state together, as in
-``recursive_fit``.
+G, H and E are linear in three functions of c (``varying_kernel.basis``). a is the square of the angular amplitude of
+the links' vibration, and mu is the coefficient by which the stiffness falls with a. The published model is that of
+small vibrations, a = 0. D has a constant term and one term for the rate of each link. b is a slow offset. E and F stand
+for the modes above those of the model. All signals pass one low-pass filter with a corner above the modes. Each block
+of ``BLOCK`` samples updates parameters and state together, as in ``recursive_fit``.
 """
 
 from __future__ import annotations
@@ -32,60 +32,63 @@ from flexmanip_ros.samples.signals import reads_angles, relative_angle
 from flexmanip_ros.types import Array
 
 FUNCTIONS = 3
-"""Functions of the configuration, see ``varying_kernel.basis``."""
+"""Number of functions of the configuration, see ``varying_kernel.basis``."""
 MOST_TRIALS, SHORTER = 3, 0.3
-"""Trials for each iteration of a fit at most, and factor on a step that would raise its cost."""
+"""Largest number of trial steps per iteration of a fit, and factor that shortens a step that would raise the cost."""
 VARIES, KNOWN = 0.12, 1.0
-"""Prior deviations, as shares of the largest entry: of the parts of G and H that vary with c, and of the rest."""
+"""Prior deviations, as shares of the largest entry: of the parts of G and H that vary with c, and of constant parts."""
 UNEVEN = 0.005
-"""The same of the parts of G that change as no arm of two links does. Where link 2 points the other way, c and the
-bends of link 2 change sign: G of a link alone is even in c, what couples the links is odd."""
+"""Prior deviation, as a share of the largest entry, of the parts of G that no arm of two links has. With link 2
+pointing the other way, c and the displacements of link 2 change sign. So the entries of G of one link are even
+functions of c, and those that couple the links are odd."""
 SOFT = 0.2
-"""Prior deviation of mu. Of Duffing's x'' + (1 + x^2) x = 0 it is 3/4; that of the default arm with 20 kg is 0.2. Until
-an arm has swung with several amplitudes, a larger one follows what else the model misses."""
+"""Prior deviation of mu. Duffing's equation x'' + (1 + x^2) x = 0 has |mu| = 3/4, the default arm with 20 kg has 0.2.
+With a larger prior deviation mu fits other errors of the model, until the arm has swung with several amplitudes."""
 DIRECT, DAMPED, TURNING, OFFSET, SHARED = 0.05, 0.05, 2.0, 0.3, 1.0
-"""Prior deviations of E and F, D, its terms with rates, b and zeta; signals at unit power, time in 1 / shift."""
+"""Prior deviations of E and F, of the constant term of D, of its terms with the rates, of b and of zeta. They hold for
+signals of unit power and time in units of 1 / shift."""
 WALK = 0.0001
-"""Standard deviation by which a parameter may move in a block, as a share of its prior one: 0.5 % in ten minutes."""
+"""Standard deviation of a parameter's random walk in a block, as a share of its prior one: 0.5 % in ten minutes."""
 STATE_WALK = 0.01
-"""The same of the state, as a share of the size of the displacements."""
+"""Standard deviation of the state's random walk in a block, as a share of the displacements' standard deviation."""
 OFFSET_WALK = 0.01
-"""Standard deviation by which the offset b may move in a block, as a share of the size of the displacements."""
+"""Standard deviation of the random walk of b in a block, as a share of the displacements' standard deviation."""
 NOISE_BLOCKS, SHARE_BLOCKS = 8, 16
-"""Blocks over which the noise, and the share that is not predicted, are remembered."""
+"""Blocks over which the residuals' covariance, and the values of ``Missed``, are averaged."""
 UNPREDICTED = 0.7
-"""Share of an output's amplitude that the prediction of a block may miss before it counts against the model."""
+"""Share of an output's amplitude that the prediction of a block may miss; a block that misses more is a bad one."""
 STRIKES = 3
-"""Such blocks in a row that end the fit."""
+"""Number of bad blocks in a row that ends the fit, see ``UNPREDICTED``."""
 UNKNOWN = 3.0
-"""Standard deviation of a state of which nothing is known, in signals of unit power."""
+"""Prior standard deviation of an unknown state, for signals of unit power."""
 SETTLE = 2.0
-"""Periods of the corner frequency after which a filter that began anew is trusted."""
+"""Settling time of a restarted filter, in periods of its corner frequency."""
 ITERATIONS = 4
-"""Gauss-Newton iterations of a block at most, while the fit is younger than ``SHARE_BLOCKS``: it moves the parameters
-far. Later ones need one: more made nothing better in three minutes of a wandering arm."""
+"""Largest number of Gauss-Newton iterations in each of the first ``SHARE_BLOCKS`` blocks, which move the parameters
+far. A later block gets one iteration: more improved nothing in three minutes of a wandering arm."""
 AT_REST = np.array([1.0, 0.0, 0.0])
-"""Factors on the parts of D when the links stand still."""
+"""Factors on the three terms of D when the links stand still."""
 QUALITIES = (1.0 / 0.5411961, 1.0 / 1.3065630)
-"""Damping of the two stages of a Butterworth filter of fourth order, times two."""
+"""Twice the damping ratio of each of the two second-order stages of a fourth-order Butterworth filter."""
 
 
 class Roles(NamedTuple):
-    """Which outputs are displacements (h), and for each output the state that it shows."""
+    """Indices of the outputs that are displacements (h), and for each output the index of the state it measures."""
 
     displacements: tuple[int, ...]
     states: tuple[int, ...]
 
 
 class Varying(NamedTuple):
-    """The fit and what it remembers, constant in size; h displacements, r inputs, k parameters.
+    """State of the parameter-varying fit, constant in size; h displacements, r inputs, k parameters.
 
-    shift: unit of time [1/s]; scale_u (r,), scale_y (h,): factors on signals; theta: (k,) see ``parts``; x: (2h,);
-    root: (k + 2h, k + 2h) S with S S' their covariance; noise: (h, h); averaged over the last blocks, share (h,) and
-    chi2: see ``Missed``; corner [Hz], every: the filter and the samples that it keeps one of; filtered: (4, r + h + 2)
-    its state; dt: sample time [s]; angle: relative angle of the links at the end [rad]; blocks: number taken; strikes:
-    bad ones in a row; lost: samples were missing, so filter and state begin anew; settling: kept samples until the
-    filter that began anew is trusted; gain: (n, m) published K.
+    shift: 1 over the unit of time [1/s]; scale_u (r,), scale_y (h,): factors on signals; theta: (k,) parameters, see
+    ``parts``; x: (2h,) state; root: (k + 2h, k + 2h) S with S S' the covariance of [theta; x]; noise: (h, h) covariance
+    of the residuals; share (h,), chi2: averages of ``Missed`` over the last blocks; corner: of the low-pass [Hz];
+    every: one of so many filtered samples is kept; filtered: (4, r + h + 2) state of the filter; dt: sample time [s];
+    angle: relative angle of the links after the last block [rad]; blocks: number taken; strikes: number of bad blocks
+    in a row; lost: samples were missing, so filter and state restart; settling: kept samples until the restarted filter
+    has settled; gain: (n, m) published K.
     """
 
     shift: float
@@ -110,10 +113,11 @@ class Varying(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Filtered and scaled samples, and the configuration in the middle of them; see ``simulate_block``.
+    """Filtered and scaled samples of a block, and the configuration in its middle; see ``simulate_block``.
 
-    swing: square of the angle through which a link swings with the displacements, summed over the links [rad^2]; that
-    of a sinusoid is twice its mean square.
+    c: cos(theta2 - theta1) in the middle; by_s: change of c from there to the end; rates: (3,) factors on the terms of
+    D; angle: theta2 - theta1 at the end [rad]; swing: squared amplitude of the angle through which a link swings with
+    the displacements, summed over the links [rad^2]; as for a sinusoid it is twice the mean square.
     """
 
     U: Array
@@ -130,17 +134,18 @@ class Block(NamedTuple):
 
 
 def roles(config: IdentifierParameters) -> Roles | None:
-    """Return the roles of the outputs, or None where the model cannot be one of the configuration.
+    """Return the roles of the outputs, or None where the model cannot be a function of the configuration.
 
-    It needs angles, at most half as many displacements as states, and no other outputs than these and their rates. A
-    payload that is read out of the model, or has linear dynamics, is weighed at one working point, with that model.
+    Such a model needs measured angles, at most half as many displacements as states, and no outputs besides the
+    displacements and their rates. A payload that is read out of the model, or estimated with linear dynamics, needs the
+    model of one working point instead.
     """
     at_one_point = config.payload_method in ('block', 'frequency') or config.payload.dynamics == 'linear'
     return None if at_one_point or not reads_angles(config) else shown(config)
 
 
 def shown(config: IdentifierParameters) -> Roles | None:
-    """Return the roles of the outputs by their names alone."""
+    """Return the roles of the outputs from their names; None where these do not suit the order or the decimation."""
     names = config.outputs
     places = tuple(k for k, name in enumerate(names) if name.endswith('/position'))
     if not 0 < 2 * len(places) <= config.order or config.decimation > 1:
@@ -159,7 +164,10 @@ def shown(config: IdentifierParameters) -> Roles | None:
 
 @cache
 def parts(h: int, r: int) -> dict[str, tuple[slice, tuple[int, ...]]]:
-    """Return where each part of theta stands, and its shape: G, H, E by functions of c, F, D by rates, b, mu, zeta."""
+    """Return the slice of theta and the shape of each of its parts G, H, E, F, D, b, mu and zeta.
+
+    G, H, E have one matrix for each function of c, D has one for each factor of ``Block.rates``.
+    """
     shapes = {'G': (FUNCTIONS, h, h), 'H': (FUNCTIONS, h, r), 'E': (FUNCTIONS, h, r), 'F': (h, r), 'D': (3, h, h),
               'b': (h,), 'mu': (1,), 'zeta': (1,)}
     found, at = {}, 0
@@ -193,7 +201,7 @@ def prior(G: Array, H: Array) -> Array:
 
 
 def walk(theta: Array, h: int, r: int, size: Array) -> Array:
-    """(k + 2h,) standard deviations of the random walk in a block; size: (h,) of the displacements."""
+    """(k + 2h,) standard deviations of the random walk in a block; size: (h,) those of the displacements."""
     found = WALK * prior(part(theta, 'G', h, r)[0], part(theta, 'H', h, r)[0])
     found[parts(h, r)['b'][0]] = OFFSET_WALK * size
     return np.concatenate([found, STATE_WALK * size, STATE_WALK * size])
@@ -201,9 +209,9 @@ def walk(theta: Array, h: int, r: int, size: Array) -> Array:
 
 def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, swing: float = 0.0
           ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """G, G1, H, H1, D, E of ``simulate_block`` at c, where c changes by ``by_s`` towards the end of the block.
+    """G, G1, H, H1, D, E of ``simulate_block`` at the configuration c.
 
-    swing: see ``Block.swing``.
+    by_s, rates, swing: see ``Block``.
     """
     value, by_c, _, _ = basis(c, float(theta[-1]))
     G, H, E = (part(theta, name, h, r) for name in 'GHE')
@@ -215,7 +223,7 @@ def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, swi
 
 
 def to_local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, swing: float = 0.0) -> Array:
-    """(l, k + 2h) derivative of the local parameters and the state by theta and the state; see ``local``."""
+    """(l, k + 2h) derivative of [local parameters; state] with respect to [theta; state]; see ``local``."""
     value, by_c, by_zeta, by_both = basis(c, float(theta[-1]))
     at = {name: where.start for name, (where, _) in parts(h, r).items()}
     a, b, q, k = h * h, h * r, 2 * r + 1, len(theta)
@@ -264,10 +272,10 @@ def signals_of(config: IdentifierParameters, rows: Rows, role: Roles) -> Array:
 
 
 def passed(v: Varying, signals: Array, anew: bool) -> tuple[Array, Array, Array]:
-    """Filter signals (N, w): those that are kept, their second derivatives, and the state of the filter."""
+    """Filter signals (N, w); return the kept samples, their second derivatives, and the filter's state at the end."""
     state = np.zeros_like(v.filtered) if anew else v.filtered.copy()
     if anew:
-        state[0], state[2] = signals[0], signals[0]  # as if the first sample had been there for long
+        state[0], state[2] = signals[0], signals[0]  # the steady state for the first sample
     count = len(signals) // v.every
     out, second = np.empty((count, signals.shape[1])), np.empty((count, signals.shape[1]))
     low_pass(signals, *_filter(v), state, v.every, out, second)
@@ -275,16 +283,16 @@ def passed(v: Varying, signals: Array, anew: bool) -> tuple[Array, Array, Array]
 
 
 def straight(s: Array, Y: Array, angles: Array) -> Array:
-    """(2 + h, a) begin and slope of straight lines in s (N,) through angles (N, a), and what goes with Y (N, h).
+    """(2 + h, a) coefficients of the least-squares fit of angles (N, a) by [1, s, Y], with s (N,) and Y (N, h).
 
-    Encoders see the slopes of bent links: the lines are the angles that straight links would have.
+    Encoders measure the slopes of bent links. The first two rows, a straight line in s, are the angles without bending.
     """
     found = np.linalg.lstsq(np.column_stack([np.ones(len(s)), s, Y]), angles, rcond=None)[0]
     return np.asarray(found)
 
 
 def block_of(v: Varying, out: Array, second: Array) -> Block:
-    """Scale filtered signals (N, w) and find the configuration in them, see ``straight``."""
+    """Scale filtered signals (N, w) and determine the configuration from their angles, see ``straight``."""
     r, h, n = len(v.scale_u), len(v.scale_y), len(out)
     U, Y = out[:, :r] * v.scale_u, out[:, r:r + h] * v.scale_y
     s = np.asarray((np.arange(n) - 0.5 * (n - 1)) / (0.5 * n), dtype=np.float64)
@@ -303,10 +311,10 @@ def block_of(v: Varying, out: Array, second: Array) -> Block:
 
 
 class Run(NamedTuple):
-    """Simulated samples of a block, by the local parameters and the first state, l of them; see ``simulate_block``.
+    """Simulation of a block, differentiated by the l local parameters and first states; see ``simulate_block``.
 
-    N: (l, l) information, g: (l,) gradient, moments: (h, h) sum of the residuals' products, X: (2h, l) derivative of
-    the state at the end, and that state: (2h,).
+    N: (l, l) information; g: (l,) gradient; moments: (h, h) sum of e e' over the residuals e; X: (2h, l) derivative of
+    the state at the end; end: (2h,) that state.
     """
 
     N: Array
@@ -330,13 +338,13 @@ def _run(v: Varying, block: Block, theta: Array, x: Array, noise: Array) -> Run:
 
 
 def _first_state(v: Varying, block: Block, noise: Array) -> Array:
-    """(2h,) first state of a block that fits it best, parameters as they are: the output is linear in it."""
+    """(2h,) first state that fits a block best with the present parameters: a linear least-squares problem."""
     run, n = _run(v, block, v.theta, np.zeros_like(v.x), noise), len(v.x)
     return np.asarray(np.linalg.solve(run.N[-n:, -n:] + np.eye(n) / UNKNOWN ** 2, run.g[-n:]))
 
 
 def noise_of(signals: Array, v: Varying) -> Array:
-    """(h, h) covariance of the sensors' white noise behind the filter, by fourth differences of signals (N, w)."""
+    """(h, h) covariance of the sensors' white noise after the filter, from fourth differences of signals (N, w)."""
     r, h = len(v.scale_u), len(v.scale_y)
     white = np.median(np.abs(np.diff(signals[:, r:r + h], 4, axis=0)), axis=0) / (0.6745 * math.sqrt(70.0))
     size = np.std(signals[:, r:r + h], axis=0) * v.scale_y
@@ -345,11 +353,11 @@ def noise_of(signals: Array, v: Varying) -> Array:
 
 
 def updated(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, iterations: int) -> Varying | None:
-    """Update parameters and state by blocks; None where the numbers leave the finite range.
+    """Update parameters and state with one or more blocks; None where a number is not finite.
 
     noise: (h, h) covariance that weighs the residuals; white: (h, h) that of the sensors.
 
-    The first block begins with the state of v, further ones after gaps, each with an unknown state of its own.
+    The first block starts from the state of v. Each further block follows a gap and has an unknown first state.
     """
     h, r, k = len(v.scale_y), len(v.scale_u), len(v.theta)
     root = v.root
@@ -369,7 +377,7 @@ def updated(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
     share, chi2, strikes = v.share, v.chi2, 0
     if not v.blocks:
         share, chi2 = np.sqrt(np.diag(moments) / np.var(Y, axis=0)), float(np.mean(np.diag(moments) / np.diag(white)))
-    elif not after_gap:  # there the state was unknown: that was no prediction
+    elif not after_gap:  # after a gap the state is unknown, so the block has no prediction
         part_of = max(1.0 / v.blocks, 1.0 / SHARE_BLOCKS)
         strikes = v.strikes + 1 if float(missed.share.max()) > UNPREDICTED else 0
         share, chi2 = share + (missed.share - share) * part_of, chi2 + (missed.chi2 - chi2) * part_of
@@ -380,13 +388,14 @@ def updated(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
 
 def _fitted(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, iterations: int, root: Array, x: Array
             ) -> tuple[Array, list[Run], Array, Missed] | None:
-    """Return theta, the runs with it, the root of the covariance of theta and the last state, what the first missed.
+    """Return theta, the runs with it, the covariance root of theta and the last block's first state, and ``Missed``.
 
-    Gauss-Newton iterations in units of ``root``, the prior's, from the states that fit best; with more than one a step
-    that raises the cost is shortened (backtracking).
+    ``Missed`` is that of the prediction before the first iteration. The Gauss-Newton iterations run in z, where
+    [theta; first states] = base + root z and z has unit prior covariance. With more than one iteration a step that
+    raises the cost is shortened (backtracking).
     """
     h, r, k, n = len(v.scale_y), len(v.scale_u), len(v.theta), len(v.x)
-    wide = max(1.0, 1.0 / (2.1 * v.corner * v.dt * v.every))  # filtered noise: that many samples say what one says
+    wide = max(1.0, 1.0 / (2.1 * v.corner * v.dt * v.every))  # correlated noise: so many samples count as one
     root = scipy.linalg.block_diag(root, *[UNKNOWN * np.eye(n)] * (len(blocks) - 1))
     base = np.concatenate([v.theta, x, *(_first_state(v, block, noise) for block in blocks[1:])])
     places = [np.r_[:k, k + j * n:k + j * n + n] for j in range(len(blocks))]
@@ -432,7 +441,7 @@ def _fitted(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
 
 
 class Missed(NamedTuple):
-    """What the prediction of a block misses beyond what the parameters' deviations explain.
+    """Errors of the prediction of a block beyond those that the parameters' deviations explain.
 
     share: (h,) of the outputs' amplitude; chi2: power of the residuals over that expected from white noise.
     """
@@ -444,8 +453,8 @@ class Missed(NamedTuple):
 def _missed(block: Block, run: Run, noise: Array, white: Array, own: Array) -> Missed:
     """Return what the prediction of a block misses.
 
-    own: derivative of the local parameters along the parameters' deviations. What these explain is no fault of the
-    model.
+    own: derivative of the local parameters along the columns of the parameters' covariance root. Errors that these
+    deviations explain are not counted.
     """
     left = np.diag(run.moments) / len(block.Y)
     power = np.maximum(np.var(block.Y, axis=0), np.diag(noise))
@@ -454,7 +463,7 @@ def _missed(block: Block, run: Run, noise: Array, white: Array, own: Array) -> M
 
 
 def advance(config: IdentifierParameters, v: Varying, rows: Rows) -> Varying | None:
-    """Take a block of ``BLOCK`` samples; None where the fit has come to its end."""
+    """Update the fit with a block of ``BLOCK`` samples; None where the fit ends, see ``STRIKES`` and ``updated``."""
     role = shown(config)
     assert role is not None
     signals, end = signals_of(config, rows, role), 0
@@ -467,10 +476,11 @@ def advance(config: IdentifierParameters, v: Varying, rows: Rows) -> Varying | N
 
 
 def measured(v: Varying, signals: Array, missing: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """First row and the row after the last one of each part of signals (N, w) that has no gap. missing: (N,).
+    """First row and the row after the last one of each part of signals (N, w) without a gap; missing: see ``Rows``.
 
-    A straight line through more missing samples than the filter lets pass is no motion. A part is a multiple of
-    ``every`` long, so that its last row is one that the filter keeps, and the state stands at its end.
+    Missing samples are bridged by straight lines; over more than a quarter of the period of the filter's corner they
+    are a gap. The length of a part is a multiple of ``every``, so the filter keeps its last row and the state is that
+    at its end.
     """
     blind = ~np.all(np.isfinite(signals), axis=1)
     after = np.append(missing[1:], 0)
@@ -481,7 +491,7 @@ def measured(v: Varying, signals: Array, missing: NDArray[np.int64]) -> list[tup
 
 
 def taken(v: Varying, signals: Array) -> Varying | None:
-    """Take a block of samples (N, w) without a gap between them, once the filter has settled."""
+    """Update the fit with samples (N, w) that have no gap between them, once the filter has settled."""
     out, second, state = passed(v, signals, v.lost)
     waiting = settling(v) if v.lost else v.settling
     if v.lost or waiting:
@@ -496,7 +506,7 @@ def taken(v: Varying, signals: Array) -> Varying | None:
 
 
 def reopened(v: Varying, waiting: int) -> Varying:
-    """Forget the state, of which nothing is known after a gap; waiting: see ``Varying.settling``."""
+    """Make the state unknown, as it is after a gap; waiting: see ``settling`` of ``Varying``."""
     k, n = len(v.theta), len(v.x)
     root = np.zeros_like(v.root)
     root[:k, :k] = triangle(v.root[:k].T).T
@@ -505,10 +515,10 @@ def reopened(v: Varying, waiting: int) -> Varying:
 
 
 def settling(v: Varying) -> int:
-    """Return the number of kept samples after which a filter that began anew is trusted."""
+    """Return the number of kept samples after which a restarted filter has settled."""
     return math.ceil(SETTLE / (v.corner * v.dt * v.every))
 
 
 def lost(v: Varying) -> Varying:
-    """Samples are missing: what was learnt is kept, the state is unknown."""
+    """Mark that samples are missing: the parameters are kept, filter and state restart."""
     return v._replace(lost=True)

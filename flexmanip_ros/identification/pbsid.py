@@ -1,7 +1,7 @@
-"""Batch predictor-based subspace identification: the oracle beside the recursion.
+"""Batch predictor-based subspace identification: the reference for the recursion.
 
-Straight from the data matrices (paper eqs. 22-37 with all samples at once), sharing no arithmetic with
-the factor of ``moments.py``: the states are formed sample by sample and regressed as they stand.
+It works on the data matrices (paper eqs. 22-37 with all samples at once) and shares no arithmetic with the factor of
+``moments.py``: the states are computed sample by sample, and the matrices are regressed on them.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ def pbsid(
 ) -> tuple[StateSpace, Array]:
     """Identify from inputs U (N, r) and outputs Y (N, m) of one record without gaps.
 
-    forgetting: weight of the sample before, relative to the one after it; regularization: ridge on the
-    VARX parameters; fixed: S = [I 0], otherwise the leading singular vectors. Returns the model, in the
-    basis of its state, and the singular values.
+    forgetting: weight of a sample relative to the next one; regularization: ridge on the VARX parameters; fixed: S =
+    [I 0], otherwise the leading singular vectors. Returns the model, in the basis of its state, and the singular
+    values.
     Raises ModelError when the record is shorter than the window or carries fewer than n states.
     """
     r, m = U.shape[1], Y.shape[1]

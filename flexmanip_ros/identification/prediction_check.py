@@ -1,8 +1,8 @@
-"""Whether a model predicts: 0.25 s ahead, over the last second, against the sensors' noise, with the right frequencies.
+"""Check of a model by predictions 0.25 s ahead over the last second, and by its frequencies in the same samples.
 
-A model that is wrong leaves residuals which it takes for its noise, so it must not be judged against them. White noise
-of a sensor shows in fourth differences, whatever the model. A frequency that is a few percent off costs such a
-prediction little, so the frequencies are asked for by themselves (``frequency_errors``).
+A wrong model has a large innovation covariance, so its residuals are not compared with that but with the sensors' white
+noise. The fourth differences of an output give this noise without a model. A frequency error of a few percent changes a
+prediction 0.25 s ahead little, so the frequencies have a test of their own (``frequency_errors``).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import scipy  # its parts are loaded where they are first used
+import scipy  # its submodules are imported at first use
 from numba import njit
 from numpy.typing import NDArray
 
@@ -24,60 +24,61 @@ from flexmanip_ros.types import Array, Mode, StateSpace, Status
 Complex = NDArray[np.complex128]
 
 AHEAD_S = 0.25
-"""How far ahead predictions are judged [s]; in the first 0.75 s after an event a third of that time."""
+"""Prediction horizon [s]. In the first 0.75 s after an event the horizon is a third of the time since the event."""
 LAST_S = 1.5
-"""Time over which they are judged [s], with that of the first state."""
+"""Time of the latest samples on which a model is judged [s], that for the first state of the predictions included."""
 INSTANTS = 10
-"""Predictions start every ``horizon / INSTANTS`` samples."""
+"""Number of predictions that start within one horizon: one every ``horizon / INSTANTS`` samples."""
 STRETCHES = 6
-"""Stretches in that time, at least, whose frequencies are compared."""
+"""Least number of stretches into which ``frequency_errors`` divides the latest samples."""
 MOST_ROWS = 4096
 MISSED = 0.5
-"""Share of an output's power that predictions may miss."""
+"""Largest share of an output's power that predictions may miss."""
 SILENT = 10.0
-"""Power of an output, in units of its white noise, below which it says nothing."""
+"""Power of an output, in units of its white noise, below which the output is silent: it does not count."""
 FOURTH = 0.6744897501960817 * math.sqrt(70.0)
-"""Median of the absolute fourth differences of white noise, in standard deviations."""
+"""Median of the absolute fourth differences of white noise, in standard deviations of the noise."""
 
 MEDIAN_SPREAD = 2.9
 """Relative standard deviation of ``white_noise`` from N samples of white noise, times the root of N."""
 CHANCE = 4.0
-"""Of these deviations by which residuals may exceed the white noise before the model is taken to miss something."""
+"""Number of standard deviations (``MEDIAN_SPREAD``) by which the power of the residuals may exceed that of the white
+noise. A larger excess counts as an error of the model."""
 OFF, VAGUE = 0.02, 0.01
-"""Relative error of a frequency that the last samples may show, and its relative standard deviation."""
+"""Largest relative error of a frequency beyond its 95 % interval, and largest relative standard deviation of one."""
 UNSHOWN = 0.1
-"""Half 95 % interval of that error beyond which the samples do not show the frequency. It was at most 0.066 in 4762
-readings of right models, and 0.21 to 0.41 for a mode that was not there."""
+"""Half 95 % interval of a relative frequency error above which the samples do not show the frequency. It was at most
+0.066 in 4762 readings of right models, and 0.21 to 0.41 for a mode that the plant did not have."""
 EARLY = 4096
-"""Samples before which a model whose modes are not known so well is still warming up."""
+"""Number of samples behind a model below which uncertain modes mean WARMING_UP, not POORLY_EXCITED."""
 DAMPED = 0.3
-"""Damping ratio above which a mode has no frequency worth a verdict."""
+"""Damping ratio above which the frequency of a mode is not judged."""
 LOOSE = 0.1
-"""Standard deviation of a damping ratio beyond which the mode is not known. It was 0.01 to 0.06 for the damped mode of
-the measured ist_arm after the first second, and 0.106 to 0.29 for modes that were not there."""
+"""Largest standard deviation of the damping ratio of a known mode. It was 0.01 to 0.06 for the damped mode of the
+measured ist_arm after the first second, and 0.106 to 0.29 for modes that the plant did not have."""
 MOST_MODES = 4
-"""The lowest ones are judged."""
+"""Number of modes that are judged, from the lowest frequency on."""
 MOST_SKEW = 1e8
-"""Condition of the eigenvectors of an A that is as good as defective."""
+"""Condition number of the eigenvectors of A above which A counts as defective."""
 TWO_SIDED = 0.975
-"""Student's t lies between this quantile and its negative in 95 %."""
+"""Probability of the upper quantile of Student's t that bounds a two-sided 95 % interval."""
 
 
 def length(dt: float) -> int:
-    """Return the number of samples that are looked at. dt: sample time [s]."""
+    """Return the number of latest samples on which a model is judged. dt: sample time [s]."""
     return min(math.ceil(LAST_S / max(dt, 1e-9)), MOST_ROWS)
 
 
 def white_noise(Y: Array) -> Array:
-    """(m,) variance of the white noise in Y (N, m), N > 4, by the median of fourth differences."""
+    """(m,) variance of the white noise in Y (N, m), N > 4, from the median of absolute fourth differences."""
     found: Array = (np.median(np.abs(np.diff(Y, 4, axis=0)), axis=0) / FOURTH) ** 2
     return found
 
 
 def free_motion(model: StateSpace, count: int) -> Array:
-    """(count, m, n) C A^k."""
+    """(count, m, n) C A^k, k = 0 to count - 1."""
     free, ahead = model.C[None], model.A
-    while len(free) < count:  # twice as many each time
+    while len(free) < count:  # doubles the number of powers
         free, ahead = np.concatenate([free, free @ ahead]), ahead @ ahead
     return free[:count]
 
@@ -85,8 +86,9 @@ def free_motion(model: StateSpace, count: int) -> Array:
 def missed(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np.bool_] | None = None) -> Array:
     """(m,) share of the power of Y (N, m) that predictions ``horizon`` samples ahead miss.
 
-    Each begins at the state that fits as many samples before it, outputs at unit power; no output after that is used.
-    seen: (N,) rows that were measured, all of them by default. nan where an output is silent.
+    Each prediction starts from the state that fits the ``horizon`` samples (at least 2 n) before it best, with outputs
+    scaled to unit power; it uses no later output. seen: (N,) rows that were measured, all of them by default. nan where
+    an output is silent (``SILENT``).
     """
     n, m = model.order, model.C.shape[0]
     before = max(horizon, 2 * n)
@@ -94,8 +96,8 @@ def missed(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np
     power, white = np.var(Y, axis=0), white_noise(Y)
     unit = 1.0 / np.sqrt(np.where(power > 0.0, power, 1.0))
     free = free * unit[:, None]
-    left = (Y - simulate(model, U)) * unit  # a free motion of the model, as far as it is right
-    if not np.all(np.isfinite(free)) or not np.all(np.isfinite(left)):  # a model that runs away
+    left = (Y - simulate(model, U)) * unit  # of a right model: its free motion and noise
+    if not np.all(np.isfinite(free)) or not np.all(np.isfinite(left)):  # a model that diverges
         return np.full(m, np.inf)
     known = np.ones(len(Y), dtype=np.bool_) if seen is None else seen
     back = np.linalg.pinv(free[:before].reshape(-1, n), rcond=1e-9)
@@ -115,7 +117,7 @@ def missed(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np
 
 @njit(cache=True, nogil=True)
 def swing(poles: Complex, turns: Complex, gains: Complex, U: Array, Z: Complex, S: Complex) -> None:
-    """Run modes z+ = pole z + gain u from rest over U (N, r), and their derivatives S = dz by ln(pole) = turn.
+    """Simulate modes z+ = pole z + gain u from rest over U (N, r), and S, the derivative of z along d ln(pole) = turn.
 
     poles, turns: (n,), gains: (n, r), Z, S: (N, n).
     """
@@ -133,10 +135,11 @@ def frequency_errors(model: StateSpace, U: Array, Y: Array, horizon: int, seen: 
                      ) -> tuple[Array, Array]:
     """Relative errors (g,) of the model's lowest frequencies that the samples show, and half their 95 % intervals.
 
-    One Gauss-Newton step from the model's own frequencies (Rao's score over its information) on stretches of
-    ``horizon`` samples of Y (N, m), outputs at unit power; the state at the begin of each is free. The deviations are
-    White's sandwich: from the scatter of the scores of the stretches, of which Student's t allows for there being few.
-    Empty where there is no mode, nan where there are too few stretches. seen: as in ``missed``.
+    The errors are one Gauss-Newton step from the model's own frequencies (Rao's score over its information). Y (N, m)
+    is scaled to unit power and divided into stretches of ``horizon`` samples, each with a free first state. The
+    standard deviations come from the scatter of the stretches' scores (White's sandwich estimator), the intervals from
+    Student's t, as the stretches are few. Empty where there is no mode, nan where there are fewer than 3 stretches.
+    seen: as in ``missed``.
     """
     values, right = np.linalg.eig(model.A + 0j)
     logs = np.log(np.where(values == 0.0, 1e-300, values))
@@ -187,7 +190,8 @@ def frequency_errors(model: StateSpace, U: Array, Y: Array, horizon: int, seen: 
 def unfitted(model: StateSpace, U: Array, Y: Array, seen: NDArray[np.bool_]) -> float:
     """Share of the amplitude of Y (N, m) that the model leaves beyond white noise, the first state being free.
 
-    In the mean over the outputs that say something; 0 where it may be chance. seen: as in ``missed``.
+    The share is the root of the mean power over the outputs that are not silent; an output within chance (``CHANCE``)
+    counts as 0. seen: as in ``missed``.
     """
     power, white = np.var(Y, axis=0), white_noise(Y)
     heard = power > SILENT * white
@@ -204,10 +208,10 @@ def unfitted(model: StateSpace, U: Array, Y: Array, seen: NDArray[np.bool_]) -> 
 
 
 def widened(found: Identified, share: float) -> Identified:
-    """Return the model with what errors of its poles explain of a share of the amplitude that it leaves.
+    """Return the model with its spread widened by the pole errors that explain a share of the amplitude.
 
-    A pole that is off by d [rad a sample] turns or swells the motion by d k in k samples, in the mean over N samples by
-    d N / sqrt(3) (root of the mean square).
+    share: what the model leaves, see ``unfitted``. A pole error d [rad a sample] changes the phase or the logarithm of
+    the amplitude of the motion by d k after k samples; over N samples this has the root mean square d N / sqrt(3).
     """
     A = found.model.A
     values, right = np.linalg.eig(A)
@@ -222,10 +226,10 @@ def widened(found: Identified, share: float) -> Identified:
 
 
 def is_vague(oscillations: Sequence[Mode]) -> bool:
-    """Whether the frequency of a low light mode, or the damping ratio of any low mode, is not known well enough.
+    """Whether the frequency of a low lightly damped mode, or the damping ratio of any low mode, is too uncertain.
 
-    A damped mode may have an uncertain frequency, not an uncertain damping ratio: a mode that the samples do not hold
-    may drift above DAMPED as well.
+    A mode damped above ``DAMPED`` may have an uncertain frequency, but no uncertain damping ratio: a mode that the
+    samples do not contain may also drift to such a damping.
     """
     light = [mode for mode in oscillations if abs(mode.damping_ratio) < DAMPED][:MOST_MODES]
     return (any(mode.frequency_std_hz > VAGUE * mode.frequency_hz for mode in light)
@@ -233,27 +237,29 @@ def is_vague(oscillations: Sequence[Mode]) -> bool:
 
 
 def judged(found: Identified, rows: Rows, outputs: tuple[str, ...]) -> Identified:
-    """Return the model with what its predictions of the last samples are worth; outputs: their names.
+    """Return the model with the status that its predictions of the last samples give; outputs: the outputs' names.
 
-    INCONSISTENT where they miss too much of the outputs in the mean, or where the last samples show another frequency;
-    ORDER_TOO_LOW where they miss one output while the others are predicted; POORLY_EXCITED, at first WARMING_UP, where
-    a mode of a model of one configuration is not known well enough, or the last samples do not show its frequency.
-    Rates count in the mean alone where there are others: they ring with modes above the order, which displacements
-    hardly show, so that right models of the first modes would be refused.
-    A model of one configuration has its deviations widened by what it leaves of the samples, as nothing else tells how
-    far a fit of two periods, or an arm that turns, leads it astray.
+    INCONSISTENT: the predictions miss over half of the outputs' mean power, or the last samples show another frequency.
+    ORDER_TOO_LOW: they miss over half of one output. POORLY_EXCITED, in the first ``EARLY`` samples WARMING_UP: a mode
+    of a model of one configuration is too uncertain, or the last samples do not show its frequency.
+
+    Where there are outputs other than rates, the rates count in the mean power alone. Rates contain modes above the
+    order, which displacements hardly show, and would reject right models of the first modes.
+
+    The spread of a model of one configuration is widened by what the model leaves of the samples. Nothing else shows
+    the errors from a fit to two periods, or from an arm that turns.
     """
     if found.status is not Status.TRACKING:
         return found
     gaps = np.flatnonzero(rows.gap[1:])
-    if gaps.size:  # predictions cannot go over unknown torques
+    if gaps.size:  # a prediction needs every torque
         rows = rows.between(rows.first + 1 + int(gaps[-1]), rows.until)
     rates = np.array([name.endswith('/velocity') for name in outputs])
     chosen = ~rates | rates.all()
     model = replace(found.model, C=found.model.C[chosen], D=found.model.D[chosen])
     seen = rows.missing == 0
     unknown = Status.WARMING_UP if found.samples < EARLY else Status.POORLY_EXCITED
-    if found.configurations is None:  # that of every configuration has rules of its own
+    if found.configurations is None:  # ``varying_model.judge`` has those of every configuration
         last = slice(max(0, len(rows) - round(found.samples)), None)
         if len(seen[last]) > STRETCHES * model.order:
             with np.errstate(over='ignore', invalid='ignore'):

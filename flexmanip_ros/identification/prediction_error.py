@@ -14,8 +14,8 @@ from flexmanip_ros.identification.realization import to_continuous, to_discrete
 from flexmanip_ros.types import Array, StateSpace
 
 GATHERED = 64
-"""Samples whose derivatives are gathered before they are multiplied: at 4 outputs and 52 parameters they fill 100 kB,
-which a core's second cache holds."""
+"""Number of samples whose derivatives J are gathered for one product J' J. At 4 outputs and 52 parameters J takes
+100 kB, which fits the second-level cache of a core."""
 
 
 @njit(cache=True, nogil=True)
@@ -52,13 +52,13 @@ def linearize(
 ) -> None:
     """Run the predictor x+ = A x + B u + K e, e = y - C x - D u over (L, r), (L, m), and its derivatives.
 
-    A row of Y that is NaN was not measured: e = 0, and it counts for nothing.
+    A row of Y that is NaN was not measured: e = 0 there, and the row adds nothing to N, g and moments.
 
-    Parameters in order: A, B row-major if free_system, K if free_gain, C if free_output, D if free_direct,
-    then x at the start. whiten: (m, m), whiten' whiten = inverse innovation covariance. On return x is the
-    state after the last sample, N (d, d) += J' J and g (d,) += J' e with J the derivatives of the whitened
-    predictions; moments (m, m) += e e' and X (n, d) = dx/dparameters, started at [0 I] by the caller.
-    J is gathered for ``GATHERED`` samples, then J' J is one product of the library.
+    Parameters in order: A, B row-major if free_system, K if free_gain, C if free_output, D if free_direct, then x at
+    the start. whiten: (m, m), whiten' whiten = inverse innovation covariance. On return x is the state after the last
+    sample, N (d, d) += J' J and g (d,) += J' e with J the derivatives of the whitened predictions; moments (m, m)
+    += e e' and X (n, d) = dx/dparameters, started at [0 I] by the caller. J is gathered for ``GATHERED`` samples, so
+    J' J is one matrix product of the BLAS library.
     """
     n, r, m = A.shape[0], B.shape[1], C.shape[0]
     d = N.shape[0]
@@ -72,7 +72,7 @@ def linearize(
     filled = 0
     for k in range(U.shape[0]):
         absent = Y[k, 0] != Y[k, 0]
-        if absent:  # the prediction goes on without it
+        if absent:  # the prediction goes on without the row
             for o in range(m):
                 e[o] = 0.0
         else:
@@ -156,8 +156,8 @@ def residual_moments(
 def condition(H: Array, root: Array, gradient: Array, step: Array) -> None:
     """Update in square-root form: root (k, k) <- root L^-T with L L' = I + H, step = (I + H)^-1 gradient.
 
-    H: (k, k) symmetric, overwritten with L (lower); gradient, step: (k,). A library's routine would start
-    threads for this.
+    H: (k, k) symmetric, overwritten with L (lower); gradient, step: (k,). The loops are written out because a routine
+    of the LAPACK library would start threads.
     """
     k = H.shape[0]
     for i in range(k):
@@ -209,10 +209,10 @@ class Theta(NamedTuple):
 
 
 class Structure(NamedTuple):
-    """What may vary.
+    """Which matrices a fit varies; those held keep their values.
 
-    free_output False holds C (the basis is fixed by it), free_gain False holds K, only_gain holds everything
-    but K and the state.
+    free_output False holds C, which then fixes the basis; free_direct False holds D; free_gain False holds K; only_gain
+    holds everything but K and the state.
     """
 
     free_output: bool
@@ -221,7 +221,7 @@ class Structure(NamedTuple):
     only_gain: bool = False
 
     def names(self) -> str:
-        """Return the parts that vary, in the order of the kernel."""
+        """Return the letters of the parts that vary, in the order of the kernel."""
         if self.only_gain:
             return 'Kx'
         free = {'K': self.free_gain, 'C': self.free_output, 'D': self.free_direct}
@@ -231,8 +231,9 @@ class Structure(NamedTuple):
 class Fit(NamedTuple):
     """Result of a descent.
 
-    directions: (d, k) coordinates that varied, information: (k, k) in them, arrival: (n, k) derivative of
-    the state after the stretch, end: (n,) that state, covariance: (m, m) of the innovations, cost: log det.
+    directions: (d, k) orthonormal coordinates that varied; information: (k, k) in these coordinates; arrival: (n, k)
+    derivative of the state after the stretch; end: (n,) that state; covariance: (m, m) of the innovations; cost: log
+    det, see ``score``.
     """
 
     theta: Theta
@@ -260,7 +261,7 @@ def moved(theta: Theta, step: Array, structure: Structure) -> Theta:
 
 
 def directions(theta: Theta, structure: Structure) -> Array:
-    """(d, k) orthonormal coordinates: all of the parameters but changes of basis and what is held."""
+    """(d, k) orthonormal coordinates of the parameters that vary, without the directions that only change the basis."""
     n = theta.A.shape[0]
     d = pack(theta, structure).size
     chosen = np.eye(d - n)
@@ -298,7 +299,7 @@ def measured(Y: Array) -> int:
 
 
 def score(U: Array, Y: Array, theta: Theta) -> tuple[float, Array]:
-    """Log det of the innovation covariance (infinite when the predictor runs away), and the covariance."""
+    """Log det of the innovation covariance (infinite when the predictor diverges), and the covariance."""
     covariance, _ = run(U, Y, theta)
     if not np.all(np.isfinite(covariance)):
         return np.inf, covariance
@@ -309,9 +310,9 @@ def derivatives(
     U: Array, Y: Array, theta: Theta, structure: Structure, covariance: Array, P: Array,
     before: Array | None = None,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Information (k, k), gradient (k,), innovation moments (m, m), arrival (n, k) and end state (n,).
+    """Information (k, k), gradient (k,), innovation moments (m, m), arrival (n, k) and end state (n,), see ``Fit``.
 
-    before: (n, k) derivative of the state at the start of the stretch, [0 I] when it is itself a parameter.
+    before: (n, k) derivative of the state at the start of the stretch; None: [0 I], that state is itself a parameter.
     """
     n, m = theta.A.shape[0], Y.shape[1]
     d = P.shape[0]
@@ -329,16 +330,17 @@ def derivatives(
 
 
 def forgets(theta: Theta, count: int) -> bool:
-    """Whether the predictor A - K C has let go of a state error after ``count`` samples."""
+    """Whether the predictor A - K C forgets a state error in ``count`` samples: spectral radius < 1 - 1 / count."""
     if not all(np.all(np.isfinite(part)) for part in theta):
         return False
     return float(np.abs(np.linalg.eigvals(theta.A - theta.K @ theta.C)).max()) < 1.0 - 1.0 / count
 
 
 def descend(U: Array, Y: Array, theta: Theta, structure: Structure, iterations: int) -> Fit | None:
-    """Gauss-Newton on the innovation covariance over U (N, r), Y (N, m); None where it cannot start.
+    """Minimize log det of the innovation covariance over U (N, r), Y (N, m) by damped Gauss-Newton steps.
 
-    Stops when the likelihood gains less than a hundredth of its own standard deviation.
+    None where a number is not finite. Stops when the likelihood gains less than a hundredth of its own standard
+    deviation.
     """
     cost, covariance = score(U, Y, theta)
     if not np.isfinite(cost):
@@ -378,7 +380,7 @@ def descend(U: Array, Y: Array, theta: Theta, structure: Structure, iterations: 
 
 
 def covariance_root(information: Array) -> Array:
-    """S with S S' = information^-1, directions without information at a large finite size."""
+    """S with S S' = information^-1; directions without information have a large finite variance."""
     size = np.sqrt(np.diag(information))
     size[size == 0.0] = 1.0
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
@@ -388,11 +390,12 @@ def covariance_root(information: Array) -> Array:
 
 
 ROWS, PAST, RIDGE = 128, 8, 1e-3
-"""Means over the stretch, their past window, and the ridge on them, of a start for slow modes."""
+"""Settings of ``averaged``: number of means over the stretch, past window in means, and ridge on the VARX
+parameters."""
 
 
 def candidate(model: StateSpace, feedthrough: bool) -> tuple[Theta, Structure]:
-    """Starting point from a model of scaled signals, C held when it can fix the basis."""
+    """Starting point from a model of scaled signals; C is held at I where it is square and well conditioned."""
     n, m = model.A.shape[0], model.C.shape[0]
     theta = Theta(model.A, model.B, model.C, model.D, model.K, np.zeros(n))
     if n == m and np.linalg.cond(model.C) < 1e6:
@@ -404,9 +407,9 @@ def candidate(model: StateSpace, feedthrough: bool) -> tuple[Theta, Structure]:
 
 
 def averaged(U: Array, Y: Array, n: int) -> StateSpace | None:
-    """Model of order n from the means over many samples (N, r), (N, m): a short past that reaches far back.
+    """Batch model of order n, with slow modes, from means over many samples of U (N, r), Y (N, m); None where it fails.
 
-    Its own past is as many samples as the window of the recursion, and yet sees whole periods of slow modes.
+    Its past window is ``PAST`` means long, and so spans whole periods of slow modes.
     """
     every = len(U) // ROWS
     if every < 2:

@@ -14,7 +14,7 @@ from flexmanip_ros.identification.moments import triangle
 from flexmanip_ros.types import Array, StateSpace
 
 WORST_BASIS = 1e10
-"""A transformation conditioned worse than this (after scaling) is not used."""
+"""Largest condition number (after scaling) of a transformation that is used."""
 
 
 def transform(model: StateSpace, W: Array) -> StateSpace:
@@ -25,11 +25,11 @@ def transform(model: StateSpace, W: Array) -> StateSpace:
 
 
 def to_continuous(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
-    """Ac (n, n) [1/s] and Bc (n, r) whose response to inputs held over dt is (A, B).
+    """Ac (n, n) [1/s] and Bc (n, r) whose response to inputs held over dt [s] is (A, B).
 
-    By eigenvectors, B = Ac^-1 (A - I) Bc; where they do not serve by the matrix logarithm of
-    [[A, B], [0, I]], which does not always give the same bits twice. Raises ModelError where no real
-    logarithm exists (a pole at zero or on the negative real axis).
+    Ac comes from the eigenvectors of A, and Bc from B = Ac^-1 (A - I) Bc. Where these are ill conditioned, both come
+    from the matrix logarithm of [[A, B], [0, I]], which does not always give the same bits twice. Raises ModelError
+    where no real logarithm exists (a pole at zero or on the negative real axis).
     """
     n, r = B.shape
     if not np.all(np.isfinite(A)) or _outside_log(np.linalg.eigvals(A)):
@@ -70,7 +70,7 @@ def continuous_state_matrix(A: Array, dt: float) -> Array | None:
 
 
 def stabilized(A: Array) -> Array:
-    """A (n, n) with every pole outside the unit circle drawn back onto it along its radius."""
+    """A (n, n) with every pole outside the unit circle moved onto it along its radius."""
     values, vectors = np.linalg.eig(A)
     radius = np.abs(values)
     if np.all(radius <= 1.0):
@@ -82,9 +82,9 @@ def stabilized(A: Array) -> Array:
 
 
 def lightly_damped(A: Array, most: float) -> Array:
-    """A (n, n) with every oscillation damped by at most the ratio ``most``, at its own frequency.
+    """A (n, n) with the damping ratio of every oscillation limited to ``most``; its angle per sample is kept.
 
-    A itself where that holds already.
+    A itself where no damping ratio exceeds ``most``.
     """
     values, vectors = np.linalg.eig(A)
     angle = np.abs(np.angle(values))
@@ -98,9 +98,10 @@ def lightly_damped(A: Array, most: float) -> Array:
 
 
 def slowest(model: StateSpace, count: int, most: float) -> StateSpace | None:
-    """Return the ``count`` slowest oscillations damped by at most the ratio ``most``; None where there are fewer.
+    """Return a model of the ``count`` slowest oscillations with a damping ratio up to ``most``; None if not so many.
 
-    Two states each, real and imaginary part of the modal coordinate. What the others do is left out.
+    Each oscillation has two states, the real and the imaginary part of its modal coordinate. The other modes are left
+    out.
     """
     values, right = np.linalg.eig(model.A)
     if np.linalg.cond(right) > WORST_BASIS:
@@ -120,10 +121,10 @@ def slowest(model: StateSpace, count: int, most: float) -> StateSpace | None:
 
 
 def known_output_basis(model: StateSpace) -> Array | None:
-    """W (n, n) that brings the model to the basis in which the configured C is known, or None.
+    """W (n, n) that transforms the model to the basis in which C is known, or None.
 
-    As many outputs as states: y = x, W = C. Half as many (displacements only): x = [y; dy/dt],
-    W = [C; C Ac] with Ac found before anything else (docs/identification.md).
+    With as many outputs as states: x = y, W = C. With half as many (displacements only): x = [y; dy/dt], W = [C; C Ac],
+    where Ac = log(A) / dt is computed first (docs/identification.md).
     """
     m, n = model.C.shape
     if m == n:
@@ -142,10 +143,10 @@ def known_output_basis(model: StateSpace) -> Array | None:
 
 
 def balancing(model: StateSpace) -> Array:
-    """W (n, n) with equal, diagonal observability and controllability over 10 n steps.
+    """W (n, n) that makes the observability and controllability Gramians over 10 n steps equal and diagonal.
 
-    A finite horizon also serves marginal and unstable models. Signs are fixed by the
-    first non-zero output of each state, so the basis moves smoothly with the model.
+    With a finite horizon they also exist for marginal and unstable models. The sign of each state makes its first
+    sizeable entry of C positive, so the basis changes smoothly with the model.
     """
     n = model.order
     inputs = np.hstack([model.B, model.K]) if np.linalg.norm(model.B) > 0 else model.K

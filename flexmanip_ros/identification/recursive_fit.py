@@ -1,4 +1,4 @@
-"""Prediction-error fit of growing stretches, then of blocks: when it is made, and what a block adds to it."""
+"""Prediction-error fit of growing stretches, then of blocks: the schedule of the fits, and the update by a block."""
 
 from __future__ import annotations
 
@@ -21,35 +21,36 @@ from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Array
 
 CHUNK = 64
-"""Samples handed over at once."""
+"""Samples that the fit takes over at once."""
 FIRST, LONGEST = 256, 2048
-"""Samples of the first fit, and of the last one that sees them all; multiples of CHUNK."""
+"""Samples in the first fit of a stretch, and in the last fit of the whole stretch; multiples of CHUNK."""
 SOON = (640, 768)
-"""Further ones after an event, where the arm was known before."""
+"""Samples in further fits of the whole stretch, after an event before which the parameter-varying model was known."""
 DELAY = 4
 SOONEST = 128
-"""A fit of N samples is taken N / DELAY samples later, and at least so many."""
+"""Delay of the result of a fit of N samples: N / DELAY samples, and at least ``SOONEST`` samples."""
 SOONEST_S, EACH_S = 0.1, 2e-4
-"""Nor sooner than this, nor than so much for each of its samples [s]: at 1 kHz that is less."""
+"""Least delay of that result [s], and least delay per sample of the fit [s]. At 1 kHz ``DELAY`` and ``SOONEST`` give
+more."""
 BLOCK_S = 0.06
-"""A block is taken so much later [s], at least CHUNK samples, and less than BLOCK: so it catches up."""
+"""Delay of the result of a block [s]. It is at least CHUNK samples, and below BLOCK samples to keep up with them."""
 LATEST = 4096
-"""Nor later than this: what is kept meanwhile is bounded, at any rate."""
+"""Largest delay in samples that a time [s] may ask for: it bounds the samples that are kept, at any sample rate."""
 PARAMETERS, USUAL = 120, 80
-"""Numbers in A, B, C, D and K beyond which the subspace model is published as it is, and up to which the times above
-hold: the time that a fit takes grows as the square of their number."""
+"""Number of entries in A, B, C, D and K above which the subspace model is not refined, and number up to which the
+delays above hold. Beyond it the delays grow as the square of the number, as the time for a fit does."""
 PAUSE = 8192
-"""Samples from a fit that failed to the next attempt; a multiple of CHUNK."""
+"""Samples from a failed fit to the begin of the next stretch; a multiple of CHUNK."""
 
 
 @dataclass(frozen=True, eq=False)
 class FitRequest:
     """A fit to be made; ``background.Request``.
 
-    rows: its samples, a slice of the sample log; R: (q, q) factor of the moments and scale: (r + m,), both
-    None for the update by a block; old: the fit before, if any; older: that of before the last event, where
-    it is another; later: samples from its last one until the result is taken; varying: the parameter-varying fit
-    that goes on with a block, or that of before the last event.
+    rows: samples of the fit, a slice of the sample log; R: (q, q) factor of the moments and scale: (r + m,), both None
+    for the update by a block; old: the previous fit, if any; older: the fit from before the last event, where that is
+    another one; later: samples from the last row until the result is taken; varying: the parameter-varying fit that the
+    block updates, or for a whole stretch that from before the last event.
     """
 
     config: IdentifierParameters
@@ -62,13 +63,13 @@ class FitRequest:
     varying: Varying | None = None
 
     def solve(self) -> FitResult:
-        """Make the fit. Numbers that leave the finite range are found where the result is looked at."""
+        """Make the fit without warnings: numbers that are not finite are detected where the result is checked."""
         with np.errstate(over='ignore', invalid='ignore'):
             return solve(self)
 
 
 class FitResult(NamedTuple):
-    """What a request gave: None where nothing fits. failed: a decomposition did."""
+    """Result of a request: None where no model fits. failed: a matrix decomposition failed."""
 
     recursion: Recursion | None
     failed: bool = False
@@ -76,13 +77,13 @@ class FitResult(NamedTuple):
 
 
 class Refined(NamedTuple):
-    """What the refinement remembers.
+    """State of the refinement.
 
-    begin: row of the sample log with which the stretch began; it may still be to come (a pause after a fit
-    that failed); end: the row after the last one taken; seen: the row after the last one that the fit has
-    taken in; batch: the fit still sees every sample of the stretch; request: under way, its result is taken at
-    row ``due``; before: the fit of before the last event, to start from; since_ns: stamp of the first sample;
-    varying: the parameter-varying fit, which takes the blocks once it is there; varying_before: as before.
+    begin: first row of the stretch in the sample log, in the future during a pause after a failed fit; end: the row
+    after the last one taken; seen: the row after the last one that a fit has used; batch: each fit still uses every
+    sample of the stretch; request: the fit under way, whose result is taken at row ``due``; before: the fit from before
+    the last event, a starting point; since_ns: stamp of the first sample; varying: the parameter-varying fit, which
+    takes the blocks once it exists; varying_before: the parameter-varying fit from before the last event.
     """
 
     begin: int
@@ -99,12 +100,12 @@ class Refined(NamedTuple):
 
     @property
     def total(self) -> int:
-        """Samples of the stretch; negative while it is still to begin."""
+        """Number of samples in the stretch; negative before it begins."""
         return self.end - self.begin
 
     @property
     def closed(self) -> int:
-        """Row up to which the stretch consists of whole chunks."""
+        """The row after the last whole chunk of the stretch."""
         return self.begin + self.total // CHUNK * CHUNK
 
 
@@ -114,7 +115,7 @@ def start(row: int, before: Recursion | None = None, varying_before: Varying | N
 
 
 def restart(refined: Refined) -> Refined:
-    """Begin a new stretch after an event; the fit so far is where the next one starts."""
+    """Begin a new stretch after an event; the present fit is a starting point of the next one."""
     return start(refined.end, refined.recursion or refined.before, refined.varying or refined.varying_before)
 
 
@@ -124,7 +125,7 @@ def first_needed(refined: Refined) -> int:
 
 
 def until_chunk(refined: Refined) -> int:
-    """Samples until the next piece of work (at least 1)."""
+    """Number of samples until the present chunk is full (at least 1)."""
     return CHUNK - refined.total % CHUNK
 
 
@@ -136,9 +137,10 @@ def take(refined: Refined, rows: Rows) -> Refined:
 
 
 def is_fit_due(config: IdentifierParameters, refined: Refined) -> bool:
-    """Whether the whole stretch is to be fitted now: at FIRST samples and each time they double.
+    """Whether the whole stretch is to be fitted now: at FIRST samples and each time their number has doubled.
 
-    A model of every configuration from before an event is fitted to more stretches, as soon as it may be right.
+    With a parameter-varying model from before an event the stretch is also fitted at ``SOON`` samples, where that model
+    may already hold.
     """
     total = refined.total
     if not refined.batch or refined.request is not None or total <= 0:
@@ -162,21 +164,21 @@ def is_block_due(refined: Refined) -> bool:
 
 
 def size(config: IdentifierParameters) -> int:
-    """Return the count of numbers in A, B, C, D and K."""
+    """Return the number of entries in A, B, C, D and K."""
     n, r, m = config.order, len(config.inputs), len(config.outputs)
     return n * (n + r + 2 * m + 1) + m * r
 
 
 def fitted(config: IdentifierParameters) -> IdentifierParameters:
-    """Return what is fitted: of a large order only the begin of a model of every configuration, where there is one."""
+    """Return what is fitted: of a large model only the order that the parameter-varying model starts from, if any."""
     role = parameter_varying.roles(config) if size(config) > USUAL else None
     return config if role is None else replace(config, order=2 * len(role.displacements))
 
 
 def result_delay(config: IdentifierParameters, refined: Refined, now_ns: int) -> int:
-    """Samples until the result of a fit is taken, a multiple of CHUNK; now_ns: stamp of the last sample.
+    """Number of samples until the result of a fit is taken, a multiple of CHUNK; now_ns: stamp of the last sample.
 
-    From the stamps of the stretch, so that a replay waits as long as the live node.
+    It follows from the stamps of the stretch, so a replay takes the result at the same sample as the live node.
     """
     count, longer = refined.total, max(1.0, (size(config) / USUAL) ** 2)
     needed = _chunks(refined, now_ns, longer * max(SOONEST_S, EACH_S * count), LATEST)
@@ -184,13 +186,16 @@ def result_delay(config: IdentifierParameters, refined: Refined, now_ns: int) ->
 
 
 def _chunks(refined: Refined, now_ns: int, duration: float, most: int) -> int:
-    """Samples, a multiple of CHUNK, that come in a time [s], by the stamps so far; 0 where unknown."""
+    """Number of samples in ``duration`` [s], at most ``most``, rounded up to a multiple of CHUNK; 0 where unknown.
+
+    The sample time is the mean one of the stretch so far.
+    """
     spacing = max(now_ns - refined.since_ns, 0) * 1e-9 / (refined.total - 1)
     return CHUNK * math.ceil(min(duration / spacing, most) / CHUNK) if spacing > 0.0 else 0
 
 
 def ask_fit(config: IdentifierParameters, refined: Refined, rows: Rows, R: Array, scale: Array) -> Refined:
-    """Ask for a fit of the whole stretch, see ``batch_fit.fit_stretch``; rows: the latest."""
+    """Request a fit of the whole stretch, see ``batch_fit.fit_stretch``; rows: the latest ones."""
     old, older, *_ = *(fit for fit in (refined.recursion, refined.before) if fit is not None), None, None
     config = fitted(config)
     later = result_delay(config, refined, int(rows.stamp_ns[-1]))
@@ -200,7 +205,7 @@ def ask_fit(config: IdentifierParameters, refined: Refined, rows: Rows, R: Array
 
 
 def ask_block(config: IdentifierParameters, refined: Refined, rows: Rows) -> Refined:
-    """Ask for an update by the oldest block that the fit has not seen; rows: the latest."""
+    """Request an update by the oldest block that the fit has not used; rows: the latest ones."""
     block = rows.since(refined.seen).between(refined.seen, refined.seen + BLOCK)
     request = FitRequest(config, block, None, None, refined.recursion, varying=refined.varying)
     later = max(CHUNK, _chunks(refined, int(rows.stamp_ns[-1]), BLOCK_S, BLOCK - CHUNK))
@@ -208,14 +213,14 @@ def ask_block(config: IdentifierParameters, refined: Refined, rows: Rows) -> Ref
 
 
 def deliver(refined: Refined, result: FitResult) -> Refined:
-    """Go on with the result of the request."""
+    """Return the refinement with the result of its request."""
     request = refined.request
     assert request is not None
     refined = refined._replace(request=None)
-    if result.failed:  # the subspace model remains; a new stretch begins
+    if result.failed:  # the subspace model is published, and a new stretch begins
         return start(refined.end)
     if request.R is None:
-        if request.varying is not None and result.varying is None:  # begin anew
+        if request.varying is not None and result.varying is None:  # that fit has ended: a new stretch begins
             return start(refined.end, result.recursion)
         if result.recursion is None and result.varying is None and not refined.batch:
             return give_up(refined)
@@ -228,18 +233,18 @@ def deliver(refined: Refined, result: FitResult) -> Refined:
 
 
 def give_up(refined: Refined) -> Refined:
-    """Drop a fit that does not hold, and wait before the next: the plant may not be of this kind at all."""
+    """Drop a fit that fails, and pause before the next stretch: the model may not suit the plant at all."""
     later = refined.end + PAUSE
     return Refined(later, refined.end, later)
 
 
 def skip(refined: Refined) -> Refined:
-    """Pass over one row, of a stretch that has not begun."""
+    """Pass over one row before the stretch begins."""
     return refined._replace(begin=refined.begin + 1, end=refined.end + 1, seen=refined.seen + 1)
 
 
 def break_window(refined: Refined) -> Refined:
-    """Samples are missing: what was learnt is kept, the state is unknown, the open stretch is over."""
+    """Begin another stretch where samples are missing: the fits are kept, their state is unknown."""
     old = refined.recursion
     fresh = start(refined.end, refined.before, refined.varying_before)
     if refined.varying is not None:
@@ -250,27 +255,27 @@ def break_window(refined: Refined) -> Refined:
     k = old.root.shape[0]
     root = np.zeros((k, k))
     root[:k - n, :k - n] = triangle(old.root[:k - n].T).T[:, :k - n]
-    root[k - n:, k - n:] = 10.0 * np.eye(n)  # nothing is known of it: signals are at unit power
+    root[k - n:, k - n:] = 10.0 * np.eye(n)  # deviation 10 of an unknown state: signals have unit power
     theta = old.theta._replace(x=np.zeros(n))
     return fresh._replace(batch=False, recursion=old._replace(theta=theta, root=root, lost=True))
 
 
 MEMORY = 1_000_000.0
-"""Samples after which parameters may have drifted by their own standard deviation."""
+"""Number of samples in which the covariance of the parameters grows by a factor e, so that they may drift slowly."""
 NOISE_BLOCKS, DRIFT_BLOCKS, TREND_BLOCKS = 16, 4, 8
 """Blocks over which the covariance of the innovations, the drift and the mean step of the parameters are averaged."""
 SURPRISE = 4.0
-"""Standard deviations beyond which a block says that the parameters have gone elsewhere."""
+"""Excess of a block's score statistic, in standard deviations, above which the parameters count as changed."""
 AGE = 1.25
-"""Blocks from the middle of one to when its result is read, in the mean."""
+"""Mean age of a block's result when it is read, counted from the middle of the block, in blocks."""
 CHANCE = 2.0
-"""Excess, in standard deviations, below which larger residuals or a trend of the parameters are left to chance."""
+"""Excess, in standard deviations, up to which larger residuals or a trend of the parameters count as chance."""
 LARGEST_DRIFT = 1.4
-"""Logarithm of the largest factor on a variance from one block."""
+"""Logarithm of the largest factor by which one block may raise the prior variances."""
 
 
 def solve(request: FitRequest) -> FitResult:
-    """Make the fit."""
+    """Make the fit of a request."""
     try:
         if request.R is not None and request.scale is not None:
             found = _stretch(request, request.R, request.scale)
@@ -285,7 +290,7 @@ def solve(request: FitRequest) -> FitResult:
 
 
 def samples_of(rows: Rows) -> Array:
-    """Return inputs and outputs (N, r + m); outputs that were not measured are NaN, and no fit counts them."""
+    """Return inputs and outputs (N, r + m); outputs that were not measured are NaN, and no fit uses them."""
     samples = rows.u_y
     absent = rows.missing > 0
     if absent.any():
@@ -295,7 +300,7 @@ def samples_of(rows: Rows) -> Array:
 
 
 def _stretch(request: FitRequest, R: Array, scale: Array) -> Recursion | None:
-    """Fit the whole stretch, see ``batch_fit.fit_stretch``, from the subspace model of one or two windows."""
+    """Fit the whole stretch, see ``batch_fit.fit_stretch``, from subspace models with one or two future windows."""
     config = request.config
     starts = [model_output.from_factor(config, R, scale)]
     if config.order > len(config.outputs) and config.past_window > config.future_window:
@@ -307,11 +312,14 @@ def _stretch(request: FitRequest, R: Array, scale: Array) -> Recursion | None:
         starts[0][2], config.direct_feedthrough, 'sensor' if config.refinement == 'output_error' else 'any')
     if found is None or found.trend_share == 0.0:
         return found
-    return found._replace(trend_lag=request.later / BLOCK + 1.0)  # the arm goes on until it is read
+    return found._replace(trend_lag=request.later / BLOCK + 1.0)  # the arm drifts on until the result is read
 
 
 def _varying(request: FitRequest, found: Recursion | None) -> Varying | None:
-    """Fit the whole stretch with a parameter-varying model: from that of before the event, and from the fit."""
+    """Fit the whole stretch with a parameter-varying model, once from that before the event and once from ``found``.
+
+    found: the fit of one configuration. The better of the two is returned.
+    """
     tried = [varying_start.start(request.config, request.rows, None, request.varying)]
     if found is not None and len(request.rows) >= varying_start.WINDOW:
         tried.append(varying_start.start(request.config, request.rows, found, None))
@@ -320,7 +328,7 @@ def _varying(request: FitRequest, found: Recursion | None) -> Varying | None:
 
 
 def _block(old: Recursion, samples: Array) -> Recursion | None:
-    """One recursive block, square-root covariance form: parameters and state together. None: no fit holds."""
+    """Update parameters and state by one block, in square-root covariance form; None where the fit is to be dropped."""
     r = old.theta.B.shape[1]
     U = np.ascontiguousarray(samples[:, :r] * old.scale[:r])
     Y = np.ascontiguousarray(samples[:, r:] * old.scale[r:])
@@ -329,7 +337,7 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
     if old.trend_share > 0.0:
         kept = triangle(np.hstack([kept, old.trend_share * old.trend[:, None]]).T).T
     noise = old.covariance
-    if not old.lost:  # what the model leaves (a moving arm is not linear) is noise to it
+    if not old.lost:  # residuals beyond the noise (a moving arm is not linear) count as noise
         before, _ = run(U, Y, old.theta)
         if not np.all(np.isfinite(before)):
             return None
@@ -338,7 +346,7 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
         noise = noise * max(1.0, power - CHANCE * np.sqrt(2.0 / Y.shape[1] * (1.0 / count + 1.0 / known)))
     zeta, theta, further = np.zeros(k), old.theta, 0.0
     arrival, root = np.zeros((0, k)), kept
-    for _ in range(2 if old.lost else 1):  # a state that was lost makes the first derivatives poor
+    for _ in range(2 if old.lost else 1):  # from an unknown state the first derivatives are poor
         information, gradient, _, arrival, _ = derivatives(U, Y, theta, old.structure, noise, old.P)
         H = kept.T @ information @ kept
         if not np.all(np.isfinite(H)):
@@ -362,7 +370,7 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
         return None
     share = max(count / (old.weight + count), count / len(U) / NOISE_BLOCKS)
     step = kept @ zeta
-    step[k - len(end):] = 0.0  # the state moves anyway
+    step[k - len(end):] = 0.0  # the state changes in any case: no trend of it
     moving = old.drift + further if further > 0.0 else 0.0
     trend = old.trend if old.lost else old.trend + (step - old.trend) / TREND_BLOCKS
     lasting, lag = trend_of(trend[:k - len(end)], kept[:k - len(end)], root[:k - len(end)])
@@ -376,17 +384,17 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
 
 
 def is_surprising(size: float, H: Array, widening: float) -> bool:
-    """Whether a block says that the parameters have gone elsewhere, or its residuals have a memory.
+    """Whether a block shows that the parameters have changed, or that its residuals are correlated.
 
-    H: (k, k) information of the block in coordinates of unit prior deviation, size: g' (I + H)^-1 g with its
-    gradient g (k,). Parameters that stayed where they were give it the mean tr H and the variance 2 tr H^2.
+    H: (k, k) information of the block in coordinates of unit prior deviation; size: g' (I + H)^-1 g with the block's
+    gradient g (k,). With unchanged parameters ``size`` has the mean tr H and the variance 2 tr H^2.
     """
     deviation = np.sqrt(2.0) * float(np.linalg.norm(H))
     return bool(size > widening ** 2 * (float(np.trace(H)) + SURPRISE * deviation))
 
 
 def drift(H: Array, g: Array, widening: float) -> float:
-    """Logarithm >= 0 of the factor on the prior variances at which the block is what it should be."""
+    """Logarithm >= 0 of the factor on the prior variances at which ``size`` of ``is_surprising`` equals its mean."""
     values, vectors = np.linalg.eigh(H)
     values = np.maximum(values, 0.0)
     square = (vectors.T @ g) ** 2
@@ -402,10 +410,11 @@ def drift(H: Array, g: Array, widening: float) -> float:
 def trend_of(trend: Array, before: Array, after: Array) -> tuple[float, float]:
     """Return the share of the mean step ``trend`` (a,) that chance does not explain (0 to 1), and the lag in steps.
 
-    before, after: (a, k) roots of the covariance around a block. Estimates of parameters that stay where they
-    are move too, by what a block teaches: T = 1 - after after', in units of the covariance before. Their mean
-    over the blocks has the size tr T / (2 TREND_BLOCKS - 1), with the deviation sqrt(2) |T| / (..). T is also
-    the share of an error that a block takes away: a steady drift stays (1 - T) / T steps ahead of the fit.
+    before, after: (a, k) roots of the covariance before and after a block. Estimates of constant parameters also move
+    in a block. In units of the covariance before, the covariance of such a step is T = 1 - after after'. The squared
+    norm of the mean step over the blocks then has the mean tr T / (2 TREND_BLOCKS - 1) and the deviation sqrt(2) |T| /
+    (2 TREND_BLOCKS - 1). T is also the share of an error that a block removes, so the fit stays (1 - T) / T steps
+    behind a steady drift.
     """
     L = triangle(before.T).T
     step = scipy.linalg.solve_triangular(L, trend, lower=True, check_finite=False)
@@ -423,10 +432,10 @@ def trend_of(trend: Array, before: Array, after: Array) -> tuple[float, float]:
 
 def refine(config: IdentifierParameters, refined: Refined, rows: Rows, outcome: Outcomes, R: Array, scale: Array,
            background: Background) -> Refined:
-    """Hand rows to the prediction-error fit; ask for the work that is due, take the result that is due.
+    """Hand rows to the prediction-error fit; request the fit that is due, and take the result that is due.
 
-    rows: at most until_chunk(refined); outcome: (N,) of each; R, scale: factor of the moments and scale after
-    them. Rejected samples break the stretch, and so do quiet ones: there is nothing to learn from them.
+    rows: at most until_chunk(refined); outcome: (N,) of each row; R, scale: factor of the moments and scale after these
+    rows. Rejected samples break the stretch, and so do quiet ones, which carry no information.
     """
     first = rows.first
     for k in np.flatnonzero(outcome):
@@ -450,7 +459,7 @@ def refine(config: IdentifierParameters, refined: Refined, rows: Rows, outcome: 
 
 
 def broken(refined: Refined, background: Background) -> Refined:
-    """Samples are missing: take what is under way, and begin another stretch."""
+    """Take the result under way and begin another stretch, where samples are missing."""
     return break_window(delivered(refined, background)) if refined.total > 0 else refined
 
 

@@ -1,9 +1,9 @@
 """Recursive predictor-based subspace identification, paper section 3.1: init, step, restart.
 
-Two estimators behind one interface. ``factor`` (default) carries one triangular factor of the moments of
-[z; u; y] and solves the whole method when a model is asked for (``moments``); ``paper`` runs the three
-recursive least squares of the paper at every sample (``paper_recursion``). Memory is constant and the cost
-per sample bounded in both; decompositions happen only in ``identified``.
+Two estimators behind one interface. ``factor`` (default) carries one triangular factor of the moments of [z; u; y] and
+computes the model from it when one is read (``moments``); ``paper`` runs the three recursive least squares of the paper
+at every sample (``paper_recursion``). Memory is constant and the cost per sample bounded in both; decompositions happen
+only in ``identified``.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ MODES = {
     'innovation': factor.INNOVATION,
 }
 FRESH = 3.0
-"""A fit is published while the subspace model rests on at most this many times its samples."""
+"""Largest ratio of the samples behind the subspace model to those behind a fit at which the fit is published."""
 
 
 class RpbsidState(NamedTuple):
-    """All the identifier remembers; nothing grows.
+    """State of the identifier, constant in size.
 
-    z: (p (r + m),) past window, scaled; scale: (r + m,); mean: (2, r + m) slow means and peaks;
-    variance: (m,) of the innovations, scaled; scalars, counts: see ``factor``;
-    memory: the arrays of the estimator, in the order its kernel takes them; refined: the prediction-error
-    fit, None where it is off; decimator: the anti-alias filter, None where every sample is used; decimated: the
-    log of filtered samples, where it is used; cursor: row of the sample log that is taken next.
+    z: (p (r + m),) past window, scaled; scale: (r + m,) factors on the signals; mean: (2, r + m) slow means and peaks;
+    variance: (m,) of the innovations, scaled; scalars, counts: see ``factor``; memory: the arrays of the estimator, in
+    the order of its kernel's arguments; refined: the prediction-error fit, None where it is off; decimator: the
+    anti-alias filter, None without decimation; decimated: the log of filtered samples, None without decimation; cursor:
+    row of the sample log that is taken next.
     """
 
     z: Array
@@ -55,7 +55,7 @@ class RpbsidState(NamedTuple):
     cursor: int = 0
 
     def owned(self) -> RpbsidState:
-        """Return a state whose arrays may be overwritten."""
+        """Return a copy whose arrays may be overwritten."""
         return RpbsidState(
             self.z.copy(), self.scale.copy(), self.mean.copy(), self.variance.copy(), self.scalars.copy(),
             self.counts.copy(), tuple(array.copy() for array in self.memory), self.refined,
@@ -78,7 +78,7 @@ def init(config: IdentifierParameters) -> RpbsidState:
 
 
 def _is_refined(config: IdentifierParameters) -> bool:
-    """Whether the prediction-error fit runs: it needs a growing memory and a model of bearable size."""
+    """Whether the prediction-error fit runs: it needs a growing memory and at most ``PARAMETERS`` model entries."""
     return (config.refinement != 'none' and config.estimator == 'factor'
             and config.forgetting == 'innovation'
             and recursive_fit.size(recursive_fit.fitted(config)) <= recursive_fit.PARAMETERS)
@@ -99,7 +99,7 @@ def _paper_memory(config: IdentifierParameters, r: int, m: int) -> tuple[Array, 
     d1 = _regressors(config, r, m)
     d2 = n + r + m
     d3 = n + r if config.direct_feedthrough else n
-    theta_x, theta_y = np.eye(n, d2), np.eye(m, d3)  # the paper's step (d)
+    theta_x, theta_y = np.eye(n, d2), np.eye(m, d3)  # initial values of the paper's step (d)
     return (
         np.zeros((d1, d1)), np.zeros((m, d1)), np.zeros((m, d1)), np.zeros(d1),
         np.zeros((d2, d2)), theta_x, np.zeros(d2), np.zeros((d3, d3)), theta_y, np.zeros(d3),
@@ -108,10 +108,10 @@ def _paper_memory(config: IdentifierParameters, r: int, m: int) -> tuple[Array, 
 
 def advance(config: IdentifierParameters, state: RpbsidState, rows: Rows, background: Background = INLINE
             ) -> RpbsidState:
-    """Take the next N rows of the sample log: the same bits as one by one, with one copy of the state.
+    """Take the next N rows of the sample log; N calls with one row each give the same bits.
 
-    Pure: the state given is left as it was. A sample that is not finite is rejected and breaks the window.
-    Raises SignalError on wrong sizes.
+    The function is pure: it copies the given state once. A sample that is not finite is rejected and empties the past
+    window. Raises SignalError on wrong sizes.
     """
     r, m = len(config.inputs), len(config.outputs)
     width = rows.log.width
@@ -156,7 +156,7 @@ def _advance(config: IdentifierParameters, state: RpbsidState, rows: Rows, backg
 
 def _decimate(config: IdentifierParameters, state: RpbsidState, decimator: decimation.Decimator,
               log: SampleLog, rows: Rows) -> tuple[RpbsidState, Rows]:
-    """Filter rows; return those of the decimated log that they complete."""
+    """Filter rows; return the new state and the rows that they add to the decimated log."""
     decimator, kept, at = decimation.decimate(decimator, rows.u_y, config.decimation)
     r = log.width.inputs
     first = log.end
@@ -169,8 +169,8 @@ def _decimate(config: IdentifierParameters, state: RpbsidState, decimator: decim
 
 
 def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array, missing: NDArray[np.int64]) -> Outcomes:
-    """Run the compiled kernel, overwriting the arrays of the state; return what became of each sample."""
-    recursive = config.estimator == 'paper'  # stale states: it must forget
+    """Run the compiled kernel, overwriting the arrays of the state; return the outcome of each sample."""
+    recursive = config.estimator == 'paper'  # its states date from earlier parameters, so it must forget
     mode = MODES['excitation' if recursive and config.forgetting == 'innovation' else config.forgetting]
     outcome = np.zeros(len(U), dtype=np.int8)
     if config.estimator == 'paper':
@@ -182,7 +182,7 @@ def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array, m
             np.array(config.regularization), np.array(config.forgetting_factor), mode)
         memory: tuple[Any, ...] = state.memory
         Y = Y.copy()
-        Y[missing > 0] = np.nan  # rejected, as what is no number
+        Y[missing > 0] = np.nan  # rejected like a sample that is not finite
         paper_recursion.advance_paper(U, Y, *memory, *common, *options)
         return outcome
     R, row, scratch, peaks, prior = state.memory
@@ -194,7 +194,7 @@ def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array, m
 
 
 def finish(config: IdentifierParameters, state: RpbsidState, background: Background = INLINE) -> RpbsidState:
-    """No sample follows: take the result of the fit under way now."""
+    """Take the result of the fit under way now, as no sample follows."""
     if state.refined is None:
         return state
     return state._replace(refined=recursive_fit.delivered(state.refined, background))
@@ -202,7 +202,7 @@ def finish(config: IdentifierParameters, state: RpbsidState, background: Backgro
 
 def window_restart(config: IdentifierParameters, state: RpbsidState, background: Background = INLINE
                    ) -> RpbsidState:
-    """Samples are missing: no regressor will straddle the gap; what was learnt is kept."""
+    """Empty the past window where samples are missing, so no regressor spans the gap; what was learnt is kept."""
     new = state.owned()
     new.counts[FILLED] = 0
     if config.estimator == 'paper':
@@ -217,8 +217,8 @@ def window_restart(config: IdentifierParameters, state: RpbsidState, background:
 def restart(config: IdentifierParameters, state: RpbsidState, background: Background = INLINE) -> RpbsidState:
     """Take note that the plant changed at this instant (capture, release).
 
-    The window restarts and, if so configured, the information. Parameters stay as prior mean, worth
-    ``regularization`` on signals of unit peak.
+    The past window is emptied. With ``restart_on_event`` the information is dropped too; the parameters remain as the
+    mean of a prior of weight ``regularization`` on signals of unit peak.
     """
     new = window_restart(config, state, background)
     if new.refined is not None:
@@ -248,8 +248,8 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float, rows
                ) -> Identified | None:
     """Return the model as of the last sample, or None before there is one. dt: sample time [s].
 
-    With decimation the model steps ``decimation`` sample times. rows: the latest ones, in which a model of every
-    configuration looks for the present one; without them it is read at that of the latest block.
+    With decimation a step of the model is ``decimation`` sample times. rows: the latest ones, from which a model of
+    every configuration takes the present one; without them it takes the configuration at the end of the last block.
     """
     dt *= config.decimation
     d = _regressors(config, len(config.inputs), len(config.outputs))
@@ -280,6 +280,6 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float, rows
     early = refined is not None and (state.counts[USED] < recursive_fit.FIRST + recursive_fit.SOONEST
                                      or recursive_fit.is_first_under_way(refined))
     if found is not None and early and found.status is Status.TRACKING:
-        return found._replace(status=Status.WARMING_UP)  # a short past is biased, and no fit has been made
+        return found._replace(status=Status.WARMING_UP)  # a short past window gives a bias, and no fit has been made
     return found
 

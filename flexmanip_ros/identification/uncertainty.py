@@ -1,4 +1,4 @@
-"""First-order uncertainty: the spread of the VARX parameters carried to (A, B, C, D, K) and to the modes."""
+"""First-order uncertainty: the covariance of the VARX parameters propagated to (A, B, C, D, K) and to the modes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flexmanip_ros.identification.moments import Realized, solved
 from flexmanip_ros.types import Array, Mode, StateSpace, Status
 
 NEARLY_SINGULAR = 1e-12
-"""Relative size of a regressor of the state below which it is taken for none."""
+"""Relative size of a diagonal entry of the QR factor of the state's regressors at which they count as dependent."""
 
 
 class AnyConfiguration(Protocol):
@@ -22,10 +22,11 @@ class AnyConfiguration(Protocol):
 
 
 class Identified(NamedTuple):
-    """A model and what it is worth."""
+    """A model with its uncertainty and status."""
 
     model: StateSpace
-    """In JointState units. Its state is y, or [y; dy/dt]; else balanced, and the spread holds that basis still."""
+    """In JointState units. The state is y or [y; dy/dt]; else it is balanced, and the spread takes that basis as
+    exact."""
     spread: Array
     """(k, s): the covariance of [A, B, C, D, K], each row-major, one after another, is spread @ spread.T;
     (k, 0) where none is known."""
@@ -35,11 +36,11 @@ class Identified(NamedTuple):
     innovation_power: float
     status: Status
     refined: bool = False
-    """A prediction-error fit, not the subspace model it began with."""
+    """Whether the model is a prediction-error fit, not a subspace model."""
     samples: float = 0.0
     """Effective number of samples behind the model."""
     configurations: AnyConfiguration | None = None
-    """The model of every configuration, where this is one of them."""
+    """The model of every configuration, where ``model`` is that at one configuration."""
 
     def at(self, angles: Array) -> Identified:
         """Return the model at other measured angles (2,) [rad]. Raises ModelError where it does not depend on them."""
@@ -78,9 +79,9 @@ def variance(identified: Identified, **gradients: Array) -> float:
 
 
 def tangent(R: Array, realized: Realized, r: int, deviation: Array) -> Tangent:
-    """Propagate dXi = deviation' Omega regression^-T, Omega unit normal.
+    """Propagate dXi = deviation' Omega regression^-T, where Omega has independent standard normal entries.
 
-    deviation: (m, m), deviation' deviation = covariance of the innovations, effective memory included.
+    deviation: (m, m), deviation' deviation = covariance of the innovations x sum of squared weights / sum of weights.
     """
     A, T, Xi = realized.A, realized.T, realized.Xi
     n, past = T.shape
@@ -129,7 +130,7 @@ def _dual(known: Array, n: int) -> tuple[Array, Array]:
 
 
 def _combine(left: list[Array], right: Array) -> Array:
-    """Sum over t of left_t Omega right_t, for every unit Omega: (s, rows, columns).
+    """Sum over t of left_t Omega right_t, for each Omega with a single entry of 1: (s, rows, columns).
 
     right: (d, terms x columns).
     """
@@ -143,9 +144,9 @@ def _combine(left: list[Array], right: Array) -> Array:
 
 
 def move(model: StateSpace, along: Tangent, W: Array, dW: Array | None) -> Tangent:
-    """Carry a tangent to the state W x, W varying by dW (s, n, n) with the model (None: held still)."""
+    """Transform a tangent to the state W x; dW (s, n, n): variation of W with the model (None: W is constant)."""
     back = np.asarray(np.linalg.inv(W), dtype=np.float64)
-    # all directions of an entry side by side: few large products instead of many small ones
+    # the directions are the last axis: few large products instead of many small ones
     parts = (along.A, along.B, along.C, along.K)
     dA, dB, dC, dK = (np.ascontiguousarray(part.transpose(1, 2, 0)) for part in parts)
     dA, dB, dC, dK = _after(_before(W, dA), back), _before(W, dB), _after(dC, back), _before(W, dK)
@@ -162,17 +163,17 @@ def move(model: StateSpace, along: Tangent, W: Array, dW: Array | None) -> Tange
 
 
 def _before(M: Array, X: Array) -> Array:
-    """M X of every direction, X: (rows, columns, s)."""
+    """M X for each of the s directions, X: (rows, columns, s)."""
     return np.asarray((M @ X.reshape(X.shape[0], -1)).reshape(M.shape[0], *X.shape[1:]))
 
 
 def _after(X: Array, M: Array) -> Array:
-    """X M of every direction, X: (rows, columns, s)."""
+    """X M for each of the s directions, X: (rows, columns, s)."""
     return np.asarray(np.matmul(M.T, X))
 
 
 def known_basis_tangent(model: StateSpace, along: Tangent) -> Array | None:
-    """Derivatives dW (s, n, n) of ``realization.known_output_basis``."""
+    """Derivatives dW (s, n, n) of the basis from ``realization.known_output_basis`` along the tangent."""
     m, n = model.C.shape
     if m == n:
         return along.C
@@ -193,7 +194,7 @@ REAL = 1e-9
 
 
 def modes(identified: Identified) -> tuple[Mode, ...]:
-    """Oscillations of the identified model, rising frequency; deviations to first order (nan: unknown)."""
+    """Oscillations of the identified model by rising frequency, with first-order standard deviations (nan: unknown)."""
     A, dt = identified.model.A, identified.model.dt
     n = A.shape[0]
     values, right = np.linalg.eig(A)

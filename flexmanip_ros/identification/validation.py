@@ -1,4 +1,4 @@
-"""Scores of a model held still, on data it has not seen."""
+"""Scores of a fixed model on data that it was not identified from."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from flexmanip_ros.identification.realization import markov
 from flexmanip_ros.types import Array, StateSpace
 
 TIME_CONSTANTS = 10.0
-"""Time constants of the slowest pole in a record: after them e^-10, or 5e-5, of a state is left; or it grew so much."""
+"""Length of the record for ``state_at_end`` in time constants of the slowest pole. In this time a state decays to
+e^-10, or 5e-5, of itself, or grows by the inverse."""
 ROWS_A_STATE = 10
-"""Samples for each state at least: fewer are fitted by noise."""
+"""Least number of samples for each state in that record: with fewer the state fits the noise."""
 QUICKEST = 1e-3
-"""Least size of a pole that is asked for its time constant."""
+"""Lower bound on the modulus of the slowest pole, for its time constant."""
 
 
 def vaf(y: Array, yhat: Array) -> Array:
@@ -68,9 +69,9 @@ def predict(model: StateSpace, U: Array, Y: Array, x0: Array | None = None) -> A
 
 
 def predict_ahead(model: StateSpace, U: Array, Y: Array, steps: int, x0: Array | None = None) -> Array:
-    """Predictions (N - steps + 1, m) of outputs Y (N, m), ``steps`` >= 1 ahead of the last output that each uses.
+    """Predictions (N - steps + 1, m) of outputs Y (N, m), each ``steps`` >= 1 samples after the last output it uses.
 
-    Row k predicts Y[k + steps - 1] from the state that the outputs before k give, and from all inputs U (N, r).
+    Row k predicts Y[k + steps - 1] from the state after the outputs before k, and from all inputs U (N, r).
     """
     m, count = model.C.shape[0], U.shape[0] - steps + 1
     if count < 1:
@@ -85,10 +86,10 @@ def predict_ahead(model: StateSpace, U: Array, Y: Array, steps: int, x0: Array |
 
 
 def state_at_end(model: StateSpace, U: Array, Y: Array) -> Array:
-    """State (n,) one step after the last sample of a record, from which the record follows best.
+    """State (n,) one step after the last sample of a record, for the initial state that fits the record best.
 
-    Least squares over the initial state of a free run through (U, Y), then that run's state at the end.
-    It is done over the stretch in which the model's own dynamics stay well conditioned.
+    Least squares gives the initial state of a simulation through (U, Y); the result is the simulated state at the end.
+    The record is cut to its last samples (``TIME_CONSTANTS``), over which the problem stays well conditioned.
     """
     n = model.order
     A, B, C, D = model.A, model.B, model.C, model.D

@@ -21,7 +21,7 @@ def past_windows(U: Array, Y: Array, p: int) -> Array:
 
 @njit(cache=True)
 def predictions(Xi: Array, f: int, r: int, weighted: bool, G: Array) -> None:
-    """Fill G (f m, past): Xi (m, past) on windows shifted by 0..f - 1 samples, see ``varx``."""
+    """Fill G (f m, past) from Xi (m, past), shifted by 0..f - 1 samples; see ``observability_controllability``."""
     m, past = Xi.shape
     width = r + m
     for i in range(f):
@@ -42,7 +42,7 @@ def predictions(Xi: Array, f: int, r: int, weighted: bool, G: Array) -> None:
 
 @njit(cache=True)
 def open_loop(Xi: Array, f: int, r: int, L: Array) -> None:
-    """Turn L (f m, f m), the identity, into the weight from predictor to system, see ``varx``."""
+    """Turn L (f m, f m), at first the identity, into the result of ``open_loop_weight``."""
     m, past = Xi.shape
     width = r + m
     for i in range(f):
@@ -58,8 +58,8 @@ def open_loop(Xi: Array, f: int, r: int, L: Array) -> None:
 def observability_controllability(Xi: Array, f: int, r: int, weighted: bool) -> Array:
     """(f m, p (r + m)): predictions of the next f outputs for inputs (and innovations) at rest.
 
-    weighted False: outputs that have not come yet count as zero (observability of the predictor, A - K C);
-    True: they are replaced by their own predictions (observability of the system, A).
+    weighted False: future outputs count as zero (observability of the predictor, A - K C); True: they are replaced by
+    their own predictions (observability of the system, A).
     """
     G = np.empty((f * Xi.shape[0], Xi.shape[1]))
     predictions(np.ascontiguousarray(Xi), f, r, weighted, G)

@@ -10,15 +10,15 @@ from numba import njit
 from flexmanip_ros.types import Array
 
 TERMS = 6
-"""Terms of the exponential series of a step: at 0.3 rad a step the rest is 1e-7 of it."""
+"""Number of terms in the exponential series of a step. At 0.3 rad a step the terms left out are 1e-7 of the series."""
 
 
 @njit(cache=True, nogil=True)
 def low_pass(rows: Array, Ad: Array, Bd: Array, Cd: Array, state: Array, every: int, out: Array, second: Array) -> None:
-    """Run columns of rows (N, w) through one filter, state (f, w); keep the last one of every ``every`` rows.
+    """Run the columns of rows (N, w) through one filter of state (f, w); keep the last one of each ``every`` rows.
 
-    Ad (f, f), Bd (f,), Cd (2, f): the filter, its output and the second derivative of that. Fills out and second
-    (N // every, w). All columns pass the same filter, so what relates them linearly stays as it was.
+    Ad (f, f), Bd (f,): the filter; Cd (2, f): its output and the second derivative of the output. Fills out and second
+    (N // every, w). All columns pass the same filter, so linear relations between them are preserved.
     """
     order, width = state.shape
     after = np.empty(order)
@@ -48,10 +48,10 @@ def simulate_block(U: Array, slope: Array, V: Array, Y: Array, s: Array, dt: flo
                    X: Array) -> None:
     """Simulate w'' = -(G + s G1) w - D w' + (H + s H1) u, y = w + E v over N steps, with its derivatives.
 
-    U (N, r): u at the begin of each step, slope (N, r): its change in the step; V (N, q); Y (N, h) measured y;
-    s (N,): where in the block, -1 to 1; x (2h,): [w; w'], on return at the end. Local parameters: G, G1, H, H1, D, E
-    row by row, then x at the begin. X (2h, l): derivative of the state by them, [0 I] at the begin. N (l, l) += J' J,
-    g (l,) += J' e with whitened J and e = Y - y; moments (h, h) += e e'.
+    U (N, r): u at the begin of each step; slope (N, r): change of u in the step; V (N, q): v; Y (N, h): measured y; s
+    (N,): position in the block, -1 to 1; x (2h,): [w; w'], on return at the end. The l local parameters are G, G1, H,
+    H1, D, E row by row, then x at the begin. X (2h, l): derivative of the state by them, [0 I] at the begin. N (l, l)
+    += J' J, g (l,) += J' e with whitened J and e = Y - y; moments (h, h) += e e' of the unwhitened e.
     """
     h, r = H.shape
     q, width = V.shape[1], X.shape[1]
@@ -127,9 +127,9 @@ def simulate_block(U: Array, slope: Array, V: Array, Y: Array, s: Array, dt: flo
 def basis(c: float, zeta: float) -> tuple[Array, Array, Array, Array]:
     """Functions of the configuration (3,): 1, c / (1 - k c^2), c^2 / (1 - k c^2); derivatives by c, by zeta, by both.
 
-    k = 1 / (1 + exp(-zeta)), between 0 and 1. The mass matrix of two links is affine in c = cos(theta2 - theta1), and
-    c couples one coordinate of link 1 with those of link 2. So its inverse is exact in these three functions, with
-    whatever number of modes.
+    k = 1 / (1 + exp(-zeta)), between 0 and 1. The mass matrix of two links is affine in c = cos(theta2 - theta1), and c
+    couples one coordinate of link 1 with those of link 2. So the inverse of the mass matrix is exactly linear in these
+    three functions, for any number of modes.
     """
     k = 1.0 / (1.0 + math.exp(-zeta))
     dk, below = k * (1.0 - k), 1.0 - k * c * c

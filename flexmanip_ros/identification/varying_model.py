@@ -1,4 +1,4 @@
-"""The parameter-varying model at one configuration: matrices, their uncertainty, and what they are worth."""
+"""The parameter-varying model at one configuration: matrices, their uncertainty and their status."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ from flexmanip_ros.samples.signals import relative_angle
 from flexmanip_ros.types import Array, StateSpace, Status
 
 TERMS = 12
-"""Terms of the exponential series over one sample time, which is at most a sixteenth of a period."""
+"""Number of terms in the exponential series over one sample time, which is at most a sixteenth of a period."""
 PERIODS = 1.5
-"""Periods of the mean frequency in which the present configuration is looked for: the angles are off by 0.08 degrees
-there (rms, default arm), by 0.15 in four times as many samples and by 0.3 in half of them."""
+"""Length of the latest samples that give the present configuration, in periods of the mean frequency. The angle then
+has an error of 0.08 degrees (rms, default arm), with four times as many samples 0.15 degrees and with half of them 0.3
+degrees."""
 MISSED = 0.5
-"""Share of an output's amplitude that the predictions of the last blocks may miss."""
+"""Largest share of an output's amplitude that the predictions of the last blocks may miss."""
 VAGUE = 0.008
 """Relative standard deviation of a frequency above which the model is not published as tracking."""
 EARLY = 16
-"""Blocks before which a vague model is still warming up."""
+"""Number of blocks below which a frequency above ``VAGUE`` means WARMING_UP, not POORLY_EXCITED."""
 
 
 class Configurations(NamedTuple):
-    """A model of every configuration: ``at`` reads it at one."""
+    """A model of every configuration; ``at`` returns the model at one of them."""
 
     config: IdentifierParameters
     varying: Varying
@@ -44,14 +45,14 @@ class Configurations(NamedTuple):
         return self.with_relative(float(relative_angle(self.config, angles)))
 
     def now(self, rows: Rows) -> Identified:
-        """Return the model at the configuration that the latest rows end with, see ``straight``."""
+        """Return the model at the configuration at the end of the latest rows, see ``straight``."""
         v, role = self.varying, shown(self.config)
         assert role is not None
         count = math.ceil(PERIODS * 2.0 * math.pi / (v.shift * self.dt))
         rows = rows.between(max(rows.first, rows.until - count), rows.until)
         here = rows.missing == 0
         Y, angles = rows.y[:, list(role.displacements)], relative_angle(self.config, rows.angles)
-        if np.count_nonzero(here) < count // 2:  # too few since a gap
+        if np.count_nonzero(here) < count // 2:  # too few measured rows since a gap
             return self.with_relative(v.angle, present=True)
         s = np.linspace(-1.0, 0.0, len(rows))
         return self.with_relative(float(straight(s[here], Y[here] * v.scale_y, angles[here, None])[0, 0]), present=True)
@@ -59,8 +60,9 @@ class Configurations(NamedTuple):
     def with_relative(self, angle: float, *, present: bool = False) -> Identified:
         """Return the model where link 2 makes this angle with link 1 [rad].
 
-        present: the arm stands there, so its predictions tell how wrong the frequencies are. Elsewhere the deviations
-        of the parameters do, times the Birge ratio of the predictions (root of chi square over degrees of freedom).
+        present: the arm is at this angle, so the errors of its predictions give the uncertainty of the frequencies. At
+        other angles the deviations of the parameters are multiplied by the Birge ratio of the predictions (root of chi
+        square over degrees of freedom).
         """
         role = shown(self.config)
         assert role is not None
@@ -75,7 +77,7 @@ class Configurations(NamedTuple):
 
 
 def judge(found: Identified, v: Varying) -> Status:
-    """Name what the model is worth: by its predictions of samples it had not been fitted to, and by its deviations."""
+    """Return the status, from the predictions of samples before they were fitted and from the deviations."""
     if float(v.share.max()) > MISSED:
         return Status.INCONSISTENT
     oscillations = modes(found)
@@ -87,17 +89,16 @@ def judge(found: Identified, v: Varying) -> Status:
 
 
 def unmodelled(v: Varying) -> float:
-    """Return the relative error of frequencies that explains what predictions over a block miss.
+    """Return the relative error of the frequencies that explains what predictions over a block miss.
 
-    A frequency off by the share e turns the phase by shift t e in a time t, in the mean over a block of the time T
-    by shift T e / sqrt(3) (root of the mean square). Half of the power that is missed counts as one of phase, half as
-    one of amplitude.
+    A relative frequency error e gives the phase error shift t e after a time t; over a block of duration T its root
+    mean square is shift T e / sqrt(3). Half of the missed power counts as phase error, half as amplitude error.
     """
     return math.sqrt(3.0 / 2.0) * float(v.share.mean()) / (v.shift * BLOCK * v.dt)
 
 
 def _matrices(read: Configurations, c: float, role: Roles, ratio: float) -> tuple[StateSpace, Tangent]:
-    """Model at c in JointState units, and the directions in which it varies; ratio: on the parameters' deviations."""
+    """Model at c in JointState units, and its tangent; ratio: factor on the parameters' deviations."""
     v = read.varying
     h, r = len(v.scale_y), len(v.scale_u)
     m, n = len(role.states), 2 * h
@@ -111,7 +112,7 @@ def _matrices(read: Configurations, c: float, role: Roles, ratio: float) -> tupl
     L = np.hstack([L, more])
     M = np.zeros((n + r, n + r))
     M[:h, h:n], M[h:n, :h], M[h:n, h:n], M[h:n, n:] = np.eye(h), -G, -D, H
-    turns = np.zeros((2 * a + b, n + r, n + r))  # by the entries of G, D, H
+    turns = np.zeros((2 * a + b, n + r, n + r))  # derivatives of M by the entries of G, D, H
     for i in range(h):
         for j in range(h):
             turns[i * h + j, h + i, j] = turns[a + i * h + j, h + i, h + j] = -1.0
@@ -143,7 +144,7 @@ def _matrices(read: Configurations, c: float, role: Roles, ratio: float) -> tupl
 
 
 def _exponential(M: Array, turns: Array) -> tuple[Array, Array]:
-    """exp(M) (q, q) and its derivatives along ``turns`` (e, q, q), by their series."""
+    """exp(M) (q, q) and its derivatives along ``turns`` (e, q, q), from their power series."""
     term, along = np.eye(len(M)), np.zeros_like(turns)
     total, by = term.copy(), along.copy()
     for j in range(1, TERMS + 1):

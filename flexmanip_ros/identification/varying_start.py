@@ -1,4 +1,4 @@
-"""The begin of the parameter-varying fit: from the fit of one configuration, or from the model before an event."""
+"""Start of the parameter-varying fit, from the fit of one configuration or from the model before an event."""
 
 from __future__ import annotations
 
@@ -39,36 +39,36 @@ from flexmanip_ros.samples.signals import relative_angle
 from flexmanip_ros.types import Array, StateSpace
 
 CUTOFF = 2.0
-"""Corner of the low-pass filter over the highest frequency of the model."""
+"""Ratio of the corner frequency of the low-pass filter to the highest frequency of the model."""
 FINE = 18.0
-"""Samples kept per period of the corner frequency, at least; between them torques are taken for straight lines."""
+"""Least number of kept samples per period of the corner frequency; torques are taken as linear between them."""
 WINDOW = 1024
-"""Samples of the longest stretch that is fitted at once, as one block."""
+"""Number of samples in the longest stretch that is fitted at once, as one block."""
 GROWTH = (256, 512, 640, 768, WINDOW)
-"""Samples of the stretches that lead there, each started from the one before."""
+"""Numbers of samples of the growing stretches up to that one; each fit starts from the previous one."""
 FEWEST = 24
-"""Kept samples of a block at least, from which a first fit may begin."""
+"""Least number of kept samples in a block of a first fit, after the settling time of the filter."""
 ITERATIONS = 8
 LATE = 16.0
-"""Times the noise by which the first stretches may miss, as their start may be far off."""
+"""Factor on the noise covariance in fits of fewer than ``WINDOW`` samples, whose starting model may be far off."""
 ZETA = 0.8
 """First value of zeta: k = 0.69."""
 SAME = 0.3
-"""Factor on prior deviations around the model before an event: the same arm, with another object."""
+"""Factor on the prior deviations around the model before an event: the arm is the same, its object another."""
 
 
 def from_model(model: StateSpace, role: Roles) -> tuple[Array, Array, Array] | None:
-    """G, D, H of a model of one configuration, in its own units; None where it does not swing as it should.
+    """G, D, H of a model of one configuration, in its own units; None without h lightly damped oscillations.
 
-    Of more modes than displacements the slowest are taken.
+    From a model with more modes than the h displacements the slowest modes are taken.
     """
     h = len(role.displacements)
     if model.order > 2 * h:
-        slow = slowest(model, h, DAMPED)  # the fit may begin with modes below this damping ratio alone
+        slow = slowest(model, h, DAMPED)  # a fit may start from modes below this damping ratio alone
         if slow is None:
             return None
         model = slow
-    seen = model.C[list(role.displacements)]  # x = [w; w'] by these alone: then w' is the derivative of w
+    seen = model.C[list(role.displacements)]  # from these alone x = [w; w'], where w' is the derivative of w
     W = known_output_basis(replace(model, C=seen, D=model.D[list(role.displacements)]))
     if W is None:
         return None
@@ -86,7 +86,7 @@ def from_model(model: StateSpace, role: Roles) -> tuple[Array, Array, Array] | N
 
 
 def start(config: IdentifierParameters, rows: Rows, old: Recursion | None, before: Varying | None) -> Varying | None:
-    """Begin with a stretch of samples, from the fit of one configuration or from the model before an event."""
+    """Start with a stretch of samples, from the fit of one configuration or from the model before an event."""
     role = roles(config)
     if role is None or len(rows) < GROWTH[0] or rows.angles.shape[1] != 2 or (old is None and before is None):
         return None
@@ -108,16 +108,16 @@ def start(config: IdentifierParameters, rows: Rows, old: Recursion | None, befor
     more_u, more_y = unit[:r] / begun.scale_u, unit[r:] / begun.scale_y
     ratio = more_y[:, None] / more_y
     theta, root = _around(G * ratio, H * more_y[:, None] / more_u, D * ratio, c)
-    if before is not None:  # the same arm, with another object
+    if before is not None:  # the arm is the same, its object another
         root[:len(theta), :len(theta)] *= SAME
     return _fit_stretch(
         config, begun._replace(dt=dt, theta=theta, root=root, scale_u=unit[:r], scale_y=unit[r:]), rows, role)
 
 
 def _around(G: Array, H: Array, D: Array, c: float) -> tuple[Array, Array]:
-    """Theta of the model that is most likely, by its prior, if it has these matrices at c; and the prior's root.
+    """Theta that is most likely under the prior among those that have these matrices at c, and the prior's root.
 
-    The root is that of the covariance of theta and state.
+    The root is that of the covariance of [theta; state].
     """
     h, r = H.shape
     value, variance = basis(c, ZETA)[0][:, None, None], shares(h) ** 2
@@ -134,7 +134,7 @@ def _from_recursion(old: Recursion, role: Roles, r: int, dt: float, c: float) ->
         return None
     G, D, H = found
     h = len(G)
-    # of the state [y; dy/dt] in the order of the displacements
+    # G, D, H belong to the state [y; dy/dt] in the order of the displacements
     frequencies = np.sqrt(np.abs(np.linalg.eigvals(G)))
     shift = float(frequencies.mean())
     corner = CUTOFF * float(frequencies.max()) / (2.0 * np.pi)
@@ -150,7 +150,7 @@ def _from_recursion(old: Recursion, role: Roles, r: int, dt: float, c: float) ->
 
 
 def _fit_stretch(config: IdentifierParameters, v: Varying, rows: Rows, role: Roles) -> Varying | None:
-    """Fit a whole stretch: its first second at once, the rest block by block."""
+    """Fit a whole stretch: its first ``WINDOW`` samples at once, the rest block by block."""
     signals = signals_of(config, rows, role)
     if not np.all(np.isfinite(signals)):
         return None
@@ -161,7 +161,7 @@ def _fit_stretch(config: IdentifierParameters, v: Varying, rows: Rows, role: Rol
 
 
 def _fit_at_once(v: Varying, signals: Array, missing: NDArray[np.int64]) -> Varying | None:
-    """Fit growing stretches of signals (N, w), without the gaps between them and what a filter takes to settle."""
+    """Fit growing stretches of signals (N, w), leaving out gaps and, after each, the settling time of the filter."""
     quiet, begin = settling(v), v
     parts = [(first, last, *passed(v, signals[first:last], True)) for first, last in measured(v, signals, missing)]
     least = noise_of(signals, v)
@@ -179,7 +179,7 @@ def _fit_at_once(v: Varying, signals: Array, missing: NDArray[np.int64]) -> Vary
             continue
         noise = (LATE if count < WINDOW else 4.0) * least + 1e-4 * power
         found = updated(begin, blocks, noise, least, ITERATIONS)
-        if found is not None:  # once more, with the noise that it leaves
+        if found is not None:  # once more, weighted with the residuals' covariance
             begin = begin._replace(theta=found.theta)
             found = updated(begin, blocks, 1.5 * found.noise + least, least, ITERATIONS)
         if found is None:

@@ -1,6 +1,6 @@
-"""Long computations: asked for at one sample, their result taken a fixed number of samples later.
+"""Long computations: requested at one sample, with the result used a fixed number of samples later.
 
-A fit or the reading of a model takes longer than the time between two samples. The core describes the work as a
+A fit or the computation of a model takes longer than the time between samples. The core describes the work as a
 request, a value with a pure ``solve``, and takes the result at a later sample that depends on stamps alone. So
 the numbers do not depend on the thread that solved the request, nor on when it was ready.
 """
@@ -43,16 +43,16 @@ class Inline:
 INLINE = Inline()
 
 THREADS = 2
-"""One for a fit, which takes up to a second, and one for the models that are read meanwhile, each in 1 to 3 ms."""
+"""Threads: one for a fit, which takes up to a second, one for the models computed meanwhile, each in 1 to 3 ms."""
 REPLAY_THREADS = 3
-"""One more, for the payload."""
+"""Threads of a replay: one more, for the payload."""
 KEPT = 8
-"""Requests kept with their results. A late event rewinds 0.2 s, and the results of that time are wanted again: at most
-a fit and, where every estimate has a model of its own, those of the last few estimates."""
+"""Number of requests kept with their results. A late event rewinds the estimator by 0.2 s and needs the results of that
+time again: at most a fit and, where every estimate has a model of its own, the models of the last few estimates."""
 
 
 class Threads:
-    """Solves requests beside the samples, with the bits of ``INLINE``. A node or a program has it, not the core."""
+    """Solves requests on other threads, with the same bits as ``INLINE``. A node or a program owns it, not the core."""
 
     def __init__(self, threads: int = THREADS) -> None:
         self._pool = ThreadPoolExecutor(threads, 'background')
@@ -80,16 +80,16 @@ class Threads:
         return future.result()
 
     def close(self) -> None:
-        """Drop every request; wait for those that are being solved. Results are solved in place from here on."""
+        """Drop every request; wait for those that are being solved. Later requests are solved by ``result``."""
         self._closed = True
         self._solved.clear()
         self._pool.shutdown(cancel_futures=True)
 
 
 class Deferred(Threads):
-    """Begins to solve requests when it is told to: a node does so when an estimate is out, so that none waits for them.
+    """Solves requests from ``begin`` on: a node calls it after it publishes an estimate, so that no estimate waits.
 
-    Python runs one thread at a time: another one waits for its turn, up to 5 ms.
+    Python runs one thread at a time, and another thread waits up to 5 ms for its turn.
     """
 
     def __init__(self) -> None:
@@ -116,7 +116,7 @@ T = TypeVar('T')
 
 
 def read_ahead(items: Iterable[T]) -> Generator[T]:
-    """Yield items; a thread makes the next one while one is used."""
+    """Yield items; a thread computes the next item while the caller uses the present one."""
     stream, end = iter(items), object()
     with ThreadPoolExecutor(1, 'ahead') as pool:
         coming = pool.submit(next, stream, end)

@@ -1,6 +1,6 @@
 """How the inner functions are compiled (numba): no fast-math, so that every machine gets the same bits.
 
-They are kept on disk from the first use on; what an update of the sources made stale is deleted at the next import.
+Compiled functions are cached on disk at first use; those that are older than the sources are deleted at import.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def inlined(function: Function) -> Function:
     """Compile a kernel into those that call it; Python may call it as well.
 
     Passing a Manipulator takes some 300 words on the stack and as many instructions at every call: half the
-    time of the small kernels. Every caller compiles it again, so what is called in few places and works long stays
-    a ``kernel``.
+    time of the small kernels. Every caller compiles the function again, so a function with few callers and a long
+    run time stays a ``kernel``.
     """
     return _compiled(function, forceinline=True)
 
@@ -40,7 +40,7 @@ def inlined(function: Function) -> Function:
 def inner(function: Function) -> Function:
     """Compile a function into the kernels that call it, and nowhere else; Python runs it as it is written.
 
-    What unpacks the arguments that Python would pass takes longer to compile than a short function itself.
+    There is no code that unpacks arguments from Python, which takes longer to compile than a short function itself.
     """
     made: Function = register_jitable(forceinline=True, **_OPTIONS)(function)
     return made
@@ -49,17 +49,17 @@ def inner(function: Function) -> Function:
 def merged(function: Function) -> Function:
     """Put the text of a function into the one kernel that calls it, before anything is compiled.
 
-    The compiler optimizes all that a function calls once more with each function above it, so whatever stands above
-    the equations of motion is one function. It copies the whole text for each that is put in: what calls no kernel is
-    ``inner``.
+    The compiler optimizes all that a function calls once more with each of its callers, so the callers of the equations
+    of motion are merged into one function. Each merge copies the whole text, so a function that calls no kernel is
+    ``inner`` instead.
     """
     return _compiled(function, inline='always')
 
 
 def library(function: Function) -> Function:
-    """Compile a function that kernels call and that calls NumPy's linear algebra: BLAS.
+    """Compile a function that kernels call and that calls BLAS through NumPy's linear algebra.
 
-    With reference counting, which numba asks for there.
+    Reference counting is on, because numba requires it there.
     """
     counted: dict[str, Any] = {'_nrt': True, 'forceinline': False}
     compiled: Function = njit(cache=True, nogil=True, **counted)(function)
@@ -67,7 +67,7 @@ def library(function: Function) -> Function:
 
 
 _OPTIONS: dict[str, Any] = {'nogil': True, '_nrt': False, 'no_cfunc_wrapper': True}
-"""No wrapper for callbacks from C: it unpacks all arguments once more."""
+"""Options of numba. There is no wrapper for callbacks from C, which would unpack all arguments once more."""
 
 
 def _compiled(function: Function, **more: Any) -> Function:
@@ -81,10 +81,10 @@ CONSTANT = re.compile(r'\b[A-Z][A-Z_]+\b')
 
 
 def drop_stale(package: Path) -> int:
-    """Delete compiled functions older than the newest source of any; return how many.
+    """Delete cached functions that are older than the newest source of any compiled function; return how many.
 
-    numba looks at the file of a function alone, not at those of the functions it calls or of the constants it reads:
-    after an update one kernel in two would be the old one, and numbers wrong. Raises OSError where the folder is
+    numba checks the file of a function alone, not those of the functions it calls or of the constants it reads. After
+    an update one kernel in two would be outdated, and its numbers wrong. Raises OSError where the folder is
     read-only.
     """
     compiled = {path: path.stat().st_mtime_ns for path in package.rglob('__pycache__/*.nb[ic]')}

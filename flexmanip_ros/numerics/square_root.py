@@ -19,7 +19,7 @@ def multiply(A: Array, B: Array, product: Array) -> None:
 
 @inner
 def project(x: Array, S: Array, H: Array, offset: int, f: Array) -> float:
-    """Return H x[offset:] and fill f = S' H', the spread of that measurement, for the first f.size columns of S."""
+    """Return H x[offset:] and fill f = S[offset:, :f.size]' H'; f'f is the variance of H x[offset:]."""
     value = 0.0
     for c in range(f.size):
         f[c] = 0.0
@@ -33,7 +33,7 @@ def project(x: Array, S: Array, H: Array, offset: int, f: Array) -> float:
 
 @inner
 def dot(a: Array, b: Array) -> float:
-    """Return a . b in four sums that do not wait for each other: three times as fast, and the same on every machine."""
+    """Return a . b as four independent sums: three times as fast as one, and the same bits on every machine."""
     n = a.size - a.size % 4
     first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
     for c in range(0, n, 4):
@@ -50,9 +50,9 @@ def dot(a: Array, b: Array) -> float:
 def absorb_measurement(
     x: Array, S: Array, opened: NDArray[np.int64], f: Array, e: float, r: float, variance: float,
 ) -> None:
-    """Potter's update: innovation e of variance = f'f + r, r the noise variance, f = S' H' where that is not zero.
+    """Update x and S by Potter's algorithm: innovation e of variance f'f + r, r of the noise, f the nonzero S' H'.
 
-    opened: (1 + np,) how many of the last np states are not taken as known, then which these are.
+    opened: (1 + np,) number of the last np states that are not taken as known, then the indices of these states.
     """
     gamma = 1.0 / (1.0 + np.sqrt(r / variance))
     first = x.size - opened.size + 1
@@ -67,9 +67,9 @@ def absorb_measurement(
 
 @kernel
 def absorb_noise(S: Array, deviation: Array, W: Array) -> None:
-    """S <- lower triangular L, L L' = S S' + diag(deviation^2), by Householder; W: (nx, 2 nx) scratch.
+    """Overwrite S with lower L, L L' = S S' + diag(deviation^2), by Householder reflections; W: (nx, 2 nx) scratch.
 
-    A row of zeros takes no column: the columns behind the last one needed are zero.
+    A row of zeros uses no column of L, so the columns after the last one used are zero.
     """
     nx = S.shape[0]
     for i in range(nx):
@@ -149,7 +149,7 @@ class Bounds(NamedTuple):
     rows: Array
     """(c, n); overwritten with rows of length one."""
     least: Array
-    """(c,); scaled with them."""
+    """(c,) bounds; scaled with the rows."""
     gram: Array
     """(c, c) scratch."""
     factor: Array
@@ -159,28 +159,28 @@ class Bounds(NamedTuple):
     active: Array
     """(c,) scratch: 1 where the vector is on the bound."""
     shortest: Array
-    """(n,) the shortest vector that meets the first ``count`` of them."""
+    """(n,) the shortest vector that meets the first ``count`` inequalities."""
 
 
 def allocate_bounds(c: int, n: int) -> Bounds:
-    """Allocate for c inequalities of vectors of n."""
+    """Allocate ``Bounds`` for c inequalities of a vector (n,)."""
     return Bounds(np.zeros((c, n)), np.zeros(c), np.zeros((c, c)), np.zeros((c, c)), np.zeros(c), np.zeros(c),
                   np.zeros(n))
 
 
 MOST_PIVOTS = 200
-"""Pivots after which it is given up: the nine bounds of an arm take some ten."""
+"""Number of pivots after which ``least_distance`` gives up: the nine bounds of an arm take some ten."""
 MET = 1e-9
-"""What an inequality may lack by rounding, its row of length one."""
+"""Tolerance for rounding of an inequality whose row has length one."""
 
 
 @kernel
 def least_distance(bounds: Bounds, count: int) -> bool:
     """Fill bounds.shortest with the shortest u that meets the first ``count`` inequalities; False: none was found.
 
-    Least-distance programming (Lawson and Hanson): u = rows' z with multipliers z >= 0, of which each is zero or its
-    inequality an equality. That linear complementarity problem is solved by least-index principal pivoting (Murty
-    1974). It ends where no row depends on the others.
+    Least-distance programming (Lawson and Hanson): u = rows' z with multipliers z >= 0; each multiplier is zero or its
+    inequality holds with equality. This linear complementarity problem is solved by least-index principal pivoting
+    (Murty 1974), which terminates where the rows are linearly independent.
     """
     rows, least, Q, L = bounds.rows, bounds.least, bounds.gram, bounds.factor
     z, active, u = bounds.multiplier, bounds.active, bounds.shortest
@@ -199,7 +199,7 @@ def least_distance(bounds: Bounds, count: int) -> bool:
     found = False
     for _ in range(MOST_PIVOTS):
         first = count
-        for i in range(count):  # the least index at which the signs are wrong
+        for i in range(count):  # least index of a negative multiplier or a violated inequality
             short = least[i]
             for j in range(count):
                 short -= Q[i, j] * z[j] * active[j]
@@ -210,7 +210,7 @@ def least_distance(bounds: Bounds, count: int) -> bool:
             found = True
             break
         active[first] = 1.0 - active[first]
-        for i in range(count):  # multipliers of those on their bound; identity in place of the others
+        for i in range(count):  # solve for the active multipliers; rows of the identity for others
             z[i] = least[i] if active[i] == 1.0 else 0.0
             for j in range(i + 1):
                 both = active[i] * active[j]

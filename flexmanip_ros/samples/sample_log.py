@@ -1,8 +1,8 @@
-"""The one place where samples are kept: columns to which rows are only ever appended.
+"""Store of all samples of a run: columns to which rows are only appended.
 
 A ``SampleLog`` is a value: appending returns a new one and leaves the old one as it was. Both share one buffer, so
-an append costs a copy of the new rows alone. Estimators remember row numbers, counted from the first sample of
-the run, and read slices.
+an append copies the new rows alone. Estimators keep row numbers, counted from the first sample of the run, and
+read slices.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from flexmanip_ros.types import Array
 
 Kind = TypeVar('Kind', bound=np.generic)
 SMALLEST = 1024
-"""Rows of the first buffer: one second at 1 kHz."""
+"""Number of rows of the first buffer: about one second at 1 kHz."""
 
 
 class Width(NamedTuple):
@@ -33,7 +33,7 @@ class Width(NamedTuple):
 class _Buffer:
     """Memory shared by logs. Rows below ``filled`` belong to some log and are never written again.
 
-    The exception are the inputs of rows that wait for them, which no log shows until they are there.
+    The exception is the inputs of waiting rows. They are written later, and no log shows such a row before.
     """
 
     first: int
@@ -50,8 +50,8 @@ class _Buffer:
 class SampleLog:
     """Samples of the configured signals, one a row.
 
-    start, end: numbers of the first row still kept, and of the row after the last; waiting: rows after these
-    whose inputs (``arm.effort_delay``) or whose sample time are not known yet.
+    start, end: numbers of the first row still kept, and of the row after the last one shown; waiting: number of rows
+    from ``end`` on that are not shown yet, because their inputs (``arm.effort_delay``) or the sample time are unknown.
     """
 
     width: Width
@@ -78,9 +78,9 @@ class SampleLog:
                delay: int = 0, missing: NDArray[np.int64] | None = None) -> SampleLog:
         """Return the log with N more rows.
 
-        stamp_ns: (N,); u: (N, r), of which row k belongs to the row ``delay`` before k; y: (N, m);
+        stamp_ns: (N,); u: (N, r), whose row k holds the inputs of the row ``delay`` rows before row k; y: (N, m);
         angles: (N, a); gap: (N,); missing: (N,), see ``Rows.missing``; None: all were measured. A row is shown once its
-        inputs are there.
+        inputs are known.
         """
         buffer = self._with_room(len(stamp_ns))
         r, m = self.width.inputs, self.width.outputs
@@ -100,16 +100,16 @@ class SampleLog:
         return SampleLog(self.width, self.start, end, buffer.filled - end, buffer)
 
     def wait(self, stamp_ns: int, u: Array, y: Array, angles: Array) -> SampleLog:
-        """Return the log with one more row that is not shown yet, its own inputs with it."""
+        """Return the log with one more waiting row, whose inputs u (r,) are its own (no ``delay``)."""
         log = self.append(np.array([stamp_ns]), u[None], y[None], angles[None], np.zeros(1, dtype=np.bool_))
         return SampleLog(self.width, self.start, self.end, self.waiting + 1, log._buffer)
 
     def waiting_rows(self) -> Rows:
-        """Return the rows that are not shown yet."""
+        """Return the waiting rows."""
         return Rows(self, self.end, self.end + self.waiting)
 
     def without_waiting(self) -> SampleLog:
-        """Return the log without the rows that are not shown yet."""
+        """Return the log without the waiting rows."""
         return SampleLog(self.width, self.start, self.end, 0, self._buffer) if self.waiting else self
 
     def from_row(self, first: int) -> SampleLog:
@@ -204,16 +204,16 @@ class Rows:
 
     @property
     def missing(self) -> NDArray[np.int64]:
-        """(N,) 0: the row was measured; k: it is the k-th of a few rows in a row whose message never came.
+        """(N,) 0 where the row was measured; k where it is the k-th of consecutive rows whose messages never came.
 
-        Its values are interpolated between the messages around it. No estimator takes its outputs for measured, but
-        that a row made of several (decimation) counts as measured where half of them were.
+        The values of a missing row are interpolated between the messages around it. No estimator treats its outputs as
+        measured. A row made of several rows (decimation) counts as measured where half of them were.
         """
         return self._column('missing', np.int64)
 
     @property
     def gap(self) -> NDArray[np.bool_]:
-        """(N,) the motion before the row is unknown, or its torques: no regressor may reach back over it."""
+        """(N,) True where motion or torques just before the row are unknown: no regressor may reach back over it."""
         return self._column('gap', np.bool_)
 
     def stretches(self) -> list[Rows]:
@@ -230,8 +230,8 @@ class Rows:
 class Signals:
     """The samples of a run as named columns, for pictures, tables and scores.
 
-    stamp_ns: (N,); u: (N, r); y: (N, m); angles: (N, 2) or (N, 0); gap: (N,) the motion
-    before it is unknown; missing: (N,) not 0: its message never came, and its values are interpolated.
+    stamp_ns: (N,); u: (N, r); y: (N, m); angles: (N, 2) or (N, 0); gap: (N,) True where the
+    motion before the sample is unknown; missing: (N,) not 0 where the message never came and values are interpolated.
     """
 
     stamp_ns: NDArray[np.int64]

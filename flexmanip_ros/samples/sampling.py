@@ -1,8 +1,9 @@
-"""From messages to rows of the sample log, on one clock: stamps rule, not arrival.
+"""From messages to rows of the sample log, on one clock: header stamps decide, not times of arrival.
 
-A message becomes at most one row. Repeated and late stamps are dropped, a jump back resets, and inputs are shifted by
-``arm.effort_delay`` samples. Messages that never came become rows that are marked as missing, with interpolated values.
-After more than ``max_gap`` the next row is marked with ``gap`` instead; so it is where the torque changed meanwhile.
+A message becomes at most one row. Repeated and late stamps are dropped, a jump back in time starts a new log, and
+inputs are shifted by ``arm.effort_delay`` samples. Messages that never came become rows that are marked as missing,
+with interpolated values. After more than ``max_gap`` without a message the next row is marked with ``gap`` instead. A
+row is marked with ``gap`` too where the torque changed too much while messages were missing.
 """
 
 from __future__ import annotations
@@ -18,20 +19,21 @@ from flexmanip_ros.samples.signals import Channels, Rejection, columns, extract,
 from flexmanip_ros.types import Array, CaptureEvent, JointBlock, JointRecord, Sample
 
 LEARNING = 20
-"""Intervals whose median is the first estimate of the sample time; 20 stand a few irregular ones."""
+"""Number of intervals whose median is the first estimate of the sample time; 20 tolerate a few irregular ones."""
 FAR = 100.0
-"""A stamp this many sample times ahead is doubted where ``max_time_jump`` is shorter (a slow clock)."""
+"""Sample times ahead beyond which a stamp is doubted, where ``max_time_jump`` is shorter (a low sample rate)."""
 MOST_MISSING = 200
-"""Rows that are filled in at most: the fit of the model takes blocks of 256."""
+"""Largest number of consecutive missing rows that are interpolated: the fit of the model takes blocks of 256."""
 UNKNOWN_TORQUE = 3.0
-"""Change of a torque over missing samples, over its peak, times their number, beyond which it counts as unknown. At
-1 kHz it leaves the vibration of a mode at 6 Hz unknown by some 3 % of what a step of the whole torque makes."""
+"""Limit of (change of a torque over missing samples / its peak) x number of missing samples; beyond it the torque
+counts as unknown. At 1 kHz, the limit leaves the vibration of a 6 Hz mode uncertain by some 3 % of what a step of the
+peak torque excites."""
 RELEARN = 20
-"""Irregular intervals in a row after which the sample time is learned again."""
+"""Number of consecutive irregular intervals after which the sample time is learned again."""
 
 
 class Counters(NamedTuple):
-    """What became of the messages."""
+    """Numbers of messages by what became of them."""
 
     received: int = 0
     accepted: int = 0
@@ -59,7 +61,7 @@ class Counters(NamedTuple):
 
 
 class Clock(NamedTuple):
-    """The sample time as learned so far, and where the signals stand in a message."""
+    """The sample time as learned so far, and the position of the signals in a message."""
 
     channels: Channels | None = None
     outputs: tuple[str, ...] | None = None
@@ -67,12 +69,12 @@ class Clock(NamedTuple):
     interval_sum_ns: int = 0
     interval_count: int = 0
     irregular: int = 0
-    """Irregular intervals in a row."""
+    """Number of consecutive irregular intervals up to now."""
     counters: Counters = Counters()
     rejection: Rejection | None = None
     """Why the latest unusable message could not be used."""
     latest: Sample | None = None
-    """The sample of the row before."""
+    """The sample placed last."""
     peak: Array = np.empty(0)
     """(r,) largest size of each input so far."""
     jump_candidate: Sample | None = None
@@ -85,7 +87,7 @@ class Clock(NamedTuple):
 
 
 class Sampled(NamedTuple):
-    """Clock and log after a message; reset: the stamps began again, and the log with them."""
+    """Clock and log after a message; reset: whether the message made both start anew."""
 
     clock: Clock
     log: SampleLog
@@ -120,7 +122,8 @@ def push_block(config: IdentifierParameters, clock: Clock, log: SampleLog, block
                ) -> tuple[Sampled, int]:
     """Take messages of a block from number ``first`` on; return clock and log, and how many were taken.
 
-    All those are taken at once that follow one another regularly; else one. The rows are those of ``push``.
+    Messages that follow one another regularly are taken at once, any other message alone. The rows equal those of
+    ``push``.
     """
     regular = _regular(config, clock, block, first)
     if regular == 0:
@@ -160,7 +163,7 @@ def _is_expected(clock: Clock, message: JointBlock) -> bool:
 def _is_on_time(config: IdentifierParameters, interval: Any, total: Any, count: Any) -> Any:
     """Whether intervals [ns] agree with the mean of those before, whose sum is ``total``; numbers or arrays.
 
-    Compared in whole nanoseconds times count: the same stamps give the same verdict on any machine.
+    The comparison is one of integers, nanoseconds times count: equal stamps give the same result on any machine.
     """
     return ((interval * count < config.gap_factor * total)
             & (interval * count > (2.0 - config.gap_factor) * total))
@@ -180,7 +183,7 @@ def _regular(config: IdentifierParameters, clock: Clock, block: JointBlock, firs
 
 
 def flush(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Sampled:
-    """No message follows: show the samples that wait for the sample time, or for the end of a doubt."""
+    """Place the samples that wait for the sample time, or whose stamp is in doubt: no message follows."""
     if clock.jump_candidate is not None:
         return _placed(config, clock._replace(jump_candidate=None), log, clock.jump_candidate)
     return _learned(config, clock, log) if _is_learning(clock, log) else Sampled(clock, log)
@@ -244,7 +247,7 @@ def _fault(channels: Channels, record: JointRecord | JointBlock) -> Rejection | 
 
 
 def _on_clock(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sample) -> Sampled:
-    """Place a sample. One from far ahead waits for the next: a single wrong stamp must not cost all."""
+    """Place a sample. One with a stamp far ahead waits for the next, so that one wrong stamp does not reset the log."""
     candidate, last = clock.jump_candidate, clock.last_ns
     if last is None or clock.interval_count == 0:
         return _placed(config, clock, log, raw)
@@ -294,7 +297,7 @@ def _is_learning(clock: Clock, log: SampleLog) -> bool:
 
 
 def _learned(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Sampled:
-    """The sample time is the median of the first intervals; place the waiting samples on that clock."""
+    """Set the sample time to the median of the first intervals; place the waiting samples on that clock."""
     rows = log.waiting_rows()
     stamps = rows.stamp_ns.tolist()
     samples = [Sample(stamps[k], rows.u[k].copy(), rows.y[k].copy(), rows.angles[k].copy())

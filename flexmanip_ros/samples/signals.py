@@ -1,4 +1,4 @@
-"""Where the configured signals stand in a message: matched by name, in any order, extra joints ignored."""
+"""Position of the configured signals in a message: matched by name, in any order, extra joints ignored."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Channels:
     y: tuple[tuple[str, int], ...]
     angles: tuple[tuple[str, int], ...]
     places: tuple[tuple[str, int], ...]
-    """All of them, in this order."""
+    """The places of u, y and angles, in this order."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,12 @@ def joints(config: IdentifierParameters | TriggerParameters) -> tuple[str, ...]:
 
 
 def reads_angles(config: IdentifierParameters) -> bool:
-    """Whether the angles are read: for a payload, or where they are named (the default ones are of one arm)."""
+    """Whether the angles are read: for a payload, or where the user names them (the default names are of one arm)."""
     return bool(config.angles) and (config.payload_method != 'none' or not _is_default('angles', config))
 
 
 def _is_default(group: str, config: IdentifierParameters) -> bool:
-    """Whether the signals of a group are those that an arm of so many links has where none are named."""
+    """Whether the signals of a group are the default ones for the arm's number of links."""
     default = getattr(IdentifierParameters, group)
     return getattr(config, group) in (default, of_links(default, len(config.arm.link_length)))
 
@@ -101,11 +101,11 @@ def wrong_size(record: JointRecord | JointBlock) -> Rejection | None:
 
 
 def extract(channels: Channels, record: JointRecord) -> Sample | None:
-    """Return the configured signals of a record that ``channels`` fit; None where one is not finite."""
+    """Return the configured signals of a record with the names of ``channels``; None where one is not finite."""
     fields = {'position': record.position.tolist(), 'velocity': record.velocity.tolist(),
               'effort': record.effort.tolist()}
     values = [fields[field][index] for field, index in channels.places]
-    if not all(map(math.isfinite, values)):  # a sum may overflow
+    if not all(map(math.isfinite, values)):  # a check of their sum would reject finite values whose sum overflows
         return None
     row = np.array(values, dtype=np.float64)
     r, m = len(channels.u), len(channels.y)

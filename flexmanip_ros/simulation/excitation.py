@@ -1,4 +1,4 @@
-"""Torques that excite the arm, and their design: the largest that keep it within an angle, and what they would tell."""
+"""Torques that excite the arm; the largest within an allowed angle, and the payload accuracy to expect from them."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from flexmanip_ros.simulation import models, sensors, simulator, waveforms
 from flexmanip_ros.types import Array
 
 TIMES = (0.25, 1.0, 3.0)
-"""Seconds after the capture for which the accuracy is told."""
+"""Times after the capture at which the expected accuracy is given [s]."""
 CLOSE = 0.02
-"""The fitted motion ends within this share below the allowed angle."""
+"""Tolerance of the fitted motion: it stays below the allowed angle by no more than this share."""
 BEYOND = 10.0
-"""Logarithm that stands for an arm that diverges."""
+"""Logarithm of turn over allowed turn that stands for an arm that diverges."""
 
 
 def torque(config: ExcitationParameters, k: int) -> Array:
@@ -42,10 +42,10 @@ def amplitude(config: ExcitationParameters) -> tuple[float, ...]:
 
 
 def plant_of(config: ExcitationParameters) -> PlantParameters:
-    """Return the plant the design is made for: noise-free, chord angles seen.
+    """Return the plant the design is made for: noise-free, with chord angles as outputs.
 
-    With Coulomb friction, whose steps are many, it takes the fewest that are stable: the motion is then good to 0.2 %,
-    the accuracy to 12 %.
+    With Coulomb friction, which needs many integration steps, it takes the fewest that are stable. The motion is then
+    accurate to 0.2 %, and the expected payload accuracy to 12 %.
     """
     plant = PlantParameters(
         rate=config.rate, initial_angles=config.initial_angles, payload_mass=config.payload_mass,
@@ -57,10 +57,10 @@ def plant_of(config: ExcitationParameters) -> PlantParameters:
 
 @lru_cache(maxsize=16)
 def fitted_amplitude(config: ExcitationParameters) -> tuple[float, ...]:
-    """Scale the amplitudes so that the chords turn by allowed_angle within design_time, the arm empty.
+    """Scale the amplitudes so that the chords of the empty arm turn by allowed_angle within design_time.
 
-    The linearized arm, on a fixed base, without gravity and Coulomb friction, gives the first guess, the nonlinear arm
-    the rest. Raises ParameterError when no torque is asked for, or offset and gravity alone turn the arm further.
+    The linearized arm, on a fixed base, without gravity and Coulomb friction, gives the first guess. The nonlinear arm
+    refines it. Raises ParameterError when no torque is asked for, or offset and gravity alone turn the arm further.
     """
     plain = replace(config, allowed_angle=0.0)
     plant = plant_of(config)

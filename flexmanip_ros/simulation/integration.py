@@ -1,4 +1,4 @@
-"""Compiled time stepping: the nonlinear arm by methods of Runge and Kutta, linear plants exactly."""
+"""Compiled time stepping: the nonlinear arm by Runge-Kutta methods, linear plants exactly."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ if TYPE_CHECKING:
     from flexmanip_ros.arm.manipulator import Manipulator, Workspace
 
 LIMIT = 1e6
-"""A coordinate or rate beyond this has diverged."""
+"""Magnitude beyond which a coordinate or rate counts as diverged."""
 
 
 class Method(NamedTuple):
-    """An explicit method of Runge and Kutta."""
+    """An explicit Runge-Kutta method and the largest steps it may take."""
 
     stages: Array
-    """(s, s) its Butcher tableau."""
+    """(s, s) coefficients of the Butcher tableau."""
     weights: Array
-    """(s,) of the slopes."""
+    """(s,) weights of the slopes."""
     angle: float
-    """Largest angle [rad] the fastest mode may turn in a step: its phase and its size are then good to 4e-6."""
+    """Largest phase advance [rad] of the fastest mode in a step: its phase and amplitude are then accurate to 4e-6."""
     decay: float
-    """Largest step over the shortest time constant of what decays; the rate of decay is good to 4e-5, with Coulomb
-    friction, a joint that sticks, to 2 %."""
+    """Largest ratio of a step to the shortest time constant of a decaying motion: the rate of decay is then accurate to
+    4e-5, and to 2 % for a joint that sticks by Coulomb friction."""
     stable: float
-    """Largest step times the fastest pole that is stable."""
+    """Largest stable product of the step and the magnitude of the fastest pole."""
 
 
 SMOOTH = Method(np.ascontiguousarray(DOP853.A), np.ascontiguousarray(DOP853.B), angle=1.5, decay=2.5, stable=5.9)
-"""Of eighth order (Dormand and Prince): a third of the evaluations."""
+"""Method of eighth order (Dormand and Prince), for smooth motion: it needs a third of the evaluations of ``ROUGH``."""
 ROUGH = Method(np.diag([0.5, 0.5, 1.0], -1), np.array([1.0, 2.0, 2.0, 1.0]) / 6.0, angle=0.15, decay=1.0, stable=2.6)
-"""Of fourth order, where Coulomb friction changes its sign: more does not follow it any better."""
+"""Method of fourth order, for Coulomb friction: a higher order is no more accurate where the friction changes sign."""
 
 
 @merged
@@ -45,10 +45,10 @@ def runge_kutta(
     arm: Manipulator, payload: Array, held: Array, x: Array, effort: Array, h: float, steps: int,
     stages: Array, weights: Array, scratch: Array, work: Workspace,
 ) -> bool:
-    """Advance x = [q; qd] (2n,) by steps of h seconds under a held torque; False when it diverged.
+    """Advance x = [q; qd] (2n,) by steps of h seconds under a held torque; return False when it diverges.
 
-    held: (0 or 2, n) combinations of q that stay; stages, weights: see ``Method``; scratch: (s + 1, 2n), the slopes and
-    the trial state.
+    held: (0 or L, n) rows whose product with q stays constant; stages, weights: see ``Method``; scratch: (s + 1, 2n),
+    the slopes and the trial state.
     """
     size = x.size
     n = size // 2
@@ -86,7 +86,7 @@ def run_nonlinear(
     arm: Manipulator, payload: Array, held: Array, x: Array, efforts: Array, dt: float, steps: int,
     stages: Array, weights: Array, position: Array, velocity: Array, scratch: Array, work: Workspace,
 ) -> int:
-    """Record each sample, then integrate to the next under its torque; return how many samples are good.
+    """Record each sample, then integrate to the next under its torque; return how many it completes without diverging.
 
     x (2n,) is advanced in place. efforts: (N, L); position, velocity: (N, 2 L) filled; scratch: see
     ``runge_kutta``.

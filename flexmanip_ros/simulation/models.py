@@ -1,13 +1,13 @@
 """The plants a simulator can step: nonlinear assumed modes, linear assumed modes, finite elements.
 
-A model turns a state x = [q; q'] (2n,) into samples and into the next state, and knows its mass matrix
-and the motion of a body at its tip. ``advance`` is one compiled loop whatever the number of samples, so
+A model turns a state x = [q; q'] (2n,) into samples and into the next state, and gives its mass matrix
+and the Jacobian of a body at its tip. ``advance`` is one compiled loop whatever the number of samples, so
 that stepping one by one and simulating at once give the same bits.
 
-The linear plants stand at a working point and are stepped exactly. The elements (paper section 4.3) are independent of
-the assumed modes: two chains of Euler-Bernoulli elements (cubic Hermite), each link's transverse displacement y_i(x)
-from the posture of rest includes its rigid motion. Joint 2 carries link 2 along, axially as well. The chains are kept
-at the working point's geometry.
+The linear plants are linearized at a working point and stepped exactly. The finite element plant (paper section 4.3)
+is independent of the assumed modes: each link is a chain of Euler-Bernoulli elements (cubic Hermite), whose transverse
+displacement y_i(x) from the posture at rest includes the link's rigid motion. Joint 2 moves the root of link 2 both
+transversely and axially. The geometry stays that of the working point.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ MOST_SUBSTEPS = 1000
 
 
 class NonlinearModel:
-    """The arm of ``manipulator.py``, any amplitude and configuration.
+    """Nonlinear plant: the arm of ``manipulator.py`` at any amplitude and configuration.
 
-    held: combinations (0 or L, n) of q that locked joints keep.
+    held: (0 or L, n) rows; locked joints keep the product of each row with q constant.
     """
 
     def __init__(self, config: PlantParameters) -> None:
@@ -54,7 +54,7 @@ class NonlinearModel:
         return x
 
     def advance(self, x: Array, payload: Array, efforts: Array, position: Array, velocity: Array) -> int:
-        """Record efforts.shape[0] samples and advance x in place; return how many are good."""
+        """Record efforts.shape[0] samples and advance x in place; return how many it completes without diverging."""
         return run_nonlinear(self.arm, payload, self.held, x, efforts, self._dt, self._steps, self._method.stages,
                              self._method.weights, position, velocity, self._scratch, self._work)
 
@@ -63,12 +63,12 @@ class NonlinearModel:
         return linearization.mass_matrix(self.arm, payload, x[:x.size // 2])
 
     def body_jacobian(self, x: Array, payload: Array, com: tuple[float, float]) -> Array:
-        """Motion (3, n) of a point in the tip's frame: x, y [m], angle [rad]."""
+        """Jacobian (3, n) of a point that is fixed in the tip's frame at com: x, y [m], angle [rad]."""
         q = x[:x.size // 2]
         return body_jacobian(tip_jacobian(self.arm, payload, q), tip_angle(self.arm, q), com)
 
     def floating_mass(self, payload: Array) -> float:
-        """Mass of all that floats with the base [kg]; inf: the base is fixed."""
+        """Total mass of a floating base and all that moves with it [kg]; inf where the base is fixed."""
         return linearization.momentum(self.arm, payload, self.rest()[:self.arm.stiffness.size])[1] \
             if self.arm.floating else np.inf
 
@@ -76,8 +76,8 @@ class NonlinearModel:
 class LinearModel:
     """A linear plant M dq'' + D dq' + K dq = B tau around the initial angles, stepped exactly.
 
-    M0: (n, n) without payload, D, K: (n, n), B: (n, L), C: (2 L, n) outputs, rest_output: (2 L,), tip: Jacobian (3, n)
-    of the tip and the angle of its cross-section, turn: that angle [rad].
+    M0: (n, n) mass matrix without payload; D, K: (n, n); B: (n, L); C: (2 L, n) outputs; rest_output: (2 L,) outputs at
+    rest; tip: (3, n) Jacobian of tip position and angle of its cross-section; turn: that angle at rest [rad].
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class LinearModel:
         tip: Array, turn: float, locked: bool = False,
     ) -> None:
         self.held = np.zeros((0, M0.shape[0]))
-        if locked:  # coordinates that leave both joint angles alone
+        if locked:  # reduce to the motions T that leave the joint angles unchanged
             T = null_space(C[:len(C) // 2])
             M0, D, K, B, C = T.T @ M0 @ T, T.T @ D @ T, T.T @ K @ T, T.T @ B, C @ T
             tip = tip @ T
@@ -122,7 +122,7 @@ class LinearModel:
         """See ``NonlinearModel``; constant."""
         m, hx, hy, inertia = payload
         J = self._tip
-        # the body's first moments act across J: body_jacobian of a unit mass, less the tip's own, is linear in them
+        # d: body_jacobian at (hx, hy) less that of the tip is linear in hx, hy: the first moments give d^T J + J^T d
         d = body_jacobian(J, self._turn, (hx, hy))[:2] - J[:2]
         total: Array = self.M0 + m * J[:2].T @ J[:2] + J[:2].T @ d + d.T @ J[:2] + inertia * np.outer(J[2], J[2])
         return total
@@ -140,7 +140,7 @@ Model = NonlinearModel | LinearModel
 
 
 def build(config: PlantParameters) -> Model:
-    """Make the plant the parameters ask for. Raises ParameterError where a linear plant cannot be so."""
+    """Return the plant the parameters ask for. Raises ParameterError where a linear plant lacks what they set."""
     if config.model == 'nonlinear':
         return NonlinearModel(config)
     arm = config.arm
@@ -153,20 +153,21 @@ def build(config: PlantParameters) -> Model:
             raise ParameterError(f"parameter 'arm.{name}' is set, but a {config.model} plant has none",
                                  "choose 'model' nonlinear")
     model = (finite_element_model if config.model == 'finite_element' else linear_model)(config)
-    for payload in (np.zeros(4), free_object(config).payload):  # so that a live capture is not late
+    for payload in (np.zeros(4), free_object(config).payload):  # now, so that a live capture is not delayed
         model.step_matrices(payload)
     return model
 
 
 def method(arm: Manipulator) -> Method:
-    """Return how the motion is integrated."""
+    """Return the integration method: ``ROUGH`` for an arm with Coulomb friction, else ``SMOOTH``."""
     return ROUGH if arm.coulomb.any() else SMOOTH
 
 
 def substeps(arm: Manipulator, config: PlantParameters) -> int:
-    """Integration steps a sample for the fastest mode of the empty arm, in any configuration.
+    """Return how many integration steps a sample needs for the fastest mode of the empty arm, in any configuration.
 
-    Raises ParameterError naming the field when the steps asked for are unstable, or none suffice.
+    Raises ParameterError naming the field when the steps asked for are unstable, or the fastest mode needs more than
+    ``MOST_SUBSTEPS``.
     """
     if config.substeps:
         least = fewest_substeps(arm, config)
@@ -186,12 +187,12 @@ def substeps(arm: Manipulator, config: PlantParameters) -> int:
 
 
 def fewest_substeps(arm: Manipulator, config: PlantParameters) -> int:
-    """Integration steps a sample that are just stable; where a joint sticks, its friction is a stiff damper."""
+    """Return the fewest stable integration steps a sample; the friction of a sticking joint acts as a stiff damper."""
     return int(np.ceil(_fastest(arm, 1.0) / config.rate / method(arm).stable))
 
 
 def _fastest(arm: Manipulator, sticking: float) -> float:
-    """Largest pole magnitude [rad/s] in any configuration; sticking: share of the joints' friction."""
+    """Largest pole magnitude [rad/s] in any configuration; sticking: share (0 to 1) of the damping of stuck joints."""
     n, links = arm.torque.shape
     friction = arm.viscous + sticking * arm.coulomb / STICTION_RATE
     D = np.diag(arm.damping) + (arm.torque * friction) @ arm.torque.T
@@ -253,9 +254,9 @@ def beam(length: float, density: float, stiffness: float, elements: int) -> Beam
 
 
 def bending_damping(arm: ArmParameters, element_beam: Beam) -> Array:
-    """Damping matrix of a link in the coordinates of its beam, none of its rigid motion."""
+    """Damping matrix of a link in the coordinates of its beam; its rigid motion is not damped."""
     size = element_beam.M.shape[0]
-    chord = np.tile([0.0, 1.0], size // 2)  # slope of the chord at every node, then its height
+    chord = np.tile([0.0, 1.0], size // 2)  # the chord's slope at every node; its height at the nodes follows
     chord_rows = np.zeros((size, size))
     ends = np.zeros(size)
     ends[0], ends[-2] = -1 / element_beam.length, 1 / element_beam.length
@@ -276,7 +277,7 @@ def bending_damping(arm: ArmParameters, element_beam: Beam) -> Array:
 
 
 class Chain(NamedTuple):
-    """The two-link arm in free coordinates z: M z'' + D z' + K z = B tau; rows give motions from z."""
+    """The two-link arm in free coordinates z: M z'' + D z' + K z = B tau; C z and tip z are its outputs."""
 
     M: Array
     D: Array
@@ -285,7 +286,7 @@ class Chain(NamedTuple):
     C: Array
     """(4, n) joint angles by the arm's convention and bends."""
     tip: Array
-    """(3, n) displacement of the tip along e2 and n2 [m], its angle [rad]."""
+    """(3, n) displacement of the tip along and across link 2 (e2, n2) [m], and its angle [rad]."""
 
 
 def chain(arm: ArmParameters, theta: tuple[float, ...], elements: int) -> Chain:
@@ -301,7 +302,7 @@ def chain(arm: ArmParameters, theta: tuple[float, ...], elements: int) -> Chain:
     T2[1:, size - 1:] = np.eye(size - 1)
     elbow = T1[-2]
     T2[0] = c * elbow
-    along = s * elbow  # link 2 moves as one along e2
+    along = s * elbow  # link 2 moves rigidly along its axis e2
     slopes = {'root1': T1[1], 'tip1': T1[-1], 'root2': T2[1], 'tip2': T2[-1]}
     M, K, D = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
     for T, link in zip((T1, T2), beams, strict=True):
@@ -333,7 +334,7 @@ def chain(arm: ArmParameters, theta: tuple[float, ...], elements: int) -> Chain:
 
 
 def finite_element_model(config: PlantParameters) -> LinearModel:
-    """Plant for the simulator: the chain at the initial angles."""
+    """Return the finite element plant: the chain at the initial angles."""
     arm, theta = config.arm, config.initial_angles
     parts = chain(arm, theta, config.elements)
     rest = np.zeros(4)

@@ -10,7 +10,7 @@ from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.types import Array
 
 BLOCK = 512
-"""Samples drawn at once."""
+"""Number of samples whose random numbers are drawn at once."""
 COLUMNS = 10
 
 
@@ -51,7 +51,7 @@ def low_pass(values: Array, state: Array, share: float) -> None:
 
 
 def gauge(config: PlantParameters, position: Array, velocity: Array, state: Array) -> None:
-    """Let strain gauges smooth the deflections, in place; state (2, L) carries on between calls."""
+    """Apply the low-pass of strain gauges to deflections and their rates, in place, and update state (2, L)."""
     cutoff = config.sensors.strain_cutoff
     if cutoff:
         share = 1.0 - np.exp(-2.0 * np.pi * cutoff / config.rate)
@@ -63,12 +63,12 @@ def gauge(config: PlantParameters, position: Array, velocity: Array, state: Arra
 
 
 def bends_needed(config: PlantParameters) -> int:
-    """Return of how many samples before the bends are read."""
+    """Return how many past samples delayed bends are interpolated from; 0 where they are not delayed."""
     return int(config.arm.bend_delay * config.rate) + 1 if config.arm.bend_delay else 0
 
 
 def late_bends(config: PlantParameters, position: Array, velocity: Array, past: Array) -> Array:
-    """Let the bends come late, in place, by cubics between samples.
+    """Delay the bends by ``arm.bend_delay``, in place, with cubic Hermite interpolation between samples.
 
     past: (K, 2 L) deflections and rates of the last samples; returns those for the next call.
     """
@@ -86,7 +86,7 @@ def late_bends(config: PlantParameters, position: Array, velocity: Array, past: 
 
 
 def misread(config: PlantParameters, position: Array, velocity: Array) -> None:
-    """Let the bend sensors read with their gain and offset, in place."""
+    """Apply gain and offset of the bend sensors, in place."""
     if not any(config.arm.bend_offset) and all(gain == 1.0 for gain in config.arm.bend_gain):
         return  # arithmetic that changes nothing, here and below, costs a live plant 65 us a sample
     links = position.shape[1] // 2
@@ -124,7 +124,7 @@ def arrives(config: PlantParameters, drawn: Array) -> np.ndarray[tuple[int], np.
 
 
 def saturated(config: PlantParameters, efforts: Array) -> Array:
-    """Efforts (N, L) [N m] within the torque limits."""
+    """Return efforts (N, L) [N m] clipped to the torque limits."""
     if not any(config.actuators.torque_limit):
         return efforts
     limits = np.array(config.actuators.torque_limit)

@@ -44,17 +44,17 @@ class PlantState(NamedTuple):
     payload: Array
     """(4,) what the arm holds, see ``manipulator.payload_array``."""
     noise_std: Array
-    """(4 L,) of the positions, then the rates."""
+    """(4 L,) standard deviations of the noise on the positions, then on the rates."""
     noise_block: Array
     """(BLOCK, 10) standard normal numbers around the next sample."""
     noise_number: int
-    """Which block that is."""
+    """Number of the block in ``noise_block``."""
     gauges: Array
     """(2, L) low-pass state of the deflections and of their rates."""
     bends: Array
     """(K, 2 L) deflections and their rates of the last samples, where they are measured late."""
     efforts: Array
-    """(P - 1, L) efforts of the drives that still act, where torques are late."""
+    """(P - 1, L) past efforts that still affect the torque, where torques are late."""
     commands: Array
     """(command_delay, L) torques on their way to the drives."""
     reported: Array
@@ -65,7 +65,7 @@ class PlantState(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """A simulated run as its messages tell it, columns in the order of its names (effort: the joints)."""
+    """A simulated run as its messages carry it; columns in the order of ``names`` (effort: of the joints only)."""
 
     stamp_ns: np.ndarray[tuple[int], np.dtype[np.int64]]
     position: Array
@@ -122,9 +122,9 @@ def step(
 
 
 def attach(config: PlantParameters, state: PlantState) -> PlantState:
-    """Take the object of the parameters, before the next sample; a soft gripper begins to.
+    """Attach the object of the parameters before the next sample; a soft gripper begins to take it.
 
-    What it still has to take of an object before is taken at once.
+    The part of a previous object that a soft gripper has yet to take is attached at once.
     """
     if state.taking is not None:
         state = _take(config, state, state.taking.part(state.taking_left))

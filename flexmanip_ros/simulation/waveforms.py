@@ -55,7 +55,7 @@ def _table(
 
 
 def _multisine(rate: float, band: tuple[float, float], repeat: float, seed: int, joint: int) -> Array:
-    """Flat spectrum over the band, phases optimized for a low peak; joints share no line.
+    """Flat spectrum over the band, phases optimized for a low peak; joints share no spectral line.
 
     Clipping algorithm of Van der Ouderaa, Schoukens and Renneboog (IEEE Trans. IM 37, 1988): clip in
     time, keep the phases of the clipped signal and the amplitudes wanted, repeat.

@@ -1,7 +1,7 @@
 """The result of a run: its numbers, named as in the ``--json`` line of identify_bag, and its payload in words.
 
-Then how good the results of many runs are: their error, how often their interval holds the truth, and the least error
-possible.
+The scores of many runs are here too: the error of the payload, how often its 95 % interval holds the true mass, and
+the least error possible (Cramer-Rao bound).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ ADVICE: Mapping[Status, str] = {
     Status.UNOBSERVABLE: 'add the torques, angles and bends of both links to inputs, outputs and angles',
     Status.DIVERGED: 'check the units of the signals and the parameters arm.*',
 }
-"""What a user can do next."""
+"""What a user can do next, for each status."""
 
 
 def status_text(status: Status, config: IdentifierParameters | None = None) -> str:
@@ -47,7 +47,7 @@ def status_text(status: Status, config: IdentifierParameters | None = None) -> s
 
 @dataclass(frozen=True)
 class Summary:
-    """Times count from the first sample's stamp [s]; None where a value does not apply."""
+    """The numbers of a run. Times count from the first sample's stamp [s]; None where a value does not apply."""
 
     samples: int
     gaps: int
@@ -70,7 +70,7 @@ class Summary:
     vaf_prediction_percent: tuple[float | None, ...] | None = None
     vaf_horizon_percent: tuple[float | None, ...] | None = None
     smoothed: tuple[Smoothed, ...] | None = None
-    """Models of whole stretches, where they are asked for; in the JSON then, too."""
+    """Models of whole stretches, where they are asked for; only then are they in the JSON."""
     model_status: str = 'TRACKING'
     """Status of the model, where ``status`` is that of the payload. It is not in the JSON."""
 
@@ -168,7 +168,7 @@ def _body(payload: Payload | None) -> dict[str, Any]:
 
 
 def event_time(state: pipeline.State, kind: EventKind) -> float | None:
-    """Return when the latest event of a kind was, from the first sample's stamp [s]; None if not reached."""
+    """Return the time of the latest event of a kind from the first sample's stamp [s]; None before it is reached."""
     stamp = state.stamp_of(kind)
     waiting = () if state.payload is None else state.payload.pending
     is_to_come = any(event.kind is kind and event.stamp_ns == stamp for event in waiting)
@@ -190,19 +190,20 @@ def _json(value: Any) -> Any:
 
 
 RATE_WINDOW = 50
-"""Samples over which the rates of the chord angles at the capture are measured."""
+"""Number of samples over which the rates of the chord angles at the capture are measured."""
 LONGEST = 20_000
-"""Samples after the capture that the bound is computed from at most; more would lower it further."""
+"""Largest number of samples after the capture that the bound is computed from; more would lower it further."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """One estimator over many runs.
+    """Scores of one estimator over many runs.
 
-    runs, failed: counts; mean_error_percent, median_error_percent: of the mean relative error in the window;
-    rms_error_percent: of the last estimate; bias_kg: mean of its error; coverage_percent: how often its 95 %
-    interval, where it gave one, held the truth, with the 95 % interval of that figure; us_per_sample: median
-    cost; bound_ratio: root mean square of the last error over its Cramer-Rao bound.
+    runs, failed: counts; mean_error_percent, median_error_percent: mean and median over the runs of the mean relative
+    error in the window; rms_error_percent: of the relative error of the last estimate; bias_kg: mean error of the last
+    estimate; coverage_percent: how often its 95 % interval, where there is one, holds the true mass; coverage_low,
+    coverage_high: 95 % interval of coverage_percent; us_per_sample: median cost; bound_ratio: root mean square of the
+    last error over its Cramer-Rao bound.
     """
 
     runs: int

@@ -1,8 +1,8 @@
-"""Which decimation, windows, order and direct term predict best what they have not seen.
+"""Choice of decimation, windows, order and direct term by cross-validation on a recording.
 
-For each decimation and past window the moments of a recording are gathered in one factor for each fold. Every order,
-future window and direct term is read off sums of these: a model of the other folds predicts a fold, a given time
-ahead.
+For each decimation and past window, the moments of each fold of the recording are gathered in one triangular factor.
+The models of every order, future window and direct term are computed from sums of these factors: a model of the other
+folds predicts a fold a given time ahead.
 """
 
 from __future__ import annotations
@@ -23,41 +23,41 @@ from flexmanip_ros.types import Array, StateSpace
 
 DECIMATIONS = (1, 2, 3, 5, 10, 20, 50, 100)
 WINDOWS_S = (0.05, 0.1, 0.2, 0.3, 0.5)
-"""Lengths of the past window that are tried [s]; those of ``WINDOWS`` samples too."""
+"""Lengths of the past window that are tried [s]; windows of ``WINDOWS`` samples are tried too."""
 WINDOWS = (6, 10, 20)
 ORDERS = tuple(range(2, 17))
 COARSE = (4, 6, 8, 10, 12, 16)
 """Orders of the first pass."""
 FINALISTS = 3
-"""Pairs of decimation and past window that are looked at closely."""
+"""Number of pairs of decimation and past window that the second pass tries with all orders."""
 FOLDS, BLOCKS = 4, 12
-"""The recording is cut into blocks, dealt out to the folds in turn: each fold sees every kind of motion."""
+"""Numbers of folds and blocks. The blocks of a recording go to the folds in turn: each has every kind of motion."""
 STEPS = 4
-"""Steps of the model that the horizon has at least: a lower rate than that predicts nothing."""
+"""Least number of steps of the model in the horizon: a model of a lower rate predicts nothing."""
 ROWS = 2.0
-"""Samples to learn from, for each regressor, below which a window is not tried."""
+"""Least number of training samples for each element of the regressor; a window with fewer is not tried."""
 WORK = 2.5e7
-"""Squared length of the regressor times the rate [1/s] that a live node bears: 15 % of a core."""
+"""Largest product of squared length of the regressor and rate [1/s] for a live node: it takes 15 % of a core."""
 LONGEST = 300
-"""Length of the regressor beyond which the factor takes minutes."""
+"""Largest length of the regressor: beyond it the factor takes minutes."""
 MARGIN = 1.03
-"""The smallest order whose error is at most this many times the least one is taken."""
+"""Largest ratio of error to least error that is accepted: the smallest order within it is chosen."""
 PRIOR = 1e-3
-"""Ridge on the regression, on signals of unit peak."""
+"""Ridge parameter of the regression, for signals of unit peak."""
 BRIDGED_S = 0.02
-"""Samples missing for at most so long are interpolated, in the search alone [s]."""
+"""Longest gap in the samples that is interpolated, in the search alone [s]."""
 WORST = 1e9
-"""Share that stands for a model that runs away."""
+"""Unexplained share that stands for a model whose prediction diverges."""
 WARM = 5
-"""Past windows that a predictor runs before what it is judged by: its state has settled then."""
+"""Number of past windows that a predictor runs before the samples it is scored on: its state has settled then."""
 CHUNK = 4096
-"""Regressors that are formed at once."""
+"""Number of regressors that are formed at once."""
 Progress = Callable[[int, int | None], None]
 Kept = tuple[Array, NDArray[np.int64]]
 
 
 class Shape(NamedTuple):
-    """What the moments decide."""
+    """The parameters chosen on moments: decimation factor, past and future window, direct term, weighting, order."""
 
     factor: int
     past: int
@@ -76,7 +76,7 @@ class Stretch(NamedTuple):
 
 @dataclass
 class Search:
-    """The recording, what is given, and what was found so far."""
+    """The recording, the parameters that are given, and the shapes tried so far."""
 
     given: Mapping[str, Any]
     stretches: list[Stretch]
@@ -85,7 +85,7 @@ class Search:
     dt: float
     horizon_s: float
     tried: dict[Shape, Array] = field(default_factory=dict)
-    """Unexplained share of each output (m,), the mean over the folds."""
+    """Unexplained share of each output (m,), errors and powers summed over the folds."""
 
     @property
     def count(self) -> int:
@@ -114,7 +114,7 @@ class Search:
 def search_shapes(search: Search, step: Callable[[], None]) -> Shape:
     """Try every shape that is not given; return the best. ``step`` is called ``steps_of(search)`` times.
 
-    Raises ParameterError when the recording is too short for any model, or carries none.
+    Raises ParameterError when the recording is too short for any model, or none can be computed from it.
     """
     runs = _plan(search)
     if not runs:
@@ -162,7 +162,7 @@ def stretches_of(signals: Signals, dt: float) -> list[Stretch]:
 
 
 def _plan(search: Search) -> list[tuple[int, int]]:
-    """Return the pairs of decimation and past window to try, the cheap ones first."""
+    """Return the pairs of decimation and past window to try, the largest decimation first: its fits cost least."""
     width, plan = search.r + search.m, []
     for factor in _choices(search.given, 'decimation', DECIMATIONS):
         dt = factor * search.dt
@@ -223,7 +223,7 @@ def _try(search: Search, factor: int, past: int, futures: Sequence[int], directs
 
 def shares(search: Search, kept: list[Kept], sums: list[Array], shape: Shape, orders: Sequence[int], alpha: float
             ) -> dict[int, Array]:
-    """Return the unexplained share (m,) of each order that there is a model of for every fold."""
+    """Return the unexplained share (m,) of each order for which every fold has a model."""
     d = shape.past * (search.r + search.m)
     prior = np.zeros((d, d + search.r + search.m))
     prior[:, :d] = alpha ** 0.5 * np.eye(d)
@@ -270,7 +270,7 @@ def _models(R: Array, search: Search, orders: Sequence[int], shape: Shape) -> li
 
 def powers(search: Search, model: StateSpace, kept: list[Kept], factor: int, past: int,
             chosen: NDArray[np.bool_]) -> Array:
-    """Return the variances (2, m) of what the prediction ahead leaves of the samples chosen (N,), and of these."""
+    """Return variances (2, m): of the error of the prediction ahead at the samples chosen (N,), and of the samples."""
     steps = max(1, round(search.horizon_s / model.dt)) + (decimation.LAG if factor > 1 else 0)
     targets, errors = [np.empty((0, search.m))], [np.empty((0, search.m))]
     with np.errstate(all='ignore'):
@@ -296,12 +296,12 @@ def powers(search: Search, model: StateSpace, kept: list[Kept], factor: int, pas
 
 
 def share(powers: Array) -> Array:
-    """Return the variance of each output (m,) that is left over, over its own; nan where it stands still."""
+    """Return the ratio (m,) of error variance to variance of each output; nan where the output is constant."""
     left, spread = powers
     share = np.divide(left, spread, out=np.full(len(left), np.nan), where=spread > 0.0)
     return np.asarray(np.minimum(share, WORST), dtype=np.float64)
 
 
 def loss(left: Array) -> float:
-    """Return one number for shares (m,): their mean while they are small; one wild output does not hide the rest."""
+    """Return the mean of log(1 + share), close to that of small shares (m,); one wild output does not hide the rest."""
     return float(np.nanmean(np.log1p(left)))

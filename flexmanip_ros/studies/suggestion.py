@@ -1,7 +1,8 @@
 """The parameters to identify a recording with, and why.
 
-``shape_search`` chooses decimation, windows, order and direct term on moments. What the moments cannot tell (prior,
-forgetting, refinement) is tried here with the identifier itself, which runs through the recording and predicts on.
+``shape_search`` chooses decimation, windows, order and direct term on moments. The prior is chosen here, by
+cross-validation on these moments. What they cannot tell (forgetting, refinement) is tried with the identifier itself:
+it runs through the recording and predicts the samples that follow.
 """
 
 from __future__ import annotations
@@ -20,23 +21,24 @@ from flexmanip_ros.studies.shape_search import PRIOR, Progress, Search, Shape
 from flexmanip_ros.studies.whole_recording import HORIZON_S
 
 PLAIN = 1.03
-"""A departure from the plain settings is taken where it divides the error by this at least."""
+"""Least factor by which another setting must reduce the error to replace the plain one."""
 NEARLY, REFINED = 1.3, 1.1
-"""A refined model, whose order is small, is tried where the order costs less than this, taken where it gains more."""
+"""Factors of the error: a refined model, of small order, is tried if the order costs less than the first of them, and
+taken if the refinement gains more than the second."""
 PRIORS = (1e-5, 0.1)
 SHOWN = 5
-"""Values that the reason of a choice compares."""
+"""Number of values that the reason for a choice compares."""
 TRIALS = 5
-"""Runs of the identifier itself."""
+"""Number of runs of the identifier itself."""
 FORGOTTEN = 3
-"""Time constants of the constant forgetting that is tried, in the length of the recording."""
+"""Length of the recording over the time constant of the constant forgetting that is tried."""
 PARTS = 6
-"""The model of the first half predicts the fourth sixth of the recording, and so on."""
+"""Number of parts of the recording: the model of the first half predicts the fourth sixth, and so on."""
 
 
 @dataclass(frozen=True)
 class Suggestion:
-    """Parameters by dotted name; for each choice its name and why, in one line."""
+    """Suggested parameters by dotted name; for each choice, its name and its reason in one line."""
 
     values: dict[str, Any]
     reasons: tuple[tuple[str, str], ...]
@@ -46,9 +48,9 @@ def suggest(given: Mapping[str, Any], signals: Signals, dt: float, *, horizon_s:
             progress: Progress | None = None) -> Suggestion:
     """Choose the parameters for a recording of one machine that does not change meanwhile.
 
-    given: dotted names and values that stay as they are, ``inputs`` and ``outputs`` among them; signals: of these;
-    dt: sample time [s]; horizon_s: how far ahead the models are to predict [s].
-    Raises ParameterError when the recording is too short for any model, or carries none.
+    given: dotted names and values that stay as they are, ``inputs`` and ``outputs`` among them; signals: those of
+    these inputs and outputs; dt: sample time [s]; horizon_s: how far ahead the models are to predict [s].
+    Raises ParameterError when the recording is too short for any model, or none can be computed from it.
     """
     stretches = shape_search.stretches_of(signals, dt)
     search = Search(given, stretches, signals.u.shape[1], signals.y.shape[1], dt, horizon_s)
@@ -68,7 +70,7 @@ def suggest(given: Mapping[str, Any], signals: Signals, dt: float, *, horizon_s:
 
 
 def _shape_reasons(search: Search, shape: Shape) -> list[tuple[str, str]]:
-    """Return why each part of the shape, with what the others would leave unexplained."""
+    """Return the reason for each part of the shape, with the unexplained shares of the values compared."""
     found = []
     for name, part, text in (
             ('decimation', 'factor', lambda factor: f'{1.0 / (factor * search.dt):.4g} Hz'),
@@ -108,7 +110,7 @@ def _prior(search: Search, shape: Shape) -> float:
 
 def _settings(search: Search, shape: Shape, step: Callable[[], None]
               ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
-    """Settle what the moments cannot tell, with the identifier itself; return all values, and why."""
+    """Choose what the moments cannot tell by runs of the identifier itself; return all values, and the reasons."""
     memory = max(0.5, 1.0 - FORGOTTEN * shape.factor / search.count)
     alpha = _prior(search, shape)
     plain: dict[str, Any] = {
@@ -153,11 +155,11 @@ def _values(shape: Shape) -> dict[str, Any]:
 
 def _is_refinable(search: Search, shape: Shape) -> bool:
     n, r, m = shape.order, search.r, search.m
-    return n * (n + r + 2 * m + 1) + m * r <= recursive_fit.USUAL  # fits of more would take most of the search's time
+    return n * (n + r + 2 * m + 1) + m * r <= recursive_fit.USUAL  # fits of more parameters would take most of the time
 
 
 def _identified_error(search: Search, values: Mapping[str, Any]) -> float:
-    """Return what the identifier leaves unexplained ahead, the mean over outputs: it predicts each later part.
+    """Return the loss, over all outputs, of the identifier's predictions ahead on the later parts of the recording.
 
     It runs through the recording once; the model of the first half predicts the fourth sixth, and so on.
     """

@@ -102,9 +102,9 @@ def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_k
             window: tuple[float, float], *, bound: bool = False, settled: float = 0.0) -> Row:
     """Run the identifier and return the columns of a row.
 
-    true_kg: mass of the object [kg]; None when unknown. window: from and to [s] of the mean error, at the
-    earliest ``settled`` seconds after the event that made it true; bound: add the least standard deviation
-    that the samples after the capture allow.
+    true_kg: mass of the object [kg]; None when unknown. window: start and end [s] of the mean error. It
+    starts at the earliest ``settled`` seconds after the event from which on the true mass holds. bound: add the least
+    standard deviation that the samples after the capture allow.
     """
     started = time.perf_counter()
     state, estimates = pipeline.init(), []

@@ -1,8 +1,8 @@
-"""What a recording says once all of it is there.
+"""Evaluation of a complete recording.
 
 ``score``: how well a model predicts the part that it was not identified on. ``smooth``: the best model of each stretch
-between events, from the samples that follow too. ``sweep``: the frequencies over configurations, of a model that holds
-in each.
+between events, from all samples of the stretch. ``sweep``: the frequencies over configurations, of a model that holds
+in each configuration.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from flexmanip_ros.samples.signals import relative_angle
 from flexmanip_ros.types import Array, Mode, StateSpace, Status
 
 HORIZON_S = 0.25
-"""How far ahead the prediction is scored where nobody says [s]: what a controller of a flexible arm looks ahead."""
+"""Default prediction horizon of the score [s]: the horizon of a controller of a flexible arm."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Variance accounted for (VAF) per output (m,) [%], and the outputs it is of.
+    """Variance accounted for (VAF) per output (m,) [%], and the outputs it is computed from.
 
-    horizon: of the prediction a given time ahead of the last sample used, nan where too few samples are left.
+    horizon: VAF of the prediction a given time ahead of the last sample used, nan where too few samples are left.
     time: (N,) [s]; measured, simulated, predicted (one step ahead): (N, m).
     """
 
@@ -51,13 +51,13 @@ class Scores:
 
 def score(model: StateSpace | None, signals: Signals, start_s: float, *, factor: int = 1,
           horizon_s: float = HORIZON_S) -> Scores:
-    """Score a model that is not adapted further on the samples from ``start_s`` [s] on, up to the first gap.
+    """Score a fixed model (no further adaptation) on the samples from ``start_s`` [s] on, up to the first gap.
 
     The state at the start is estimated on the samples before it, by least squares over a free run of the
     model and of its predictor; simulation then uses no measured output.
-    factor: decimation of the model, whose signals are then filtered as the identifier filters them; simulation and
-    one-step prediction are scored on these, the prediction ``horizon_s`` [s] ahead on the samples as they were
-    measured, from those that were there by then.
+    factor: decimation of the model. Above 1, signals are filtered as the identifier filters them, and simulation and
+    one-step prediction are scored on the filtered signals. The prediction ``horizon_s`` [s] ahead is scored on the
+    samples as they were measured; it uses samples up to ``horizon_s`` before.
     Raises ParameterError when nothing is left to score, ModelError when there is no model.
     """
     time = signals.time
@@ -73,7 +73,7 @@ def score(model: StateSpace | None, signals: Signals, start_s: float, *, factor:
     after = int(gaps[gaps > first][0]) if (gaps > first).any() else time.size
     measured = signals.y[before:after]
     kept, rows = decimation.whole(np.hstack([signals.u[before:after], measured]), factor)
-    if factor > 1:  # the last of the samples that a filtered one is made of decides
+    if factor > 1:  # a filtered sample is scored if its last raw sample is scored
         lag = decimation.LAG
         split = int(np.searchsorted(rows, first - before - lag * factor))
     else:
@@ -211,11 +211,11 @@ def _fit(config: IdentifierParameters, state: rpbsid.RpbsidState, samples: Array
 
 
 STEP_DEG = 2.5
-"""Between two configurations [degrees]."""
+"""Step between two configurations of a sweep [degrees]."""
 
 
 class Sweep(NamedTuple):
-    """Modes at each angle between the links, NaN where one is not there. They are the same to either side.
+    """Modes at each angle between the links, NaN where there is none. Angles of either sign have the same modes.
 
     relative: (N,) [rad]; frequency, std: (N, k) [Hz]; damping: (N, k); seen: (2,) smallest and largest angle between
     the links since the last event [rad].
@@ -242,7 +242,7 @@ class Sweep(NamedTuple):
 
 
 def sweep(state: pipeline.State, angles: Array) -> Sweep | None:
-    """Ask the model for every angle between the links; None where it holds at one configuration only.
+    """Return the model's modes at every angle between the links; None where it holds at one configuration only.
 
     state: at the end of a recording; angles: (N, 2) measured ones since the last event [rad].
     """
