@@ -1,6 +1,6 @@
 """The layout of everything published, as plain values: the live node and a bag written offline share it.
 
-Nothing here knows ROS. ``ros/conversions`` and ``io/bag_writer`` each turn these values into their own
+Nothing here imports ROS. ``ros/conversions`` and ``io/bag_writer`` each turn these values into their own
 message classes, so both carry the same numbers.
 """
 
@@ -87,8 +87,8 @@ def model_matrix(model: StateSpace) -> LabelledArray:
 def modes_matrix(modes: tuple[Mode, ...], order: int) -> LabelledArray:
     """Return (order // 2, 2), one mode a row in rising frequency: damped frequency [Hz], damping ratio.
 
-    A model of order n has up to n // 2 modes; rows without one are NaN. The size never changes: a viewer that makes
-    one curve of each entry of the first message shows them all.
+    A model of order n has up to n // 2 modes; rows without a mode are NaN. The size never changes, so a viewer that
+    draws one curve for each entry of the first message shows all modes.
     """
     rows = [(mode.frequency_hz, mode.damping_ratio) for mode in _known(modes)]
     return _matrix('modes', 'frequency_hz damping_ratio', _filled(rows, order // 2, 2))
@@ -97,9 +97,9 @@ def modes_matrix(modes: tuple[Mode, ...], order: int) -> LabelledArray:
 def modes_interval(modes: tuple[Mode, ...], order: int) -> LabelledArray:
     """Return (order // 2, 4), rows as in ``modes_matrix``: lower and upper 95 % of frequency [Hz] and damping ratio.
 
-    NaN where there is no mode, where its deviation is not known, and where the interval says nothing: it would reach
-    below 0 Hz, or more than 1 to either side of the damping ratio. The first samples of a model give intervals of 1e10
-    Hz, which would set the scale of every viewer.
+    Entries are NaN where there is no mode, where its standard deviation is unknown, and where the interval is too wide:
+    it would reach below 0 Hz, or more than 1 to either side of the damping ratio. The first samples of a model give
+    intervals of 1e10 Hz, which would set the scale of every viewer.
     """
     rows = []
     for mode in _known(modes):
@@ -119,7 +119,7 @@ def _known(modes: tuple[Mode, ...]) -> list[Mode]:
 
 
 def _filled(rows: Sequence[tuple[float, ...]], height: int, width: int) -> Array:
-    """Return rows as (height, width); entries that are missing or not finite are NaN, always the same NaN."""
+    """Return rows as (height, width); missing or non-finite entries are NaN, all with the same bits."""
     values = np.full((height, width), np.nan)
     if rows:
         given = np.array(rows[:height], dtype=np.float64)
@@ -134,14 +134,14 @@ def payload_row(payload: Payload) -> LabelledArray:
 
 
 def payload_body(payload: Payload) -> LabelledArray:
-    """Return (5, 4): mass [kg], centre of mass x, y [m] and inertia about it [kg m^2]; then their covariance."""
+    """Return (5, 4): row 1 mass [kg], centre of mass x, y [m], inertia about it [kg m^2]; rows 2 to 5 covariance."""
     first = np.array([payload.mass, payload.com[0], payload.com[1], payload.inertia[5]])
     return _matrix('value covariance_mass covariance_com_x covariance_com_y covariance_izz', 'mass com_x com_y izz',
                    np.vstack([first, np.array(payload.covariance).reshape(4, 4)]))
 
 
 def arm_parameters(found: Sequence[ArmParameter]) -> LabelledArray:
-    """Return one parameter a row, value and standard deviation; the label of the rows names them, in this order."""
+    """Return value and standard deviation, one parameter a row; the label of the rows lists the names in order."""
     return _matrix(','.join(one.name for one in found), 'value std',
                    np.array([(one.value, one.std) for one in found]).reshape(len(found), 2))
 
@@ -188,7 +188,7 @@ def outgoing(estimate: Estimate, frame_id: str) -> Iterator[tuple[str, Value]]:
 def outgoing_payload(payload: Payload | None, stamp_ns: int, frame_id: str) -> Iterator[tuple[str, Value]]:
     """Yield what an estimate says of the payload.
 
-    Never a NaN outside the status. While nothing is known the interval is infinite, and neither ``payload`` nor
+    Only the status may contain NaN. While nothing is known the interval is infinite, and neither ``payload`` nor
     ``payload_mass`` is published.
     """
     if payload is None or not math.isfinite(payload.mass):
@@ -207,7 +207,7 @@ def outgoing_payload(payload: Payload | None, stamp_ns: int, frame_id: str) -> I
 
 
 def outgoing_arm(estimate: Estimate) -> Iterator[tuple[str, Value]]:
-    """Yield what the arm taught, if it is told with this estimate."""
+    """Yield the learned arm parameters, if this estimate carries them."""
     found = estimate.arm_parameters
     if found and all(math.isfinite(one.value) and math.isfinite(one.std) for one in found):
         yield ARM_PARAMETERS, arm_parameters(found)
@@ -216,7 +216,7 @@ def outgoing_arm(estimate: Estimate) -> Iterator[tuple[str, Value]]:
 def outgoing_model(estimate: Estimate) -> Iterator[tuple[str, Value]]:
     """Yield model, modes and their status if they were read with this estimate.
 
-    Rows of modes and intervals that are not known are NaN; the model is finite.
+    Unknown rows of modes and intervals are NaN. Nothing is yielded where a matrix of the model is not finite.
     """
     model = estimate.model
     if model is None or not estimate.model_is_new:

@@ -1,8 +1,8 @@
-"""Joint states and events in, estimates out.
+"""Turn joint states and events into estimates.
 
-A message becomes a row of the sample log. Two estimators, payload and identifier, are cursors into that log and take
-its rows in groups. The live node calls ``step`` with the messages that came, a replay ``run`` for a recording: the same
-give the same estimates bit for bit.
+A joint state becomes a row of the sample log. Two estimators, that of the payload and that of the model (the
+identifier), take the rows of this log in groups, each with its own cursor. The live node calls ``step`` with the
+messages that came. A replay calls ``run`` with a recording. The same messages give the same estimates bit for bit.
 """
 
 from __future__ import annotations
@@ -27,45 +27,46 @@ from flexmanip_ros.samples.sampling import Clock, Counters
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Payload
 
 GROUP = 8
-"""Rows that wait until there are so many or an estimate is due: a group costs less than its rows one by one. At 30 us a
-row it takes 0.24 ms, a tenth of the time that an estimate may take."""
+"""Number of rows that wait until the estimators take them as a group, or until an estimate is due. A group costs less
+than its rows one by one. At 30 us a row it takes 0.24 ms, a tenth of the time that an estimate may take."""
 RESULT_DELAY_S = 0.005
-"""Time from the row that a model is asked for at to the row at which it is taken [s]. Reading it takes 1 to 3 ms."""
+"""Time from the row where a model is requested to the row where its result is used [s]. Reading it takes 1 to 3 ms."""
 ARM_RATE = 1.0
-"""Rate at which estimates carry the arm parameters that were learned [Hz]: they change slowly."""
+"""Rate at which estimates carry the learned arm parameters [Hz]. It is low because they change slowly."""
 HOPELESS = 2000
-"""Messages without a single usable one after which a replay gives up."""
+"""Number of messages after which a replay gives up if none of them is usable."""
 REPLAY_GROUP = 2000
-"""Rows that a replay takes at once at least: what Python adds to a row is then below a microsecond."""
+"""Number of rows that wait in a replay, where ``GROUP`` rows wait in the live node. Python's overhead is then below a
+microsecond a row."""
 ABSORB_GROUP = 16_000
-"""The same where no estimate is made on the way: both estimators take some tenths of a second for them, so that fits,
-which take up to 0.1 s each, seldom leave the other one waiting."""
+"""Number of rows that wait in ``absorb``, which makes no estimate on the way. Both estimators take some tenths of a
+second for them. A fit takes up to 0.1 s, so it seldom makes the other estimator wait."""
 EARLY_STAMP = 0.1
-"""Share of the sample time by which the sample that an estimate is due with may seem to come before its instant.
-
-Its stamp is foretold by the mean interval, and may be earlier than it will be. The node looks for it then, as the next
-one would be a sample time later."""
+"""Fraction of the sample time by which the predicted stamp of a sample may be before the instant of an estimate, while
+the node still expects the estimate with this sample. The prediction uses the mean interval and may be too early. The
+sample after it would come a whole sample time later."""
 ROUNDING = 1e-6
-"""Share of an instant by which a stamp may fall short of it, for stamps that are rounded to nanoseconds."""
+"""Fraction of the grid interval by which a stamp may be before an instant of the grid and still count as reaching it.
+Stamps are rounded to nanoseconds."""
 
 Item = JointRecord | JointBlock | CaptureEvent
 
 
 class PendingModel(NamedTuple):
-    """A model that was asked for at a row and is taken at row ``due``, or with the next estimate."""
+    """A model that was requested at one row and whose result is used at row ``due``, or with the next estimate."""
 
     request: estimator.ModelRequest
     payload: Payload | None
-    """The payload at that row; None where it rests on the model, and until it is estimated."""
+    """The payload at the row of the request; None where it is read from the model, and until it is estimated."""
     since_ns: int
-    """Stamp of the last event before it [ns]."""
+    """Stamp of the last event before the request [ns]."""
     instant: int
-    """Number of its instant on the grid of ``model_rate``."""
+    """Number of the request's instant on the grid of ``model_rate``."""
     due: int
 
 
 class ModelEstimate(NamedTuple):
-    """The last model: its estimate, the event it came after, and its instant on the grid of ``model_rate``."""
+    """The last model: its estimate, the stamp of the event before it [ns], its instant on ``model_rate``'s grid."""
 
     estimate: Estimate
     since_ns: int
@@ -89,7 +90,7 @@ class State(NamedTuple):
     published: int = -1
     """Number of the last instant of ``publish_rate``, counted from the first stamp."""
     told: int = -1
-    """Number of the last second from the first stamp on in which an estimate carried the arm's parameters."""
+    """Number of the last second, counted from the first stamp, in which an estimate carried the arm parameters."""
     pending: PendingModel | None = None
     model: ModelEstimate | None = None
 
@@ -100,7 +101,7 @@ class State(NamedTuple):
 
     @property
     def next_due_ns(self) -> int | None:
-        """Stamp of the sample that the next estimate is due with [ns], if none is missing; None while nobody knows."""
+        """Stamp of the sample with which the next estimate is due [ns], if no sample is missing; None while unknown."""
         last_ns, dt_ns = self.clock.last_ns, self.clock.dt * 1e9
         if self.config is None or last_ns is None or not dt_ns > 0.0:
             return None
@@ -121,9 +122,9 @@ def step(config: IdentifierParameters, state: State, item: Item, background: Bac
          group: int = GROUP) -> tuple[State, tuple[Estimate, ...]]:
     """Take a message, a block of messages or an event; return the estimates that are due with it.
 
-    An estimate with a new payload comes at once (``payload_is_new``); where its model is read, the model follows
-    in an estimate of the same stamp (``model_is_new``). Rows wait until an estimate is due, or ``group`` of them.
-    Raises ParameterError when the configuration does not fit the signals that the messages carry.
+    An estimate with a new payload comes at once (``payload_is_new``). Where a model is read at its stamp, the model
+    follows in a second estimate of the same stamp (``model_is_new``). Rows wait until an estimate is due or ``group``
+    rows wait. Raises ParameterError when the configuration does not fit the signals that the messages carry.
     """
     if isinstance(item, CaptureEvent):
         return _insert(state, item, background), ()
@@ -138,9 +139,9 @@ def step(config: IdentifierParameters, state: State, item: Item, background: Bac
 
 
 def absorb(config: IdentifierParameters, items: Iterable[Item], background: Background = INLINE) -> Iterator[State]:
-    """Yield the states of a recording of which the end alone counts: no estimate is made on the way.
+    """Yield the states of a recording for a caller that needs the last one only: no estimate is made on the way.
 
-    The last one has the bits of ``replay``. Raises SignalError when no message can be used.
+    The last state equals that of ``replay`` bit for bit. Raises SignalError when no message can be used.
     """
     state, ahead = init(), None
     for item in items:
@@ -177,7 +178,7 @@ def _length(item: JointRecord | JointBlock) -> int:
 
 def _push(config: IdentifierParameters, state: State, item: JointRecord | JointBlock, taken: int,
           background: Background) -> tuple[State, int]:
-    """Put messages into the log, of a block those from number ``taken`` on; return how many."""
+    """Put messages into the log (of a block, those from number ``taken`` on); return the state and their number."""
     if isinstance(item, JointBlock):
         sampled, some = sampling.push_block(config, state.clock, state.log, item, taken)
     else:
@@ -192,9 +193,9 @@ def _hopeless(state: State) -> bool:
 def catch_up(state: State, background: Background = INLINE, group: int = 1) -> tuple[State, list[Estimate]]:
     """Let the estimators take the rows of the log.
 
-    The payload's takes the rows up to each instant of ``publish_rate``. Where the estimate that is due there needs a
-    new model, the identifier takes the same rows. Where several estimates are due, as in a replay, the payload is
-    estimated beside the models. Last the rows left over, if they are ``group`` or more.
+    The payload's estimator takes the rows up to each instant of ``publish_rate``. Where the estimate that is due there
+    needs a new model, the identifier takes the same rows. Where several estimates are due, as in a replay, payload and
+    models are estimated in parallel. Finally both estimators take the remaining rows, if these are ``group`` or more.
     """
     estimates: list[Estimate] = []
     if state.payload is None or state.identifier is None:
@@ -220,7 +221,7 @@ def catch_up(state: State, background: Background = INLINE, group: int = 1) -> t
 
 
 def run(config: IdentifierParameters, items: Iterable[Item]) -> Iterator[Estimate]:
-    """Yield the estimates of a recording, one a stamp. Raises SignalError when no message can be used."""
+    """Yield the estimates of a recording, one for each stamp. Raises SignalError when no message can be used."""
     for _, estimate in replay(config, items):
         if estimate is not None:
             yield estimate
@@ -246,7 +247,7 @@ def replay(config: IdentifierParameters, items: Iterable[Item], background: Back
 
 
 def _one_a_stamp(estimates: Iterable[tuple[State, Estimate]]) -> Iterator[tuple[State, Estimate]]:
-    """Yield payload and model of one stamp in one estimate."""
+    """Merge the estimates of payload and model that have the same stamp."""
     waiting: tuple[State, Estimate] | None = None
     for state, estimate in estimates:
         arm = estimate.arm_parameters
@@ -272,7 +273,7 @@ def _steps(config: IdentifierParameters, state: State, items: Iterable[Item], ba
 
 def finish(config: IdentifierParameters, state: State, background: Background = INLINE
            ) -> tuple[State, tuple[Estimate, ...]]:
-    """No message follows: take every row, and the model under way."""
+    """Take every remaining row and the pending model, as no message follows."""
     if state.config is None:
         return state, ()
     sampled = sampling.flush(config, state.clock, state.log)
@@ -283,9 +284,9 @@ def finish(config: IdentifierParameters, state: State, background: Background = 
 
 
 def current(state: State) -> Estimate | None:
-    """Return the estimate at the latest sample, whatever the publishing grid; None before the first.
+    """Return the estimate at the latest sample, on or off the publishing grid; None before the first sample.
 
-    A fit under way is awaited, as no sample follows.
+    The call waits for a fit that is in progress, as no sample follows.
     """
     if state.payload is None:
         return None
@@ -327,7 +328,7 @@ def reconfigure(config: IdentifierParameters, state: State, background: Backgrou
 
 
 def _sampled(config: IdentifierParameters, state: State, sampled: sampling.Sampled, background: Background) -> State:
-    """Go on with clock and log after a message; build the estimators with the first that can be used."""
+    """Return the state with new clock and log; at the first usable message build the estimators."""
     if sampled.reset:
         state = State(config=state.config)
     state = state._replace(clock=sampled.clock, log=sampled.log)
@@ -363,16 +364,16 @@ def _running(state: State) -> tuple[IdentifierParameters, EventReplay[PayloadEst
 
 
 class Ahead(NamedTuple):
-    """Rows that both estimators take while further rows come into the log."""
+    """The progress of both estimators on rows that they take while further rows come into the log."""
 
     request: estimator.PayloadRequest
-    """What the payload's takes, in a replay in the background."""
+    """The request of the payload's estimator; a replay solves it in the background."""
     identifier: EventReplay[ModelEstimator]
-    """The identifier after them."""
+    """The identifier after these rows."""
 
 
 def _ahead(state: State, until: int, background: Background) -> Ahead:
-    """Let both estimators begin with the rows up to ``until``, in a replay beside each other."""
+    """Let both estimators begin with the rows up to ``until``; in a replay they work in parallel."""
     config, payload, identifier = _running(state)
     request = estimator.PayloadRequest(config, payload, state.log, until)
     if until - payload.cursor >= REPLAY_GROUP:
@@ -381,7 +382,7 @@ def _ahead(state: State, until: int, background: Background) -> Ahead:
 
 
 def _joined(state: State, ahead: Ahead | None, background: Background) -> State:
-    """Return the state with the rows taken that both estimators have begun with."""
+    """Return the state after both estimators have taken the rows that they began with."""
     if ahead is None:
         return state
     payload, _, _ = background.result(ahead.request)
@@ -402,7 +403,7 @@ def _without_old_rows(state: State) -> State:
 
 
 def _latest(state: State, until: int) -> Rows:
-    """Return the rows before ``until`` on which a model is judged: the last 1.5 s, since the last event."""
+    """Return the rows before ``until`` on which a model is judged: the last 1.5 s, but none before the last event."""
     first = max(state.log.start, until - prediction_check.length(state.clock.dt))
     first = min(state.log.row_at(_running(state)[2].estimator.since_ns, first), until)
     return state.log.rows(first, until)
@@ -445,22 +446,22 @@ def _payload_request(state: State, due: list[int]) -> estimator.PayloadRequest:
 
 
 class ModelStep(NamedTuple):
-    """What becomes of the models at a row that an estimate is due at."""
+    """What happens to the models at a row where an estimate is due."""
 
     stamp_ns: int
     taken: list[Estimate]
-    """The model that was under way, if there was one. One asked for at a row before it has no payload yet."""
+    """The model that was pending, if any. A model requested at an earlier row of the same call has no payload yet."""
     last: ModelEstimate | None
     """The last model."""
     asked: bool
-    """Whether another one was asked for."""
+    """Whether another model was requested at this row."""
 
 
 def _models(state: State, due: list[int], background: Background) -> tuple[State, list[ModelStep]]:
-    """Take the model under way at each row in turn, and ask for another one when it is due.
+    """Use the pending model at each row in turn, and request another one when it is due.
 
-    A model is due by ``model_rate``, and with every estimate for as long after an event as another may arrive
-    late: so any order of arrival reads models at the same stamps.
+    A model is due at the rate ``model_rate``. After an event it is due with every estimate, for as long as another
+    event may arrive late. So the stamps at which models are read do not depend on the order of arrival.
     """
     steps = []
     for row in due:
@@ -498,7 +499,7 @@ def _with_payloads(state: State, steps: list[ModelStep], readings: list[estimato
         last, held = step.last, payload if step.asked else held
         if payload is not None and last is None:
             estimate = estimator.without_model(config, step.stamp_ns, payload)
-        elif last is None or (payload is None and step.asked):  # it rests on the model
+        elif last is None or (payload is None and step.asked):  # it is read from the model
             continue
         else:
             estimate = estimator.with_model_of(config, step.stamp_ns, last.estimate, payload)
@@ -509,7 +510,7 @@ def _with_payloads(state: State, steps: list[ModelStep], readings: list[estimato
 
 
 def _take_model(state: State, background: Background) -> tuple[State, list[Estimate]]:
-    """Take the model under way, if there is one."""
+    """Use the pending model, if there is one."""
     pending = state.pending
     if pending is None:
         return state, []

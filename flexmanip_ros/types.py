@@ -1,4 +1,4 @@
-"""The values that travel through the package. Immutable; arrays inside are never written to."""
+"""Value types that the modules exchange. They are immutable, and their arrays are never written to."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class EventKind(Enum):
 
 
 DATING_STD_S = 0.003
-"""Standard deviation of the instant of an event that was found in the signals [s]: half of them are dated to 2 ms
-(benchmark ``detection_delay``), which is 0.67 of it."""
+"""Standard deviation of the instant of an event that was found in the signals [s]. For half of these events the error
+is at most 2 ms (benchmark ``detection_delay``), which is 0.67 standard deviations."""
 
 
 class CaptureEvent(NamedTuple):
-    """The arm took or let go of an object at ``stamp_ns``; that stamp is the first after the jump."""
+    """The arm took or let go of an object at ``stamp_ns``; that is the stamp of the first sample after the change."""
 
     stamp_ns: int
     kind: EventKind
@@ -36,12 +36,12 @@ class CaptureEvent(NamedTuple):
     """Standard deviation of the instant [s]; 0: it is known."""
 
     def heard_on(self, topic: str) -> CaptureEvent:
-        """Return the event as it came on a topic: what comes on ``capture_detected`` was found in the signals."""
+        """Return the event with the deviation of its topic: one on ``capture_detected`` was found in the signals."""
         return self._replace(std_s=DATING_STD_S) if topic.endswith('capture_detected') else self
 
 
 def events_at(start_ns: int, capture_s: float, release_s: float, end_s: float = math.inf) -> tuple[CaptureEvent, ...]:
-    """Return a capture and a release at times from a stamp on [s]; none for a negative time, or one from end_s on."""
+    """Return a capture and a release at times after a stamp [s]; leave out one with a time below 0 or from end_s on."""
     return tuple(CaptureEvent(start_ns + round(at * 1e9), kind) for at, kind in (
         (capture_s, EventKind.CAPTURE), (release_s, EventKind.RELEASE)) if 0.0 <= at < end_s)
 
@@ -101,7 +101,7 @@ class Sample(NamedTuple):
 
 
 class Status(Enum):
-    """What an estimate is worth. The value is the sentence a user reads."""
+    """How far an estimate can be trusted. The value is the sentence a user reads."""
 
     WARMING_UP = 'not enough samples yet'
     TRACKING = 'tracking'
@@ -148,7 +148,7 @@ class Payload(NamedTuple):
     mass, std, lower, upper: [kg], the last two a 95 % interval; consistency: normalised residual
     power (1 = noise only); com: (3,) [m] and inertia: (6,) ixx ixy ixz iyy iyz izz [kg m^2] about
     the centre of mass, in the frame of the tip; covariance: (16,) row by row of mass, com x, com y and izz, empty where
-    the object is no body.
+    the object is not estimated as a body.
     """
 
     mass: float
@@ -163,7 +163,7 @@ class Payload(NamedTuple):
 
 
 class ArmParameter(NamedTuple):
-    """A parameter of the arm as it was found, with its standard deviation, in SI units."""
+    """A learned parameter of the arm with its standard deviation, in SI units."""
 
     name: str
     value: float
@@ -187,10 +187,10 @@ class Estimate(NamedTuple):
     innovation_power: float = float('nan')
     """Mean squared innovation over the variance expected [-]."""
     model_status: Status = Status.TRACKING
-    """What the model is worth; ``status`` is that of the payload where one is estimated beside the model."""
+    """Status of the model; ``status`` is that of the payload where the payload is not read from the model."""
     model_is_new: bool = True
-    """Whether model and modes were read at this stamp, or are those of an estimate before."""
+    """Whether model and modes were read at this stamp; False: they are those of an earlier estimate."""
     payload_is_new: bool = True
-    """Whether the payload has not been in an estimate of this stamp before."""
+    """Whether no earlier estimate of this stamp contained the payload."""
     arm_parameters: tuple[ArmParameter, ...] = ()
-    """What the arm taught, with the first estimate of each second."""
+    """The learned arm parameters, in the first estimate of each second only."""

@@ -25,23 +25,23 @@ SUCCESS, DEFECT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 LONGEST = 1e9
 """Largest time that is accepted [s]; larger ones overflow a stamp in nanoseconds."""
 LOADING_S = 0.05
-"""Time after which a signal comes again that came while a kernel was loaded, which takes some milliseconds."""
+"""Time after which a signal that came while a kernel was loaded is sent again [s]; loading takes milliseconds."""
 TRACEBACK = 'FLEXMANIP_TRACEBACK'
 """Environment variable; where it is set, a defect prints its traceback."""
 
 
 class Report:
-    """Where a program says how far it is: on a bar of the terminal, or nowhere."""
+    """Progress of a program: this class shows nothing; ``progress`` yields one that shows a bar on a terminal."""
 
     def __call__(self, done: int, total: int | None) -> None:
         """Note the steps done and the steps in all (None: unknown)."""
 
     def phase(self, words: str) -> None:
-        """Begin another part of the work, of which nobody knows how long it takes."""
+        """Begin another part of the work, whose duration is not known."""
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that answers a mistake with one line."""
+    """An argument parser that reports a mistake in one line."""
 
     def error(self, message: str) -> NoReturn:
         """Print the mistake and where to find help; exit with 2."""
@@ -81,11 +81,11 @@ def parser(prog: str, words: str, epilog: str) -> Parser:
 
 
 class Once(argparse.Action):
-    """An option that may be given once: of two values the first would be lost without a word."""
+    """An option that may be given once; argparse would drop the first of two values without a message."""
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any,
                  option_string: str | None = None) -> None:
-        """Take the value, or say that there is one."""
+        """Store the value, or report an error where the option already has one."""
         if getattr(namespace, self.dest) is not None:
             parser.error(f'{option_string} was given twice; give one file with the parameters of both')
         setattr(namespace, self.dest, values)
@@ -154,9 +154,9 @@ def require_scikit_fem() -> None:
 
 
 def run(prog: str, body: Callable[[], int]) -> int:
-    """Run a program; return its exit status: 2 after an error of this package, 130 after an interrupt."""
+    """Run a program; return its exit status: 2 after an error of the package, 130 when interrupted, 1 for a defect."""
     with _signals_as_interrupt(), warnings.catch_warnings():
-        warnings.simplefilter('ignore')  # numbers out of range are told by the status; stderr is for one line
+        warnings.simplefilter('ignore')  # the status reports numbers out of range; stderr is for one line
         try:
             return body()
         except FlexmanipError as error:
@@ -177,7 +177,7 @@ def run(prog: str, body: Callable[[], int]) -> int:
 
 
 def is_postponed(number: int, frame: FrameType | None) -> bool:
-    """Return whether a signal came while LLVM calls back to load a kernel; it then comes again ``LOADING_S`` later.
+    """Return whether a signal came in a callback of LLVM that loads a kernel; it is sent again after ``LOADING_S``.
 
     An exception in such a callback is printed and lost, or ends the process with SIGSEGV.
     """
@@ -190,7 +190,7 @@ def is_postponed(number: int, frame: FrameType | None) -> bool:
 
 
 def send_again(number: int, seconds: float) -> None:
-    """Let a signal come to this process once more after a time [s]."""
+    """Send a signal to this process after a time [s]."""
     timer = threading.Timer(seconds, os.kill, (os.getpid(), number))
     timer.daemon = True
     timer.start()

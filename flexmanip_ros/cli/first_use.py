@@ -16,18 +16,18 @@ from typing import Any
 from numba.core import event
 
 PATIENCE = 2.0
-"""Time [s] for which a kernel is compiled before the user is told; one that takes less is not worth a line."""
+"""Duration of a compilation [s] from which on the user is told of it; a shorter one is not worth a line."""
 WORDS = ('flexmanip_ros: compiling the kernels for this machine. It takes a minute or two, at the first use of each '
          'method after an installation.')
 
 
 def tell() -> None:
-    """Write the words on stderr."""
+    """Write ``WORDS`` on stderr."""
     print(WORDS, file=sys.stderr, flush=True)
 
 
 class Listener(event.Listener):
-    """Hears when numba compiles a kernel that is not on disk, and calls ``say`` once if one takes long."""
+    """Listener to numba's compilations of kernels that are not on disk; calls ``say`` once if one takes long."""
 
     def __init__(self, say: Callable[[], None] = tell) -> None:
         self._say = say
@@ -36,7 +36,7 @@ class Listener(event.Listener):
         self._timer: threading.Timer | None = None
 
     def on_start(self, event: Any) -> None:
-        """Note the begin of a compilation; one kernel may compile another within."""
+        """Note the start of a compilation; the compilation of one kernel may contain that of another."""
         self._depth += 1
         if self._depth == 1 and not self._told:
             self._timer = threading.Timer(PATIENCE, self._tell)
@@ -56,13 +56,13 @@ class Listener(event.Listener):
 
 @contextmanager
 def announced(say: Callable[[], None] = tell) -> Iterator[None]:
-    """Tell the user, at most once and on stderr where nothing else is said, that kernels are being compiled."""
+    """Tell the user at most once, on stderr unless ``say`` does otherwise, that kernels are being compiled."""
     with event.install_listener('numba:compile', Listener(say)):
         yield
 
 
 def announce_in_worker(told: Synchronized[bool]) -> None:
-    """Tell the same in a process of a pool, whose workers share ``told``: one of them speaks."""
+    """Do as ``announced`` in a worker process. The workers of a pool share ``told``, so only one tells the user."""
     def once() -> None:
         with told.get_lock():
             if told.value:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 PROG = 'identify_bag'
 NODE = 'rpbsid_identifier'
 SWITCH_S = 0.0002
-"""Time after which a waiting thread gets its turn [s]; a kernel for the samples between two estimates takes 2 ms."""
+"""Thread switch interval of Python [s]; a kernel for the samples between two estimates takes 2 ms."""
 EXAMPLES = """examples:
   identify_bag recording                                     the default arm; captures are found in the signals
                                                              where the recording has no topic of events
@@ -120,7 +120,7 @@ def _main(given: argparse.Namespace) -> int:
 
 
 def describe(result: Result) -> list[str]:
-    """Return the result as lines for people."""
+    """Return the result as the lines to print."""
     from flexmanip_ros.studies.results import result_rows
 
     rows = result_rows(result.summary, result.config, result.modes, result.events)

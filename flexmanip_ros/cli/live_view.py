@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 PROG = 'live_view'
 LARGEST_PORT = 65535
 MOST_ROWS = 1_000_000
-"""Samples that the page gets: a quarter of an hour at 1 kHz without thinning."""
+"""Largest number of samples in the page: a quarter of an hour at 1 kHz; a longer recording is thinned out."""
 EPILOG = """without a recording, as a node (ROS must run):
   live_view --ros-args -p port:=8765
   subscribes to joint_states, capture_event, capture_detected and rpbsid_identifier/status; only listens.
@@ -90,7 +90,7 @@ def _play(options: argparse.Namespace) -> int:
     with console.progress('identifying', 'messages') as progress, first_use.announced():
         items: Iterable[pipeline.Item] = bag.read_blocks(options.bag, topics, progress)
         if config.payload_method != 'none' and not bag.event_topics(options.bag, topics):
-            with suppress(ParameterError):  # as identify_bag, captures are looked for in signals that can show them
+            with suppress(ParameterError):  # as in identify_bag, captures are looked for in signals that can show them
                 items = capture_detection.with_detected(capture_detection.watch(config), items)
         found, fault = read(config, items, source)
     if fault is not None:

@@ -139,7 +139,7 @@ def _digest(values: Any) -> str:
 
 
 def describe(rows: Sequence[Row]) -> list[str]:
-    """Return the scores of each estimator as lines for people."""
+    """Return the scores of each estimator as the lines to print."""
     from flexmanip_ros.studies.results import score
 
     lines = [f'{"estimator":24s} {"runs":>6s} {"failed":>6s} {"mean err %":>10s} {"median %":>9s} '

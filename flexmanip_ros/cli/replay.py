@@ -30,12 +30,12 @@ from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointB
 from flexmanip_ros.view.screen import Screen, embedded, of_identifier
 
 NEVER = (1 << 63) - 1
-"""A stamp after all others [ns]."""
+"""The largest stamp [ns], which is after all others."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """What identify_bag is asked for. Times count from the first stamp [s]."""
+    """The options of one run of identify_bag. Times count from the first stamp [s]."""
 
     bag: str | Path
     config: IdentifierParameters
@@ -52,28 +52,28 @@ class Request:
     horizon: float = whole_recording.HORIZON_S
     """How far ahead the held-out samples are predicted [s]."""
     smooth: bool = False
-    """Fit each stretch between events with all of its samples too."""
+    """Whether each stretch between events is also fitted with all of its samples."""
     output: str | None = None
     report: str | None = None
     save_arm: str | None = None
-    """Parameter file for what the arm taught."""
+    """Path of the parameter file for the arm parameters that the recording gave; None: none is written."""
     configurations: str | None = None
-    """Table for the frequencies of every configuration."""
+    """Path of the table of the frequencies of every configuration; None: none is written."""
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """The result. fault: what was wrong with the recording, of which the rest was used all the same."""
+    """The result of a run. fault: what was wrong with the recording; its sound messages were used all the same."""
 
     summary: Summary
     modes: tuple[Mode, ...]
     config: IdentifierParameters
-    """With the outputs that the messages really carry."""
+    """The configuration, with the outputs that the messages really carry."""
     written: tuple[str, ...]
     fault: FlexmanipError | None
     interrupted: bool = False
     events: str = ''
-    """What was found in the signals where events were looked for, or why they were not; empty where they are known."""
+    """The events found in the signals, or why they were not looked for, as text; empty where events are known."""
     remark: str = ''
     """One line about messages that were left out and events that were not applied at their stamp; empty if none."""
 
@@ -100,7 +100,7 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     with (output or nullcontext(), closing(Threads(REPLAY_THREADS)) as background,
           closing(read_ahead(messages)) as items):
         try:
-            if output is None and request.report is None:  # the end alone is asked for
+            if output is None and request.report is None:  # only the last estimate is needed
                 for now in pipeline.absorb(request.config, items, background):
                     state = now
             else:
@@ -117,7 +117,7 @@ def identify(request: Request, progress: Report | None = None) -> Result:
             messages.fault, interrupted = BagError('interrupted', 'the messages until then are reported'), True
         if interrupted and state.counters.accepted == 0:
             raise KeyboardInterrupt
-        if messages.fault is not None and state.counters.accepted == 0:  # an output that was there stays
+        if messages.fault is not None and state.counters.accepted == 0:  # an existing output file stays
             raise messages.fault
         if isinstance(output, TableOutput):
             output.start_ns = messages.first_ns
@@ -172,9 +172,9 @@ class _Messages:
         self._findings = capture_detection.Findings()
         self._looked = False
         self._search = ''
-        """Why events were not looked for, or what there was no need to."""
+        """Text on why events were not looked for in the signals; else empty."""
         self.screen = Screen(of_identifier(request.config, Path(request.bag).name))
-        """What the page in the report shows."""
+        """The signals that the player in the report shows."""
         self._request = request
         self._progress = progress
         self._joints = set(joints(request.config))
@@ -195,7 +195,7 @@ class _Messages:
     def _watch(self, topics: bag.Topics) -> capture_detection.Watch | None:
         """Return the detector where events are to be looked for in the signals; say why where they are not.
 
-        It costs about as much time as the payload itself, so where events are announced it is asked for.
+        Detection costs about as much time as the payload estimate, so where events are announced it needs --detect.
         """
         request = self._request
         given = request.capture_time is not None or request.release_time is not None
@@ -221,7 +221,7 @@ class _Messages:
     def search(self, status: str) -> str:
         """Return what was found in the signals, or why nothing was looked for; empty where events are known.
 
-        status: of the last estimate.
+        status: name of the status of the last estimate.
         """
         found = [event for event in self._findings.events if event.stamp_ns < self._limit_ns()]
         if found:
@@ -284,7 +284,7 @@ def _angles_held(signals: Signals, events: Sequence[CaptureEvent]) -> Array:
 
 
 def _save_arm(request: Request, state: pipeline.State, last: Estimate | None) -> None:
-    """Write what the arm taught as parameters for every node. Raises SignalError where it taught nothing."""
+    """Write the arm parameters that the recording gave as a file for every node. Raises SignalError without any."""
     config = state.config or request.config
     found = () if state.payload is None else estimator.arm_parameters(config, state.payload.estimator)
     if not found:
@@ -299,7 +299,7 @@ def _save_arm(request: Request, state: pipeline.State, last: Estimate | None) ->
 
 
 def _dropped(state: pipeline.State) -> FlexmanipError | None:
-    """Return the fault of messages with unusable numbers; None without any."""
+    """Return an error on messages with unusable numbers; None without such messages."""
     counters, rejection = state.counters, state.clock.rejection
     faulty = counters.not_finite + counters.unequal_sizes
     if not faulty or rejection is None:
@@ -312,7 +312,7 @@ def _dropped(state: pipeline.State) -> FlexmanipError | None:
 def _remark(state: pipeline.State, foreign: int) -> str:
     """Return one line about messages left out and events not applied at their stamp; empty if there are none.
 
-    foreign: number of messages of other publishers on the same topic, which are left out without a word.
+    foreign: number of messages of other publishers on the same topic, which are left out of this line.
     """
     counters, events = state.counters, state.payload
     left_out = [f'{count} {why}' for count, why in (

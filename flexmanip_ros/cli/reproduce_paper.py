@@ -139,7 +139,7 @@ def _results(cases: Sequence[experiments.Case], seeds: Sequence[int], processes:
 
 
 def describe(lines: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the summary as lines for people."""
+    """Return the summary as the lines to print."""
     shown = [f'{"case":40s} {"method":12s} {"4-6 s, %":>9s} {"rms 6 s %":>9s} {"bound %":>9s} '
             f'{"covered %":>11s} {"us/sample":>10s}']
     for line in lines:

@@ -27,9 +27,9 @@ from flexmanip_ros.types import Array, CaptureEvent, JointBlock
 
 NODE = 'rpbsid_identifier'
 STILL = 1e-9
-"""A signal that varies by less than this share of its size stands still."""
+"""Ratio of standard deviation to largest magnitude below which a signal counts as standing still."""
 MOST_OUTPUTS = 8
-"""Outputs chosen at most: the effort of the identifier grows with their square."""
+"""Largest number of outputs chosen: the computing time of the identifier grows with its square."""
 DEFAULTS = IdentifierParameters()
 
 
@@ -43,15 +43,15 @@ class Found:
     std: float
     rate: float
     broken: int
-    """Values that are not finite."""
+    """Number of values that are not finite."""
 
     @property
     def moves(self) -> bool:
-        """Whether it can be an input or an output."""
+        """Whether the signal is finite and varies, so that it can be an input or an output."""
         return self.broken == 0 and self.std > STILL * max(abs(self.low), abs(self.high))
 
     def text(self) -> str:
-        """Return it as a line for people."""
+        """Return the signal as a line to print."""
         what = f'{self.broken} values are not finite' if self.broken else (
             f'{self.low:.4g} .. {self.high:.4g}, standard deviation {self.std:.3g}' if self.moves
             else f'stands still at {self.low:.4g}')
@@ -77,7 +77,7 @@ def given_values(path: str | None, overrides: list[str]) -> dict[str, Any]:
 
 
 def suggest_for(arguments: argparse.Namespace) -> tuple[IdentifierParameters, list[str]]:
-    """Do what identify_bag was asked for; return the configuration and the lines for people."""
+    """Run ``suggest`` with the arguments of identify_bag; return the configuration and the lines to print."""
     topics = bag.Topics(arguments.joint_states, arguments.capture_event or bag.Topics().events,
                         arguments.capture_event is not None)
     return suggest(arguments.bag, arguments.suggest, given_values(arguments.params, arguments.set), topics,
@@ -86,9 +86,9 @@ def suggest_for(arguments: argparse.Namespace) -> tuple[IdentifierParameters, li
 
 def suggest(source: str, place: str, given: Mapping[str, Any], topics: bag.Topics, until_s: float | None,
             horizon_s: float) -> tuple[IdentifierParameters, list[str]]:
-    """Look at a recording and write the parameters to identify it with; return them and the lines for people.
+    """Look at a recording and write the parameters to identify it with; return them and the lines to print.
 
-    given: parameters that stay as they are; until_s: the samples from there on are not looked at [s].
+    given: parameters that stay as they are; until_s: time from which on samples are not looked at [s].
     Raises FlexmanipError where the recording tells too little, and where the file cannot be written.
     """
     check_place(place, '.yaml', '.yml')
@@ -118,7 +118,7 @@ def file_text(heading: str, words: Sequence[str], values: Mapping[str, Any]) -> 
 
 
 def _recording(source: str, topics: bag.Topics, until_s: float | None, progress: bag.Progress) -> _Recording:
-    """Read up to a time; of a damaged recording what comes before the damage."""
+    """Read a recording up to a time; of a damaged one, read what comes before the damage."""
     found, is_cut = _Recording(), until_s is None
     try:
         for item in bag.read_blocks(source, topics, progress):

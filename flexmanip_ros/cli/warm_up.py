@@ -15,16 +15,16 @@ from dataclasses import replace
 import numpy as np
 
 SAMPLES = 1200
-"""Enough for the prediction-error fit to begin."""
+"""Number of samples, enough for the prediction-error fit to begin."""
 REFINED = 2600
-"""Enough for the fit to go on block by block, and for a test of a drift."""
+"""Number of samples, enough for the fit to continue block by block, and for a test of a drift."""
 MOVING_SAMPLES = 1400
-"""Enough for the model of every configuration to begin."""
+"""Number of samples, enough for the model of every configuration to begin."""
 PERIOD_NS = 1_000_000
 
 
 def simulator_and_identifier() -> None:
-    """Simulate a capture and a release, and identify the model of it; simulate and predict with a model."""
+    """Simulate a capture and a release, identify a model from the samples, and simulate and predict with a model."""
     from flexmanip_ros import pipeline
     from flexmanip_ros.identification import validation
     from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
@@ -90,7 +90,7 @@ def main(argv: list[str] | None = None) -> int:
     print(f'compiling {len(PARTS)} parts side by side, about a minute the first time: {", ".join(PARTS)}', flush=True)
     running = {name: subprocess.Popen([sys.executable, '-m', 'flexmanip_ros.cli.warm_up', name]) for name in PARTS}
     for name, process in running.items():
-        if process.wait() != 0:  # an installation does not fail for it
+        if process.wait() != 0:  # an installation does not fail because of this
             print(f'{name} is not compiled yet; it is compiled at its first use', file=sys.stderr)
     print(f'kernels ready after {time.perf_counter() - begin:.1f} s')
     return 0

@@ -31,21 +31,21 @@ from flexmanip_ros.studies.scenario import Scenario
 from flexmanip_ros.types import CaptureEvent, JointBlock
 
 KEY = 'run'
-"""Column with the name of a run. A study continues with the runs whose names are not in its journal."""
+"""Name of the column with the key of a run. A study continues with the runs whose keys are not in its journal."""
 SETTLING_TIME = 1.0
-"""Seconds after a capture in a recording from which on the error counts, as in the paper."""
+"""Time after a capture in a recording from which on the error counts [s], as in the paper."""
 
 THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 AHEAD = 4
-"""Runs submitted per worker, so that no worker waits for the next."""
+"""Number of runs submitted per worker, so that no worker waits for its next run."""
 ANSWER_TIME = 10.0
 """Time after which a scheduler that does not answer counts as missing [s]."""
 GARBAGE = 20_000
-"""New objects between two collections of garbage. A run keeps many small objects, and each collection visits them."""
+"""Number of new objects between two garbage collections, each of which visits the many small objects of a run."""
 RECOUNT = 5.0
 """Time after which the workers of a cluster are counted again [s]."""
 ATTEMPTS = 2
-"""Times that a run is tried when its worker dies; the last time it runs alone."""
+"""Number of times that a run is tried when its worker dies; the last time it runs alone."""
 
 Task = Any
 Work = Callable[[Task], Any]
@@ -53,7 +53,7 @@ Work = Callable[[Task], Any]
 
 @dataclass(frozen=True)
 class Simulated:
-    """One seed of a scenario."""
+    """A run of a scenario with one seed."""
 
     scenario: Scenario
     seed: int
@@ -66,7 +66,7 @@ class Simulated:
 
 @dataclass(frozen=True)
 class Recorded:
-    """One recording. window: from and to [s] of the mean error."""
+    """A run on one recording. window: start and end of the time over which the mean error is taken [s]."""
 
     path: str
     config: IdentifierParameters
@@ -137,7 +137,7 @@ def compute(work: Work, tasks: Iterable[Task], count: int | None) -> Iterator[Ou
 
 
 def serial(work: Work, tasks: Iterable[Task]) -> Iterator[Outcome]:
-    """Compute here, one after the other."""
+    """Compute the tasks in this process, one after the other."""
     with first_use.announced():
         for task in tasks:
             try:
@@ -163,7 +163,7 @@ def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome
         pool = ProcessPoolExecutor(count, spawn, _serve, (told,))
         running: dict[Future[Any], tuple[Task, int]] = {}
         try:
-            if again:  # alone, so that it is known which run the worker dies of
+            if again:  # alone, so that it is known which run kills its worker
                 task, attempt = again.pop()
                 running[pool.submit(work, task)] = (task, attempt)
             else:

@@ -61,7 +61,7 @@ COLOURS = ('0.20 0.45 0.70 1', '0.85 0.50 0.15 1')
 
 
 def urdf(arm: ArmParameters, segments: int = 12) -> str:
-    """Return the description as XML text; ``segments`` of each link, encoder angles assumed.
+    """Return the description as XML text, for encoder angles. segments: number of segments of each link.
 
     Raises ModelError for fewer than two segments.
     """
@@ -78,9 +78,10 @@ def urdf(arm: ArmParameters, segments: int = 12) -> str:
 
 
 def segment_angles(arm: ArmParameters, link: int, segments: int) -> Array:
-    """Turn of each piece against the one before per metre of measured deflection, (segments + 1,) [rad/m].
+    """Return the turn of each piece against the one before per metre of measured deflection, (segments + 1,) [rad/m].
 
-    From the root tangent over the segments' secants to the tip tangent of w = b sin(pi x / L) / sin(pi s).
+    The directions are the root tangent, the secants of the segments and the tip tangent of
+    w = b sin(pi x / L) / sin(pi s).
     """
     import numpy as np  # not before the arguments are parsed
 
@@ -95,7 +96,7 @@ def segment_angles(arm: ArmParameters, link: int, segments: int) -> Array:
 def _flexible_link(
     robot: ET.Element, arm: ArmParameters, link: int, segments: int, parent: str, offset: float,
 ) -> tuple[str, float]:
-    """Add joint, sensor and segments of a link; return its last frame and where the next begins in it."""
+    """Add joint, sensor and segments of a link; return its last frame and the offset of the next link in it [m]."""
     number = link + 1
     L, rho = arm.link_length[link], arm.linear_density[link]
     bend, h = f'link{number}_bend', L / segments

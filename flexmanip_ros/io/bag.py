@@ -1,9 +1,10 @@
-"""Recordings (rosbag2, sqlite3 or mcap) -> the messages that the identifier takes, in recorded order.
+"""Read the messages that the identifier needs from a rosbag2 recording (sqlite3 or mcap), in recorded order.
 
-Of a damaged recording every complete message before the fault comes out: the reading libraries reject an mcap file
-whose end is missing, or lose the whole chunk that the fault is in (several seconds at 1 kHz). An mcap file is a
-sequence of records (opcode, length, content; https://mcap.dev/spec); chunks hold such a sequence, compressed. A fault
-inside a compressed chunk costs that chunk. Of a .db3 file sqlite itself returns the rows before the first missing page.
+From a damaged recording this module reads every complete message before the fault. It parses mcap files itself for
+this: the reading libraries reject a file whose end is missing, or lose the whole chunk with the fault (several seconds
+at 1 kHz). An mcap file is a sequence of records (opcode, length, content; https://mcap.dev/spec). A chunk is a record
+that holds such a sequence, compressed. A fault inside a compressed chunk costs that chunk. From a .db3 file sqlite
+itself returns the rows before the first missing page.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ CHUNK_HEAD = struct.Struct('<QQQI')
 U16 = struct.Struct('<H')
 U32 = struct.Struct('<I')
 LARGEST = 1 << 30
-"""Bytes read of a record at most, whatever its length says."""
+"""Largest number of bytes that are read of a record, whatever length it states."""
 
 
 class Raw(NamedTuple):
@@ -51,7 +52,7 @@ class Raw(NamedTuple):
 
 
 class DamagedError(Exception):
-    """The recording ends before it should, or holds bytes that mean nothing. Its text says which."""
+    """The recording ends too early or contains invalid bytes. The text of the error says which."""
 
 
 def salvaged(path: Path) -> Iterator[Raw]:
@@ -86,7 +87,7 @@ def _mcap(file: BinaryIO) -> Iterator[Raw]:
 
 
 def _records(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """Yield the complete records of a file or an unpacked chunk, those inside its chunks too."""
+    """Yield the complete records of a file or an unpacked chunk, including those inside its chunks."""
     while head := stream.read(RECORD.size):
         if len(head) < RECORD.size:
             raise DamagedError('its end is missing')
@@ -100,7 +101,7 @@ def _records(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
 
 
 def _unpacked(chunk: bytes) -> bytes:
-    """Return the records of a chunk, as many as its bytes give where its end is missing."""
+    """Return the unpacked records of a chunk; where its end is missing, as many as can be unpacked."""
     compression = _text(chunk, CHUNK_HEAD.size)
     packed = chunk[CHUNK_HEAD.size + 4 + len(compression) + 8:]
     if compression == 'zstd':
@@ -133,15 +134,15 @@ def _sqlite(path: Path) -> Iterator[Raw]:
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 HEADER = 'std_msgs/msg/Header'
 BLOCK = 2048
-"""Messages decoded at once at most: 2 s at 1 kHz, half a megabyte. Larger ones are no faster."""
+"""Largest number of messages decoded at once: 2 s at 1 kHz, half a megabyte. Larger blocks are no faster."""
 
 Progress = Callable[[int, int | None], None]
-"""Called with messages read and messages there (None when the recording does not say)."""
+"""Callback with the number of messages read and their total number (None when the recording does not state it)."""
 
 
 @dataclass(frozen=True)
 class Topics:
-    """Where to look. Without a leading slash a name is found in any one namespace."""
+    """Names of the topics to read. A name without a leading slash is found in any one namespace."""
 
     joint_states: str = 'joint_states'
     events: tuple[str, ...] = ('capture_event', 'capture_detected')
@@ -163,7 +164,7 @@ def read_blocks(path: str | Path, topics: Topics | None = None, progress: Progre
     """Yield the joint states and events of a bag (its directory, or the .mcap or .db3 file itself).
 
     Joint states come in blocks of up to ``BLOCK`` messages; a block ends before an event and where names or array
-    lengths change. Of a damaged recording everything before the fault is yielded, then BagError says what is
+    lengths change. From a damaged recording everything before the fault is yielded; then BagError says what is
     wrong, so that nothing recorded is lost and no damage goes unseen.
     """
     recording = _Recording(Path(path), topics or Topics())
@@ -192,10 +193,10 @@ def read_blocks(path: str | Path, topics: Topics | None = None, progress: Progre
 
 
 def event_topics(path: str | Path, topics: Topics | None = None) -> tuple[str, ...]:
-    """Return the topics of events that a bag has, with or without messages on them.
+    """Return the event topics of a bag, with or without messages on them.
 
-    Of a bag that cannot be opened as it is the messages are looked through. Nothing is raised: reading it will say what
-    is wrong.
+    If the library cannot open the bag, its messages are searched for topics. The function raises no error for a faulty
+    bag: reading the bag reports the fault.
     """
     recording: _Recording | None = None
     with suppress(BagError):
@@ -208,14 +209,14 @@ def event_topics(path: str | Path, topics: Topics | None = None) -> tuple[str, .
 
 
 class _Recording:
-    """One pass over one bag, and what was wrong on the way."""
+    """One pass over one bag, with the faults that it found."""
 
     def __init__(self, path: Path, topics: Topics) -> None:
         self.path = path
         self.topics = topics
         self.joint_topic = ''
         self.taken = 0
-        """Messages on the chosen topics."""
+        """Number of messages on the chosen topics that were read so far."""
         self.total: int | None = None
         self._kinds: dict[str, str] = {}
         self._damage = ''
@@ -223,14 +224,14 @@ class _Recording:
         self._joint_states = 0
         self._layout: cdr.Layout | None = None
         self._run = BLOCK
-        """Messages that are tried to be decoded at once: few where the names change often."""
+        """Number of messages that the next attempt decodes at once; small where the names change often."""
         try:
             self._look()
         except OSError as err:
             raise BagError(f"bag '{path}' cannot be read: {err.strerror}", 'check the permissions') from err
 
     def _look(self) -> None:
-        """Say at once what cannot be a bag."""
+        """Raise BagError for a path that cannot be a bag."""
         path = self.path
         if not path.exists():
             raise BagError(f"bag '{path}' does not exist", 'check the path')
@@ -248,11 +249,11 @@ class _Recording:
         if self.path.is_file():
             return [self.path]
         found = (file for file in self.path.iterdir() if file.suffix in ('.mcap', '.db3'))
-        return sorted(found, key=lambda file: [  # of a split recording 10 comes after 9
+        return sorted(found, key=lambda file: [  # file 10 of a split recording comes after file 9
             (part.isdigit(), int(part) if part.isdigit() else 0, part) for part in re.split(r'(\d+)', file.name)])
 
     def messages(self) -> Generator[tuple[str, bytes]]:
-        """Yield topic and bytes of the messages on the chosen topics: what the library reads, then what is left."""
+        """Yield topic and bytes of each message on the chosen topics: those that the library reads, then the others."""
         try:
             reader = Reader(self.path)
             reader.open()
@@ -272,7 +273,7 @@ class _Recording:
             yield from self._salvaged()
 
     def _salvaged(self) -> Iterator[tuple[str, bytes]]:
-        """Read on from where the library gave up."""
+        """Yield the messages after the last one that the library could read."""
         skip = self.taken
         self.total = None
         try:
@@ -290,16 +291,16 @@ class _Recording:
 
     @property
     def is_damaged(self) -> bool:
-        """Whether the library gave up on it."""
+        """Whether the library failed to read the bag."""
         return bool(self._damage)
 
     @property
     def event_topics(self) -> tuple[str, ...]:
-        """Topics of events that were seen so far."""
+        """Event topics that were found so far."""
         return tuple(sorted(topic for topic, kind in self._kinds.items() if kind == HEADER))
 
     def joint_states(self, raws: list[bytes], first: int) -> Iterator[JointBlock]:
-        """Decode joint states that follow one another, the first of which is message number ``first``."""
+        """Decode consecutive joint states; ``first`` is the number of the first one among the messages read."""
         done = 0
         while done < len(raws):
             tried = raws[done:done + self._run]
@@ -316,7 +317,7 @@ class _Recording:
             yield block
 
     def event(self, topic: str, raw: bytes) -> Iterator[CaptureEvent]:
-        """Decode an event; note one that is none."""
+        """Decode an event; record a fault if the message is not an event."""
         try:
             yield cdr.capture_event(raw).heard_on(topic)
         except (cdr.CdrError, UnicodeDecodeError) as err:
@@ -325,7 +326,7 @@ class _Recording:
             self._faults.append(f"an event on '{topic}' is neither capture nor release: {err}")
 
     def check(self) -> None:
-        """Raise BagError with what was wrong."""
+        """Raise BagError if a fault was found, or no joint state."""
         count = f"{self._joint_states} messages on '{self.joint_topic}' were read"
         if self._damage and self._joint_states == 0:
             raise BagError(f"bag '{self.path}' cannot be read: {self._damage}",
@@ -342,7 +343,7 @@ class _Recording:
                            'record while the joint states are published')
 
     def _choose(self, there: dict[str, str], *, complete: bool = True) -> bool:
-        """Choose the topics that are read; return whether one of ``there`` is among them."""
+        """Choose the topics to be read among ``there`` (topic -> type); return whether one of these is chosen."""
         if not self.joint_topic:
             found = _resolve(self.topics.joint_states, there, JOINT_STATE, self.path)
             if found is None and complete:

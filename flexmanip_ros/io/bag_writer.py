@@ -1,4 +1,4 @@
-"""Plain values -> a rosbag2 recording (mcap). It is flushed so often that a kill loses a fraction of a second."""
+"""Write plain values to a rosbag2 recording (mcap). A killed process loses a fraction of a second of it at most."""
 
 from __future__ import annotations
 
@@ -45,8 +45,9 @@ def _qos(latched: bool) -> Qos:
 class BagWriter:
     """A recording under ``path``, a new directory. Use it in a ``with``; any thread may write.
 
-    It is closed, and so readable, after an exception too. Raises BagError when the path exists or the disk fails.
-    flush_period: time between flushes [s]; None leaves them to the library, and equal messages then give equal bytes.
+    The ``with`` closes it after an exception too, so that it can be read. Raises BagError when the path exists or the
+    disk fails.
+    flush_period: time between flushes [s]; None: the library flushes, and equal messages give equal bytes.
     """
 
     def __init__(self, path: str | Path, *, storage: StoragePlugin = StoragePlugin.MCAP,

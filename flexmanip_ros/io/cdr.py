@@ -1,4 +1,4 @@
-"""JointState and Header straight from their CDR bytes, and JointState to them.
+"""Decode JointState and Header directly from CDR bytes, and encode JointState.
 
 The messages of one publisher share one layout: names and array lengths, and with them every byte offset, stay the
 same. So the messages of a recording are decoded many at a time as rows of one numpy table, after a check that their
@@ -19,9 +19,9 @@ from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, JointRecord
 STAMP = struct.Struct('<iI')
 COUNT = struct.Struct('<I')
 START = 4
-"""Bytes of the encapsulation, after which a message begins. CDR aligns to this place."""
+"""Size of the CDR encapsulation header [bytes]. The message begins after it, and alignment counts from there."""
 HEAD = START + STAMP.size
-"""Bytes before frame_id: encapsulation and stamp. All offsets below count from the encapsulation's start."""
+"""Size of encapsulation header and stamp, after which frame_id begins [bytes]. Offsets count from the first byte."""
 LITTLE_ENDIAN = b'\x00\x01'
 
 
@@ -30,13 +30,13 @@ class CdrError(ValueError):
 
 
 class Layout(NamedTuple):
-    """Where everything stands in JointStates of one size with the same frame_id, names and array lengths."""
+    """Position of each field in JointStates that have the same size, frame_id, names and array lengths."""
 
     size: int
-    """Bytes of a message."""
+    """Size of a message [bytes]."""
     names: tuple[str, ...]
     words: bytes
-    """frame_id and names as they stand in the message."""
+    """The bytes of frame_id and names in the message."""
     counts: tuple[int, int, int]
     """Lengths of position, velocity and effort."""
     starts: tuple[int, int, int]
@@ -64,7 +64,7 @@ def capture_event(raw: bytes) -> CaptureEvent:
 
 
 def joint_record(raw: bytes, layout: Layout | None) -> tuple[JointRecord, Layout]:
-    """Return one JointState and its layout; give the layout with the next message. Raises CdrError."""
+    """Return one JointState and its layout; pass that layout with the next message. Raises CdrError."""
     if layout is None or len(raw) != layout.size:
         layout = _joint_layout(raw)
     order, seconds, nanoseconds, words, *counts = layout.head.unpack_from(raw)
@@ -90,9 +90,9 @@ _EMPTY.setflags(write=False)
 
 
 def joint_block(raws: Sequence[bytes], layout: Layout | None) -> tuple[JointBlock, Layout]:
-    """Decode JointStates from the first on, as many as have its layout; return them with that layout.
+    """Decode JointStates up to the first one with another layout; return them with their layout.
 
-    layout: a guess, such as that of the messages before. Raises CdrError where the first is no JointState.
+    layout: a guess, such as the layout of the messages before. Raises CdrError where the first is no JointState.
     """
     guess = None if layout is None else _decoded(raws, layout)
     if layout is not None and guess is not None:

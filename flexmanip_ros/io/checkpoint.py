@@ -1,4 +1,4 @@
-"""The state of the identifier in a file: exact to the bit, safe to read, written whole or not at all.
+"""Save the identifier's state in a file that is exact to the bit, safe to read, and written whole or not at all.
 
 The file is a header, a SHA-256 checksum and an ``np.savez`` archive. The archive holds every array of the state (the
 rows of the sample log among them) and one text, ``tree``: JSON that says which array and which plain value stands
@@ -29,11 +29,12 @@ from flexmanip_ros.errors import CheckpointError
 from flexmanip_ros.parameters import IdentifierParameters, flatten, leaves
 
 NAME, FORMAT = b'flexmanip_ros checkpoint ', b'16\n'
-"""The format changes with what a state holds, and with the place of a class."""
+"""First bytes of the file: its name and the number of the format. The number changes when the fields of a state change,
+and when a class moves to another module."""
 CHECKSUM = hashlib.sha256().digest_size
 PACKAGE = 'flexmanip_ros.'
 _NUMBERS = 'biuf'
-"""Kinds of arrays that a state holds: truth values, integers and floats."""
+"""numpy kinds of the arrays that a state contains: truth values, integers and floats."""
 _EMPTY_START = 'the identifier starts with nothing known'
 
 
@@ -46,7 +47,7 @@ def save(path: str | Path, value: Any) -> None:
         os.replace(partial, target)
     except OSError as err:
         with contextlib.suppress(OSError):
-            partial.unlink()  # on a full disk it would stay in the way
+            partial.unlink()  # on a full disk it would take up space
         raise CheckpointError(f"checkpoint '{path}' cannot be written: {err.strerror}",
                               'give another checkpoint_file, or free some space') from err
 
@@ -101,7 +102,7 @@ def decode(data: bytes) -> Any:
 
 
 def _plain(value: Any, found: dict[int, tuple[int, Any]]) -> Any:
-    """Return a value as JSON has it. Arrays and dataclasses that occur twice are written once: found: by ``id``."""
+    """Return a value as JSON data; found: by ``id``, the arrays and dataclasses so far, each written once."""
     if isinstance(value, Enum):
         return {'enum': _name(type(value)), 'member': value.name}
     if value is None or isinstance(value, (bool, str, int, float)):
@@ -172,7 +173,7 @@ class Saved(NamedTuple):
 class CheckpointWriter:
     """Writes the identifier's state to ``checkpoint_file`` every ``checkpoint_period``, on a thread.
 
-    The rows that a state shows are never written again, so the thread can write it while samples go on.
+    The rows of the sample log in a state are never changed, so the thread can save it while further samples come.
     """
 
     def __init__(self, config: IdentifierParameters) -> None:

@@ -2,8 +2,8 @@
 
 A table of estimates (.csv for people and spreadsheets, .npz with the matrices for numpy) is written at the end of a
 run; a recording grows with the run. A study has a journal: one JSON line per run, on disk before the next run is added.
-A study that was interrupted or killed continues from it. Its table (.csv or .parquet) is made from the journal at the
-end, and on an interrupt.
+A study that was interrupted or killed continues from its journal. Its table (.csv or .parquet) is made from the journal
+at the end, and on an interrupt.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def columns(estimates: Sequence[Estimate], start_ns: int | None = None) -> dict[str, Any]:
-    """Return arrays with one row an estimate.
+    """Return arrays with one row for each estimate.
 
     stamp_ns (T,), time_s (T,) from ``start_ns`` (default: the first estimate), status, model_status (T,), frequency_hz,
     damping_ratio and their _std (T, k), payload_mass_kg, payload_std_kg, payload_lower_kg, payload_upper_kg,
@@ -136,7 +136,7 @@ def matrices(estimates: Sequence[Estimate]) -> dict[str, Array]:
 
 
 def write_csv(path: str | Path, estimates: Sequence[Estimate], start_ns: int | None = None) -> None:
-    """Write one line an estimate; columns with several modes are numbered from 1, NaN is an empty cell."""
+    """Write one line for each estimate; columns of several modes are numbered from 1, NaN is an empty cell."""
     flat: dict[str, Any] = {}
     for name, values in columns(estimates, start_ns).items():
         if values.ndim == 2:
@@ -196,7 +196,7 @@ class TableOutput(Output):
         """Stamp at which the time of the table is 0; None: the first estimate."""
 
     def write(self, estimate: Estimate) -> None:
-        """Keep one row."""
+        """Keep one estimate as a row of the table."""
         super().write(estimate)
         self.estimates.append(estimate)
 
@@ -207,7 +207,7 @@ class TableOutput(Output):
 
 
 class BagOutput(Output):
-    """A recording with the identifier's topics, stamped as the input. It is made with the first estimate."""
+    """A recording with the identifier's topics and the stamps of the input. The first estimate creates it."""
 
     def __init__(self, path: Path, frame_id: str) -> None:
         super().__init__()
@@ -288,7 +288,7 @@ class Journal:
             return  # this file system has no locks
 
     def _resume(self, head: str) -> bool:
-        """Read the rows; drop an incomplete last line, as a kill leaves it. Return whether the first was complete."""
+        """Read the rows; drop an incomplete last line, left by a kill. Return whether the first line was complete."""
         content = self.journal.read_bytes()
         whole = content[:content.rfind(b'\n') + 1]
         if not whole and not f'{head}\n'.encode().startswith(content):

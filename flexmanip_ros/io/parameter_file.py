@@ -1,4 +1,4 @@
-"""ROS parameter files and ``name=value`` overrides -> dotted names and values."""
+"""Read ROS parameter files and ``name=value`` overrides as dotted names and values."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def parse(text: str, what: str) -> Any:
 def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, Any]:
     """Return the parameters a file gives to ``node``, nested groups flattened with dots.
 
-    Sections named ``/**``, ``node``, ``/ns/node`` or with wildcards apply, later ones win; sections of other
-    nodes are left alone, and so are their parameters in a section for every node. An empty file gives no values; one
+    Sections named ``/**``, ``node``, ``/ns/node`` or with wildcards apply; later ones win. Sections of other nodes are
+    ignored, and so are parameters of other nodes in a section for every node. An empty file gives no values. A file
     without any section for ``node`` is an error unless ``optional``. Raises ParameterError naming the file.
     """
     where = f"parameter file '{path}'"
@@ -155,7 +155,7 @@ def load(cls: type[Config], node: str, path: str | Path | None, overrides: Itera
 
 
 def _stands(cls: type[Config], values: dict[str, Any]) -> bool:
-    """Whether the parameters of a file are right by themselves."""
+    """Whether the parameters of a file are valid without the overrides."""
     try:
         configure(cls, values)
     except ParameterError:

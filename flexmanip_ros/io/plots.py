@@ -33,7 +33,7 @@ WIDTH = 10.0
 """Width of a figure [inches], about that of a page."""
 DPI = 120
 POINTS = 2000
-"""Points above which a line is reduced to its envelope."""
+"""Number of points above which a line is reduced to its envelope."""
 
 Event = tuple[float, EventKind]
 Known = tuple[float, float, Sequence[float]]
@@ -41,9 +41,9 @@ Known = tuple[float, float, Sequence[float]]
 
 
 def figure(heights: Sequence[float], *, columns: int = 1, share_time: bool = True) -> tuple[Figure, list[Any]]:
-    """Return a figure of the page's width and its axes, row by row. heights: of the rows [inches].
+    """Return a figure of the page's width and its axes, row by row. heights: those of the rows [inches].
 
-    share_time: the axes have one time axis, labelled at the bottom.
+    share_time: all axes share one time axis, labelled at the bottom.
     """
     made = Figure(figsize=(WIDTH, float(sum(heights)) + 0.6), dpi=DPI, layout='constrained')
     FigureCanvasAgg(made)
@@ -136,13 +136,13 @@ def _band(ax: Any, x: Array, frequency: Array, std: Array, k: int) -> None:
 
 
 def _lowest(values: Array, stds: Array) -> Array:
-    """Return the frequencies (T, k) that set the range, those far above the lowest that is known as NaN.
+    """Return the frequencies (T, k) that set the range of a plot; those far above the lowest known one are NaN.
 
     Noise gives modes far above those of the arm; a range that includes them would hide the change at a capture.
     """
     settled, spread = values[values.shape[0] // 2:], stds[values.shape[0] // 2:]
     low = settled[np.isfinite(settled)]
-    known = settled[QUANTILE * spread <= KNOWN_BAND * settled]  # a drift of the sensors is a mode near 0 Hz
+    known = settled[QUANTILE * spread <= KNOWN_BAND * settled]  # a drift of the sensors gives a mode near 0 Hz
     if known.size:
         low = known
     if low.size == 0:
@@ -163,7 +163,7 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
             truth: Sequence[tuple[float, float, float]] = (), *, zoom: bool = False) -> None:
     """Draw the payload with its 95 % interval.
 
-    truth: (from [s], to [s], mass [kg]) of each stretch; zoom: the range of the last estimates, without zero.
+    truth: (from [s], to [s], mass [kg]) of each stretch; zoom: show the range of the late estimates, without zero.
     """
     rows = [estimate for estimate in estimates if estimate.payload is not None]
     time = times(rows, start_ns)
@@ -248,10 +248,10 @@ class Run:
     estimates: Sequence[Estimate]
     events: tuple[Event, ...]
     has_arm: bool
-    """Whether the signals are those of the two-link arm, so that positions of bends are in metres."""
+    """Whether the signals are those of an arm, so that positions of bends are in metres."""
     truth: Truth = Truth()
     smoothed: Sequence[Smoothed] = ()
-    """Models of whole stretches."""
+    """Models of whole stretches, each from all samples of its stretch."""
 
     @property
     def start_ns(self) -> int:
@@ -349,7 +349,7 @@ def frequency_figure(made: Run) -> Figure:
 
 
 def configurations_figure(found: Sweep) -> Figure:
-    """Draw the frequencies over the angle between the links with their bands, and where the recording has been."""
+    """Draw the frequencies over the angle between the links with their bands, and the angles in the recording."""
     drawn, (ax,) = figure([3.2], share_time=False)
     angle = np.degrees(found.relative)
     ax.axvspan(*np.degrees(found.seen), color='#F0F0F0', linewidth=0, label='configurations\nof the recording')

@@ -113,7 +113,7 @@ def matrix(name: str, values: Array, rows: Sequence[str] = (), columns: Sequence
 
 
 SHOWN_FAILURES = 50
-"""Failed runs listed at most."""
+"""Largest number of failed runs that are listed."""
 
 
 def identification_report(
@@ -124,8 +124,8 @@ def identification_report(
 ) -> None:
     """Write the report of identify_bag: the answer, then pictures, then tables.
 
-    events: what was found in the signals where captures were looked for; empty where they are known. player: the page
-    that plays the recording; configurations: the modes at other angles, where the model knows them.
+    events: text on the events that were detected in the signals; empty where the events are known. player: the page
+    that plays the recording; configurations: the modes at other angles, where the model gives them.
     """
     sections = [Section('Result', _answer(config, summary, modes, events, fault))]
     if player:
@@ -156,7 +156,7 @@ def identification_report(
 
 
 def _answer(config: IdentifierParameters, summary: Summary, modes: Sequence[Mode], events: str, fault: str) -> str:
-    """Say what the arm holds, since when, how sure that is, and its modes."""
+    """Return the answer as HTML: the payload, since when it is held, its interval and status, and the modes."""
     status = Status[summary.status]
     parts = [f'<p class="changed">{escape(fault)}</p>'] if fault else []
     if summary.payload_ci95_kg is not None:
@@ -191,7 +191,7 @@ def _result(config: IdentifierParameters, summary: Summary, modes: Sequence[Mode
 
 
 def _smoothed(parts: Sequence[Smoothed]) -> str:
-    """Return the models of whole stretches as a table, those of the grey bands; empty without any."""
+    """Return a table of the models of whole stretches, which are the grey bands; empty without any."""
     rows = [(f'{part.start_s:.3f} to {part.end_s:.3f} s', part.method, f'{mode.frequency_hz:.4f} Hz',
              f'{QUANTILE * mode.frequency_std_hz:.2g} Hz', f'{mode.damping_ratio:.4f}')
             for part in parts for mode in part.modes]

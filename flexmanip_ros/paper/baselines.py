@@ -1,10 +1,10 @@
 """The two estimators that the paper compares with: rigid least squares, and the algebraic method.
 
-Rigid least squares (paper eqs. 45-46) takes both links as rigid and differentiates the angles by a filter. It knows
-nothing of bending, hence its bias. The algebraic method (Fliess; Becedas; Cambera) looks at link 2 alone, its base at
-rest: with the known link subtracted, torque - J a'' - moment g L cos a = dm (L^2 a'' + g L cos a) + nu a'. Multiplied
-by t^2, t from the capture on, and integrated twice, nothing is differentiated; least squares give (dm, nu). On a
-two-link arm it leaves the moving base out, as the paper does: that is its bias.
+Rigid least squares (paper eqs. 45-46) takes both links as rigid and differentiates the angles by a filter. It neglects
+bending, which biases it. The algebraic method (Fliess; Becedas; Cambera) models link 2 alone, with its base at rest.
+With the known link subtracted, torque - J a'' - moment g L cos a = dm (L^2 a'' + g L cos a) + nu a'. The equation is
+multiplied by t^2, with t from the capture on, and integrated twice, so that nothing is differentiated. Least squares
+give (dm, nu). On a two-link arm the method neglects the moving base, as the paper does, which biases it.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, JointRecord, Payload, Status
 
 FEWEST = 200
-"""Samples since the event before anything is claimed."""
+"""Smallest number of samples since the event with which a payload is estimated."""
 
 
 @dataclass(frozen=True, eq=False)
 class BaselineState:
-    """Everything remembered; constant in size."""
+    """Everything that a method remembers; constant in size."""
 
     x: Array
     """States of filters or integrals."""
@@ -39,7 +39,7 @@ class BaselineState:
     dt: float = 0.0
     last_ns: int | None = None
     effort: Array | None = None
-    """(2,) torque held since the last sample."""
+    """(2,) torque that is held since the last sample [N m]."""
 
 
 def _series(config: IdentifierParameters, state: BaselineState, rows: Rows) -> tuple[Array, Array, float]:
@@ -65,10 +65,10 @@ def _unknown(status: Status) -> Payload:
 
 
 def _interval(mass: float, std: float, misfit: float) -> Payload:
-    """Return mass and interval; misfit: share of the regression's power that is left, 0 where it fits.
+    """Return mass and interval; misfit: residual power over the regression's power, 0 for a perfect fit.
 
-    Neither method knows its noise: the deviation is that of the residuals, and a fit that leaves most of the
-    power is called inconsistent.
+    Neither method knows its noise: the deviation is that of the residuals. A fit that leaves more than a tenth of the
+    power, or a negative mass, is called inconsistent.
     """
     if not (math.isfinite(mass) and math.isfinite(std)):
         return _unknown(Status.POORLY_EXCITED)
@@ -77,15 +77,15 @@ def _interval(mass: float, std: float, misfit: float) -> Payload:
         status = Status.POORLY_EXCITED
     elif misfit > 0.1 or mass < 0.0:
         status = Status.INCONSISTENT
-    # a negative mass says how wrong the method is here: the interval reaches as far to the other side
+    # a negative mass shows the size of the error: the interval reaches as far to the positive side
     lower, upper = max(0.0, mass - QUANTILE * std), abs(mass) + QUANTILE * std
     return Payload(max(mass, 0.0), std, lower, upper, 1.0 + float(misfit), status)
 
 
 CUTOFF = 0.2
-"""Of the differentiating filters, over the lowest pinned frequency: it must not see the vibration."""
+"""Cutoff of the differentiating filters over the lowest pinned frequency [-]; low, to remove the vibration."""
 MEMORY_S = 10.0
-"""Seconds after which a sample counts 1/e."""
+"""Time after which the weight of a sample is 1/e [s]."""
 
 
 def _rigid_take(config: IdentifierParameters, x: Array, sums: Array, dt: float, efforts: Array, angles: Array,
@@ -107,7 +107,7 @@ def _rigid_estimate(config: IdentifierParameters, state: BaselineState) -> Paylo
 
 
 def _cutoff(config: IdentifierParameters) -> float:
-    """Of the filters [rad/s]."""
+    """Return the cutoff of the filters [rad/s]."""
     return CUTOFF * 2 * np.pi * min(pinned_frequencies(config.arm))
 
 
@@ -122,14 +122,14 @@ def _arm(config: IdentifierParameters, dt: float) -> RigidArm:
 
 
 def _frozen_turn(config: IdentifierParameters) -> float:
-    """Where a linear plant stays, as far as it is given [rad]."""
+    """Return the angle between the links at the working point of a linear plant [rad]; nan where none is given."""
     point = config.payload.working_point
     frozen = config.payload.dynamics == 'linear' and len(point) == 2
     return point[1] - point[0] if frozen else float('nan')
 
 
 STILL = 1e-6
-"""Motion [rad] below which a link tells nothing."""
+"""Motion below which a link gives no information on the payload [rad]."""
 
 
 def _algebraic_take(config: IdentifierParameters, x: Array, sums: Array, dt: float, efforts: Array, angles: Array,
@@ -143,7 +143,7 @@ def _algebraic_take(config: IdentifierParameters, x: Array, sums: Array, dt: flo
 
 
 def _algebraic_estimate(config: IdentifierParameters, state: BaselineState) -> Payload:
-    """Return the payload; the twice integrated residuals count as one a tenth of the record."""
+    """Return the payload; each tenth of the record counts as one independent residual."""
     if state.sums[6] < FEWEST:
         return _unknown(Status.WARMING_UP)
     A = np.array([[state.sums[0], state.sums[1]], [state.sums[1], state.sums[2]]])
@@ -160,7 +160,7 @@ def _algebraic_estimate(config: IdentifierParameters, state: BaselineState) -> P
 
 
 class RigidArm(NamedTuple):
-    """Two rigid links: M11 = a + ..., constants of Ma and of the payload's part."""
+    """Two rigid links: constants of the mass matrix Ma and of the payload's part in it, and the filter settings."""
 
     Ma11: float
     Ma22: float
@@ -171,9 +171,9 @@ class RigidArm(NamedTuple):
     reaction: float
     """1: torque 2 reacts on link 1; 0: it acts on link 2 alone."""
     cutoff: float
-    """Of the differentiating filter [rad/s]."""
+    """Cutoff of the differentiating filters [rad/s]."""
     fade: float
-    """Forgetting factor a sample."""
+    """Forgetting factor per sample [-]."""
     frozen_turn: float
     """Angle between the links at which a linear plant stays [rad]; nan: measured, with centripetal terms."""
 
@@ -200,7 +200,7 @@ def _rigid_kernel(arm: RigidArm, x: Array, sums: Array, dt: float, efforts: Arra
                     drive = slope + w * level
                     row[stage] = target + (level + drive * dt) * decay
                     row[stage + 1] = (slope - w * drive * dt) * decay
-                    # the mean over the sample: its end would show the staircase of the held input
+                    # the mean over the sample; the value at its end would show the steps of the held input
                     acceleration = (row[stage + 1] - slope) / dt if dt > 0.0 else 0.0
                     target = row[stage]
                 if part == 1:
@@ -214,7 +214,7 @@ def _rigid_kernel(arm: RigidArm, x: Array, sums: Array, dt: float, efforts: Arra
                     rate1, acc1 = x[1, 1], acceleration
         sums[4] += 1.0
         if sums[4] * dt * w < 12.0:
-            continue  # the filters still carry their start
+            continue  # the filters still depend on their initial state
         turn = x[1, 0] - x[0, 0]
         c, s = np.cos(turn), np.sin(turn)
         if not np.isnan(arm.frozen_turn):
@@ -281,7 +281,7 @@ class Baseline(NamedTuple):
     """One estimator; its calls are those of ``payload.structured``."""
 
     start: BaselineState
-    """With an empty arm."""
+    """The state at the start, with an empty arm."""
     keeps_filters: bool
     """Whether an event restarts the sums alone, not the states of filters or integrals."""
     take: Callable[[IdentifierParameters, Array, Array, float, Array, Array, bool], None]
@@ -302,12 +302,12 @@ class Baseline(NamedTuple):
         return replace(state, x=x, sums=sums, dt=dt, last_ns=int(rows.stamp_ns[-1]), effort=rows.u[-1].copy())
 
     def event(self, config: IdentifierParameters, state: BaselineState, event: CaptureEvent) -> BaselineState:
-        """Restart the least squares, and integrals, whose time counts from the event."""
+        """Restart the least squares, and the integrals (not the filters), whose time counts from the event."""
         return replace(state, x=state.x if self.keeps_filters else self.start.x, sums=self.start.sums,
                        held=event.kind is EventKind.CAPTURE)
 
     def estimate(self, config: IdentifierParameters, state: BaselineState) -> Payload:
-        """Return the payload; an arm is empty as long as nothing was caught, these methods do not test it."""
+        """Return the payload; without a captured object it is exactly 0, as these methods do not test for one."""
         if not _usable(config):
             return _unknown(Status.UNOBSERVABLE)
         return self.fitted(config, state) if state.held else Payload(0.0, 0.0, 0.0, 0.0, 1.0, Status.TRACKING)

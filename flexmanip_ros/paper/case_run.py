@@ -171,7 +171,7 @@ def _rows(case: Case, seed: int, found: dict[str, MethodResult], failed: dict[st
 
 
 def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[Item]) -> dict[str, MethodResult]:
-    """Run one identifier once; each of the methods that read it costs the pass and its own reading.
+    """Run one identifier once; the time of each method that reads it is that of the pass and its own reading.
 
     A method without settings of its own takes the identifier's estimates; the others read a block payload
     from its model, from the capture on.
@@ -181,7 +181,7 @@ def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[
     walls = dict.fromkeys(found, 0.0)
     begun = time.perf_counter()
     for state, estimate in pipeline.replay(_identifier(case, name), items):
-        now = estimate if estimate is not None else pipeline.current(state)  # the last: at the last sample
+        now = estimate if estimate is not None else pipeline.current(state)  # the last one: at the last sample
         if now is None:
             continue
         captured = (now.stamp_ns - state.first_ns) * 1e-9 >= experiments.CAPTURE_TIME

@@ -1,8 +1,9 @@
 """Section 4 of the paper as cases (what is simulated) and methods (how the payload is estimated).
 
-Linear plant at a fixed working point, one mode per link, the paper's torque convention (torque 2 does no work
-on bending), chord angles, rates continuous at the capture, 40 dB, 1 kHz, square waves, capture at 3 s,
-errors averaged over 4 to 6 s. Its Table 1 is lost: the arm is the reference arm of the parameters.
+Most plants are linear at a fixed working point, with one mode per link. All have the paper's torque convention (torque
+2 does no work on bending) and chord angles. Rates are continuous at the capture at 3 s. The signal-to-noise ratio is 40
+dB, the sample rate 1 kHz. The torques are square waves. Errors are averaged over 4 to 6 s. Table 1 of the paper is
+lost: the arm is the reference arm of the parameters.
 """
 
 from __future__ import annotations
@@ -18,17 +19,17 @@ ARM: Mapping[str, Any] = {
     'modes': 1, 'torque_convention': 'paper', 'angle_convention': 'chord', 'shortening': False,
     'shape_functions': 'sines'}
 WINDOW = (4.0, 6.0)
-"""From and to [s] of the mean errors."""
+"""Begin and end of the time over which errors are averaged [s]."""
 CAPTURE_TIME = 3.0
 GRAVITY = 9.81
-"""In the run of link 2 alone [m/s^2]; the arm itself moves in a horizontal plane."""
+"""Gravity in the run of link 2 alone [m/s^2]; the arm itself moves in a horizontal plane."""
 TRACK_RATE = 5.0
-"""Estimates a second: enough for the tracks, and thirty runs stay quick."""
+"""Rate of the estimates [Hz]: enough for the tracks, and low enough that thirty runs stay quick."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One simulation of the paper. angles_deg: chord angles; payload [kg]; model: of the plant."""
+    """One simulation of the paper. angles_deg: chord angles; payload [kg]; model: that of the plant."""
 
     name: str
     payload: float
@@ -51,9 +52,9 @@ class Method:
     identifier: str = ''
     """The one of ``IDENTIFIERS`` whose state it reads; several methods may read the same one."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Identifier parameters over those of ``identifier`` with which it is read."""
+    """Identifier parameters that replace those of ``identifier`` when its state is read."""
     baseline: str = ''
-    """Name in ``studies.baselines`` of a method that is no part of the identifier."""
+    """Name in ``paper.baselines`` of a method that is no part of the identifier."""
 
 
 PAYLOADS = (Case('payload_20', 20.0, (60.0, 45.0)), Case('payload_50', 50.0, (60.0, 45.0)),

@@ -1,6 +1,6 @@
 """The figures of the paper's section 4, and the test responses that some of them show.
 
-Every method has one colour and one marker in all of them; links and frequencies differ by the line.
+Every method has one colour and one marker in all figures; links and frequencies differ by the line style.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from flexmanip_ros.types import Array, EventKind, StateSpace
 from flexmanip_ros.view import screen
 
 Tracks = Mapping[str, Sequence[Track]]
-"""Method -> one track a run."""
+"""Method -> one track for each run."""
 LOOKS: Mapping[str, tuple[str, str]] = {
     'paper': ('#0072B2', 'o'), 'restart': ('#D55E00', 's'), 'known M_b': ('#E69F00', '^'),
     'rigid RLS': ('#CC79A7', 'v'), 'algebraic': ('#7F7F7F', 'D'), 'algebraic, 1 link': ('#56B4E9', 'P'),
@@ -37,12 +37,12 @@ TRUE = {'color': plots.TRUTH_COLOUR, 'linestyle': (0, (4, 3)), 'linewidth': 1.1}
 CAPTURE = ((experiments.CAPTURE_TIME, EventKind.CAPTURE),)
 CLOSE = ('restart', 'known M_b', 'structured')
 """Methods whose own 95 % interval is drawn."""
-LEAST_KG = 1e-5
-"""Bottom of the logarithmic axes over the payload."""
+LEAST_SHARE = 1e-5
+"""Bottom of the logarithmic error axes, as a fraction of the payload."""
 RATE = 1000.0
 DURATION = 3.0
 TEST_INPUT = {'shape': 'multisine', 'band': [0.5, 10.0], 'repeat_time': 3.0, 'amplitude': [10.0, 5.0], 'seed': 4}
-"""A torque that the model was not identified with."""
+"""Parameters of the test torque, with which the model was not identified."""
 
 
 class Response(NamedTuple):
@@ -89,7 +89,7 @@ def _response(case: experiments.Case, model: StateSpace, payload: float) -> Resp
 
 
 def torques(run: Trajectory) -> Figure:
-    """Fig. 2."""
+    """Fig. 2: torques over time."""
     drawn, axes = plots.figure([2.2])
     plots.lines(axes[0], _time(run), run.effort, ['joint 1', 'joint 2'], 'torque', 'N m')
     plots.events(axes, CAPTURE)
@@ -164,7 +164,7 @@ def test_response(true: Response, found: Mapping[str, Response]) -> Figure:
                 top.plot(true.time, estimate, **style)
                 below.semilogy(true.time[1:], np.abs(estimate - exact[:, k])[1:], **style)
         room = 1.2 * float(np.abs(exact).max())
-        top.set_ylim(-room, room)  # the range of the true response, which a wrong model must not hide
+        top.set_ylim(-room, room)  # the range of the true response, so that a wrong model does not hide it
         below.set_ylim(1e-6 * room, 10.0 * room)
         top.set_ylabel(f'{name}\n[{unit}]')
         below.set_ylabel(f'error of\n{name} [{unit}]')
@@ -279,13 +279,13 @@ def error_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Tracks]
             if not runs:
                 continue
             since = runs[0].time >= experiments.CAPTURE_TIME
-            error = np.maximum(np.abs(stack(runs, 'mass') - case.payload), LEAST_KG * case.payload)[since]
+            error = np.maximum(np.abs(stack(runs, 'mass') - case.payload), LEAST_SHARE * case.payload)[since]
             if np.isfinite(error).any():
                 colour, marker = LOOKS[method]
                 band(ax, runs[0].time[since], error, method, color=colour, marker=marker, markersize=4)
         ax.set_yscale('log')
         ax.set_xlim(experiments.CAPTURE_TIME - 0.1, experiments.WINDOW[1])
-        ax.set_ylim(LEAST_KG * case.payload, 100.0 * case.payload)
+        ax.set_ylim(LEAST_SHARE * case.payload, 100.0 * case.payload)
         ax.set_ylabel('absolute error\n[kg]')
         ax.set_title(case.title, loc='right', fontsize=10)  # the event's name is at the left
         plots.legend(ax)

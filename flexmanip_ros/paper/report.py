@@ -1,6 +1,6 @@
 """The page of reproduce_paper: what each figure of the paper's section 4 claims, and what is measured here.
 
-``summary`` has one line a case and method, from the rows of all runs.
+``summary`` returns one line for each case and method, from the rows of all runs.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Line = dict[str, Any]
 
 
 def summary(rows: Sequence[trial.Row], bounds: Bounds) -> list[Line]:
-    """Return one line a case and method: error, bound, coverage with its interval, failures, cost."""
+    """Return one line for each case and method: error, bound, coverage with its interval, failures, cost."""
     lines = []
     for case in experiments.CASES:
         for method in experiments.METHODS:
@@ -149,7 +149,7 @@ def drawing(planned: Planned) -> bytes:
 def planned(tracks: Mapping[str, figures.Tracks], rows: Sequence[trial.Row]) -> list[Planned]:
     """Return the figures in the order of the page: signals, example 1, example 2, section 4.3.
 
-    tracks: of each case, method -> one track per run; cases without any are left out.
+    tracks: case -> method -> one track per run; cases without tracks are left out.
     """
     signals = {one.numbers: one for one in without_results()}
     first = [case for case in experiments.PAYLOADS[:1] if any(tracks[case.name].values())]

@@ -1,4 +1,4 @@
-"""Every parameter of the package: the only place of defaults, units, ranges and words."""
+"""All parameters of the package. Defaults, units, ranges and descriptions are declared here only."""
 
 from flexmanip_ros.parameters.arm import (
     ActuatorParameters,

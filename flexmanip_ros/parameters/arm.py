@@ -1,4 +1,4 @@
-"""The arm, what a user measures or looks up, and what is simulated: sensors and drives, torques, the demonstration."""
+"""Parameters of the arm, which a user measures or looks up, and of the simulation: sensors, drives, torques, demo."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ REFERENCE_ANGLES = (math.pi / 3, math.pi / 4)
 
 @dataclass(frozen=True)
 class SensorParameters:
-    """Errors of the measurement beside noise; all are off by default."""
+    """Measurement errors other than noise; all are off by default."""
 
     encoder_resolution: float = parameter(
         0.0, 'joint angles are rounded to multiples of this; 0: no rounding', unit='rad', low=0.0, high=1.0)
@@ -190,7 +190,7 @@ class PlantParameters:
         if self.arm.bend_delay < 0.0:
             raise ParameterError(f"parameter 'arm.bend_delay' is {self.arm.bend_delay} s",
                                  'a simulated arm shows bends late or in time: give 0 or more')
-        if self.sensors.stamp_jitter * self.rate > 0.15:  # three deviations stay below half an interval
+        if self.sensors.stamp_jitter * self.rate > 0.15:  # three standard deviations stay below half a sample time
             raise ParameterError(
                 f"parameter 'sensors.stamp_jitter' is {self.sensors.stamp_jitter} s, so that stamps change places",
                 f'stay below {0.15 / self.rate:g} s at {self.rate:g} Hz')

@@ -26,11 +26,11 @@ NODES: Mapping[str, type] = {
 """Each node and the class that declares its parameters."""
 
 WIDTH = 100
-"""Characters in a line of a comment or of --help."""
+"""Largest number of characters in a line of a comment or of --help."""
 
 
 def package_names() -> frozenset[str]:
-    """Return the names of all nodes' parameters: a section for every node (``/**``) may serve several."""
+    """Return the names of all nodes' parameters, all of which a section for every node (``/**``) may contain."""
     return frozenset(leaf.name for cls in NODES.values() for leaf in leaves(cls))
 
 
@@ -90,7 +90,7 @@ def _comment(leaf: Leaf) -> str:
 def yaml_text(node: str, values: Mapping[str, Any] | None = None, heading: str = '') -> str:
     """Return a ROS parameter file of a node, for any name and namespace: each parameter with words, unit and range.
 
-    values: dotted names that differ from the defaults. With ``values`` only those are written.
+    values: dotted name -> value of each parameter to be written; None: all parameters with their defaults.
     """
     lines = [f'# {line}' for line in textwrap.wrap(heading, WIDTH)]
     lines += ['/**:', '  ros__parameters:']

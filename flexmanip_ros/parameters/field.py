@@ -1,4 +1,4 @@
-"""How a parameter is declared: default, words, unit and range, once, on a dataclass field."""
+"""Declaration of parameters: one dataclass field holds the default, description, unit and range of each."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from flexmanip_ros.errors import ParameterError
 Config = TypeVar('Config')
 
 LINKS = 2
-"""Most links of an arm."""
+"""Largest number of links of an arm."""
 WANTED = {
     bool: ('true or false', 'true/false values'), int: ('a whole number', 'whole numbers'),
     float: ('a number', 'numbers'), str: ('a text', 'texts'),
 }
-"""What to ask for, by type: one value, several."""
+"""What an error message asks for, by type: one value, several values."""
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,11 @@ class Leaf:
     size: int | None
     live: bool
     per_link: bool = False
-    """Whether it holds as many values for each link or joint; ``size`` is that of two links."""
+    """Whether the parameter has the same number of values for each link or joint; ``size`` is that of two links."""
 
     @property
     def range_words(self) -> str:
-        """The inclusive range with its unit, as a sentence asks for it."""
+        """The inclusive range with its unit, as an error message asks for it."""
         low = '-inf' if self.low is None else f'{self.low:g}'
         high = 'inf' if self.high is None else f'{self.high:g}'
         return f'a value from {low} to {high} {self.unit}'.rstrip()
@@ -67,7 +67,7 @@ def leaves(cls: type) -> tuple[Leaf, ...]:
     return _leaves(cls, '')
 
 
-@cache  # finding out the types takes 3 ms, as often as a configuration is made or changed
+@cache  # resolving the types takes 3 ms, each time that a configuration is made or changed
 def _leaves(cls: type, prefix: str) -> tuple[Leaf, ...]:
     hints = get_type_hints(cls)
     found: list[Leaf] = []
@@ -149,7 +149,7 @@ def fit_links(config: Any, links: int) -> None:
 
 
 def of_links(values: tuple[Any, ...], links: int) -> tuple[Any, ...]:
-    """Return those values of the first links; values: of two links, alternating."""
+    """Return the values of the first ``links`` links; values: those of two links, alternating."""
     return tuple(value for k, value in enumerate(values) if k % LINKS < links)
 
 

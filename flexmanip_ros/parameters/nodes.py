@@ -176,7 +176,7 @@ PORT = 8765
 
 @dataclass(frozen=True)
 class ViewParameters:
-    """What the live page shows and where. Signals and arm have the names that they have for the identifier."""
+    """What the live page shows and where. Signals and arm have the same parameter names as in the identifier."""
 
     port: int = parameter(PORT, 'port of the page on this machine; 0: any that is free', low=0, high=65535)
     rate: float = parameter(25.0, 'updates of the page a second', unit='Hz', low=1.0, high=60.0)

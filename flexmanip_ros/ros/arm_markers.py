@@ -1,6 +1,6 @@
-"""The arm and what it holds as markers for RViz, Lichtblick and Foxglove.
+"""Markers of the arm and of the object that it holds, for RViz, Lichtblick and Foxglove.
 
-The messages are made once and then only filled: that takes 0.1 ms, to publish them 0.2 ms.
+The marker messages are created once and refilled for each publication: filling takes 0.1 ms, publishing 0.2 ms.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from flexmanip_ros.studies.results import ADVICE
 from flexmanip_ros.types import Array, JointRecord, Payload, Status
 
 POINTS = 13
-"""Points of each link."""
+"""Number of points of the line strip that draws one link."""
 
 
 class Drawing(NamedTuple):
-    """The L links in the frame of the base, joint 1 at its origin."""
+    """The shape of the L links in the base frame, whose origin is joint 1."""
 
     links: Array
     """(L, N, 2) points of each link from root to tip [m]."""
     tip_angle: float
-    """Direction of the tip of the last link [rad]: the x axis of the frame of the payload."""
+    """Direction of the tangent at the tip of the last link [rad], the x axis of the payload frame."""
 
 
 def draw(arm: ArmParameters, angles: Array, bends: Array, points: int = POINTS) -> Drawing:
     """Return the arm at joint angles (L,) [rad] and deflections of the bend sensors (L,) [m].
 
-    The deflection from the chord is that of the first shape function, w(x) = b sin(pi x / L) / sin(pi s) with the
-    sensor at s L. An encoder reads the slope of the root: of link 1 from the base, of link 2 from the tip of link 1.
+    The deflection from the chord is the first shape function, w(x) = b sin(pi x / L) / sin(pi s), with b the reading of
+    the sensor at s L. An encoder reads the slope of a link's root: link 1 from the base, link 2 from the tip of link 1.
     """
     x = np.linspace(0.0, 1.0, points)
     links = np.empty((len(arm.link_length), points, 2))
@@ -43,7 +43,7 @@ def draw(arm: ArmParameters, angles: Array, bends: Array, points: int = POINTS) 
     tip = 0.0
     for k, L in enumerate(arm.link_length):
         amplitude = float(bends[k]) / np.sin(np.pi * arm.sensor_position[k])
-        slope = float(np.arctan(np.pi * amplitude / L))  # of the root from the chord; of the tip with the other sign
+        slope = float(np.arctan(np.pi * amplitude / L))  # of the root from the chord; that of the tip is -slope
         chord = float(angles[k]) if arm.angle_convention == 'chord' else tip + float(angles[k]) - slope
         c, s = np.cos(chord), np.sin(chord)
         w = amplitude * np.sin(np.pi * x)
@@ -55,9 +55,9 @@ def draw(arm: ArmParameters, angles: Array, bends: Array, points: int = POINTS) 
 
 LINK_COLOURS = (0.0, 0.45, 0.70), (0.84, 0.37, 0.0)
 TRUSTED, DOUBTFUL, JOINT = (0.0, 0.45, 0.33), (0.70, 0.40, 0.0), (0.3, 0.3, 0.3)
-"""Red, green and blue. Those of the links are Okabe and Ito's; of text they are darker, to be read on light grey."""
+"""Colours as red, green and blue. Those of the links are Okabe and Ito's; text is darker, legible on light grey."""
 DENSITY = 1000.0
-"""The object is drawn as a ball of this density [kg/m^3], that of water."""
+"""Density of the ball that is drawn for the object [kg/m^3]; it is that of water."""
 THICKNESS = 1.0 / 60.0
 """Width of a link and radius of a joint, as a fraction of the arm's length."""
 
@@ -66,7 +66,7 @@ class ArmMarkers:
     """Fills the markers of one arm: links, joints, the object, its mass as text."""
 
     def __init__(self, config: IdentifierParameters) -> None:
-        """Make the messages. ``drawn`` is False where the signals are not those of the arm."""
+        """Create the messages; ``drawn`` is False where the configured signals lack the angles of the arm."""
         self._config = config
         known = signals(config)
         self.drawn = known is not None and known.angles
@@ -112,7 +112,7 @@ class ArmMarkers:
         return True
 
     def _held(self, payload: Payload | None, tip: np.ndarray, angle: float) -> None:
-        """Show the object where its mass is known, and what is known of it as text."""
+        """Draw the object where its mass is known, and write what is known of the payload as text."""
         known = payload is not None and math.isfinite(payload.std)
         shown = payload is not None and known and payload.mass > 0.0
         self._object.action = Marker.ADD if shown else Marker.DELETE
@@ -130,12 +130,12 @@ class ArmMarkers:
         _paint(self._text, colour)
         self._text.pose.position.x, self._text.pose.position.y = x, y + self._above
         self._text.text = words(payload)
-        # RViz never draws a text that began empty, and keeps one that becomes empty
+        # RViz never draws a text marker that was empty at first, and keeps the old text of one that becomes empty
         self._text.action = Marker.ADD if self._text.text else Marker.DELETE
 
 
 def words(payload: Payload | None) -> str:
-    """Return the payload as the text beside the arm; a number only where it is known."""
+    """Return the text about the payload beside the arm; it has numbers only where the payload is known."""
     if payload is None:
         return ''
     if not math.isfinite(payload.std):

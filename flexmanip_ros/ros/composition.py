@@ -32,25 +32,25 @@ from flexmanip_ros.ros.nodes.rpbsid_identifier import TOPICS, RpbsidIdentifier
 from flexmanip_ros.ros.rclpy_workarounds import make_executor, sequence_number, with_info
 
 READERS = 4
-"""Subscriptions to joint_states here: identifier, trigger, excitation, recorder."""
+"""Number of subscriptions to joint_states in this process: identifier, trigger, excitation, recorder."""
 SHOWN = {'/rpbsid_identifier/arm': (MarkerArray, 'visualization_msgs/msg/MarkerArray'),
          '/diagnostics': (DiagnosticArray, 'diagnostic_msgs/msg/DiagnosticArray')}
-"""What is recorded for viewers alone, as it comes; a replay does not repeat it."""
+"""Topics recorded for viewers only, as serialized: message class and type name. A replay does not repeat them."""
 DISCOVERY_TIMEOUT_S = 20.0
 DRAIN_TIMEOUT_S = 30.0
-"""A busy machine works off its backlog; an idle one needs milliseconds."""
+"""Longest wait for messages under way [s]: a busy machine has a backlog, an idle one needs milliseconds."""
 FLUSH_PERIOD_S = 0.25
 
 
 class CompositionError(FlexmanipError):
-    """The nodes cannot work together as they should."""
+    """The nodes cannot be configured or connected, or another arm is on their topics."""
 
 
 class Recorder(Node):
-    """Writes joint states, commands, events, outputs and diagnostics into a bag; counts what it missed.
+    """Writes joint states, commands, events, outputs and diagnostics into a bag; counts the joint states it missed.
 
-    In the order of arrival, so that a replay meets events and samples as the identifier did. The bag is closed and
-    readable whatever happens.
+    Messages are written in the order of arrival, so that a replay processes events and samples in the order in which
+    the identifier did. The bag is closed and readable whatever happens.
     """
 
     def __init__(self, path: Path, **options: Any) -> None:
@@ -61,7 +61,7 @@ class Recorder(Node):
         self.first_ns: int | None = None
         self.last_ns = self.joint_states = self._log_ns = 0
         self.published: dict[str, list[messages.Value]] = {name: [] for name in TOPICS}
-        """What the identifier published, by topic, in order."""
+        """Values that the identifier published, by topic, in the order of arrival."""
         self.losses = LossCounter()
         self._reader = JointStateReader()
         deep = QoSProfile(depth=qos.SENSOR_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
@@ -151,12 +151,12 @@ class Composition:
 
     @property
     def managed(self) -> Sequence[FlexmanipNode[Any]]:
-        """The nodes with a managed life in the order in which they start: readers first, the plant's clock last."""
+        """The lifecycle nodes in the order in which they start: subscribers first, the plant and its clock last."""
         return self.identifier, self.trigger, self.excitation, self.plant
 
     @property
     def recorder(self) -> Recorder:
-        """The recorder; there is one from ``connect`` on."""
+        """The recorder, which exists from the call of ``connect`` on."""
         assert self._recorder is not None
         return self._recorder
 
@@ -166,15 +166,15 @@ class Composition:
         return node
 
     def configure(self) -> None:
-        """Build states and compile kernels: the slow part, before any clock runs."""
+        """Configure every node. It builds states and compiles kernels, which is slow, before any clock runs."""
         for node in self.managed:
             if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
                 raise CompositionError(f'{node.get_name()} could not be configured', 'see its log above')
 
     def connect(self, others: int = 0) -> None:
-        """Open the bag, wait until every reader is matched with its writer, and that nobody else is there.
+        """Open the bag, wait until all publishers and subscriptions are matched, and check that there is no other arm.
 
-        others: further readers of the joint states, in other processes.
+        others: number of further subscriptions to the joint states, in other processes.
         """
         self._recorder = self._add(Recorder(self._bag))
         if not self.wait(lambda: self._matched(others), DISCOVERY_TIMEOUT_S):
@@ -197,7 +197,7 @@ class Composition:
 
     @property
     def elapsed(self) -> float:
-        """Seconds of the run that are recorded."""
+        """Time from the first to the last recorded joint state [s]."""
         recorder = self.recorder
         return 0.0 if recorder.first_ns is None else (recorder.last_ns - recorder.first_ns) * 1e-9
 
@@ -208,11 +208,11 @@ class Composition:
 
     @property
     def lost(self) -> int:
-        """Joint states that recorder or identifier missed."""
+        """Number of joint states that the recorder missed plus number that the identifier missed."""
         return self.recorder.losses.lost + self.identifier.losses.lost
 
     def drain(self) -> None:
-        """Stop the plant, and let every node take what is still on the way."""
+        """Stop the plant and the excitation, and let every node process the messages still under way."""
         self.plant.trigger_deactivate()
         self.excitation.trigger_deactivate()
         sent, recorder, identifier = self.plant.samples, self.recorder, self.identifier
@@ -222,7 +222,7 @@ class Composition:
         self.wait(lambda: sum(map(len, recorder.published.values())) >= identifier.published)
 
     def wait(self, condition: Callable[[], bool], seconds: float = DRAIN_TIMEOUT_S) -> bool:
-        """Run callbacks until a condition holds, at most so long; return whether it does."""
+        """Run callbacks until a condition holds, at most for ``seconds``; return whether it holds."""
         limit = time.monotonic() + seconds
         while time.monotonic() < limit and not condition():
             self.executor.spin_once(timeout_sec=0.02)
@@ -239,7 +239,10 @@ class Composition:
 
 
 def foreign_arm(node: Node, own_writers: int, own_readers: int) -> bool:
-    """Whether another process publishes joint states or efforts, or listens to efforts, on this domain."""
+    """Return whether another process publishes joint states or efforts, or subscribes to efforts, on this domain.
+
+    own_writers, own_readers: number of publishers and of subscriptions per topic in this process.
+    """
     return bool(node.count_publishers('joint_states') > own_writers
                 or node.count_subscribers('effort_controller/commands') > own_readers
                 or node.count_publishers('effort_controller/commands') > own_writers)

@@ -1,4 +1,4 @@
-"""ROS messages to values of the core, and back. Whether a value can be used is for ``samples.sampling`` to decide."""
+"""Conversion of ROS messages to values of the core, and back; ``samples.sampling`` decides which can be used."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointBlock, Join
 
 SECOND = 1_000_000_000
 FIRST_NS, LAST_NS = -(1 << 31) * SECOND, (1 << 31) * SECOND - 1
-"""Nanoseconds that a stamp can hold (its seconds have 32 bits)."""
+"""Smallest and largest time that a stamp can hold [ns] (its seconds have 32 bits)."""
 
 
 def stamp_ns(stamp: Time) -> int:
@@ -32,19 +32,19 @@ def stamp_ns(stamp: Time) -> int:
 
 
 def time_message(nanoseconds: int) -> Time:
-    """Return nanoseconds as a stamp, the nearest there is."""
+    """Return nanoseconds as a stamp; a time beyond the range of stamps becomes the nearest stamp."""
     sec, nanosec = divmod(min(max(nanoseconds, FIRST_NS), LAST_NS), SECOND)
     return Time(sec=sec, nanosec=nanosec)
 
 
 class JointStateReader:
-    """JointStates from the bytes of a raw subscription, the way a bag is read: a third of the cost."""
+    """Decoder of the bytes of a raw subscription, the one that reads bags: it takes a third of the time of rclpy's."""
 
     def __init__(self) -> None:
         self._layout: cdr.Layout | None = None
 
     def __call__(self, raw: bytes) -> JointRecord:
-        """Return the message; through rclpy's own decoder where the bytes are of another encoding.
+        """Return the message; rclpy's own decoder is used where the bytes have another encoding.
 
         Raises SignalError for bytes that are no JointState.
         """
@@ -55,7 +55,7 @@ class JointStateReader:
         return record
 
     def blocks(self, raws: Sequence[bytes]) -> Iterator[JointBlock | SignalError]:
-        """Yield the messages in blocks of one layout each; where bytes are no JointState, what is wrong."""
+        """Yield the messages in blocks of one layout each; yield a SignalError for bytes that are no JointState."""
         first, most = 0, len(raws)
         while first < len(raws):
             part = raws[first:first + most]
@@ -70,13 +70,13 @@ class JointStateReader:
                     continue
             yield block
             count = len(block.stamp_ns)
-            first, most = first + count, 2 * count  # layouts that alternate must not be looked at to the end each time
+            first, most = first + count, 2 * count  # where layouts alternate, a block does not scan all the rest
 
 
 class JointStateWriter:
-    """JointState to bytes, which a publisher sends as they are: a third of the cost.
+    """Serializer of JointStates, whose bytes a publisher sends as they are: it takes a third of the time of rclpy's.
 
-    The names and lengths of the last message stay; stamp and numbers are written over its own.
+    While names and array lengths stay the same, it overwrites only the stamp and the numbers of the last message.
     """
 
     def __init__(self) -> None:
@@ -84,7 +84,7 @@ class JointStateWriter:
         self._layout: cdr.Layout | None = None
 
     def __call__(self, record: JointRecord) -> bytes:
-        """Return the message."""
+        """Return a record as a serialized JointState."""
         layout, counts = self._layout, tuple(map(len, record[2:]))
         is_alike = layout is not None and layout.names == record.names and layout.counts == counts
         if layout is not None and is_alike and FIRST_NS <= record.stamp_ns <= LAST_NS:
@@ -95,14 +95,14 @@ class JointStateWriter:
 
 
 class NumbersWriter:
-    """Float64MultiArray without labels to bytes: the numbers at its end are new, all before them stays."""
+    """Serializer of Float64MultiArrays without labels: only the numbers, the last bytes, are written anew."""
 
     def __init__(self) -> None:
         self._head = b''
         self._size = -1
 
     def __call__(self, values: Array) -> bytes:
-        """Return the message with values (N,)."""
+        """Return values (N,) as a serialized Float64MultiArray."""
         data = np.ascontiguousarray(values, dtype=np.float64).tobytes()
         if len(data) != self._size:
             raw: bytes = serialize_message(Float64MultiArray(data=doubles(values)))
@@ -137,7 +137,7 @@ def joint_state(record: JointRecord) -> JointState:
 
 
 def capture_event(message: Header) -> CaptureEvent:
-    """Return an announced event; SignalError when frame_id is neither capture nor release."""
+    """Return the event in a message. Raises SignalError when frame_id is neither capture nor release."""
     try:
         kind = EventKind(message.frame_id)
     except ValueError as error:
@@ -148,7 +148,7 @@ def capture_event(message: Header) -> CaptureEvent:
 
 
 def header(event: CaptureEvent) -> Header:
-    """Return an event as it goes out."""
+    """Return an event as the Header that is published."""
     return Header(stamp=time_message(event.stamp_ns), frame_id=event.kind.value)
 
 
@@ -174,7 +174,7 @@ def labelled_array(message: Float64MultiArray) -> LabelledArray:
 
 
 def inertia_stamped(value: Inertia) -> InertiaStamped:
-    """Return a payload as a robot driver takes it."""
+    """Return a payload as an InertiaStamped, the message that a robot driver takes."""
     message = InertiaStamped()
     message.header.stamp = time_message(value.stamp_ns)
     message.header.frame_id = value.frame_id
@@ -211,7 +211,7 @@ def diagnostics(message: DiagnosticArray) -> Diagnostics:
 
 
 def to_message(value: Value) -> Float64MultiArray | InertiaStamped | DiagnosticArray | Float64:
-    """Return any value an estimate publishes as its message."""
+    """Return a value that the identifier publishes as its message."""
     if isinstance(value, Diagnostics):
         return diagnostic_array(value)
     if isinstance(value, LabelledArray):

@@ -54,7 +54,7 @@ class ViewerError(FlexmanipError):
 
 
 class Viewer:
-    """The process and its page."""
+    """The process of the node ``live_view`` and the address of its page."""
 
     def __init__(self, process: subprocess.Popen[bytes], url: str) -> None:
         self.url = url
@@ -75,12 +75,12 @@ class Viewer:
 
 @contextmanager
 def viewer(arguments: Sequence[str]) -> Iterator[Viewer]:
-    """Start ``live_view`` on the domain of this process with its ROS arguments; end it in the end.
+    """Start ``live_view`` on the domain of this process with its ROS arguments; end it when the context is left.
 
-    Raises ViewerError when it does not start, such as on a port that is in use; the node has logged why.
+    Raises ViewerError when the node does not start, for example on a port that is in use; the node has logged why.
     """
     domain = rclpy.get_default_context().get_domain_id()
-    # A session of its own: Ctrl-C at the terminal reaches the demonstration alone, which then ends the page.
+    # The node has a session of its own: Ctrl-C at the terminal reaches the demonstration alone, which then ends it.
     process = subprocess.Popen(
         [sys.executable, '-m', 'flexmanip_ros.ros.nodes.live_view', *ros_arguments(arguments)],
         env={**os.environ, 'ROS_DOMAIN_ID': str(domain)}, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
@@ -98,7 +98,7 @@ def viewer(arguments: Sequence[str]) -> Iterator[Viewer]:
 
 
 def ros_arguments(arguments: Sequence[str]) -> list[str]:
-    """Return the arguments that are meant for ROS."""
+    """Return --ros-args and the arguments that follow it up to --."""
     kept, inside = ['--ros-args'], False
     for item in arguments:
         if item == '--ros-args' or (inside and item == '--'):
@@ -109,7 +109,7 @@ def ros_arguments(arguments: Sequence[str]) -> list[str]:
 
 
 def _url(process: subprocess.Popen[bytes]) -> str:
-    """Return the address that the node prints."""
+    """Return the address of the page, which the node prints on stdout."""
     assert process.stdout is not None
     said, limit = b'', time.monotonic() + START_TIMEOUT_S
     while b'\n' not in said:
@@ -124,15 +124,15 @@ def _url(process: subprocess.Popen[bytes]) -> str:
 NAME = 'demo'
 PAGE_TIMEOUT_S = 20.0
 LOOK_AROUND_S = 0.5
-"""Time in which an arm that is on the domain already is noticed."""
+"""Time for which the program looks for another arm on a domain [s]."""
 LATEST_NS = 500_000_000
-"""Time over which the configuration is averaged, of which the true frequencies are shown."""
+"""Time over which the joint angles are averaged [ns]; the true frequencies are those at the mean angles."""
 FAILED, INTERRUPTED = 1, 130
-"""Exit codes: it could not run, or live and replay differ; it was stopped by a signal."""
+"""Exit codes: FAILED if it could not run or live and replay differ, INTERRUPTED if a signal stopped it."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the demonstration; return 0, 1 when live and replay differ or it could not run, 2 for bad input."""
+    """Run the demonstration; return 0, ``FAILED``, ``INTERRUPTED``, or 2 for bad input."""
     arguments = list(sys.argv if argv is None else argv)
     rclpy_workarounds.interrupt_on_signals()
     console = Console(highlight=False, soft_wrap=True)
@@ -198,7 +198,8 @@ def _run(config: DemoParameters, folder: Path, console: Console, view: Viewer | 
     different = compare(live, outgoing(estimates, identifier.payload_frame))
     replay_s = time.monotonic() - began
     truth = known_truth(config, plant, items)
-    # The two lowest modes are those whose change a payload shows; with the next at 50 Hz they were one line.
+    # The picture shows the two lowest modes, which a payload changes. On an axis that reaches to the next mode, at
+    # 50 Hz, these two look like one line.
     shown = [estimate._replace(modes=estimate.modes[:len(truth.before)]) for estimate in estimates]
     overview_figure(collect(identifier, items, shown, truth), folder / 'overview.png', _title(config))
     console.print(_table(config, estimates, items, truth))
@@ -224,14 +225,14 @@ def beside(program: str) -> str:
 
 
 def _wait_for_a_page(view: Viewer, composition: Composition, console: Console) -> None:
-    """On a terminal, where a person opens the page, start the run with it."""
+    """If the program runs on a terminal, wait until a person opens the page, at most ``PAGE_TIMEOUT_S``."""
     if sys.stdout.isatty():
         console.print(f'the run starts when the page is open, at the latest after {PAGE_TIMEOUT_S:.0f} s')
         composition.wait(lambda: view.pages() > 0, PAGE_TIMEOUT_S)
 
 
 class Progress:
-    """Prints once a second where the run is and what is estimated."""
+    """Prints the recorded time of the run and the latest estimate once a second."""
 
     def __init__(self, console: Console, composition: Composition) -> None:
         self._console, self._composition = console, composition
@@ -259,7 +260,7 @@ class Progress:
 
 
 def payload_words(payload: Payload) -> str:
-    """Return a payload as the progress shows it; a number only where it is known."""
+    """Return a payload as text for the progress line; it has numbers only where the payload is known."""
     if not np.isfinite(payload.std):
         return 'payload not known'
     doubt = '' if payload.status is Status.TRACKING else f' ({payload.status.name})'
@@ -285,7 +286,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def node_arguments(config: DemoParameters) -> list[str]:
-    """Return the nodes' parameters as ROS arguments; those that the user gives after them win."""
+    """Return the nodes' parameters as ROS arguments; the user's own arguments follow and override them."""
     given = ['--ros-args']
     for node, values in settings(config).items():
         for leaf in leaves(NODES[node]):
@@ -309,7 +310,7 @@ def new_folder(base: Path) -> Path:
 
 
 def _init(arguments: Sequence[str], console: Console) -> None:
-    """Join a domain without an arm on it: the user's own, or else the next free one."""
+    """Initialize rclpy on a domain without another arm: the user's own, or else a free one."""
     domain: int | None = None
     for _ in range(10):
         rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO, domain_id=domain)
@@ -323,7 +324,7 @@ def _init(arguments: Sequence[str], console: Console) -> None:
 
 
 def _occupied() -> bool:
-    """Whether joint states or efforts of another process are on the domain."""
+    """Return whether another process uses the topics of joint states or efforts on the domain."""
     node: Any = Node('demo_lookout')
     executor = rclpy_workarounds.make_executor()
     executor.add_node(node)
@@ -338,7 +339,7 @@ def _occupied() -> bool:
 
 
 def outgoing(estimates: Iterable[Estimate], frame_id: str) -> dict[str, list[Value]]:
-    """Return everything that estimates publish, per topic, in order."""
+    """Return the values that are published for estimates, by topic, in order."""
     published: dict[str, list[Value]] = {}
     for estimate in estimates:
         for name, value in messages.outgoing(estimate, frame_id):
@@ -347,7 +348,7 @@ def outgoing(estimates: Iterable[Estimate], frame_id: str) -> dict[str, list[Val
 
 
 def compare(live: Mapping[str, Sequence[Value]], replayed: Mapping[str, Sequence[Value]]) -> str:
-    """Return in words where two sets of messages differ in any bit; empty when they do not."""
+    """Return a sentence on the first difference in any bit between two sets of messages; empty when they are equal."""
     for name in sorted({*live, *replayed}):
         ours, theirs = live.get(name, ()), replayed.get(name, ())
         if len(ours) != len(theirs):
@@ -359,17 +360,17 @@ def compare(live: Mapping[str, Sequence[Value]], replayed: Mapping[str, Sequence
 
 
 def _bits(value: Value) -> bytes:
-    """Return a published value as bytes, equal only when every bit is."""
+    """Return a published value as bytes; two values give equal bytes only when every bit is equal."""
     if isinstance(value, LabelledArray):
         return repr(value.dimensions).encode() + np.asarray(value.data, dtype=np.float64).tobytes()
     return repr(value).encode()
 
 
 def known_truth(config: DemoParameters, plant: PlantParameters, items: Sequence[JointRecord | CaptureEvent]) -> Truth:
-    """Return what the simulation knows: the payload, and the frequencies of the arm.
+    """Return the true values of the simulation: the payload mass and the frequencies of the arm.
 
-    The arm moves, and its frequencies with it: they are those of the mean configuration of the last half second, as
-    the table shows the last estimate before the capture and the last one of all.
+    The frequencies vary with the joint angles. They are computed at the mean angles of the last half second before the
+    capture and of the last half second of the run, because the table shows the last estimates at these two times.
     """
     records = [item for item in items if isinstance(item, JointRecord)]
     first_ns, end_ns = records[0].stamp_ns, records[-1].stamp_ns
@@ -393,7 +394,7 @@ def _title(config: DemoParameters) -> str:
 
 def _table(config: DemoParameters, estimates: Sequence[Estimate], items: Sequence[JointRecord | CaptureEvent],
            truth: Truth) -> Table:
-    """Return estimates beside the truth, before and after the capture."""
+    """Return a table of the estimates beside the true values, before and after the capture."""
     table = Table('', 'estimate', '95 % interval', 'true')
     capture_ns = min((item.stamp_ns for item in items if isinstance(item, CaptureEvent)), default=None)
     before = [e for e in estimates if e.modes and (capture_ns is None or e.stamp_ns < capture_ns)]

@@ -1,4 +1,4 @@
-"""What a node reports once a second: rates, losses, callback times, and what its latest estimate is worth."""
+"""Diagnostics of a node, once a second: rates, losses, callback times, and the quality of its latest estimate."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ WARN = 1
 ERROR = 2
 STALE = 3
 _SEVERITY = (OK, WARN, STALE, ERROR)
-"""From the least to the most severe: silence hides a warning, and a known error hides silence."""
+"""Levels from the least to the most severe: STALE (no messages) outranks a warning, an error outranks STALE."""
 RECENT_S = 60.0
-"""A loss is a warning for so long: somebody who looks at /diagnostics now and then sees it."""
+"""Time for which a loss is a warning [s], so that an occasional reader of /diagnostics sees it."""
 
 
 @dataclass
 class Report:
-    """One diagnostic entry. ``worse`` only ever raises the level; its words are joined."""
+    """One diagnostic entry. ``worse`` can only raise the level; the words of all its calls are joined."""
 
     values: dict[str, Any] = field(default_factory=dict)
     level: int = OK
     words: list[str] = field(default_factory=list)
     waits_for: str = ''
-    """The topic that the node needs and that is silent."""
+    """Topic that the node needs and on which no message comes; empty when there is none."""
 
     def worse(self, level: int, words: str) -> None:
         """Note a problem."""
@@ -50,9 +50,9 @@ class Report:
         self.worse(STALE, f'no {topic}')
 
     def message(self, node: str, namespace: str, stamp: Time) -> DiagnosticArray:
-        """Return the entry as it goes out on /diagnostics; node: its name with the namespace.
+        """Return the entry as the message for /diagnostics; node: the fully qualified name of the node.
 
-        Nodes in one namespace belong to one arm, which the hardware_id names.
+        The hardware_id contains the namespace, because the nodes in one namespace belong to one arm.
         """
         status = DiagnosticStatus(
             level=bytes([self.level]), name=f'{node}: status', message='; '.join(self.words) or 'ok',
@@ -64,14 +64,14 @@ class Report:
 
 
 def text(value: Any) -> str:
-    """Return a value as a diagnostic shows it: short, and 'unknown' where there is no number."""
+    """Return a value as text: a float with six digits, or 'unknown' where it is not finite."""
     if isinstance(value, float):
         return f'{value:.6g}' if math.isfinite(value) else 'unknown'
     return str(value)
 
 
 class Meter:
-    """Times the runs of a callback and counts its messages: ``with meter:`` around its body."""
+    """Measures the run times of a callback and counts its messages; the callback's body runs in ``with meter:``."""
 
     def __init__(self) -> None:
         self._times_ns: list[int] = []
@@ -81,7 +81,7 @@ class Meter:
         self._window_ns = time.monotonic_ns()
 
     def of(self, messages: int) -> Meter:
-        """Return the meter for a run that takes so many messages."""
+        """Return the meter, set for a run of the callback that takes this number of messages."""
         self._taken = messages
         return self
 
@@ -112,37 +112,37 @@ class Meter:
 
 
 class LossCounter:
-    """Messages that were sent and never arrived, from the publishers' sequence numbers.
+    """Counts messages that were sent and never arrived, from the publishers' sequence numbers.
 
-    Each publisher counts its messages. rclpy does not say which publisher a message is from, so a number belongs to the
-    publisher whose next one it is; after a gap, to the one with the largest number before it. A publisher that comes or
-    goes starts the comparison again (``matched``), so its numbers are no loss.
+    Each publisher numbers its messages. rclpy does not say which publisher sent a message, so a number is assigned to
+    the publisher that has it as the next one; after a gap, to the one with the largest next number below it. When
+    a publisher goes, the comparison starts again (``matched``), so its numbers are no loss.
     """
 
     def __init__(self) -> None:
         self.lost = 0
-        """Since the node started."""
+        """Number of messages lost since the node started."""
         self._publishers = 1
         self._expected: list[int] = []
-        """The next number of each publisher heard."""
+        """Next sequence number of each publisher from which a message arrived."""
         self._losses: deque[tuple[float, int]] = deque()
-        """When [s] how many were lost, within ``RECENT_S``."""
+        """Time [s] and number of messages of each loss within ``RECENT_S``."""
 
     def matched(self, event: Any) -> None:
-        """Take the event that a publisher came or went."""
+        """Process the matched event of the subscription: a publisher came or went."""
         self._publishers = max(int(event.current_count), 1)
         if event.current_count_change < 0:
             self._expected = []
 
     def note(self, number: int | None) -> None:
-        """Take the sequence number of an arrived message (None where the middleware has none)."""
+        """Process the sequence number of an arrived message (None where the middleware has none)."""
         if number is None:
             return
         if number in self._expected:
             self._expected.remove(number)
         elif len(self._expected) >= self._publishers:
             before = max((expected for expected in self._expected if expected < number), default=None)
-            if before is None:  # a publisher began again without an event of the middleware
+            if before is None:  # a publisher started again without a matched event
                 self._expected.pop()
             else:
                 self._expected.remove(before)
@@ -154,13 +154,13 @@ class LossCounter:
         self._losses.append((time.monotonic(), count))
 
     def recent(self) -> int:
-        """Return how many were lost in the last ``RECENT_S`` seconds."""
+        """Return how many messages were lost in the last ``RECENT_S`` seconds."""
         while self._losses and time.monotonic() - self._losses[0][0] > RECENT_S:
             self._losses.popleft()
         return sum(count for _, count in self._losses)
 
     def report(self, report: Report, name: str, what: str) -> None:
-        """Add the total under a name; losses of the last ``RECENT_S`` are a warning. what: of messages, commands."""
+        """Add the total under a name, and a warning for losses in ``RECENT_S``. what: 'messages' or 'commands'."""
         report.values[name] = self.lost
         recent = self.recent()
         if recent:
@@ -181,7 +181,7 @@ ADVICE = {
 """What a user can do about each status."""
 UNANNOUNCED = ('nothing is known of the payload and no capture was announced: publish capture_event, call '
                'capture_trigger/capture, or have captures found in the signals (trigger_mode:=auto)')
-"""What to do about an interval of [0, inf] without any event."""
+"""Log line for a payload interval of [0, inf] when no event was announced: what to do."""
 
 
 def status_line(config: IdentifierParameters, status: Status) -> str:

@@ -1,4 +1,4 @@
-"""What every node of this package shares: parameters, managed life, topics, diagnostics, log lines, the program."""
+"""Base class and main program of every node: parameters, lifecycle, topics, diagnostics and log lines."""
 
 from __future__ import annotations
 
@@ -41,31 +41,31 @@ Config = TypeVar('Config')
 BAD_INPUT = 2
 """Exit code of a program whose arguments or parameters are wrong."""
 THROTTLE_S = 2.0
-"""An error that repeats is logged at most this often: a reader can follow it, and it does not fill the disk."""
+"""Shortest time between two log lines of a repeated error [s]: the log stays readable and does not fill the disk."""
 LONGEST_LINE = 600
-"""Characters of a logged error: it may quote a message of any length."""
+"""Largest number of characters of a logged error, which may quote a message of any length."""
 
 
 class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
-    """A managed node over one configuration class.
+    """A lifecycle node whose parameters are those of one configuration class.
 
-    Subclasses write ``start`` (configure), ``activated``, ``deactivated`` and ``report``. Topics and services are made
-    once and stay: a node that is not active ignores what it receives and publishes nothing.
+    Subclasses override ``start`` (configure), ``activated``, ``deactivated`` and ``report``. Topics and services are
+    created once and stay: a node that is not active ignores the messages it receives and publishes diagnostics alone.
     """
 
     def __init__(self, name: str, cls: type[Config], *, overrides: list[Parameter] | None = None, **options: Any
                  ) -> None:
-        """Declare the parameters. Raises ParameterError naming the one that is wrong.
+        """Declare the parameters. Raises ParameterError, which names the parameter that is wrong.
 
-        overrides: values given in code; options: those of ``rclpy.node.Node``, such as context and namespace.
+        overrides: values given in code; options: arguments of ``rclpy.node.Node``, such as context and namespace.
         """
         super().__init__(name, parameter_overrides=overrides, **options)
         self.active = False
         self.events: dict[str, int] = {}
-        """Events of the middleware, by topic: missed deadlines, incompatible publishers, ..."""
+        """Counts of QoS events, by topic and kind: missed deadlines, incompatible publishers, ..."""
         self._entities_made = False
         self._unknown_to_rclpy = ExitStack()
-        """Ends what ``destroy_node`` does not know of."""
+        """Clean-up of the alarms and batches, which ``destroy_node`` of rclpy does not know."""
         self._logged_at: dict[str, float] = {}
         self._waits_for = ''
         try:
@@ -78,7 +78,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
             self.destroy_node()
             raise
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        # Steady: diagnostics come even while simulated time stands still.
+        # On a steady clock, diagnostics are published even while simulated time stands still.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics_timer = self.create_timer(1.0, self.diagnose, clock=self._steady)
 
@@ -87,31 +87,31 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         """The parameters as they are now."""
         return self.parameters.config
 
-    # What a subclass fills in.
+    # Methods that a subclass overrides.
 
     def make_entities(self) -> None:
         """Create publishers, subscriptions, services and timers; called once, after the first ``start``."""
 
     def start(self) -> None:
-        """Build the state, compile what must be compiled. A FlexmanipError rejects the configuration."""
+        """Build the state and compile the kernels. A FlexmanipError makes the configure transition fail."""
 
     def summary(self) -> str:
         """Return what the node does with these parameters, for the log at activation."""
         return ''
 
     def activated(self) -> None:
-        """Begin to work."""
+        """Begin to work; called before ``active`` becomes true."""
 
     def deactivated(self) -> None:
-        """Cease to work; what was published before stays. ``active`` becomes false after it."""
+        """Cease to work; what was published before stays. ``active`` becomes false after this call."""
 
     def configuration_changed(self, config: Config) -> None:
-        """Take parameters that were changed while running."""
+        """Apply parameters that were changed while the node runs."""
 
     def report(self, report: Report) -> None:
-        """Fill the node's diagnostic entry; called once ``make_entities`` was."""
+        """Fill the node's diagnostic entry; never called before ``make_entities``."""
 
-    # Managed life.
+    # Lifecycle transitions.
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Create what the node needs and build its state."""
@@ -126,7 +126,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         return self._transition(self._deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Keep all as it is; the next configure builds a new state."""
+        """Keep topics, services and state; the next configure transition builds a new state."""
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -136,7 +136,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
     def autostart(self) -> bool:
         """Configure and activate at once, as a plain ``ros2 run`` expects, unless ``autostart`` is false.
 
-        Return False, with the reason logged, when the node could not.
+        Return False, with the reason logged, when a transition fails.
         """
         if not self.autostarts:
             self.get_logger().info('not started, as autostart is false; to start it: '
@@ -156,7 +156,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         from flexmanip_ros.cli import first_use  # it loads numba, which --help does not need
         with first_use.announced(lambda: self.get_logger().warning(first_use.WORDS)):
             self.start()
-        if not self._entities_made:  # last: what comes while kernels are loaded would fill the queues, and be lost
+        if not self._entities_made:  # last: messages that come while kernels load would overflow the queues
             self.make_entities()
             self._entities_made = True
 
@@ -193,7 +193,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
 
     def subscription(self, kind: type[Any], topic: str, callback: Callable[..., None], profile: QoSProfile, *,
                      raw: bool = False, matched: Callable[[Any], None] | None = None) -> Subscription:
-        """Create a subscription whose quality of service the user may override; its events are counted.
+        """Create a subscription whose quality of service the user may override; its QoS events are counted.
 
         matched: called when a publisher comes or goes.
         """
@@ -208,20 +208,20 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
 
     def batches(self, kind: type[Any], topic: str, profile: QoSProfile, *,
                 matched: Callable[[Any], None] | None = None) -> rclpy_workarounds.Batches:
-        """Create a subscription whose serialized messages wait until they are taken, see ``Batches``."""
+        """Create a subscription whose serialized messages wait in its queue until they are taken, see ``Batches``."""
         made = rclpy_workarounds.Batches(
             self, self.subscription(kind, topic, _unused, profile, raw=True, matched=matched))
         self._unknown_to_rclpy.callback(made.give_back, self)
         return made
 
     def alarm(self, callback: Callable[[], None]) -> rclpy_workarounds.Alarm:
-        """Return what runs a callback after times that differ, see ``Alarm``."""
+        """Return a one-shot timer that runs a callback after a time chosen at each call, see ``Alarm``."""
         made = rclpy_workarounds.Alarm(self, callback)
         self._unknown_to_rclpy.callback(made.close)
         return made
 
     def destroy_node(self) -> None:
-        """Take along alarms, and the subscriptions that the executor does not know of."""
+        """Destroy the node, its alarms, and the subscriptions that the executor does not know."""
         self._unknown_to_rclpy.close()
         super().destroy_node()
 
@@ -235,7 +235,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
             f'qos_overrides.{self.resolve_topic_name(topic)}.subscription.reliability or a similar parameter')
 
     def stamp_of(self, raw: bytes) -> int | None:
-        """Return the header stamp [ns] of a serialized JointState; None, with an error logged, without one."""
+        """Return the header stamp [ns] of a serialized JointState; log an error and return None if it is not CDR."""
         try:
             return cdr.stamp_ns(raw)
         except cdr.CdrError:
@@ -245,7 +245,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
     # Log lines and diagnostics.
 
     def log_throttled(self, reason: str, words: str) -> None:
-        """Log an error, for one reason at most every ``THROTTLE_S``."""
+        """Log an error; errors of the same reason are logged at most once in ``THROTTLE_S``."""
         now = time.monotonic()
         if now - self._logged_at.get(reason, -math.inf) >= THROTTLE_S:
             self._logged_at[reason] = now
@@ -276,12 +276,12 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
 
 
 def _unused(message: Any) -> None:
-    """Stand where rclpy wants a callback."""
+    """Do nothing; rclpy requires a callback for every subscription."""
 
 
 @contextmanager
 def _qos_errors(topic: str) -> Iterator[None]:
-    """Raise ParameterError for a quality of service that cannot be, naming the parameter that asked for it."""
+    """Raise ParameterError for a quality of service that is not possible, naming the parameters that set it."""
     try:
         yield
     except (RuntimeError, ValueError, InvalidQosOverridesError, ParameterException) as error:
@@ -290,9 +290,9 @@ def _qos_errors(topic: str) -> Iterator[None]:
 
 
 class SampleGrid:
-    """A uniform grid of instants that begins at ``begin``: instant k is k / rate seconds later.
+    """A uniform grid of instants: instant k is k / rate seconds after the call of ``begin``.
 
-    On the wall clock elapsed time is steady, so a correction of the system clock moves no stamp. With ``use_sim_time``
+    Elapsed time is that of a steady clock, so a correction of the system clock moves no stamp. With ``use_sim_time``
     it is that of /clock.
     """
 
@@ -305,7 +305,7 @@ class SampleGrid:
         self._origin_ns: int | None = None
 
     def begin(self) -> bool:
-        """Set instant 0 to now; False while simulated time has not come yet."""
+        """Set instant 0 to now; return False while no simulated time has been received."""
         self.start_ns = int(self._ros.now().nanoseconds)
         self._origin_ns = int(self.clock.now().nanoseconds) if self.start_ns > 0 else None
         return self._origin_ns is not None
@@ -320,7 +320,7 @@ class SampleGrid:
         self._origin_ns = None
 
     def latest(self) -> int:
-        """Return the index of the latest instant reached; negative when the clock went back before 0."""
+        """Return the index of the latest instant reached; negative when the clock went back before instant 0."""
         assert self._origin_ns is not None
         elapsed_ns = int(self.clock.now().nanoseconds) - self._origin_ns
         return int(elapsed_ns * self.rate / 1e9 + 1e-6) if elapsed_ns >= 0 else -1
@@ -330,7 +330,8 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
         argv: Sequence[str] | None = None) -> int:
     """Run one node until it is asked to stop; return the exit code.
 
-    0 after SIGINT or SIGTERM at any moment, 2 with one line on stderr for bad arguments or parameters.
+    The code is 0 after SIGINT or SIGTERM at any time, and 2, with the reason on stderr, for bad arguments or
+    parameters.
     """
     arguments = list(sys.argv if argv is None else argv)
     try:
@@ -347,7 +348,7 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
 
 
 def _spin(make: Callable[[], FlexmanipNode[Any]], name: str) -> int:
-    warnings.simplefilter('ignore', RuntimeWarning)  # numbers out of range have a status
+    warnings.simplefilter('ignore', RuntimeWarning)  # the status of an estimate reports numbers out of range
     node: FlexmanipNode[Any] | None = None
     executor: Executor | None = None
     try:

@@ -1,4 +1,4 @@
-"""A configuration class as ROS parameters: declared with words and ranges, read, and changed as a set."""
+"""A configuration class as ROS parameters: declared with descriptions and ranges, read, and changed together."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class NodeParameters(Generic[Config]):
 
 
 def descriptor(leaf: Leaf) -> ParameterDescriptor:
-    """Return the words, range and type of a parameter as ROS tools show them."""
+    """Return the descriptor of a parameter: its description, range and type as ROS tools show them."""
     unit = f' [{leaf.unit}]' if leaf.unit else ''
     described = ParameterDescriptor(
         name=leaf.name, type=_type(leaf).value, description=leaf.words + unit, read_only=not leaf.live)
@@ -91,7 +91,7 @@ def descriptor(leaf: Leaf) -> ParameterDescriptor:
 
 
 def ros_value(leaf: Leaf, value: Any) -> Any:
-    """Return a value as ROS stores it; an empty list of texts becomes [''] (ROS cannot type an empty one)."""
+    """Return a value as ROS stores it; an empty list of texts becomes [''] (ROS cannot infer its type)."""
     if not leaf.is_array:
         return value
     return [''] if leaf.kind is str and not value else list(value)
@@ -111,7 +111,7 @@ def _declare(node: Node, leaf: Leaf) -> Any:
             f'give {"a list, each " if leaf.is_array else ""}{_EXAMPLE[leaf.kind]}') from error
     except InvalidParameterValueException as error:
         given = parameter_overrides(node)[leaf.name].value
-        check(leaf, given)  # says it in our words
+        check(leaf, given)  # raises the message of this package
         raise ParameterError(f"parameter '{leaf.name}' is {given!r}", str(error)) from error
     return check(leaf, value)
 
@@ -131,9 +131,9 @@ def _reject_unknown(node: Node, known: dict[str, Leaf]) -> None:
 
 
 def arm_line(node: Any) -> str:
-    """Return which arm a node computes with and where its parameters come from; empty for a node without one.
+    """Return a log line on the arm parameters of a node and where they come from; empty for a node without an arm.
 
-    rclpy keeps what was given at start by name, not by origin: parameter files and ``-p`` look the same.
+    rclpy keeps the overrides given at start by name, not by origin: parameter files and ``-p`` look the same.
     """
     arm = getattr(node.config, 'arm', None)
     if arm is None:
@@ -141,7 +141,7 @@ def arm_line(node: Any) -> str:
     given = any(name.startswith('arm.') for name in parameter_overrides(node))
     defaults = flatten(type(arm)())
     changed = [f'arm.{name}' for name, value in flatten(arm).items() if value != defaults[name]]
-    # launch_ros writes the parameters that stand in a launch file into files of its own
+    # launch_ros writes the parameters that stand in a launch file into temporary files named launch_params_*
     files = [path for option, path in pairwise(sys.argv)
              if option == '--params-file' and not Path(path).name.startswith('launch_params_')]
     if given:

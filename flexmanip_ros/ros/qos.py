@@ -1,4 +1,4 @@
-"""Quality of service of every topic, each open to the standard ``qos_overrides`` parameters."""
+"""QoS profiles of all topics. The standard ``qos_overrides`` parameters can change each of them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 SENSOR_DEPTH = 1000
-"""Keeps a second of samples at 1 kHz: a stall of the reader loses nothing (5-10 lost 5-30 %)."""
+"""Queue depth for joint states, a second at 1 kHz: a reader that stalls loses nothing (depths 5-10 lost 5-30 %)."""
 
 
 def _profile(depth: int, reliability: ReliabilityPolicy,
@@ -17,19 +17,19 @@ def _profile(depth: int, reliability: ReliabilityPolicy,
         history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability, durability=durability)
 
 
-# Each makes a new profile, since an override changes the one that it is given.
+# Each of these is called for a new profile, because a QoS override changes the profile that it is given.
 sensor_output = partial(_profile, SENSOR_DEPTH, ReliabilityPolicy.RELIABLE)
-"""Published joint states: reliable, so that both kinds of reader match."""
+"""Profile for publishing joint states: reliable, so that reliable and best-effort subscriptions match."""
 sensor_input = partial(_profile, SENSOR_DEPTH, ReliabilityPolicy.BEST_EFFORT)
-"""Read joint states: best effort, so that both kinds of publisher match."""
+"""Profile for subscribing to joint states: best effort, so that reliable and best-effort publishers match."""
 command = partial(_profile, 10, ReliabilityPolicy.RELIABLE)
-"""Efforts."""
+"""Profile for effort commands."""
 latched = partial(_profile, 1, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
-"""Events, models and payloads: a subscriber that comes late still gets the last one."""
+"""Profile for publishing events, models and payloads: a late subscription still gets the last message."""
 latched_input = partial(_profile, 10, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
-"""Read what is latched, deeper than it is written: two events in quick succession both arrive."""
+"""Profile for subscribing to latched topics, deeper than ``latched``: two events in quick succession both arrive."""
 output = partial(_profile, 10, ReliabilityPolicy.RELIABLE)
-"""Everything else that the identifier publishes."""
+"""Profile for everything else that the identifier publishes."""
 
 
 def overridable() -> QoSOverridingOptions:

@@ -30,15 +30,15 @@ from rclpy.subscription import Subscription
 from flexmanip_ros.cli.console import is_postponed, send_again
 
 POLL_S = 0.1
-"""Longest wait inside the executor, hence the longest delay of a signal on an idle node."""
+"""Longest wait inside the executor [s], hence the longest time before an idle node handles a signal."""
 AGAIN_S = 1.0
-"""Time after which a signal is repeated that has not ended the process yet."""
+"""Time after which a signal that has not ended the process yet is sent again [s]."""
 LONGEST_END_S = 10.0
-"""Longest time in which a process leaves the middleware; it takes some tenths of a second."""
+"""Time limit for the shutdown of the middleware [s]; a normal shutdown takes some tenths of a second."""
 
 
 def make_executor(context: Context | None = None) -> Executor:
-    """Return the events executor, or the plain one where rclpy has none.
+    """Return an EventsExecutor, or a SingleThreadedExecutor where rclpy has no EventsExecutor.
 
     Without the events executor a node takes four times the processor time at 1 kHz. MultiThreadedExecutor does not
     keep up at all: 2.5 of 1000 messages a second were measured (https://github.com/ros2/rclpy/issues/1452).
@@ -53,12 +53,13 @@ def make_executor(context: Context | None = None) -> Executor:
 def interrupt_on_signals(*, again: bool = False) -> list[int]:
     """Let SIGINT and SIGTERM raise KeyboardInterrupt; call it again after an executor was made.
 
-    Return a list that holds the signals which have come: an exception in a callback from C is printed and lost. One
-    that comes while a kernel is loaded waits for that, see ``console.is_postponed``. again: each comes again, every
-    ``AGAIN_S`` until signals are ignored, in case another callback lost it.
+    Return a list to which each received signal is added, because an exception in a callback from C is printed and
+    lost. A signal that comes while a kernel is loaded is handled later, see ``console.is_postponed``. again: each
+    signal is sent again every ``AGAIN_S`` until signals are ignored, in case a callback from C lost its exception.
 
     rclpy's own handlers end the context before a node can send its last message, such as zero torque. With
-    ``SignalHandlerOptions.NO`` SIGTERM ends the process at once, and the events executor sets handlers of its own.
+    ``SignalHandlerOptions.NO`` alone, SIGTERM ends the process at once, and the events executor sets handlers of its
+    own.
     """
     caught: list[int] = []
 
@@ -79,7 +80,7 @@ def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
     """Run callbacks until the context ends or a condition holds. SIGINT and SIGTERM raise KeyboardInterrupt.
 
     The events executor of rclpy 7.1 runs no callback in ``spin()`` without a time-out. It reports a KeyboardInterrupt
-    inside a callback as a fatal error with a traceback, so the signals raise it between two callbacks.
+    inside a callback as a fatal error with a traceback, so this function raises it between two callbacks.
     """
     caught: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -97,11 +98,11 @@ def spin(executor: Executor, until: Callable[[], bool] = lambda: False) -> None:
 
 @contextmanager
 def shutdown() -> Iterator[None]:
-    """End what rclpy and Fast DDS hold; the body stops and forgets executor and nodes.
+    """Shut down rclpy and Fast DDS; the body of the context destroys executor and nodes and drops all references.
 
-    Signals are ignored: ``ros2 launch`` and the terminal both send SIGINT, and the second would interrupt the end.
-    A node is part of a reference cycle, so ``destroy_node`` leaves its DDS participant until a garbage collection
-    (https://github.com/ros2/rclpy/issues/1710). Without one, the participant goes in C's exit handlers while a thread
+    Signals are ignored: ``ros2 launch`` and the terminal both send SIGINT, and the second would interrupt the shutdown.
+    A node is part of a reference cycle, so its DDS participant outlives ``destroy_node`` until a garbage collection
+    (https://github.com/ros2/rclpy/issues/1710). Without one, C's exit handlers destroy the participant while a thread
     of rmw_fastrtps still waits on its readers, and the process aborts ("malloc_consolidate(): unaligned fastbin chunk
     detected"). Fast DDS can also wait without end where a participant is destroyed just as another leaves
     (https://github.com/eProsima/Fast-DDS/issues/6193): after ``LONGEST_END_S`` the process ends with exit code 1.
@@ -114,11 +115,11 @@ def shutdown() -> Iterator[None]:
         rclpy.try_shutdown()
         gc.collect()
         faulthandler.cancel_dump_traceback_later()
-        ignore_signals()  # the executor that went gave the signals their default actions back
+        ignore_signals()  # the destroyed executor restored the default actions of the signals
 
 
 def ignore_signals() -> None:
-    """Let SIGINT and SIGTERM pass: the process is ending."""
+    """Ignore SIGINT and SIGTERM, because the process is ending."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
 
@@ -126,8 +127,8 @@ def ignore_signals() -> None:
 def with_info(callback: Callable[[Any, Any], None]) -> Callable[..., None]:
     """Adapt a ``(message, info)`` callback to both executors.
 
-    rclpy reads off the signature that the information is wanted. The events executor then calls the callback with one
-    tuple, where the others give two arguments.
+    rclpy passes the message info to a callback whose signature has two parameters. The events executor passes message
+    and info as one tuple, the other executors as two arguments.
     """
     def adapter(message: Any, info: Any = None) -> None:
         if info is None:
@@ -145,24 +146,25 @@ def sequence_number(info: Any) -> int | None:
 
 
 class Batches:
-    """A subscription that the executor does not know: its waiting messages are taken at once, when they are asked for.
+    """A subscription that the executor does not know: ``take`` gives all messages that wait in its queue.
 
-    A Python callback for each of 1000 messages a second takes 10 % of a core, taking them a hundred times a second 3 %.
-    rclpy has no subscription without a callback, so this one is withdrawn from its node after it was made.
+    At 1000 messages a second, one Python callback per message takes 10 % of a core; taking the waiting messages a
+    hundred times a second takes 3 %. rclpy has no subscription without a callback, so this one is removed from its
+    node after its creation.
     """
 
     def __init__(self, node: Node, subscription: Subscription) -> None:
         self._subscription = subscription
         node._subscriptions.remove(subscription)
-        node._wake_executor()  # one that runs on another thread may have seen it already
+        node._wake_executor()  # an executor on another thread may have added the subscription
 
     @property
     def depth(self) -> int:
-        """How many messages can wait."""
+        """Largest number of messages that can wait."""
         return max(int(self._subscription.qos_profile.depth), 1)
 
     def take(self) -> Iterator[tuple[Any, Any]]:
-        """Yield each waiting message with its information, as many as its queue can hold."""
+        """Yield each waiting message with its message info, at most as many as the queue can hold."""
         subscription = self._subscription
         with subscription.handle:
             for _ in range(self.depth):
@@ -172,29 +174,30 @@ class Batches:
                 yield taken
 
     def give_back(self, node: Node) -> None:
-        """Let the node destroy it with its others; call it before ``destroy_node``."""
+        """Return the subscription to its node, so that a following ``destroy_node`` destroys it."""
         node._subscriptions.append(self._subscription)
 
 
 class Alarm:
-    """Runs a callback on the executor of its node, once for each ``after``.
+    """A one-shot timer that runs a callback on the executor of its node, once for each ``after``.
 
-    A timer whose period is changed and reset makes the events executor of rclpy 7.1 run other timers twice, and then
-    not at all for a period. An exception in a task ends that executor with a segmentation fault, so a timer raises it.
+    An rclpy timer that is reset with another period makes the events executor of rclpy 7.1 run other timers twice, and
+    then not at all for a period. An exception in a task ends that executor with a segmentation fault, so an exception
+    of the callback is raised in a timer.
     """
 
     def __init__(self, node: Node, callback: Callable[[], None]) -> None:
         self._node, self._callback = node, callback
         self._changed = threading.Condition()
         self._at: float | None = None
-        """When it is due, on the monotonic clock [s]; None while nothing is."""
+        """Time at which the callback is due, on the monotonic clock [s]; None while it is not due."""
         self._closed = False
         self._running = threading.RLock()
         self._thread = threading.Thread(target=self._wait, name='alarm', daemon=True)
         self._thread.start()
 
     def after(self, seconds: float) -> None:
-        """Run the callback after a time [s], and not at the one set before."""
+        """Run the callback after a time [s], which replaces the time of an earlier call."""
         with self._changed:
             self._at = time.monotonic() + seconds
             self._changed.notify()
@@ -224,7 +227,7 @@ class Alarm:
                 self._node.create_timer(0.0, partial(_raise, error))
 
     def close(self) -> None:
-        """Run it no more; wait for the callback that runs on another thread."""
+        """Never run the callback again; wait for a callback that still runs on another thread."""
         with self._running, self._changed:
             self._closed = True
             self._changed.notify()
@@ -258,7 +261,7 @@ class ManagedNode(LifecycleNode):
 
 
 def parameter_overrides(node: Node) -> dict[str, Parameter]:
-    """Return what file, command line or code gave at start; rclpy has no public name for it."""
+    """Return the overrides given at start by file, command line or code; rclpy has no public name for them."""
     given: dict[str, Parameter] = node._parameter_overrides
     return given
 
@@ -266,9 +269,9 @@ def parameter_overrides(node: Node) -> dict[str, Parameter]:
 def declare(node: Node, name: str, default: Any, kind: Parameter.Type, descriptor: ParameterDescriptor) -> Any:
     """Declare a parameter and return its value, from an override or the default; raises what rclpy raises.
 
-    rclpy reads the type off the default and takes an empty list for bytes: it then rejects every override but an empty
-    one (https://github.com/ros2/rclpy/issues/912). So a parameter with an empty default is declared by its type, and
-    set afterwards.
+    rclpy infers the type from the default and takes an empty list for a byte array: it then rejects every override but
+    an empty one (https://github.com/ros2/rclpy/issues/912). So a parameter whose default is empty is declared by its
+    type, and its value is set afterwards.
     """
     if not isinstance(default, list) or default:
         return node.declare_parameter(name, default, descriptor).value

@@ -1,9 +1,9 @@
-"""What the page shows of a run, without ROS: messages in, compact JSON out.
+"""Convert the messages of a run to the compact JSON that the page shows, without ROS.
 
-A ``Screen`` takes joint states in blocks, events and the identifier's status messages, and gives frames: everything
-since the frame before. A live page gets a frame some thirty times a second, a recorded one a single frame with all.
-Times are seconds since the first sample, by the stamps. Samples go as rows of float32 in base64: each value with seven
-digits, and NaN stays NaN, which the page draws as a gap.
+A ``Screen`` takes joint states in blocks, events and the identifier's status messages, and returns frames. A frame
+contains everything since the frame before. A live page gets a frame at a rate of ``ViewParameters.rate``, the page of a
+recording a single frame with everything. Times are the stamps in seconds since the first sample. Samples are sent as
+rows of float32 in base64: each value has seven digits, and NaN stays NaN, which the page draws as a gap.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from flexmanip_ros.parameters.nodes import WINDOWS
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, Status
 
 COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#7F7F7F', '#000000')
-"""Of lines, on this page and in figures: those of Okabe and Ito, which people with any colour vision can tell apart."""
+"""Colours of lines on this page and in figures: the palette of Okabe and Ito, distinct for any colour vision."""
 PAYLOAD_COLOUR = '#009E73'
 EVENT_COLOUR = '#AA0000'
 STATUS_LOOKS: dict[Status, tuple[str, str]] = {
@@ -37,27 +37,27 @@ STATUS_LOOKS: dict[Status, tuple[str, str]] = {
 MODES_APART = 4.0
 """Ratio to the lowest known frequency above which a mode does not set the range of a plot [-]."""
 KNOWN_BAND = 0.3
-"""Half width of its 95 % band, over the frequency, up to which a mode is known."""
+"""Largest half width of the 95 % band of a mode that counts as known, as a fraction of its frequency [-]."""
 
 LOOPED_NS = 1_000_000_000
-"""Stamps that go back further than this are a new run, and the page begins again."""
+"""Backward jump of the stamps beyond which a new run begins and the page starts again [ns]."""
 GAP = 3.0
-"""Sample times after which a line has a gap."""
+"""Interval between samples above which a line has a gap [sample times]."""
 SAME_EVENT_S = 0.2
-"""An event that is announced and also found in the signals is shown once."""
+"""Time within which two events of one kind are shown as one, as when it is announced and found in the signals [s]."""
 LATEST_INTERVALS = 64
-"""Intervals whose median is the sample time."""
+"""Number of latest intervals between samples, whose median is taken as the sample time."""
 MOST_ESTIMATES = 10_000
-"""Payloads, and models, of a recording: of more every n-th is shown."""
+"""Largest number of payloads, and of models, shown of a recording. Of a larger number every n-th is shown."""
 MOST_EVENTS = 200
 LARGEST = 3e38
-"""What a float32 can hold."""
+"""Largest magnitude of a value that is sent as float32; a larger one becomes NaN."""
 PAYLOAD_NUMBERS = ('mass_kg', 'std_kg', 'lower95_kg', 'upper95_kg', 'consistency')
 STATUSES = {status.name: index for index, status in enumerate(Status)}
 SPACE_FOR = '"insert the layout here"', '"insert the recording here"'
-"""Where the page takes its data."""
+"""Placeholders in the page that are replaced by the layout and the recording."""
 EMBEDDED_ROWS = 40_000
-"""Samples inside a report, which is to stay below some megabytes."""
+"""Number of rows to which the samples inside a report are thinned out, so that it stays below some megabytes."""
 
 
 class Source(NamedTuple):
@@ -75,19 +75,19 @@ class Source(NamedTuple):
 
     @property
     def bends(self) -> tuple[str, ...]:
-        """The signals of the second plot: positions that are no joint angles, else whatever outputs there are."""
+        """The signals of the second plot: outputs that are positions but no joint angles; without any, all outputs."""
         positions = tuple(name for name in self.config.outputs
                           if name.endswith('/position') and name not in self.config.angles)
         return positions or self.config.outputs
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The signals of a row, behind its time."""
+        """The signals of a row, in which they follow the time."""
         return (*self.torques, *self.bends, *self.config.angles)
 
     @property
     def is_arm(self) -> bool:
-        """Whether the arm can be drawn: an angle and a bend a link."""
+        """Whether the arm can be drawn: there are one angle and one bend for each link."""
         return len(self.config.angles) == len(self.bends) == len(self.config.arm.link_length)
 
     def layout(self) -> dict[str, Any]:
@@ -121,14 +121,14 @@ def of_identifier(config: IdentifierParameters, words: str) -> Source:
 
 
 class Screen:
-    """Takes messages, gives frames. Nothing is kept beyond the next frame but the latest events."""
+    """Takes messages and returns frames. After a frame it keeps only the latest events of the messages."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
         self.samples = 0
-        """Joint states taken since the start."""
+        """Number of joint states taken since the start, in all runs."""
         self.runs = 0
-        """Runs begun; the frames of another run have another time 0."""
+        """Number of runs begun; each run has its own time 0."""
         self._places: tuple[tuple[str, ...], list[tuple[str, int] | None]] = ((), [])
         self._begin()
 
@@ -186,7 +186,7 @@ class Screen:
         return values
 
     def _with_gaps(self, rows: Array, before_ns: int | None) -> Array:
-        """Return rows with one of NaN wherever samples are missing."""
+        """Return the rows with a row of NaN inserted wherever samples are missing."""
         assert self.first_ns is not None
         earlier = rows[:1, 0] if before_ns is None else [(before_ns - self.first_ns) * 1e-9]
         intervals = np.diff(np.concatenate([earlier, rows[:, 0]]))
@@ -194,7 +194,7 @@ class Screen:
         self._intervals = np.concatenate([self._intervals, known])[-LATEST_INTERVALS:]
         if not self._intervals.size:
             return rows
-        median = np.sort(self._intervals)[self._intervals.size // 2]  # a tenth of the time of np.median
+        median = np.sort(self._intervals)[self._intervals.size // 2]  # takes a tenth of the time of np.median
         missing = np.flatnonzero(intervals > GAP * median)
         if not missing.size:
             return rows
@@ -223,7 +223,7 @@ class Screen:
                 self.status(value)
 
     def frame(self, most_rows: int | None = None) -> dict[str, Any] | None:
-        """Return what came since the frame before; None when that is nothing. most_rows: thin a longer run out."""
+        """Return what came since the frame before; None if nothing came. most_rows: samples are thinned to so many."""
         if self.first_ns is None:  # without a first sample there is no time 0
             del self._payloads[:-1], self._models[:-1]
             return None
@@ -258,7 +258,7 @@ def thinned(rows: Array, most: int) -> Array:
     count = len(rows) // size
     blocks = rows[:count * size].reshape(count, size, -1)
     values = blocks[:, :, 1:]
-    low, high = values.argmin(axis=1), values.argmax(axis=1)  # of NaN where there is one
+    low, high = values.argmin(axis=1), values.argmax(axis=1)  # the index of a NaN where there is one
     pair = np.sort(np.stack([low, high], axis=1), axis=1)
     made = np.empty((count, 2, rows.shape[1]))
     made[:, :, 1:] = np.take_along_axis(values, pair, axis=1)
@@ -269,18 +269,18 @@ def thinned(rows: Array, most: int) -> Array:
 def page(source: Source, recording: dict[str, Any] | None = None, speed: float = 1.0, *, playing: bool = True) -> str:
     """Return the whole page; with a recording inside it needs no server.
 
-    playing: a recording begins at once; else its end is shown first.
+    playing: whether a recording plays at once; if not, its end is shown first.
     """
     text = resources.files('flexmanip_ros.view').joinpath('page.html').read_text(encoding='utf-8')
     layout = source.layout() | {'speed': speed, 'playing': playing}
     for place, value in zip(SPACE_FOR, (layout, recording), strict=True):
-        # A text that ends the script element would end it inside a string too.
+        # The browser ends a script element at "</script>" even inside a string.
         text = text.replace(place, encoded(value).replace('<', '\\u003c'), 1)
     return text
 
 
 def embedded(screen: Screen, events: Iterable[CaptureEvent], estimates: Iterable[Estimate]) -> str:
-    """Return a page with a recording inside, for a report. screen: it has the joint states already."""
+    """Return a page with a recording inside, for a report. screen: already contains the joint states."""
     for event in events:
         screen.event(event)
     for estimate in estimates:
@@ -294,7 +294,7 @@ def encoded(value: Any) -> str:
 
 
 def _short(name: str, by_joint: bool) -> str:
-    """Return the name of a line; where all lines have one field, the joint's is enough."""
+    """Return the label of a line: the joint's name where all lines show the same field, else the signal's name."""
     return name.rpartition('/')[0] if by_joint else name
 
 
@@ -304,7 +304,7 @@ def _place(name: str, block: JointBlock) -> tuple[str, int] | None:
 
 
 def _numbers(status: DiagnosticStatus) -> list[Any] | None:
-    """Return the number of the status, then those of a payload or, by mode, of a model; None for other entries."""
+    """Return the index of the status, then the numbers of a payload or of each mode; None for other entries."""
     texts = dict(status.values)
     index = STATUSES.get(texts.get('status', ''))
     if index is None or status.name not in ('payload', 'model'):

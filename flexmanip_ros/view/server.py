@@ -1,8 +1,8 @@
-"""The page and its events over HTTP, on this machine alone, read-only, with the standard library.
+"""Serve the page and its events over HTTP, on this machine alone, read-only, with the standard library.
 
 ``/`` is the page, ``/events`` a stream of Server-Sent Events, ``/state`` a few counts as JSON. The events of the last
 ``HISTORY_S`` seconds are kept once for all pages, and each page reads them at its own pace on a thread of its own. A
-page that is slower than that is let go: it connects again by itself and begins with the history.
+page that falls further behind is disconnected. It connects again by itself and begins with the history.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from flexmanip_ros.errors import FlexmanipError
 
 HOST = '127.0.0.1'
 HISTORY_S = 35.0
-"""A page that opens late is shown at least its longest window."""
+"""Time for which events are kept [s], so that a page that opens late shows at least its longest window."""
 MOST_BYTES = 64_000_000
-"""Bytes of history at most."""
+"""Largest size of the kept events [bytes]."""
 MOST_LASTING = 200
 MOST_PAGES = 16
 STUCK_S = 5.0
-"""A page that takes no byte for so long is let go."""
+"""Time after which a page that takes no byte is disconnected [s]."""
 BEAT_S = 1.0
-"""An event at least so often, so that a page that has gone is noticed."""
+"""Longest time without data to a page [s]. Sending data shows whether the page has gone."""
 POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; " \
     "img-src data:"
 
@@ -43,11 +43,11 @@ class ViewError(FlexmanipError):
 
 
 class Feed:
-    """Events in order, numbered; pages read them as they can."""
+    """Numbered events in order, which each page reads at its own pace."""
 
     def __init__(self, page: bytes = b'') -> None:
         self._changed = threading.Condition()
-        # A page that finds another one at its address when it connects again loads that one.
+        # The checksum of the page: a page that connects again and gets another checksum loads the new page.
         self._reset = f'{{"page":{zlib.crc32(page)}}}'
         self._lasting: deque[bytes] = deque(maxlen=MOST_LASTING)
         """Events that a page needs whenever it opens."""
@@ -72,7 +72,7 @@ class Feed:
             self._changed.notify_all()
 
     def reset(self) -> None:
-        """Begin again: what was sent before is of another run."""
+        """Drop all kept events and tell every page to begin again, as a new run begins."""
         with self._changed:
             self._lasting.clear()
             self._recent.clear()
@@ -80,15 +80,15 @@ class Feed:
         self.publish('reset', self._reset)
 
     def greeting(self) -> tuple[int, bytes]:
-        """Return the number to go on with, and what a page that opens now has to know."""
+        """Return the number of the next event, and the events that a page needs when it opens now."""
         with self._changed:
             reset = f'event: reset\ndata: {self._reset}\n\n'.encode()
             return self._next, b''.join([reset, *self._lasting, *(event for _, event in self._recent)])
 
     def after(self, number: int) -> tuple[int, bytes] | None:
-        """Return the events from a number on, waiting up to ``BEAT_S`` for one; None when they are gone or at the end.
+        """Return the events from a number on; None if these are dropped or the feed is closed.
 
-        An event that a page has twice, as one that lasts, is shown once.
+        The call waits up to ``BEAT_S`` for an event. A page may get a lasting event twice; it shows that event once.
         """
         with self._changed:
             if not self.closed and number == self._next:
@@ -100,16 +100,16 @@ class Feed:
             return self._next, b''.join(waiting) or b': nothing new\n\n'
 
     def close(self) -> None:
-        """Let every page go."""
+        """Disconnect every page."""
         with self._changed:
             self.closed = True
             self._changed.notify_all()
 
 
 class Server:
-    """Serves a page until it is closed. Raises ViewError when the port cannot be had.
+    """Serves a page until it is closed. Raises ViewError when the port cannot be opened.
 
-    page: the HTML; state: numbers for ``/state``, called on a thread of the server.
+    page: the HTML; state: returns numbers for ``/state``, called on a thread of the server.
     """
 
     def __init__(self, page: str, port: int, state: Callable[[], Mapping[str, Any]] = dict) -> None:
@@ -118,10 +118,10 @@ class Server:
         self._state = state
         self._lock = threading.Lock()
         self._closed = threading.Condition(self._lock)
-        """Notified when a page has gone."""
+        """Notified when a page has been closed."""
         self._connections: set[socket.socket] = set()
         self.pages = 0
-        """Pages that are open."""
+        """Number of pages that are open."""
         try:
             self._http = _Http(self, port)
         except OSError as error:
@@ -136,18 +136,18 @@ class Server:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         return f'http://{HOST}:{self.port}/'
 
     @property
     def invitation(self) -> str:
-        """What to tell a person."""
+        """Text that tells a user how to open the page."""
         return f'open {self.url} in a browser on this machine'
 
     def respond(self, handler: _Handler) -> None:
         """Answer one GET."""
         host = handler.headers.get('Host', '').rpartition(':')[0]
-        if host not in (HOST, 'localhost'):  # a page of another site whose name leads here would read along
+        if host not in (HOST, 'localhost'):  # another site whose name resolves to this address could read the data
             handler.send_error(HTTPStatus.FORBIDDEN, f'open {self.url}')
             return
         path = handler.path.partition('?')[0]
@@ -184,7 +184,7 @@ class Server:
             (self._connections.add if is_open else self._connections.discard)(connection)
 
     def close(self) -> None:
-        """Let every page go and give the port back. Calling it again does nothing."""
+        """Disconnect every page and release the port. Calling it again does nothing."""
         if self.feed.closed:
             return
         self.feed.close()
@@ -200,7 +200,7 @@ class Server:
 
 
 class _Http(socketserver.ThreadingTCPServer):
-    """Not HTTPServer, which looks up the name of the machine when it starts."""
+    """HTTP server without HTTPServer, which looks up the name of the machine when it starts."""
 
     allow_reuse_address = True
     daemon_threads = True  # a process that ends in a hurry waits for no page
@@ -211,7 +211,7 @@ class _Http(socketserver.ThreadingTCPServer):
         super().__init__((HOST, port), _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A page that went away is no error of ours."""
+        """Ignore the error: it means that a page has gone."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -227,15 +227,15 @@ class _Handler(BaseHTTPRequestHandler):
         self.server.owner.connected(self.connection, True)
 
     def finish(self) -> None:
-        """Forget it."""
+        """Forget the connection."""
         self.server.owner.connected(self.connection, False)
         super().finish()
 
     def do_GET(self) -> None:
-        """Answer; every other method is answered with 501."""
+        """Answer a GET; the base class answers every other method with 501."""
         try:
             self.server.owner.respond(self)
-        except OSError:  # gone, or stuck for STUCK_S
+        except OSError:  # the page has gone, or took no byte for STUCK_S
             self.close_connection = True
 
     def answer(self, kind: str, body: bytes | None = None) -> None:
@@ -252,4 +252,4 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(body)
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Say nothing: the log is the node's."""
+        """Log nothing, as the log belongs to the node."""

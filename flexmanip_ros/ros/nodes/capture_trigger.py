@@ -39,13 +39,13 @@ from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, events_at
 
 NAME = 'capture_trigger'
 LOOPED_NS = 1_000_000_000
-"""Stamps that go back further than this are a new recording, and the count begins again."""
+"""Step back of the stamps [ns] beyond which a new recording begins, whose times count from its first stamp."""
 WARM_UP_SAMPLES = 1500
-"""Made-up samples that reach every compiled function of the detector."""
+"""Number of made-up samples, enough to call every compiled function of the detector."""
 
 
 class Detector:
-    """Mode auto: joint states in, the events that they reveal out."""
+    """The detector of mode auto: it finds the events that the joint states reveal."""
 
     def __init__(self, config: TriggerParameters) -> None:
         self._config = self._settled = config
@@ -55,7 +55,7 @@ class Detector:
         self._state: capture_detection.DetectionState | None = None
 
     def take(self, record: JointRecord) -> tuple[CaptureEvent, ...]:
-        """Take one message; return the events found with it, each dated at its onset."""
+        """Process one message; return the events found with it, each with the stamp of its onset."""
         self.clock, self._log, reset = sampling.push(self._sampling, self.clock, self._log, record)
         if self.clock.outputs is None:
             return ()
@@ -70,7 +70,7 @@ class Detector:
 
     @property
     def statistic(self) -> tuple[float, float]:
-        """The latest statistic and its threshold."""
+        """The latest test statistic of the detection and its threshold."""
         return (0.0, math.inf) if self._state is None else capture_detection.statistic(self._state)
 
 
@@ -83,7 +83,7 @@ def warm_up(config: TriggerParameters) -> None:
 
 
 class CaptureTrigger(FlexmanipNode[TriggerParameters]):
-    """Announces events on the clock of the joint states."""
+    """Announces captures and releases, with times from the stamps of the joint states."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NAME, TriggerParameters, **options)
@@ -91,17 +91,17 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         self._first_ns: int | None = None
         self._last_ns: int | None = None
         self._before_ns: int | None = None
-        """Stamp before the last."""
+        """Stamp of the joint state before the last one [ns]."""
         self._arrived = -1.0
         self._pending: tuple[CaptureEvent, ...] = ()
         self._detector: Detector | None = None
         self._reader = JointStateReader()
         self.detected = self.announced = 0
-        """Events published on capture_detected, and on capture_event."""
+        """Number of events published on capture_detected, and on capture_event."""
         self.latest: CaptureEvent | None = None
 
     def make_entities(self) -> None:
-        """Publishers, subscription and services."""
+        """Create the publishers, the subscription and the services."""
         self.events_publisher = self.publisher(Header, 'capture_event', qos.latched())
         self.detected_publisher = self.publisher(Header, 'capture_detected', qos.latched())
         self.subscription(JointState, 'joint_states', self._on_joint_states, qos.sensor_input(), raw=True)
@@ -122,7 +122,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         return f'mode {config.mode}' + (f', signals {", ".join(config.outputs)}' if config.mode == 'auto' else '')
 
     def activated(self) -> None:
-        """Count from the next sample, and watch from there on."""
+        """Count time from the next sample on; in mode auto, look for events from there on."""
         self._detector = Detector(self.config) if self.config.mode == 'auto' else None
         self._first_ns = self._last_ns = self._before_ns = self.latest = None
         self._pending = ()
@@ -145,13 +145,13 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
                 self._detect(self._detector, raw)
 
     def _is_new_recording(self, stamp: int) -> bool:
-        """Whether stamps went back to a new recording, and not from one wrong stamp to the right ones."""
+        """Return whether the stamp went back to a new recording, not from a single wrong stamp to the right ones."""
         if self._last_ns is None or stamp >= self._last_ns - LOOPED_NS:
             return False
         return self._before_ns is None or not 0 <= stamp - self._before_ns <= LOOPED_NS
 
     def _detect(self, detector: Detector, raw: bytes) -> None:
-        """Mode auto: publish what the sample reveals."""
+        """Publish the events that the sample reveals (mode auto)."""
         dropped = detector.clock.counters.dropped
         try:
             record = self._reader(raw)
@@ -209,7 +209,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         return response
 
     def report(self, report: Report) -> None:
-        """Rate of the joint states and what was announced."""
+        """Report the rate of the joint states and the number of announced events."""
         report.values.update(self._meter.window(), mode=self.config.mode, announced=self.announced,
                              pending=len(self._pending))
         if self._detector is not None:

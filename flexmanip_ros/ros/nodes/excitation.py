@@ -30,7 +30,7 @@ NAME = 'excitation'
 
 
 class Excitation(FlexmanipNode[ExcitationParameters]):
-    """Publishes the torque of the present instant."""
+    """Publishes the torque that belongs to the present instant."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NAME, ExcitationParameters, **options)
@@ -41,7 +41,7 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
         self.skipped = 0
 
     def make_entities(self) -> None:
-        """Publisher, and the timer or the subscription that sets the pace."""
+        """Create the publisher, and the timer or the subscription whose callback sends each torque."""
         self.commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.command())
         self._grid = SampleGrid(self, self.config.rate)
         self._timer: Timer | None = None
@@ -64,14 +64,14 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
         return f'{config.shape} of {peaks} N m at {config.rate:g} Hz, clock {config.clock}'
 
     def activated(self) -> None:
-        """Sample 0 is now."""
+        """Begin the sequence: sample 0 is now, or with ``clock: joint_states`` at the first joint state."""
         self._last, self._first_ns = -1, None
         if self._timer is not None:
             self._grid.begin()
             self._timer.reset()
 
     def deactivated(self) -> None:
-        """Leave the arm without torque."""
+        """Stop the timer and send zero torque once."""
         if self._timer is not None:
             self._timer.cancel()
         self._grid.stop()
@@ -110,7 +110,7 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
         self.commands.publish(self._written(torque))
 
     def report(self, report: Report) -> None:
-        """Rate and instants that passed without a command."""
+        """Report the rate and the number of instants that passed without a command."""
         report.values.update(self._meter.window(), skipped_instants=self.skipped, shape=self.config.shape)
         if self.active and self.config.clock == 'joint_states' and report.values['rate_hz'] == 0.0:
             report.silent('joint_states')

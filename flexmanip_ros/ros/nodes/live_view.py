@@ -36,18 +36,18 @@ NAME = 'live_view'
 
 
 class LiveView(FlexmanipNode[ViewParameters]):
-    """Takes what has come some thirty times a second, and sends it to the pages that are open."""
+    """Takes the messages that wait at a rate of ``ViewParameters.rate``, and sends their content to the open pages."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NAME, ViewParameters, **options)
         self.server: Server | None = None
-        """There is one while the node is active."""
+        """The web server of the page, which exists while the node is active."""
         self.losses = LossCounter()
         self._meter = Meter()
         self._reader = JointStateReader()
 
     def make_entities(self) -> None:
-        """Subscriptions, and the timer that empties them."""
+        """Create the subscriptions, and the timer whose callback takes their messages."""
         self._screen = self._new_screen()
         self._joint_states = self.batches(JointState, 'joint_states', qos.sensor_input(), matched=self.losses.matched)
         self._statuses = self.batches(DiagnosticArray, f'{self.config.identifier}/status', qos.sensor_input())
@@ -63,7 +63,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
         return '' if self.server is None else self.server.invitation
 
     def activated(self) -> None:
-        """Serve the page. Raises ViewError when the port cannot be had."""
+        """Serve the page. Raises ViewError when the port is not available."""
         self._screen = self._new_screen()
         self._counted = self._runs = self._reported = 0
         self._heard: float | None = None
@@ -72,13 +72,13 @@ class LiveView(FlexmanipNode[ViewParameters]):
         print(f'{NAME}: {self.server.invitation}', flush=True)
 
     def deactivated(self) -> None:
-        """Let every page go."""
+        """Close the server and its connections to the pages."""
         if self.server is not None:
             self.server.close()
             self.server = None
 
     def destroy_node(self) -> None:
-        """Let every page go, also where a signal came while one was made."""
+        """Destroy the node and close its server, also where a signal came while the server was being made."""
         self.deactivated()
         super().destroy_node()
 
@@ -86,7 +86,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
         return {'samples': self._screen.samples, 'lost': self.losses.lost, 'runs': self._screen.runs}
 
     def _update(self) -> None:
-        """Take every waiting message; send what is new."""
+        """Take every waiting message; send what is new to the pages."""
         with self._meter:
             self._take()
             if not self.active or self.server is None:
@@ -138,7 +138,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
             self.log_throttled('event', str(error))
 
     def report(self, report: Report) -> None:
-        """Rate of the joint states, losses, and how many pages are open."""
+        """Report the rate of the joint states, losses, and the number of open pages."""
         now, samples = time.monotonic(), self._screen.samples
         report.values.update(self._meter.window())
         report.values['updates_hz'] = report.values['rate_hz']

@@ -36,11 +36,11 @@ from flexmanip_ros.ros.node import FlexmanipNode, run
 
 NAME = 'payload_adapter'
 ANSWER_S = 5.0
-"""A driver that has not answered within this time is asked again."""
+"""Longest wait for the answer of a driver [s], after which it is asked again."""
 
 
 class PayloadAdapter(FlexmanipNode[AdapterParameters]):
-    """Asks the driver, one request at a time."""
+    """Sends payloads to the driver's service, one request at a time."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NAME, AdapterParameters, **options)
@@ -50,10 +50,10 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         self._inertia: Inertia | None = None
         self.doubtful = 0
         self._asked: tuple[Any, float] | None = None
-        """The request that waits for its answer, and since when."""
+        """Future of the request that waits for its answer, and when it was sent [s]; None without such a request."""
 
     def make_entities(self) -> None:
-        """Subscriptions and the client."""
+        """Create the subscriptions and the service client."""
         if self.config.target_node:
             self._client: Client = self.create_client(
                 SetParameters, f'{self.config.target_node}/set_parameters')
@@ -70,7 +70,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         return f'payloads go to {self._client.srv_name}'
 
     def activated(self) -> None:
-        """Begin with nothing sent."""
+        """Begin in the state in which no payload has been sent."""
         self._forget_request()
         self.state, self.problem = handover.HandoverState(), ''
 
@@ -108,7 +108,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         future.add_done_callback(lambda future: self._answered(future, found))
 
     def _forget_request(self) -> None:
-        """Stop waiting for the answer; the client would keep the request without end."""
+        """Stop waiting for the answer and remove the request, which the client would keep without end."""
         if self._asked is not None:
             future, self._asked = self._asked[0], None
             self._client.remove_pending_request(future)
@@ -135,7 +135,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         self.get_logger().info(f'the driver accepted a payload of {sent.mass:.3f} kg')
 
     def report(self, report: Report) -> None:
-        """What was sent, and what went wrong."""
+        """Report what was sent, and what went wrong."""
         report.values.update(
             sent=self.sent, sent_mass_kg='none' if self.state.sent is None else self.state.sent.mass,
             trusted=self.state.trusted_since is not None, doubtful=self.doubtful)
@@ -146,10 +146,10 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
 
 
 def fits(inertia: Inertia, found: PayloadEstimate) -> bool:
-    """Say whether a body may be sent: all finite, not below zero, its mass that of the trusted estimate."""
+    """Return whether a body may be sent: finite values, a mass not below zero and close to the trusted estimate."""
     com, body = inertia.com, inertia
     numbers = (com.x, com.y, com.z, body.ixx, body.ixy, body.ixz, body.iyy, body.iyz, body.izz)
-    near = abs(inertia.m - found.mass) <= max(3.0 * found.std, 1e-3 * abs(found.mass))  # one sample apart
+    near = abs(inertia.m - found.mass) <= max(3.0 * found.std, 1e-3 * abs(found.mass))  # they may be one sample apart
     return near and inertia.m >= 0.0 and all(map(math.isfinite, numbers))
 
 
@@ -169,9 +169,9 @@ INERTIA = ('ixx', 'iyy', 'izz', 'ixy', 'ixz', 'iyz')
 def fill(request: Any, inertia: Inertia, transition_time: float = 0.0) -> Any:
     """Put a payload into a driver's request, by the fields that it has.
 
-    A geometry_msgs/Inertia; or a mass with, where there are places for them, the centre of mass (Vector3 or three
-    numbers), the inertia about it (six numbers by name, or nine of a matrix) and the transition time [s].
-    Raises ParameterError when it has no place for a payload.
+    The fields are a geometry_msgs/Inertia; or a mass and, where the request has fields for them, the centre of mass
+    (Vector3 or three numbers), the inertia about it (six numbers by name, or nine of a matrix) and the transition
+    time [s]. Raises ParameterError when the request has no field for a payload.
     """
     fields, inertia = request.get_fields_and_field_types(), physical(inertia)
     for name, kind in fields.items():
@@ -189,7 +189,7 @@ def fill(request: Any, inertia: Inertia, transition_time: float = 0.0) -> Any:
             setattr(request, name, com)
         elif kind == 'double[3]':
             setattr(request, name, [com.x, com.y, com.z])
-        elif kind == 'double[9]':  # symmetric: by rows or by columns is the same
+        elif kind == 'double[9]':  # symmetric: row-major and column-major order are the same
             i = inertia
             setattr(request, name, [i.ixx, i.ixy, i.ixz, i.ixy, i.iyy, i.iyz, i.ixz, i.iyz, i.izz])
         elif kind == 'builtin_interfaces/Duration':
@@ -200,9 +200,9 @@ def fill(request: Any, inertia: Inertia, transition_time: float = 0.0) -> Any:
 
 
 def physical(inertia: Inertia) -> Inertia:
-    """Return the inertia of a flat body where only that in the plane is known.
+    """Return the inertia with ixx and iyy of a flat body where only izz is known, that of a turn in the plane.
 
-    ixx = iyy = izz / 2 are the least that a body can have (izz <= ixx + iyy); a driver may reject less.
+    ixx = iyy = izz / 2 are the smallest values of a body (izz <= ixx + iyy); a driver may reject smaller ones.
     """
     if inertia.ixx or inertia.iyy or not inertia.izz > 0.0:
         return inertia

@@ -35,15 +35,15 @@ from flexmanip_ros.types import Array, JointRecord
 
 NAME = 'payload_controller'
 LONG_GAP = 10
-"""Missing samples after which the filter starts again instead of trusting its prediction."""
+"""Longest gap, in sample times, that the filter bridges with its prediction; after a longer one it starts again."""
 CLOCK_SET_BACK_NS = 1_000_000_000
-"""Stamps that go back further than this are a new clock (a simulation that began again)."""
+"""Step back of the stamps [ns] beyond which the clock is a new one (a simulation that began again)."""
 LARGEST = 1e6
-"""No angle, bend or rate of an arm is beyond this, in SI units."""
+"""Bound on an angle, bend or rate, in SI units, that no arm exceeds; joint states beyond it are dropped."""
 
 
 class PayloadController(FlexmanipNode[ControllerParameters]):
-    """One torque for every joint state."""
+    """Publishes one torque per joint for every joint state."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NAME, ControllerParameters, **options)
@@ -62,7 +62,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._places: list[int] = []
 
     def make_entities(self) -> None:
-        """Publisher, subscriptions, and the timer that notices that they cease."""
+        """Create the publisher, the subscriptions, and the timer that notices when joint states cease."""
         self._commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.command())
         self._message = Float64MultiArray()
         self.subscription(JointState, 'joint_states', self._on_joint_states, qos.sensor_input(), raw=True)
@@ -82,14 +82,14 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         return f'{names} at {self.config.rate:g} Hz'
 
     def activated(self) -> None:
-        """Hold from the next sample on."""
+        """Hold the joints from the next sample on."""
         self.state = controller.init(self.config)
         self._last_ns, self._arrived = None, np.inf
         if self._estimate is not None:
             self._judge(self._estimate)
 
     def deactivated(self) -> None:
-        """Leave the arm without torque."""
+        """Send zero torque once."""
         self._send(np.zeros(len(self.config.joints)))
 
     def configuration_changed(self, config: ControllerParameters) -> None:
@@ -126,7 +126,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
             self._send(torque)
 
     def _is_late(self, stamp_ns: int) -> bool:
-        """Drop a sample that is not newer than the last; stamps that went far back are a new clock."""
+        """Return whether a sample is not newer than the last, and drop it; a long step back counts as a new clock."""
         if self._last_ns is None or stamp_ns > self._last_ns:
             return False
         if stamp_ns < self._last_ns - CLOCK_SET_BACK_NS and self.state is not None:
@@ -140,7 +140,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self.log_throttled(reason, words)
 
     def _measured(self, record: JointRecord) -> controller.Measured | None:
-        """Pick the four signals by name; None when one is missing or not finite."""
+        """Pick the angles and bends by name; None when one is missing, not finite, or far too large."""
         count = len(record.names)
         if record.names != self._names:
             wanted = (*self.config.joints, *self.config.bends)
@@ -159,9 +159,9 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         if len(message.data) != 5:
             self._drop('payload_estimate', f'a payload estimate was dropped: it has {len(message.data)} values, not 5')
             return
-        self._estimate = PayloadEstimate(*message.data)  # kept: a latched one may come before activation
+        self._estimate = PayloadEstimate(*message.data)  # kept: a latched estimate may come before activation
         if self._judge(self._estimate) is None:
-            self._body = None  # of what was held before
+            self._body = None  # it is that of the object held before
 
     def _on_body(self, message: Float64MultiArray) -> None:
         if len(message.data) != 20:
@@ -172,7 +172,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
             self._judge(self._estimate)
 
     def _judge(self, estimate: PayloadEstimate) -> PayloadEstimate | None:
-        """Let the controller judge an estimate; return it with the body that belongs to it, None without one."""
+        """Let the controller judge an estimate; return it with the body that belongs to it, None without a body."""
         body = None if self._body is None else estimate.having(self._body)
         if self.state is not None:
             before = self.state.verdict
@@ -203,7 +203,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self.sent += 1
 
     def report(self, report: Report) -> None:
-        """Rate, what is scheduled on, and what became of the latest estimate."""
+        """Report the rate, the payload that the gains follow, and the verdict on the latest estimate."""
         report.values.update(self._meter.window())
         report.values['dropped'] = self.dropped
         if self.dropped:

@@ -33,9 +33,9 @@ from flexmanip_ros.types import CaptureEvent, EventKind
 
 NAME = 'plant_simulator'
 CATCH_UP = 5
-"""Samples made in one run of the timer at most, so that commands are taken between them."""
+"""Largest number of samples made in one timer callback, so that commands are taken between two callbacks."""
 MOST_EVENTS = 100
-"""Events that wait for their stamps at most."""
+"""Largest number of events that wait for their stamps."""
 
 
 class PlantSimulator(FlexmanipNode[PlantParameters]):
@@ -58,7 +58,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         self._fault = ''
 
     def make_entities(self) -> None:
-        """Publisher, subscriptions, service and timer."""
+        """Create the publisher, the subscriptions, the service and the timer."""
         self.joint_states = self.publisher(JointState, 'joint_states', qos.sensor_output())
         self.subscription(
             Float64MultiArray, 'effort_controller/commands', with_info(self._on_command), qos.command(),
@@ -70,7 +70,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         self._timer.cancel()
 
     def start(self) -> None:
-        """Take a step, a capture and a release, so that nothing is compiled while the clock runs."""
+        """Simulate a step, a capture and a release, so that nothing is compiled while the clock runs."""
         state = simulator.init(self.config)
         self._noise_std = state.noise_std
         state = simulator.attach(self.config, state)
@@ -82,17 +82,17 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         return f'{self.config.rate:g} samples a second, object of {self.config.payload_mass:g} kg'
 
     def activated(self) -> None:
-        """Sample 0 is now."""
+        """Begin the grid of stamps at sample 0, and start the timer."""
         self._begin()
         self._timer.reset()
 
     def deactivated(self) -> None:
-        """Stand still."""
+        """Stop the timer and the grid of stamps, so that the arm stands still."""
         self._timer.cancel()
         self._grid.stop()
 
     def _begin(self) -> bool:
-        """Sample 0 is now; False without a clock yet."""
+        """Set the stamp of sample 0 to now; return False while the clock has no time yet."""
         self.samples = 0
         if not self._grid.begin():
             return False
@@ -100,7 +100,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         return True
 
     def _restart(self) -> None:
-        """Put the arm at its start from the next stamp on: stamps never go back."""
+        """Put the arm at its initial state from the next stamp on."""
         self._restarted_ns = self._stamp(self.samples)
         self.state = simulator.init(self.config, self._restarted_ns, self._noise_std)
         self._pending, self._fault, self.efforts = (), '', np.zeros(len(self.config.arm.link_length))
@@ -132,7 +132,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             self.get_logger().error(f'the simulation stopped: {error}; call {NAME}/reset to start again')
             return
         self.samples += 1
-        if record is not None:  # lost on its way (sensors.drop_probability)
+        if record is not None:  # None: lost on its way (sensors.drop_probability)
             self.joint_states.publish(self._written(record))
 
     def _apply_events(self, stamp: int) -> None:
@@ -187,14 +187,14 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             response.success, response.message = False, f'{NAME} is not active'
             return response
         if self._grid.begun:
-            if self._fault:  # what passed since then is not made up
+            if self._fault:  # the samples since the fault are not made up for
                 self.samples = max(self.samples, self._grid.latest() + 1)
             self._restart()
         response.success, response.message = True, 'the arm is at its start, at rest and empty'
         return response
 
     def report(self, report: Report) -> None:
-        """Rate, backlog, dropped commands and events that came late."""
+        """Report the rate, the backlog, dropped commands and events that came late."""
         values = report.values
         values.update(self._meter.window(), samples=self.samples, backlog=self.backlog,
                       dropped_commands=self.dropped_commands, late_events=self.late_events,

@@ -68,25 +68,28 @@ TOPICS = {
     messages.PAYLOAD: (InertiaStamped, qos.latched), messages.PAYLOAD_BODY: (Float64MultiArray, qos.latched),
     messages.STATUS: (DiagnosticArray, qos.latched), messages.ARM_PARAMETERS: (Float64MultiArray, qos.latched),
 }
-"""Type and quality of service of each output."""
+"""Message type and quality of service of each output topic."""
 ARM = 'arm'
 ARM_RATE = 25.0
-"""Pictures of the arm a second [Hz]."""
+"""Rate at which the markers of the arm are published [Hz]."""
 LONGEST_WAIT_S = 0.02
-"""Messages wait so long at most [s]: the time between two estimates at 50 Hz."""
+"""Longest time that messages wait until they are taken [s]: the time between two estimates at 50 Hz."""
 MOST_AT_ONCE = 100
-"""Messages that a callback takes, 0.1 s at 1 kHz: signals and services wait for its end, and 1000 may wait."""
+"""Largest number of messages that a callback takes, 0.1 s at 1 kHz, of up to 1000 that may wait.
+
+Signals and services wait for the end of the callback.
+"""
 LEAD_S = 0.003
-"""Time before an estimate is due at which those before are taken [s]: a few are left then, so it comes soon."""
+"""Time before an estimate is due at which the messages so far are taken [s]: few are left, so it comes soon."""
 SHORTEST_WAIT_S = 0.00025
-"""Time after which a message is looked for again that did not come when it was expected [s]."""
+"""Time after which the queue is read again when an expected message has not come [s]."""
 MOST_DOUBLED = 7
-"""How often that time doubles, until it is more than ``LONGEST_WAIT_S``."""
+"""Number of times that ``SHORTEST_WAIT_S`` doubles, until it is more than ``LONGEST_WAIT_S``."""
 
 WARM_UP_EVENT = 40
-"""Samples before the event of the warm-up: more than are needed to learn the sample time."""
+"""Number of samples before the event of the warm-up, more than are needed to learn the sample time."""
 WARM_UP_SAMPLES = WARM_UP_EVENT + 3 * batch_fit.BLOCK + 2 * recursive_fit.CHUNK
-"""Samples of the warm-up: until the fits after the event were made and a block has followed."""
+"""Number of samples of the warm-up: it ends after the fits that follow the event, and one more block."""
 WARM_UP_STEP_NS = 1_000_000
 
 
@@ -122,20 +125,20 @@ def _made_up(config: IdentifierParameters) -> Iterator[JointRecord | CaptureEven
 
 
 class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
-    """Converts, takes one step of the pipeline, publishes.
+    """Converts messages, takes a step of the pipeline and publishes its estimates.
 
-    Messages are taken together, which costs a third of a callback for each (see ``Batches``): when the one is expected
-    that an estimate is due with, and 3 ms before.
+    Waiting messages are taken together, which costs a third of one callback per message (see ``Batches``). They are
+    taken 3 ms before an estimate is due, and when the message with which it is due is expected.
 
-    A model is taken 5 ms (by the stamps) after the sample that it was asked for at. Where no sample follows, the last
-    model goes out when the node is deactivated.
+    A model is taken 5 ms (by the stamps) after the sample at which it was requested. Where no sample follows, the last
+    model is published when the node is deactivated.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NAME, IdentifierParameters, **options)
         self.state = pipeline.init()
         self.estimate: Estimate | None = None
-        """The latest one published."""
+        """The latest estimate: the last one published, or that of a saved state."""
         self.rejected = self.published = 0
         self.losses = LossCounter()
         self.meter = Meter()
@@ -144,16 +147,16 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self._checkpoints: CheckpointWriter | None = None
         self._resumed = False
         self._logged: dict[str, object] = {}
-        """What was last logged of status, trusted payload and missing announcement."""
+        """What was last logged, by kind: status, trusted payload and missing announcement."""
         self._latest: JointRecord | None = None
         """The latest joint state that is not drawn yet."""
         self._lag_ns: int | None = None
-        """How much later than their stamps the latest messages arrived (median), whatever clock the stamps are of."""
+        """Median of arrival time minus stamp of the latest messages [ns]; the stamps may be those of any clock."""
         self._missed = 0
-        """How often since then nothing came that was expected."""
+        """Number of times, since the latest messages, that an expected message had not come."""
 
     def make_entities(self) -> None:
-        """Publishers, subscriptions and the reset service."""
+        """Create the publishers, the subscriptions and the reset service."""
         self.outputs = {name: self.publisher(kind, f'~/{name}', profile()) for name, (kind, profile) in TOPICS.items()}
         self._joint_states = self.batches(JointState, 'joint_states', qos.sensor_input(), matched=self.losses.matched)
         self._alarm = self.alarm(self._take)
@@ -188,12 +191,12 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
                 f'payload_method {config.payload_method}; {config.publish_rate:g} estimates a second')
 
     def activated(self) -> None:
-        """Have threads for fits and models; what came before is none of the samples."""
+        """Start the threads for fits and models; discard the messages that came before the activation."""
         self._waiting(None)
         self._background = Deferred()
 
     def deactivated(self) -> None:
-        """Take ``MOST_AT_ONCE`` waiting messages at most; publish the model that is under way; save what is known."""
+        """Take at most ``MOST_AT_ONCE`` waiting messages, publish the model under way, and save the state."""
         self._take_samples()
         self.state, estimates = pipeline.finish(self.config, self.state, self._background)
         self._publish(estimates)
@@ -203,7 +206,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self._checkpoints.save(self.config, self.state)
 
     def configuration_changed(self, config: IdentifierParameters) -> None:
-        """Go on with what may change at run time; the samples before it are taken with what was."""
+        """Continue with the changed parameters; the samples before the change are taken with the former ones."""
         if self.active:
             self._take_samples()
         self.state = pipeline.reconfigure(config, self.state, self._background)
@@ -212,7 +215,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self.state, self.estimate, self._resumed, self._logged = pipeline.init(), None, False, {}
 
     def _take(self) -> None:
-        """Take the messages that wait; come again when the next estimate is due, or at once for what is left."""
+        """Take the waiting messages; set the alarm to the next estimate, or to at once where messages are left."""
         due_ns = self.state.next_due_ns
         if self._take_samples() == MOST_AT_ONCE:
             self._alarm.after(SHORTEST_WAIT_S)
@@ -223,7 +226,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self._alarm.after(wait_s)
 
     def _take_samples(self) -> int:
-        """Convert, take one step of the pipeline, publish; return how many messages were taken."""
+        """Convert the waiting messages, step the pipeline and publish; return the number of messages taken."""
         raws, arrived_ns = self._waiting()
         if not self.active or not raws:
             return len(raws)
@@ -244,14 +247,14 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         if self._resumed:
             self._check_age(int(block.stamp_ns[0]))
         self._step(block)
-        if self.state.clock.last_ns == block.stamp_ns[-1]:  # it was not another arm's
+        if self.state.clock.last_ns == block.stamp_ns[-1]:  # false for messages of another arm
             self._lag_ns, self._missed = int(np.median(arrived_ns - block.stamp_ns)), 0
             self._latest = block.record(-1)
 
     def _waiting(self, most: int | None = MOST_AT_ONCE) -> tuple[list[bytes], NDArray[np.int64]]:
-        """Return the messages that wait, ``most`` of them (None: all), and when they arrived [ns].
+        """Take at most ``most`` waiting messages (None: all); return them and their arrival times [ns].
 
-        Also while the node is not active: what it ignores is not lost.
+        A node that is not active takes messages too, so that those it ignores do not count as lost.
         """
         raws, arrived_ns = [], []
         for raw, info in islice(self._joint_states.take(), most) if self.context.ok() else ():
@@ -261,9 +264,9 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         return raws, np.array(arrived_ns, dtype=np.int64)
 
     def _wait_s(self) -> float:
-        """Return the time until the message is expected that the next estimate is due with [s]; at first less."""
+        """Return the time until the message with which the next estimate is due [s], at first ``LEAD_S`` less."""
         longest_s = LONGEST_WAIT_S
-        if self.state.clock.dt > 0.0:  # half of what its queue holds
+        if self.state.clock.dt > 0.0:  # at most the time in which half of the queue fills
             longest_s = min(longest_s, 0.5 * self._joint_states.depth * self.state.clock.dt)
         due_ns = self.state.next_due_ns
         if due_ns is None or self._lag_ns is None:
@@ -271,7 +274,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         wait_s = (due_ns + self._lag_ns - time.time_ns()) * 1e-9
         if wait_s > 2.0 * LEAD_S:
             wait_s -= LEAD_S
-        elif wait_s < SHORTEST_WAIT_S:  # late: twice as long each time
+        elif wait_s < SHORTEST_WAIT_S:  # the message is late: the wait doubles each time
             wait_s = SHORTEST_WAIT_S * 2.0 ** min(self._missed, MOST_DOUBLED)
             self._missed += 1
         return min(wait_s, longest_s)
@@ -279,7 +282,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
     def _on_event(self, topic: str, message: Header) -> None:
         if not self.active:
             return
-        self._take_samples()  # those before the event
+        self._take_samples()  # the samples before the event
         try:
             event = capture_event(message).heard_on(topic)
         except FlexmanipError as error:
@@ -313,13 +316,13 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
                 return
             values = messages.outgoing_payload(estimate.payload, estimate.stamp_ns, self.config.payload_frame)
             new = chain(values, messages.outgoing_arm(estimate)) if estimate.payload_is_new else ()
-            for name, value in chain(new, messages.outgoing_model(estimate)):  # one is out before the next is made
+            for name, value in chain(new, messages.outgoing_model(estimate)):  # publishes each before the next is made
                 self.outputs[name].publish(to_message(value))
                 self.published += 1
             self.estimate = estimate
 
     def _draw(self) -> None:
-        """Publish the arm as it is now, if anybody looks."""
+        """Publish the arm of the latest joint state, if the topic has a subscription."""
         record, self._latest = self._latest, None
         if not self.active or record is None or self.arm.get_subscription_count() == 0:
             return
@@ -347,7 +350,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         return response
 
     def report(self, report: Report) -> None:
-        """Rate, losses, drops by reason, and what the latest estimate is worth."""
+        """Report the rate, losses, drops by reason, and the quality of the latest estimate."""
         values, counters = report.values, self.state.counters
         values.update(self.meter.window())
         self.losses.report(report, 'lost', 'messages')
