@@ -278,7 +278,7 @@ def inertias(arm: Manipulator) -> Array:
 
 
 DRIFT_SHARE = 3e-3
-"""Drift of a parameter of the arm in the square root of a second, over its prior deviation and over 1 / T."""
+"""Drift of a parameter of the arm in the square root of a second, times ``memory_time``, over its prior deviation."""
 CERTAIN = 1e-9
 """Standard deviation of a coordinate that is taken as known."""
 EMPTY_STD = 0.05
