@@ -91,13 +91,15 @@ class Sample(NamedTuple):
     """One instant of the configured signals, in JointState units.
 
     u: (r,) inputs held from ``stamp_ns`` on [N m]; y: (m,) outputs [m, m/s, rad, ...];
-    angles: (2,) measured configuration [rad], or (0,) when none is configured.
+    angles: (2,) measured configuration [rad], or (0,) when none is configured; rates: (2,) measured rates of the same
+    joints [rad/s], NaN where the message has none, or (0,) when nothing reads them.
     """
 
     stamp_ns: int
     u: Array
     y: Array
     angles: Array
+    rates: Array
 
 
 class Status(Enum):

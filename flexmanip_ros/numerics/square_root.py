@@ -66,8 +66,10 @@ def absorb_measurement(
 
 
 @kernel
-def absorb_noise(S: Array, deviation: Array, W: Array) -> None:
-    """Overwrite S with lower L, L L' = S S' + diag(deviation^2), by Householder reflections; W: (nx, 2 nx) scratch.
+def absorb_noise(S: Array, noise: Array, W: Array) -> None:
+    """Overwrite S with lower L, L L' = S S' + noise noise', by Householder reflections.
+
+    noise: (nx, c); W: (nx, nx + c) scratch.
 
     A row of zeros uses no column of L, so the columns after the last one used are zero.
     """
@@ -75,9 +77,9 @@ def absorb_noise(S: Array, deviation: Array, W: Array) -> None:
     for i in range(nx):
         for c in range(nx):
             W[i, c] = S[i, c]
-            W[i, nx + c] = 0.0
-        W[i, nx + i] = deviation[i]
-    width, own = 2 * nx, 0
+        for c in range(noise.shape[1]):
+            W[i, nx + c] = noise[i, c]
+    width, own = W.shape[1], 0
     for i in range(nx):
         norm = 0.0
         for c in range(own, width):

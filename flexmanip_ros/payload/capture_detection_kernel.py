@@ -307,11 +307,11 @@ def advance(
 ) -> int:
     """Run the filter, and if watching the test, over the rows of the table from ``first`` on; return the next row.
 
-    table: (N, 1 + L + m) duration since the sample before, torques held meanwhile, measurements (NaN: missing). While
-    the horizon is open (fewer than ``HORIZON`` samples since the event), it begins with the first sample after it. The
-    test ends at an alarm. hold: samples to be quiet at first; confirm: samples from an alarm to its return, so that it
-    can be dated; fade: factor of the recent peak a sample. A negative number -k - 1: numbers left the finite range in
-    row k. One function for both, since each compiles the whole filter.
+    table: (N, 1 + 3 L + m), see ``structured.input_table``. While the horizon is open (fewer than ``HORIZON`` samples
+    since the event), it begins with the first sample after it. The test ends at an alarm. hold: samples to be quiet at
+    first; confirm: samples from an alarm to its return, so that it can be dated; fade: factor of the recent peak a
+    sample. A negative number -k - 1: numbers left the finite range in row k. One function for both, since each
+    compiles the whole filter.
     """
     for k in range(first, table.shape[0]):
         if not take(motion, sensors, m, table, k):

@@ -89,14 +89,14 @@ class MeasurementModel(NamedTuple):
     samples."""
     diffusion: Array
     """(nx,) standard deviation that each state gains in the square root of a second."""
-    deviation: Array
-    """(nx,) scratch."""
+    noise: Array
+    """(nx, nx + L) scratch for the process noise: of each state, and of the friction of each joint."""
     f: Array
     """(nx,) scratch."""
     L: Array
     """(nx, nx) scratch."""
     W: Array
-    """(nx, 2 nx) scratch."""
+    """(nx, 2 nx + L) scratch."""
 
 
 @inner

@@ -131,6 +131,13 @@ class ProcessModel(NamedTuple):
     """(L, 2) dead time and lag of the torques [s]."""
     slope: Array
     """(L, 2) derivatives of the torques by dead time and lag."""
+    driven: Array
+    """(L,) torques of the drives, without the friction of ``share``."""
+    coulomb: Array
+    """(L,) Coulomb friction."""
+    share: Array
+    """(L,) part of it that acts over the present sample, -1 to 1, by the measured rate of the joint; NaN: that of the
+    model is used."""
     opened: NDArray[np.int64]
     """(1 + np,) number of the entries of p that are uncertain, then their indices."""
     bounds: Bounds
@@ -181,6 +188,7 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
         elif kind == VISCOUS:
             arm.viscous[i] = value
         elif kind == COULOMB:
+            motion.coulomb[i] = value
             arm.coulomb[i] = value
         elif kind == ROTOR:
             for r in range(n):
@@ -197,6 +205,44 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
                 motion.late[joint, 0] = value
         elif kind == TORQUE_LAG:
             motion.late[i, 1] = value
+
+
+@inner
+def mean_share(begin: float, end: float) -> float:
+    """Return the mean of tanh(rate / STICTION_RATE) over a sample in which the rate goes from begin to end in a line.
+
+    It is the integral ln(cosh) of tanh; begin and end: over STICTION_RATE, NaN if one is.
+    """
+    if abs(end - begin) < 1e-3:
+        return float(np.tanh(0.5 * (begin + end)))
+    first = abs(begin) + np.log1p(np.exp(-2.0 * abs(begin)))
+    last = abs(end) + np.log1p(np.exp(-2.0 * abs(end)))
+    return float((last - first) / (end - begin))
+
+
+@inner
+def set_torques(motion: ProcessModel, rows: Array, period: float) -> None:
+    """Fill motion.effort with the torques of the last of ``rows`` (see ``predict``), and what they depend on.
+
+    Where the rate of a joint was measured, its Coulomb friction is a known share of F. The model's own rate lacks the
+    waves that a step of the torque sends through the links, which are as fast as the joint where friction reverses.
+    """
+    links, newest = motion.effort.size, rows.shape[0] - 1
+    for i in range(links):
+        late, slope = motion.late[i], motion.slope[i]
+        motion.driven[i] = motion.gain[i] * late_torque(rows, 1 + i, late[0], late[1], period, slope)
+        slope[0] *= motion.gain[i]
+        slope[1] *= motion.gain[i]
+        share = np.nan
+        if rows.shape[1] > 1 + links:
+            share = mean_share(rows[newest, 1 + links + i] / STICTION_RATE,
+                               rows[newest, 1 + 2 * links + i] / STICTION_RATE)
+        motion.share[i] = share
+        motion.effort[i] = motion.driven[i]
+        motion.arm.coulomb[i] = motion.coulomb[i]
+        if share == share:
+            motion.effort[i] -= motion.coulomb[i] * share
+            motion.arm.coulomb[i] = 0.0
 
 
 @inner
@@ -414,9 +460,11 @@ def balance_columns(motion: ProcessModel, q: Array, qd: Array, qdd: Array, first
         else:
             force = 0.0
             if kind == COULOMB:
-                force = np.tanh(net[1, i] / STICTION_RATE)
+                force = motion.share[i]
+                if force != force:
+                    force = np.tanh(net[1, i] / STICTION_RATE)
             elif kind == TORQUE_GAIN:
-                force = -motion.effort[i]
+                force = -motion.driven[i]
             elif kind == TORQUE_LAG:
                 force = -motion.slope[i, 1]
             if force != 0.0:
@@ -481,18 +529,15 @@ def predict(
     """Carry x and S over ``duration`` [s] under held torques. Return the number of steps; 0: a number was not finite.
 
     used: number of the first columns of S, beyond which they are zero; rows: (P, >= 1 + L) with efforts [N m] in
-    columns 1 to L, those held meanwhile in the last row and, for late torques, those before it; period: their sample
-    time [s]. Afterwards motion.k[0] is the acceleration at the end. A duration of zero fills motion.k[0] and motion.F
+    columns 1 to L, those held meanwhile in the last row and, for late torques, those before it. The next 2 L columns,
+    if there are more, hold the rates of the joints [rad/s] before and after (NaN: unknown). period: sample time of the
+    rows [s]. Afterwards motion.k[0] is the acceleration at the end. A duration of zero fills motion.k[0] and motion.F
     at x alone.
     """
     n, taken = motion.arm.stiffness.size, 0
     set_parameters(motion, x)
     note_opened(motion, S, used)
-    for i in range(motion.effort.size):
-        late, slope = motion.late[i], motion.slope[i]
-        motion.effort[i] = motion.gain[i] * late_torque(rows, 1 + i, late[0], late[1], period, slope)
-        slope[0] *= motion.gain[i]
-        slope[1] *= motion.gain[i]
+    set_torques(motion, rows, period)
     left, stiff, h, steps, turn, stage = duration, 0.0, 0.0, 0.0, 0.0, BEGIN
     q, qd, qdd = x[:n], x[n:2 * n], motion.k[0]
     while True:

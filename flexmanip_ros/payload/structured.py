@@ -50,6 +50,8 @@ class StructuredState(NamedTuple):
     last_ns: int = 0
     efforts: Array | None = None
     """(P, L) effort held since then, and those of the samples before, newest last [N m]."""
+    rates: Array = np.empty(0)
+    """(L,) measured rates of the joints in that sample [rad/s]; NaN: unknown."""
     missing: int = 0
     """How many rows in a row were missing up to now."""
     peak: Array = np.empty(0)
@@ -73,6 +75,8 @@ class Horizon(NamedTuple):
     """Stamp of the state from which it starts [ns]."""
     efforts: Array
     """(P, L) effort held from there on, and those of the samples before [N m]."""
+    rates: Array
+    """(L,) measured rates of the joints there [rad/s]; NaN: unknown."""
 
 
 def init(config: IdentifierParameters) -> StructuredState:
@@ -121,11 +125,12 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     assert state.efforts is not None
     assert state.sensors is not None
     ahead = max(event.stamp_ns - state.last_ns, 0)
-    rows = np.pad(state.efforts, ((0, 0), (1, 0)))
+    rows, rates = np.pad(state.efforts, ((0, 0), (1, 0))), np.full(state.rates.size, np.nan)
     predict(state.model.motion, m.x, m.S, m.x.size, rows, state.sensors.period, min(ahead * 1e-9, LONGEST_S))
     _change(config, state.model, m, event)
     last_ns = state.last_ns + ahead
-    return state._replace(memory=m, last_ns=last_ns, horizon=Horizon(state.cursor, last_ns, state.efforts))
+    return state._replace(memory=m, last_ns=last_ns, rates=rates,
+                          horizon=Horizon(state.cursor, last_ns, state.efforts, rates))
 
 
 def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
@@ -261,9 +266,10 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     seen = sensors(config, model, dt, structured_model.diffusion(config, model, m))
     events = state.early
     first_ns, efforts = int(rows.stamp_ns[0]), latest(seen, rows.u[:1], state.efforts)
+    rates = np.full(efforts.shape[1], np.nan)
     state = state._replace(
         memory=m, sensors=seen, begin=None, early=(), cursor=rows.first, last_ns=first_ns, efforts=efforts,
-        horizon=Horizon(rows.first, first_ns, efforts))
+        rates=rates, horizon=Horizon(rows.first, first_ns, efforts, rates))
     for row, item in events:
         state = event(config, _part(config, state, rows, row), item)
     return _part(config, state, rows, rows.until)
@@ -282,7 +288,8 @@ def _resume(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
     assert fresh.memory is not None
     assert state.sensors is not None
     last_ns, efforts = int(rows.stamp_ns[0]), latest(state.sensors, rows.u[:1])
-    return fresh._replace(last_ns=last_ns, efforts=efforts, horizon=Horizon(rows.first, last_ns, efforts))
+    return fresh._replace(last_ns=last_ns, efforts=efforts,
+                          horizon=Horizon(rows.first, last_ns, efforts, state.rates))
 
 
 def latest(sensors: MeasurementModel, efforts: Array, before: Array | None = None) -> Array:
@@ -307,7 +314,8 @@ def _bridge(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
     m.S[:] = structured_model.widen(m.S, columns)
     if m.counts[mem.STORED] < mem.HORIZON:  # the horizon has no process noise
         _begin_horizon(state.model, m)
-    return state._replace(memory=m, missing=0, horizon=Horizon(state.cursor, state.last_ns, state.efforts))
+    return state._replace(memory=m, missing=0,
+                          horizon=Horizon(state.cursor, state.last_ns, state.efforts, state.rates))
 
 
 UNKNOWN_TORQUE = 0.1
@@ -366,7 +374,7 @@ def reopen(
     m.S[:] = structured_model.widen(m.S, np.vstack([np.zeros((2 * n, spread.shape[1])), spread]))
     _set_arrival_cost(state.model, m)
     assert state.efforts is not None
-    return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.efforts))
+    return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.efforts, state.rates))
 
 
 def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
@@ -385,44 +393,51 @@ def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> St
 
 
 def after_rows(state: StructuredState, m: mem.FilterState, taken: Rows, table: Array) -> StructuredState:
-    """Return the state once the filter, now with memory m, took these rows, the last of the table (N, 1 + L + m)."""
+    """Return the state once the filter, now with memory m, took these rows, the last of the table."""
     assert state.sensors is not None
     assert state.efforts is not None
-    efforts = latest(state.sensors, taken.u[-1:], table[:, 1:1 + taken.u.shape[1]])
+    links = taken.u.shape[1]
+    efforts = latest(state.sensors, taken.u[-1:], table[:, 1:1 + links])
     slope, peak = state.slope, np.abs(taken.u).max(axis=0)
     if state.peak.size:
         peak = np.maximum(peak, state.peak)
     if not taken.missing[-1]:
         slope = taken.u[-1] - (taken.u[-2] if len(taken) > 1 else state.efforts[-1])
-    return state._replace(memory=m, cursor=taken.until, last_ns=int(taken.stamp_ns[-1]), efforts=efforts, slope=slope,
+    return state._replace(memory=m, cursor=taken.until, last_ns=int(taken.stamp_ns[-1]), efforts=efforts,
+                          rates=table[-1, 1 + 2 * links:1 + 3 * links].copy(), slope=slope,
                           missing=int(taken.missing[-1]), peak=peak)
 
 
 def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
-    """Return what the kernel reads, (N, 1 + L + m), and the row of it that belongs to the first of ``rows``.
+    """Return what the kernel reads, (N, 1 + 3 L + m), and the row of it that belongs to the first of ``rows``.
 
-    Columns: duration since the sample before [s], efforts held meanwhile [N m], measurements (NaN: missing). While the
-    horizon is open the table reaches back to its first row; before that come the efforts that a late torque needs.
+    Columns: duration since the sample before [s]; efforts held meanwhile [N m]; rates of the joints before and after
+    [rad/s] (NaN: unknown); measurements (NaN: missing). While the horizon is open the table reaches back to its first
+    row; before that come the efforts that a late torque needs.
     """
     assert state.model is not None
-    before_ns, efforts, horizon = state.last_ns, state.efforts, state.horizon
+    before_ns, efforts, rates, horizon = state.last_ns, state.efforts, state.rates, state.horizon
     begin = first_needed(state)
     if begin < rows.first:
         assert horizon is not None
-        before_ns, efforts = horizon.before_ns, horizon.efforts
+        before_ns, efforts, rates = horizon.before_ns, horizon.efforts, horizon.rates
     reach = rows.since(begin)
     assert efforts is not None
     stamps, y = reach.stamp_ns, measurements(state.model, reach)
     before, links = len(efforts) - 1, efforts.shape[1]
-    whole = np.zeros((before + len(y), 1 + links + y.shape[1]))
+    first = 1 + 3 * links
+    whole = np.zeros((before + len(y), first + y.shape[1]))
     whole[:before + 1, 1:1 + links] = efforts
     table = whole[before:]
     table[0, 0] = stamps[0] - before_ns
     table[1:, 0], table[1:, 1:1 + links] = stamps[1:] - stamps[:-1], reach.u[:-1]
     np.maximum(table[:, 0], 0.0, out=table[:, 0])
     table[:, 0] *= 1e-9
-    table[:, 1 + links:] = y
-    table[reach.missing > 0, 1 + links:] = np.nan
+    begins, ends = table[:, 1 + links:1 + 2 * links], table[:, 1 + 2 * links:first]
+    ends[:] = reach.rates if reach.rates.shape[1] else np.nan
+    table[:, first:] = y
+    table[reach.missing > 0, 1 + 2 * links:] = np.nan
+    begins[0], begins[1:] = rates, ends[:-1]
     return whole, before + rows.first - begin
 
 
@@ -466,7 +481,7 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
         for column in (mem.EFFECTIVE, mem.POWER, mem.SLOW):  # what did not fit was taken for noise
             m.noise[:, column] = m.noise[:, mem.AT_EVENT]
         _set_arrival_cost(model, m)
-        return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.efforts))
+        return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.efforts, state.rates))
     fresh = init(config)._replace(restarts=state.restarts + (not unfit), cursor=state.cursor, refits=refits,
                                   efforts=state.efforts)
     if unfit and m.counts[mem.SEEN] >= UNTAUGHT:

@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.types import Array
+from flexmanip_ros.types import Array, Sample
 
 Kind = TypeVar('Kind', bound=np.generic)
 SMALLEST = 1024
@@ -22,11 +22,12 @@ SMALLEST = 1024
 
 
 class Width(NamedTuple):
-    """Number of inputs r, outputs m and angles a of a row."""
+    """Number of inputs r, outputs m, angles a and joint rates of a row."""
 
     inputs: int
     outputs: int
     angles: int
+    rates: int = 0
 
 
 @dataclass(eq=False, slots=True)
@@ -75,20 +76,22 @@ class SampleLog:
         return first + int(np.searchsorted(stamps, stamp_ns, side='left'))
 
     def append(self, stamp_ns: NDArray[np.int64], u: Array, y: Array, angles: Array, gap: NDArray[np.bool_],
-               delay: int = 0, missing: NDArray[np.int64] | None = None) -> SampleLog:
+               delay: int = 0, missing: NDArray[np.int64] | None = None, rates: Array | None = None) -> SampleLog:
         """Return the log with N more rows.
 
         stamp_ns: (N,); u: (N, r), whose row k holds the inputs of the row ``delay`` rows before row k; y: (N, m);
-        angles: (N, a); gap: (N,); missing: (N,), see ``Rows.missing``; None: all were measured. A row is shown once its
-        inputs are known.
+        angles: (N, a); gap: (N,); missing: (N,), see ``Rows.missing``; None: all were measured; rates: (N, a), where
+        they are kept. A row is shown once its inputs are known.
         """
         buffer = self._with_room(len(stamp_ns))
-        r, m = self.width.inputs, self.width.outputs
+        r, m, a = self.width[:3]
         at = self.end + self.waiting - buffer.first
         stop = at + len(stamp_ns)
         buffer.stamp_ns[at:stop] = stamp_ns
         buffer.values[at:stop, r:r + m] = y
-        buffer.values[at:stop, r + m:] = angles
+        buffer.values[at:stop, r + m:r + m + a] = angles
+        if rates is not None:
+            buffer.values[at:stop, r + m + a:] = rates
         buffer.gap[at:stop] = gap
         buffer.missing[at:stop] = 0 if missing is None else missing
         earliest = self.end - buffer.first
@@ -99,9 +102,10 @@ class SampleLog:
         end = max(self.end, buffer.filled - delay)
         return SampleLog(self.width, self.start, end, buffer.filled - end, buffer)
 
-    def wait(self, stamp_ns: int, u: Array, y: Array, angles: Array) -> SampleLog:
-        """Return the log with one more waiting row, whose inputs u (r,) are its own (no ``delay``)."""
-        log = self.append(np.array([stamp_ns]), u[None], y[None], angles[None], np.zeros(1, dtype=np.bool_))
+    def wait(self, raw: Sample) -> SampleLog:
+        """Return the log with one more waiting row, whose inputs are its own (no ``delay``)."""
+        log = self.append(np.array([raw.stamp_ns]), raw.u[None], raw.y[None], raw.angles[None],
+                          np.zeros(1, dtype=np.bool_), rates=raw.rates[None])
         return SampleLog(self.width, self.start, self.end, self.waiting + 1, log._buffer)
 
     def waiting_rows(self) -> Rows:
@@ -200,7 +204,13 @@ class Rows:
     @property
     def angles(self) -> Array:
         """(N, a) measured configuration [rad]."""
-        return self._values(self.log.width.inputs + self.log.width.outputs, sum(self.log.width))
+        before = self.log.width.inputs + self.log.width.outputs
+        return self._values(before, before + self.log.width.angles)
+
+    @property
+    def rates(self) -> Array:
+        """(N, a) measured rates of the joints [rad/s], NaN where the message had none; (N, 0): none are kept."""
+        return self._values(sum(self.log.width[:3]), sum(self.log.width))
 
     @property
     def missing(self) -> NDArray[np.int64]:
@@ -251,11 +261,12 @@ class Signals:
 
 
 def log_of(u: Array, y: Array, angles: Array | None = None, stamp_ns: NDArray[np.int64] | None = None,
-           gap: NDArray[np.bool_] | None = None, missing: NDArray[np.int64] | None = None) -> SampleLog:
-    """Return a log of whole arrays: u (N, r), y (N, m), angles (N, a), stamp_ns (N,), gap (N,), missing (N,)."""
+           gap: NDArray[np.bool_] | None = None, missing: NDArray[np.int64] | None = None,
+           rates: Array | None = None) -> SampleLog:
+    """Return a log of arrays: u (N, r), y (N, m), angles and rates (N, a), stamp_ns, gap and missing (N,)."""
     u, y = np.atleast_2d(u), np.atleast_2d(y)
     count = len(y)
     angles = np.zeros((count, 0)) if angles is None else angles
-    log = SampleLog(Width(u.shape[1], y.shape[1], angles.shape[1]))
+    log = SampleLog(Width(u.shape[1], y.shape[1], angles.shape[1], 0 if rates is None else rates.shape[1]))
     return log.append(np.zeros(count, dtype=np.int64) if stamp_ns is None else stamp_ns, u, y, angles,
-                      np.zeros(count, dtype=np.bool_) if gap is None else gap, missing=missing)
+                      np.zeros(count, dtype=np.bool_) if gap is None else gap, missing=missing, rates=rates)

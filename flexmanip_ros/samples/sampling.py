@@ -15,7 +15,15 @@ import numpy as np
 
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import SampleLog, Signals, Width
-from flexmanip_ros.samples.signals import Channels, Rejection, columns, extract, resolve, wrong_size
+from flexmanip_ros.samples.signals import (
+    Channels,
+    Rejection,
+    columns,
+    extract,
+    joint_rates,
+    resolve,
+    wrong_size,
+)
 from flexmanip_ros.types import Array, CaptureEvent, JointBlock, JointRecord, Sample
 
 LEARNING = 20
@@ -114,7 +122,7 @@ def push(config: IdentifierParameters, clock: Clock, log: SampleLog, record: Joi
     if raw is None:
         return Sampled(_reject(clock, _NOT_FINITE), log)
     if log.width == EMPTY.width:  # also in a state that was saved before the first usable message
-        log = SampleLog(Width(len(channels.u), len(channels.y), len(channels.angles)))
+        log = SampleLog(Width(len(channels.u), len(channels.y), len(channels.angles), len(channels.rates)))
     return _on_clock(config, clock, log, raw)
 
 
@@ -133,23 +141,25 @@ def push_block(config: IdentifierParameters, clock: Clock, log: SampleLog, block
     taken = slice(first, first + regular)
     stamps = block.stamp_ns[taken]
     u, y, angles = (columns(block, places, taken) for places in (channels.u, channels.y, channels.angles))
+    rates = joint_rates(channels, block, taken)
     finite = np.isfinite(u).all(axis=1) & np.isfinite(y).all(axis=1) & np.isfinite(angles).all(axis=1)
     if not finite.all():
         regular = int(np.argmin(finite))
         if regular == 0:
             return push(config, clock, log, block.record(first)), 1
-        stamps, u, y, angles = stamps[:regular], u[:regular], y[:regular], angles[:regular]
+        stamps = stamps[:regular]
+        u, y, angles, rates = (part[:regular] for part in (u, y, angles, rates))
     assert clock.last_ns is not None
     last = int(stamps[-1])
     counters = clock.counters
-    latest = Sample(last, u[-1].copy(), y[-1].copy(), angles[-1].copy())
+    latest = Sample(last, u[-1].copy(), y[-1].copy(), angles[-1].copy(), rates[-1].copy())
     clock = clock._replace(
         last_ns=last, latest=latest, peak=_peak(clock, np.abs(u).max(axis=0)),
         interval_sum_ns=clock.interval_sum_ns + last - clock.last_ns,
         interval_count=clock.interval_count + regular, irregular=0,
         counters=counters._replace(received=counters.received + regular,
                                    accepted=counters.accepted + regular))
-    log = log.append(stamps, u, y, angles, np.zeros(regular, dtype=np.bool_), config.arm.effort_delay)
+    log = log.append(stamps, u, y, angles, np.zeros(regular, dtype=np.bool_), config.arm.effort_delay, rates=rates)
     return Sampled(clock, log), regular
 
 
@@ -276,7 +286,7 @@ def _placed(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sam
         return Sampled(_reject(clock, _LATE), log)
     if clock.interval_count == 0:
         clock = clock._replace(last_ns=raw.stamp_ns, counters=clock.counters.received_and('accepted'))
-        log = log.wait(raw.stamp_ns, raw.u, raw.y, raw.angles)
+        log = log.wait(raw)
         return _learned(config, clock, log) if log.waiting > LEARNING else Sampled(clock, log)
     before = clock.counters
     clock, log, gap = _next(config, clock._replace(counters=before.received_and('accepted')), log, raw)
@@ -289,7 +299,7 @@ def _restart(clock: Clock, log: SampleLog, raw: Sample) -> Sampled:
     """Begin a new clock and a new log at ``raw``: the stamps went back, or the rate changed for good."""
     counters = clock.counters.plus('resets').received_and('accepted')
     fresh = Clock(channels=clock.channels, outputs=clock.outputs, counters=counters, last_ns=raw.stamp_ns)
-    return Sampled(fresh, SampleLog(log.width).wait(raw.stamp_ns, raw.u, raw.y, raw.angles), reset=True)
+    return Sampled(fresh, SampleLog(log.width).wait(raw), reset=True)
 
 
 def _is_learning(clock: Clock, log: SampleLog) -> bool:
@@ -300,7 +310,7 @@ def _learned(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Samp
     """Set the sample time to the median of the first intervals; place the waiting samples on that clock."""
     rows = log.waiting_rows()
     stamps = rows.stamp_ns.tolist()
-    samples = [Sample(stamps[k], rows.u[k].copy(), rows.y[k].copy(), rows.angles[k].copy())
+    samples = [Sample(stamps[k], *(part[k].copy() for part in (rows.u, rows.y, rows.angles, rows.rates)))
                for k in range(len(rows))]
     intervals = np.sort(np.diff(rows.stamp_ns)).tolist()
     clock = clock._replace(last_ns=None, latest=None, interval_count=1,
@@ -328,7 +338,7 @@ def _next(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sampl
             clock = clock._replace(irregular=0, interval_sum_ns=total + interval, interval_count=count + 1)
     clock = clock._replace(last_ns=raw.stamp_ns, latest=raw, peak=_peak(clock, np.abs(raw.u)))
     log = log.append(np.array([raw.stamp_ns]), raw.u[None], raw.y[None], raw.angles[None], np.array([unknown]),
-                     config.arm.effort_delay)
+                     config.arm.effort_delay, rates=raw.rates[None])
     return clock, log, gap
 
 
@@ -361,6 +371,5 @@ def _filled(log: SampleLog, clock: Clock, raw: Sample, absent: int, delay: int) 
     number = np.arange(1, absent + 1)
     share = (number / (absent + 1))[:, None]
     stamps = before.stamp_ns + (raw.stamp_ns - before.stamp_ns) * number // (absent + 1)
-    u, y, angles = (np.asarray(a + share * (b - a)) for a, b in (
-        (before.u, raw.u), (before.y, raw.y), (before.angles, raw.angles)))
-    return log.append(stamps, u, y, angles, np.zeros(absent, dtype=np.bool_), delay, number)
+    u, y, angles, rates = (np.asarray(a + share * (b - a)) for a, b in zip(before[1:], raw[1:], strict=True))
+    return log.append(stamps, u, y, angles, np.zeros(absent, dtype=np.bool_), delay, number, rates)

@@ -24,6 +24,8 @@ class Channels:
     angles: tuple[tuple[str, int], ...]
     places: tuple[tuple[str, int], ...]
     """The places of u, y and angles, in this order."""
+    rates: tuple[int, ...]
+    """Indices of the joints whose rates are read; a message may lack them."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,8 @@ def resolve(
                 return _missing(group, name, record)
             places.append(place)
         groups.append(tuple(places))
-    return Channels(record.names, wanted, groups[0], groups[1], groups[2], sum(groups, start=()))
+    rates = tuple(index for _, index in groups[2]) if reads_rates(config) else ()
+    return Channels(record.names, wanted, groups[0], groups[1], groups[2], sum(groups, start=()), rates)
 
 
 def joints(config: IdentifierParameters | TriggerParameters) -> tuple[str, ...]:
@@ -72,6 +75,13 @@ def joints(config: IdentifierParameters | TriggerParameters) -> tuple[str, ...]:
 def reads_angles(config: IdentifierParameters) -> bool:
     """Whether the angles are read: for a payload, or where the user names them (the default names are of one arm)."""
     return bool(config.angles) and (config.payload_method != 'none' or not _is_default('angles', config))
+
+
+def reads_rates(config: IdentifierParameters) -> bool:
+    """Whether the joints' rates are read: where the friction of a joint does work on the angle that is measured."""
+    arm = config.arm
+    return (config.payload.use_joint_rates and reads_angles(config) and config.payload_method == 'structured'
+            and arm.angle_convention == 'encoder' and arm.torque_convention == 'joint')
 
 
 def _is_default(group: str, config: IdentifierParameters) -> bool:
@@ -109,7 +119,21 @@ def extract(channels: Channels, record: JointRecord) -> Sample | None:
         return None
     row = np.array(values, dtype=np.float64)
     r, m = len(channels.u), len(channels.y)
-    return Sample(record.stamp_ns, row[:r], row[r:r + m], row[r + m:])
+    measured = fields['velocity']
+    rates = [measured[k] if measured and measured[k] and math.isfinite(measured[k]) else math.nan
+             for k in channels.rates]
+    return Sample(record.stamp_ns, row[:r], row[r:r + m], row[r + m:], np.array(rates, dtype=np.float64))
+
+
+def joint_rates(channels: Channels, block: JointBlock, taken: slice) -> Array:
+    """Return measured rates of the joints, as in ``extract``, of the messages ``taken``, (N, a) [rad/s]; NaN: unknown.
+
+    A rate of exactly zero counts as unknown: drivers that measure no rates report that.
+    """
+    if not block.velocity.shape[1]:
+        return np.full((taken.stop - taken.start, len(channels.rates)), np.nan)
+    rates = block.velocity[taken, list(channels.rates)]
+    return np.where(np.isfinite(rates) & (rates != 0.0), rates, np.nan)
 
 
 def columns(block: JointBlock, places: tuple[tuple[str, int], ...], taken: slice) -> Array:

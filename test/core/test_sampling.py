@@ -17,6 +17,7 @@ class Seen(NamedTuple):
     u: np.ndarray
     y: np.ndarray
     angles: np.ndarray
+    rates: np.ndarray
     gap: bool
 
 
@@ -41,7 +42,8 @@ def drive(records: list[JointRecord], config: IdentifierParameters | None = None
         resets += reset
     clock, log, reset = sampling.flush(config, clock, log)
     rows = log.rows(0, log.end)
-    samples = [Seen(int(rows.stamp_ns[k]), rows.u[k], rows.y[k], rows.angles[k], bool(rows.gap[k]))
+    samples = [Seen(int(rows.stamp_ns[k]), rows.u[k], rows.y[k], rows.angles[k], rows.rates[k],
+                    bool(rows.gap[k]))
                for k in np.flatnonzero(rows.missing == 0)]
     return clock, samples, resets + reset
 
@@ -88,6 +90,22 @@ def test_a_bag_without_velocities_uses_displacements_only() -> None:
     state, samples, _ = drive([record(k, velocity=[]) for k in range(30)])
     assert state.outputs == ('link1_bend/position', 'link2_bend/position')
     assert samples[0].y.shape == (2,)
+    assert np.isnan(samples[0].rates).all()
+
+
+def test_rates_of_the_joints_come_along_and_a_message_without_them_is_taken_too() -> None:
+    """A rate of zero is unknown as well: drivers that measure no rates report it."""
+    odd = {25: [np.nan, 1.0, 0.0, 0.0], 26: [2.0, 0.0, 0.0, 0.0], 27: [2.0, np.inf, 0.0, 0.0]}
+    _, samples, _ = drive([record(k, velocity=odd.get(k, [2.0, 3.0, 0.0, 0.0])) for k in range(30)])
+    found = [sample.rates for sample in samples[24:29]]
+    np.testing.assert_equal(found, [[2.0, 3.0], [np.nan, 1.0], [2.0, np.nan], [2.0, np.nan], [2.0, 3.0]])
+
+
+@pytest.mark.parametrize('given', [
+    {'payload.use_joint_rates': False}, {'arm.angle_convention': 'chord'}, {'payload_method': 'none'}])
+def test_rates_are_not_read_where_they_are_not_those_of_the_joints_or_unused(given: dict[str, object]) -> None:
+    _, samples, _ = drive([record(k) for k in range(30)], configure(IdentifierParameters, given))
+    assert samples[0].rates.shape == (0,)
 
 
 def test_outputs_set_by_the_user_never_shrink() -> None:

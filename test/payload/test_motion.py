@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.linalg
 
 from flexmanip_ros.parameters import IdentifierParameters, configure
@@ -184,6 +185,28 @@ def test_what_is_learned_moves_a_vibration_that_turns_by_a_radian_in_a_sample_as
         found = spread[:2 * n, 2 * n + c] / size
         # held over a sample, a rotor is 3 % off, a first moment 1 %
         assert np.linalg.norm(found - exact) <= 0.003 * np.linalg.norm(exact), Kind(arm.kind[c]).name
+
+
+@pytest.mark.parametrize(('begin', 'end'), [
+    (0.3, 0.3), (-0.7, -0.7001), (-1.0, 2.0), (40.0, -25.0), (-300.0, 500.0), (600.0, 610.0)])
+def test_the_friction_over_a_sample_is_the_mean_over_rates_on_a_line(begin, end):
+    exact, _ = scipy.integrate.quad(lambda u: np.tanh(begin + u * (end - begin)), 0.0, 1.0, points=[0.4, 0.375, 1 / 3],
+                                    epsabs=1e-10, limit=400)
+    assert process_model.mean_share(begin, end) == pytest.approx(exact, abs=1e-8)
+
+
+def test_where_the_rate_of_a_joint_was_measured_its_coulomb_friction_does_not_depend_on_the_state(arm):
+    n = arm.arm.stiffness.size
+    x, coulomb = bent(arm, n), np.flatnonzero(arm.kind == Kind.COULOMB)
+    shares = np.array([-0.4, 0.9])
+    rates = process_model.STICTION_RATE * np.arctanh(shares)
+    free = x.copy()
+    free[2 * n + coulomb] = 0.0
+    process_model.set_parameters(arm, free)
+    rows = np.array([[0.0, *((TORQUE - x[2 * n + coulomb] * shares) / arm.gain), np.nan, np.nan, np.nan, np.nan]])
+    for state, row in ((free, rows), (x, np.array([[0.0, *(TORQUE / arm.gain), *rates, *rates]]))):
+        assert process_model.predict(arm, state, np.eye(x.size), x.size, row, 1e-3, 1e-3)
+    np.testing.assert_allclose(x[:2 * n], free[:2 * n], rtol=1e-12)
 
 
 def test_steps_are_counted_and_an_arm_too_stiff_to_be_one_is_refused(arm):

@@ -325,6 +325,25 @@ def test_no_samples_are_a_table_without_rows() -> None:
     assert structured.measurements(model, rows).shape == (0, len(model.roles))
 
 
+def test_where_no_rate_was_measured_friction_follows_the_model() -> None:
+    settings = config(replace(ARM, joint_coulomb_friction=(0.3, 0.2)))
+    rows = record(0.4, arm=settings.arm)
+    found = []
+    for rates in (None, np.full((len(rows), 2), np.nan), np.full((len(rows), 2), 0.01)):
+        samples = log_of(rows.u, rows.y, rows.angles, rows.stamp_ns, rates=rates).rows(0, len(rows))
+        found.append(run(settings, samples).memory.x)
+    np.testing.assert_array_equal(found[0], found[1])
+    assert (found[0] != found[2]).any()
+
+
+def test_a_rate_is_unknown_in_a_row_that_never_came() -> None:
+    state = run(config(), record(0.1))
+    rows = log_of(np.zeros((3, 2)), np.zeros((3, 4)), np.zeros((3, 2)), missing=np.array([0, 1, 0]),
+                  rates=np.ones((3, 2))).rows(0, 3)
+    table, first = structured.input_table(state._replace(cursor=0, horizon=None, rates=np.full(2, 7.0)), rows)
+    np.testing.assert_equal(table[first:, 3:7], [[7, 7, 1, 1], [1, 1, np.nan, np.nan], [np.nan, np.nan, 1, 1]])
+
+
 def test_an_undamped_arm_is_known_without_bias():
     """Its damping ratio is at its bound: an estimate that may not fall below zero errs, and the mass with it."""
     capture, deviations = event(2.0), []
