@@ -143,11 +143,13 @@ def test_the_arm_is_brought_to_a_new_setpoint_live(ros: Ros) -> None:
 
 
 def test_a_parameter_that_is_no_setpoint_moves_nothing(ros: Ros) -> None:
-    node = start(ros, readers=0, setpoint=[0.5, 0.3])
-    before = node.state
-    for name, value in (('max_payload', 30.0), ('setpoint', [0.5, 0.3])):
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
+    node = start(ros, setpoint=[0.5, 0.3], hold_present=False)
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    for k, (name, value) in enumerate((('max_payload', 30.0), ('setpoint', [0.5, 0.3]), ('setpoint', [0.1, 0.0]))):
         (result,) = node.set_parameters([Parameter(name, value=value)])
         assert result.successful
-        assert node.state is before
-    node.set_parameters([Parameter('setpoint', value=[0.0, 0.0])])
-    assert node.state is not before
+        states.publish(joint_state(k))
+        ros.wait(lambda k=k: len(heard) == k + 1)
+        assert node.state is not None
+        assert node.state.setpoint.tolist() == ([0.1, 0.0] if k == 2 else [0.5, 0.3])

@@ -58,6 +58,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._meter = Meter()
         self._reader = JointStateReader()
         self._setpoint = self.config.setpoint
+        self._goal: Array | None = None
         self._names: tuple[str, ...] = ()
         self._places: list[int] = []
 
@@ -84,7 +85,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
     def activated(self) -> None:
         """Hold the joints from the next sample on."""
         self.state = controller.init(self.config)
-        self._last_ns, self._arrived = None, np.inf
+        self._last_ns, self._arrived, self._goal = None, np.inf, None
         if self._estimate is not None:
             self._judge(self._estimate)
 
@@ -93,12 +94,9 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._send(np.zeros(len(self.config.joints)))
 
     def configuration_changed(self, config: ControllerParameters) -> None:
-        """Go to a new setpoint."""
-        if config.setpoint == self._setpoint:
-            return
-        self._setpoint = config.setpoint
-        if self.state is not None:
-            self.state = controller.goto(self.state, np.asarray(config.setpoint))
+        """Go to a new setpoint with the next sample, as a parameter may be set while another thread takes a sample."""
+        if config.setpoint != self._setpoint:
+            self._setpoint, self._goal = config.setpoint, np.asarray(config.setpoint)
 
     def _on_joint_states(self, raw: bytes) -> None:
         if not self.active or self.state is None:
@@ -122,6 +120,9 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
             if self._last_ns is not None and record.stamp_ns - self._last_ns > longest_ns:
                 self.state = self.state._replace(x=None)
             self._last_ns = record.stamp_ns
+            goal, self._goal = self._goal, None
+            if goal is not None:
+                self.state = controller.goto(self.state, goal)
             self.state, torque = controller.step(self.config, self.state, measured)
             self._send(torque)
 
