@@ -211,9 +211,9 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
 def mean_share(begin: float, end: float) -> float:
     """Return the mean of tanh(rate / STICTION_RATE) over a sample in which the rate goes from begin to end in a line.
 
-    It is the integral ln(cosh) of tanh; begin and end: over STICTION_RATE, NaN if one is.
+    The integral of tanh is ln(cosh). begin, end: rates over STICTION_RATE; the result is NaN where one of them is.
     """
-    if abs(end - begin) < 1e-3:
+    if abs(end - begin) < 1e-3:  # the quotient would lose digits; the middle is right to 1e-7
         return float(np.tanh(0.5 * (begin + end)))
     first = abs(begin) + np.log1p(np.exp(-2.0 * abs(begin)))
     last = abs(end) + np.log1p(np.exp(-2.0 * abs(end)))
