@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from flexmanip_ros.parameters import IdentifierParameters, flatten
+from flexmanip_ros.payload.interval import moves
 from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.payload.structured import StructuredState
 from flexmanip_ros.types import ArmParameter
@@ -32,13 +34,14 @@ POSITIVE = (Kind.VISCOUS, Kind.COULOMB, Kind.ROTOR, Kind.TORQUE_DELAY, Kind.TORQ
 def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple[ArmParameter, ...]:
     """Return value and standard deviation of each parameter that ``payload.learn`` names, in SI units; empty before.
 
-    A parameter that was taken as known, as the simplest arm fits, has its given value and its prior deviation.
+    A parameter that was taken as known, as the simplest arm fits, has its given value and its prior deviation. Where
+    the parameters move further than their variances say, the deviations are larger by that.
     """
     if state is None or state.model is None or state.memory is None:
         return ()
     model, m = state.model, state.memory
     found = []
-    x, S = m.x[model.payload:].copy(), m.S[model.payload:].copy()
+    x, S = m.x[model.payload:].copy(), math.sqrt(moves(m)) * m.S[model.payload:]
     late = model.motion.kind == Kind.TORQUE_LAG
     mirrored = late & (x < 0.0)
     if mirrored.any():  # what the filter means by a lag below zero, see ``late_torque``

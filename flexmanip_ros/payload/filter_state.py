@@ -22,11 +22,11 @@ TONES = 32
 # used at the last event; most that white noise can be by the median level of the spectrum.
 EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EVENT, LEVEL = range(11)
 # Elements of ``counts``.
-(HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, BATCHES, SEEN, BEFORE,
+(HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, MOVED, SEEN, BEFORE,
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
  IN_SPECTRUM, SPECTRA) = range(22)
 # Elements of ``score``.
-MOVE, VARIANCE, SHIFT, DOUBT, DRIFT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA = range(11)
+SHIFT, DOUBT, NOW, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES = range(8)
 
 
 class FilterState(NamedTuple):
@@ -49,18 +49,22 @@ class FilterState(NamedTuple):
     Filter: HELD: the arm holds something; LEARNED: it was seen empty before; SEEN: samples measured, at most 2000;
     SINCE_EVENT: those since the last event; IN_A_ROW: those since the last one that was missing; SINCE_NOISE: samples
     since process noise was added; USED: number of the first columns of S and S0, beyond which they are zero. Noise:
-    IN_BLOCK, IN_BATCH, IN_SPECTRUM: samples of the present block, batch, spectrum; BLOCKS, BATCHES, SPECTRA: how many
-    are in the means. Fit: STORED: samples in the horizon, ``HORIZON`` once it has closed; ITERATING: an iteration is
-    under way; ITERATED, MEASURED: samples that it has read, and those of them that were not missing; BEFORE: samples of
-    the last accepted iteration; REJECTED: steps rejected since then; AGAIN: the next one reads the same samples, as it
-    has not converged; TRIED: iterations over the same samples so far; REFITS: fits begun again since the event."""
+    IN_BLOCK, IN_BATCH, IN_SPECTRUM: samples of the present block, batch, spectrum; BLOCKS, SPECTRA, MOVED: how many of
+    them, and of moves, are in the means. Fit: STORED: samples in the horizon, ``HORIZON`` once it has closed;
+    ITERATING: an iteration is under way; ITERATED, MEASURED: samples that it has read, and those of them that were not
+    missing; BEFORE: samples of the last accepted iteration; REJECTED: steps rejected since then; AGAIN: the next one
+    reads the same samples, as it has not converged; TRIED: iterations over the same samples so far; REFITS: fits begun
+    again since the event."""
     score: Array
-    """(11,) MOVE: sum of the payload's updates in this batch, VARIANCE: its variance if the model is right; DRIFT: mean
-    of MOVE^2 / VARIANCE; SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the
-    sum of the squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
-    EMPTY_ARM_BIAS: payload that the arm seemed to hold before the event, when it was empty, in standard deviations;
-    EXCESS_BIAS: the same with the error of the inertia in the deviation; COST: of the samples read in this iteration,
-    COST_BEFORE: of the last accepted one; LAMBDA: damping of Levenberg and Marquardt."""
+    """(8,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
+    squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
+    EXCESS_BIAS: payload that the arm seemed to hold before the event, when it was empty, in standard deviations, the
+    error of the inertia among them; COST: of the samples read in this iteration, COST_BEFORE: of the last accepted one;
+    LAMBDA: damping of Levenberg and Marquardt; MOVES: mean of the squared moves of payload and arm parameters, over the
+    variance that the filter says, see ``judge_moves``."""
+    moved: Array
+    """(nx, 2) mean and variance of payload and arm parameters when their moves were last judged, with the process noise
+    since then in the variance; see ``judge_moves``."""
     x0: Array
     """(nx,) mean just after the last event."""
     S0: Array
@@ -91,10 +95,10 @@ def memory(nx: int, m: int) -> FilterState:
     """Allocate for nx states and m sensors."""
     return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)),
-        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(22, dtype=np.int64), score=np.zeros(11), x0=np.zeros(nx),
-        S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx), normal=np.zeros((nx, nx)),
-        gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)), g=np.zeros(nx),
-        innovation=np.zeros((m, 2)), power=np.ones(m))
+        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(22, dtype=np.int64), score=np.zeros(8),
+        moved=np.zeros((nx, 2)), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
+        normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
+        g=np.zeros(nx), innovation=np.zeros((m, 2)), power=np.ones(m))
 
 
 def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
@@ -102,12 +106,12 @@ def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
 
     horizon False: what belongs to a complete moving horizon is shared; then only an event writes it.
     """
-    (x, S, noise, recent, spectrum, counts, score, x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g, innovation,
-     power) = state
+    (x, S, noise, recent, spectrum, counts, score, moved, x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g,
+     innovation, power) = state
     if horizon or counts[STORED] < HORIZON:
         x0, S0, xi = x0.copy(), S0.copy(), xi.copy()
         accepted, normal, gradient = accepted.copy(), normal.copy(), gradient.copy()
         xr, Sr, N, g = xr.copy(), Sr.copy(), N.copy(), g.copy()
     return FilterState(
-        x.copy(), S.copy(), noise.copy(), recent.copy(), spectrum.copy(), counts.copy(), score.copy(), x0, S0, xi,
-        accepted, normal, gradient, xr, Sr, N, g, innovation.copy(), power.copy())
+        x.copy(), S.copy(), noise.copy(), recent.copy(), spectrum.copy(), counts.copy(), score.copy(), moved.copy(),
+        x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g, innovation.copy(), power.copy())

@@ -12,13 +12,13 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured_model
 from flexmanip_ros.payload.filter_state import (
-    BATCHES,
     BLOCKS,
     DOUBT,
-    DRIFT,
     EFFECTIVE,
     HORIZON,
     LEVEL,
+    MOVED,
+    MOVES,
     REFITS,
     SHIFT,
     STORED,
@@ -37,9 +37,7 @@ UNKNOWN_POWER = 4.0
 """Innovation power over white noise beyond which the object may weigh anything: most of the residuals are no noise, so
 the fit may be in a wrong minimum. After a fit that was given up, ``POWER_LIMIT`` takes its place."""
 WIDENING_LIMIT = 4.0
-"""Factor on the payload's deviation, by its moves and the misfit, beyond which the model does not fit."""
-FREE_BIAS = 2.0
-"""Standard deviations that an empty arm may seem to hold before the interval is widened."""
+"""Factor on the payload's deviation, by the moves and the misfit, beyond which the model does not fit."""
 MOST_BIAS = 3.0
 """Standard deviations, with the error of its inertia among them, that an empty arm may seem to hold. Chance exceeds
 them 1 time in 370. Beyond them the arm is not the one that was described or learned, and what it catches is estimated
@@ -59,16 +57,16 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         return Payload(0.0, math.inf, 0.0, math.inf, 1.0, begun)
     state = model.payload
     held = bool(m.counts[mem.HELD])
-    consistency, drift, reckoned = figures(m.noise, sensors.rate, m.score, m.counts, sensors.block)
+    consistency, reckoned = figures(m.noise, sensors.rate, m.counts, sensors.block)
     if math.isnan(consistency):
         consistency = plain_misfit(sensors, m)
     fitting = held and m.counts[STORED] < HORIZON
+    g = moves(m)
     if fitting:  # the next step may be as long as the last one
-        drift = max(drift, 1.0 + float(m.score[SHIFT]) ** 2)
-    restless = math.sqrt(drift * max(1.0, consistency / POWER_LIMIT))
-    widening = restless * max(1.0, abs(float(m.score[mem.EMPTY_ARM_BIAS])) / FREE_BIAS)
+        g = max(g, 1.0 + float(m.score[SHIFT]) ** 2)
+    widening = math.sqrt(g * max(1.0, consistency / POWER_LIMIT))
     status = Status.TRACKING
-    if consistency > POWER_LIMIT or restless > WIDENING_LIMIT or abs(m.score[mem.EXCESS_BIAS]) > MOST_BIAS:
+    if consistency > POWER_LIMIT or widening > WIDENING_LIMIT or abs(m.score[mem.EXCESS_BIAS]) > MOST_BIAS:
         status = Status.INCONSISTENT
     if m.counts[mem.SINCE_EVENT] < FEW:
         status = Status.WARMING_UP
@@ -93,6 +91,14 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         status = Status.POORLY_EXCITED if status is Status.TRACKING else status
     found = Payload(mass, std, max(0.0, mass - QUANTILE * std), mass + QUANTILE * std, consistency, status)
     return found if model.body == 1 or known_point else with_body(found, body, spread)
+
+
+def moves(m: mem.FilterState) -> float:
+    """Return the factor, at least 1, by which variances of payload and arm parameters are too small for their moves.
+
+    See ``judge_moves``; 1 before the first move.
+    """
+    return max(1.0, float(m.score[MOVES])) if m.counts[MOVED] else 1.0
 
 
 def point_or_body(body: Array, spread: Array, mean: Array, std: Array) -> tuple[Array, Array]:
@@ -168,16 +174,6 @@ Integers = NDArray[np.int64]
 
 
 @kernel
-def drift(score: Array, counts: Integers) -> float:
-    """Factor on the payload's variance: the square of its moves over their variance, less what chance explains."""
-    if counts[BATCHES] == 0:
-        return 1.0
-    # a mean of N squared standard normals is 1 +- sqrt(2 / N)
-    beyond: float = score[DRIFT] - 2.0 * math.sqrt(2.0 / counts[BATCHES])
-    return max(1.0, beyond)
-
-
-@kernel
 def misjudged(noise: Array, counts: Integers, block: int) -> float:
     """Share of ``model_error`` that the interval carries, 0 to 1; block: samples in a block.
 
@@ -194,7 +190,6 @@ def misjudged(noise: Array, counts: Integers, block: int) -> float:
 
 
 @kernel
-def figures(noise: Array, rate: NDArray[np.bool_], score: Array, counts: Integers, block: int
-            ) -> tuple[float, float, float]:
-    """Return misfit, drift and ``misjudged``, in one call."""
-    return misfit(noise, rate, LEVEL), drift(score, counts), misjudged(noise, counts, block)
+def figures(noise: Array, rate: NDArray[np.bool_], counts: Integers, block: int) -> tuple[float, float]:
+    """Return misfit and ``misjudged``, in one call."""
+    return misfit(noise, rate, LEVEL), misjudged(noise, counts, block)

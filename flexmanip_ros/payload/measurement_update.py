@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 from flexmanip_ros.numerics.compiled import inlined, inner
 from flexmanip_ros.numerics.square_root import absorb_measurement, dot, project
 from flexmanip_ros.payload.filter_state import (
-    BATCHES,
     BLOCK_POWER,
     BLOCK_SUM,
     BLOCKS,
-    DRIFT,
     EFFECTIVE,
     FLOOR,
     HORIZON,
@@ -23,7 +21,8 @@ from flexmanip_ros.payload.filter_state import (
     IN_BLOCK,
     IN_SPECTRUM,
     LEVEL,
-    MOVE,
+    MOVED,
+    MOVES,
     POWER,
     SEEN,
     SINCE_EVENT,
@@ -32,7 +31,6 @@ from flexmanip_ros.payload.filter_state import (
     STORED,
     TONES,
     USED,
-    VARIANCE,
     WEIGHT,
     WHITE,
 )
@@ -45,8 +43,13 @@ OUTLIER = 4.0
 """Standard deviations beyond which an innovation has less weight (Huber)."""
 BLOCK_MEMORY = 120
 """Number of blocks over which the noise of a sensor is averaged."""
-BATCH_MEMORY = 20
-"""Number of batches over which the moves of the payload are averaged."""
+BATCH = 8
+"""Blocks in a batch: most of a period of the slowest vibration."""
+MOVES_MEMORY = 400
+"""Number of moves whose squares are averaged, so that their mean is known to 7 %: sqrt(2 / 400)."""
+LEAST_FALL = 0.02
+"""Least fall of a variance that is compared with a move, as a share of it. The move is then a seventh of a deviation;
+smaller ones are of the size of what the linearization leaves out."""
 SPECTRUM = 128
 """Samples of one spectrum. Hann's window of that length is 1.44 / 128 wide, the distance of the frequencies
 ``TONE``."""
@@ -147,7 +150,7 @@ def observe(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Ar
 
 @inner
 def measure(sensors: MeasurementModel, m: FilterState, y: Array, qdd: Array, opened: NDArray[np.int64]) -> None:
-    """Update the filter with one sample; gather the power of its innovations and the moves of the payload.
+    """Update the filter with one sample; gather the power of its innovations and their information on the payload.
 
     qdd: (n,) accelerations; opened: see ``ProcessModel``.
     """
@@ -169,8 +172,6 @@ def measure(sensors: MeasurementModel, m: FilterState, y: Array, qdd: Array, ope
             r += e * e / (OUTLIER * OUTLIER) - variance
             variance = spread + r
         gain = dot(f, S[payload]) / variance
-        m.score[MOVE] += gain * e
-        m.score[VARIANCE] += gain * gain * variance
         m.noise[i, WEIGHT] += gain * gain * variance
         absorb_measurement(x, S, opened, f, e, r, variance)
         white_noise(m, i, y[i])
@@ -301,19 +302,35 @@ def misfit(noise: Array, rate: NDArray[np.bool_], most: int) -> float:
 
 
 @inner
-def judge_payload(sensors: MeasurementModel, m: FilterState) -> None:
-    """At the end of a batch compare the payload's move with its variance.
+def judge_moves(sensors: MeasurementModel, m: FilterState) -> None:
+    """Compare the moves of payload and arm parameters with the fall of their variances, at the end of each batch.
 
-    While the horizon is open the step of the last iteration (SHIFT) says this instead, as the fit replaces the filter.
+    Covariance matching (Mehra, 1972): over some samples the mean of a Kalman filter moves by d. If the model is right,
+    d has the variance P0 + Q - P1: the fall of the variance from P0 to P1, and the process noise Q between. So the mean
+    of d^2 over that variance is 1. Larger, it is the factor by which the variances are too small. A quantity whose
+    variance has hardly fallen waits for a later batch. While the horizon is open the step of the last iteration (SHIFT)
+    says this instead, as the fit replaces the filter.
     """
-    m.counts[IN_BATCH] += 1
-    fitting = m.counts[STORED] < HORIZON
-    if m.counts[IN_BATCH] < 8 * sensors.block and not fitting:
+    if m.counts[STORED] < HORIZON:
+        m.counts[IN_BATCH] = 0
         return
-    m.counts[IN_BATCH] = 0
-    if m.score[VARIANCE] > 0.0 and not fitting:
-        m.counts[BATCHES] = min(m.counts[BATCHES] + 1, BATCH_MEMORY)
-        square = m.score[MOVE] * m.score[MOVE] / m.score[VARIANCE]
-        m.score[DRIFT] += (square - m.score[DRIFT]) / m.counts[BATCHES]
-    m.score[MOVE] = 0.0
-    m.score[VARIANCE] = 0.0
+    m.counts[IN_BATCH] += 1
+    begins = m.counts[IN_BATCH] == 1
+    if not begins and m.counts[IN_BATCH] <= BATCH * sensors.block:
+        return
+    m.counts[IN_BATCH] = 1
+    total, known = 0.0, 0
+    for i in range(2 * sensors.H.shape[1], m.x.size):
+        variance = dot(m.S[i], m.S[i])
+        fall = m.moved[i, 1] - variance
+        told = fall > LEAST_FALL * m.moved[i, 1]
+        if told and not begins:
+            move = m.x[i] - m.moved[i, 0]
+            total += move * move / fall
+            known += 1
+        if told or begins:
+            m.moved[i, 0] = m.x[i]
+            m.moved[i, 1] = variance
+    if known > 0:
+        m.counts[MOVED] = min(m.counts[MOVED] + known, MOVES_MEMORY)
+        m.score[MOVES] += (total - known * m.score[MOVES]) / m.counts[MOVED]

@@ -47,7 +47,7 @@ from flexmanip_ros.payload.filter_state import (
     WHITE,
 )
 from flexmanip_ros.payload.measurement_update import (
-    judge_payload,
+    judge_moves,
     learn_noise,
     measure,
     misfit,
@@ -466,6 +466,7 @@ def diffuse(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, dur
         for c in range(sensors.noise.shape[1]):
             sensors.noise[i, c] = 0.0
         sensors.noise[i, i] = 0.0 if known else sensors.diffusion[i] * root
+        m.moved[i, 1] += sensors.noise[i, i] * sensors.noise[i, i]
     for i in range(motion.effort.size):
         for r in range(n):
             column[r] = motion.work.B[r, i]
@@ -506,6 +507,6 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     if came:
         if strays(sensors, m):
             return False
-        judge_payload(sensors, m)
+        judge_moves(sensors, m)
     diffuse(motion, sensors, m, duration)
     return True

@@ -16,7 +16,7 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured_model
 from flexmanip_ros.payload.capture_detection_kernel import filtered
-from flexmanip_ros.payload.interval import inertia_error, judge
+from flexmanip_ros.payload.interval import inertia_error, judge, moves
 from flexmanip_ros.payload.measurement_update import MeasurementModel
 from flexmanip_ros.payload.moving_horizon import STARTS, keep_possible
 from flexmanip_ros.payload.process_model import Kind, predict
@@ -174,11 +174,9 @@ def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterSta
         f = m.S[payload].copy()
         square = float(f @ f)
         if square > 0.0:
-            if m.counts[mem.SINCE_EVENT] > mem.ENOUGH:
-                m.score[mem.EMPTY_ARM_BIAS] = m.x[payload] / np.sqrt(square)
             if m.counts[mem.SINCE_EVENT] > mem.ENOUGH or m.counts[mem.REFITS]:  # a fit begun again is doubted sooner
-                considered = inertia_error(config, model, 0.0)
-                m.score[mem.EXCESS_BIAS] = m.x[payload] / np.hypot(np.sqrt(square), considered)
+                std = math.hypot(math.sqrt(moves(m) * square), inertia_error(config, model, 0.0))
+                m.score[mem.EXCESS_BIAS] = m.x[payload] / std
             gain = m.S @ f / square
             m.x[:] -= gain * m.x[payload]
             m.S[:] -= np.outer(gain, f)
@@ -187,14 +185,12 @@ def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterSta
 
 
 def _set_arrival_cost(model: Model, m: mem.FilterState) -> None:
-    """Begin a horizon at an event: the present state is its arrival cost, and the consistency figures start again."""
+    """Begin a horizon at an event: the present state is its arrival cost; figures of payload and noise start again."""
     _begin_horizon(model, m)
-    for counter in (mem.SINCE_EVENT, mem.BATCHES):
-        m.counts[counter] = 0
+    m.counts[mem.SINCE_EVENT] = 0
     m.counts[mem.BLOCKS] = min(m.counts[mem.BLOCKS], 40)
-    m.score[:mem.EMPTY_ARM_BIAS] = 0.0
+    m.score[:mem.EXCESS_BIAS] = 0.0
     m.score[mem.DOUBT] = np.linalg.norm(m.S[model.payload]) / max(m.x[model.payload], 1e-300)
-    m.score[mem.DRIFT] = 1.0
     m.noise[:, mem.WEIGHT] = 0.0
     m.power[:] = 1.0
 
@@ -241,7 +237,7 @@ def _refit(m: mem.FilterState) -> None:
     for counter in (mem.ITERATED, mem.ITERATING, mem.SINCE_NOISE, mem.IN_BATCH, mem.BEFORE, mem.REJECTED, mem.AGAIN,
                     mem.TRIED):
         m.counts[counter] = 0
-    m.score[mem.MOVE] = m.score[mem.VARIANCE] = m.score[mem.LAMBDA] = 0.0
+    m.score[mem.LAMBDA] = 0.0
 
 
 def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
