@@ -26,7 +26,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
  IN_SPECTRUM, SPECTRA) = range(22)
 # Elements of ``score``.
-SHIFT, DOUBT, NOW, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES = range(8)
+SHIFT, DOUBT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES = range(9)
 
 
 class FilterState(NamedTuple):
@@ -56,12 +56,13 @@ class FilterState(NamedTuple):
     reads the same samples, as it has not converged; TRIED: iterations over the same samples so far; REFITS: fits begun
     again since the event."""
     score: Array
-    """(8,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
+    """(9,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
     squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
-    EXCESS_BIAS: payload that the arm seemed to hold before the event, when it was empty, in standard deviations, the
-    error of the inertia among them; COST: of the samples read in this iteration, COST_BEFORE: of the last accepted one;
-    LAMBDA: damping of Levenberg and Marquardt; MOVES: mean of the squared moves of payload and arm parameters, over the
-    variance that the filter says, see ``judge_moves``."""
+    EMPTY_ARM_BIAS: payload that the arm seemed to hold before the event, when it was empty, in the filter's standard
+    deviations; EXCESS_BIAS: the same over the deviation that its moves give, with the error of the inertia; COST: of
+    the samples read in this iteration, COST_BEFORE: of the last accepted one; LAMBDA: damping of Levenberg and
+    Marquardt; MOVES: mean of the squared moves of payload and arm parameters, over the variance that the filter says,
+    see ``judge_moves``."""
     moved: Array
     """(nx, 2) mean and variance of payload and arm parameters when their moves were last judged, with the process noise
     since then in the variance; see ``judge_moves``."""
@@ -95,7 +96,7 @@ def memory(nx: int, m: int) -> FilterState:
     """Allocate for nx states and m sensors."""
     return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)),
-        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(22, dtype=np.int64), score=np.zeros(8),
+        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(22, dtype=np.int64), score=np.zeros(9),
         moved=np.zeros((nx, 2)), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
         normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
         g=np.zeros(nx), innovation=np.zeros((m, 2)), power=np.ones(m))

@@ -1,4 +1,4 @@
-"""The 95 % interval of the payload and its status, from the covariance and the consistency of the innovations."""
+"""The 95 % interval of the payload and its status, from covariance, moves and the consistency of the innovations."""
 
 from __future__ import annotations
 
@@ -38,6 +38,8 @@ UNKNOWN_POWER = 4.0
 the fit may be in a wrong minimum. After a fit that was given up, ``POWER_LIMIT`` takes its place."""
 WIDENING_LIMIT = 4.0
 """Factor on the payload's deviation, by the moves and the misfit, beyond which the model does not fit."""
+FREE_BIAS = 2.0
+"""Standard deviations that an empty arm may seem to hold before the interval is widened."""
 MOST_BIAS = 3.0
 """Standard deviations, with the error of its inertia among them, that an empty arm may seem to hold. Chance exceeds
 them 1 time in 370. Beyond them the arm is not the one that was described or learned, and what it catches is estimated
@@ -64,9 +66,10 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     g = moves(m)
     if fitting:  # the next step may be as long as the last one
         g = max(g, 1.0 + float(m.score[SHIFT]) ** 2)
-    widening = math.sqrt(g * max(1.0, consistency / POWER_LIMIT))
+    restless = math.sqrt(g * max(1.0, consistency / POWER_LIMIT))
+    widening = max(restless, abs(float(m.score[mem.EMPTY_ARM_BIAS])) / FREE_BIAS)
     status = Status.TRACKING
-    if consistency > POWER_LIMIT or widening > WIDENING_LIMIT or abs(m.score[mem.EXCESS_BIAS]) > MOST_BIAS:
+    if consistency > POWER_LIMIT or restless > WIDENING_LIMIT or abs(m.score[mem.EXCESS_BIAS]) > MOST_BIAS:
         status = Status.INCONSISTENT
     if m.counts[mem.SINCE_EVENT] < FEW:
         status = Status.WARMING_UP

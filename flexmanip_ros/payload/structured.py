@@ -174,6 +174,8 @@ def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterSta
         f = m.S[payload].copy()
         square = float(f @ f)
         if square > 0.0:
+            if m.counts[mem.SINCE_EVENT] > mem.ENOUGH:
+                m.score[mem.EMPTY_ARM_BIAS] = m.x[payload] / math.sqrt(square)
             if m.counts[mem.SINCE_EVENT] > mem.ENOUGH or m.counts[mem.REFITS]:  # a fit begun again is doubted sooner
                 std = math.hypot(math.sqrt(moves(m) * square), inertia_error(config, model, 0.0))
                 m.score[mem.EXCESS_BIAS] = m.x[payload] / std
@@ -189,7 +191,7 @@ def _set_arrival_cost(model: Model, m: mem.FilterState) -> None:
     _begin_horizon(model, m)
     m.counts[mem.SINCE_EVENT] = 0
     m.counts[mem.BLOCKS] = min(m.counts[mem.BLOCKS], 40)
-    m.score[:mem.EXCESS_BIAS] = 0.0
+    m.score[:mem.EMPTY_ARM_BIAS] = 0.0
     m.score[mem.DOUBT] = np.linalg.norm(m.S[model.payload]) / max(m.x[model.payload], 1e-300)
     m.noise[:, mem.WEIGHT] = 0.0
     m.power[:] = 1.0
