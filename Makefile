@@ -73,8 +73,8 @@ $(VENV)/.benchmark: requirements/benchmark.txt $(VENV)/.development
 demo: setup
 	@$(BIN)/demo $(DEMO_ARGS)
 
-# Two halves side by side, of about the same length: what runs nodes and programs, and what computes.
-RUNNING := test/ros test/cli test/view test/studies
+# Two halves side by side, of about the same length: what runs nodes, programs and tools, and what computes.
+RUNNING := test/ros test/cli test/view test/studies test/paper test/packaging
 test: setup $(VENV)/.development
 ifeq ($(strip $(PYTEST_ARGS)),)
 	@mkdir -p log; status=0; \
