@@ -89,7 +89,7 @@ endif
 test-wheel: setup $(VENV)/.development
 	@FLEXMANIP_FRESH=1 $(BIN)/python -m pytest -o faulthandler_timeout=2400 test/packaging
 
-lint: setup $(VENV)/.development
+lint: $(VENV)/.development
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
 
@@ -103,7 +103,7 @@ $(DOCS)/.ready: requirements/docs.txt
 	@touch $@
 
 # A warning is an error: a link to a page or heading that is not there, a page that is in no contents.
-docs: setup $(DOCS)/.ready
+docs: $(VENV)/.package $(DOCS)/.ready
 	@$(BIN)/python -m flexmanip_ros.cli.write_parameters
 	@$(BIN)/python benchmarks/tables.py
 	@$(BIN)/python docs/write_reference.py

@@ -15,7 +15,7 @@ from flexmanip_ros.payload import structured
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Status
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, Payload, Status
 
 COUNT, CAPTURE = 6000, 2000
 PLANT = PlantParameters()
@@ -50,6 +50,14 @@ def later(items: Sequence[JointRecord | CaptureEvent]) -> list[Estimate]:
     """Estimates from 1 s after the capture on."""
     return [one for one in pipeline.run(IdentifierParameters(), items)
             if one.stamp_ns >= (CAPTURE + 1000) * 1_000_000]
+
+
+def held(items: Sequence[JointRecord | CaptureEvent], samples: int = COUNT) -> Payload:
+    """What is known of the payload after so many samples."""
+    config, rows = IdentifierParameters(), rows_of(items).between(0, samples)
+    state = structured.advance(config, structured.init(config), rows.between(0, CAPTURE))
+    state = structured.event(config, state, CaptureEvent(CAPTURE * 1_000_000, EventKind.CAPTURE))
+    return structured.estimate(config, structured.advance(config, state, rows.since(CAPTURE)))
 
 
 @pytest.fixture(scope='module')
@@ -102,10 +110,7 @@ def test_messages_lost_at_a_step_of_the_torque_do_not_bias_the_payload(
     """Both torques change at 3 s, a second after the capture; nobody knows at which sample."""
     lost = np.zeros(COUNT, dtype=bool)
     lost[first:first + count] = True
-    config, rows = IdentifierParameters(), rows_of(surviving(messages, lost)).between(0, 4000)
-    state = structured.advance(config, structured.init(config), rows.between(0, CAPTURE))
-    state = structured.event(config, state, CaptureEvent(CAPTURE * 1_000_000, EventKind.CAPTURE))
-    found = structured.estimate(config, structured.advance(config, state, rows.since(CAPTURE)))
+    found = held(surviving(messages, lost), 4000)
     assert found.status is Status.TRACKING
     assert found.mass == pytest.approx(20.0, rel=1.5e-3)
     assert abs(found.mass - 20.0) < 3.5 * found.std < 0.1
@@ -117,8 +122,7 @@ def test_a_burst_in_which_both_torques_change_does_not_widen_the_interval_for_go
     """45 ms, with both steps at 4.5 s, hide the motion: then it is learned again, with the payload as it was known."""
     lost = np.zeros(COUNT, dtype=bool)
     lost[first:first + 46] = True
-    found, known = (items[-1].payload for items in (later(surviving(messages, lost)), whole))
-    assert found is not None
+    found, known = held(surviving(messages, lost)), whole[-1].payload
     assert known is not None
     assert found.status is Status.TRACKING
     assert abs(found.mass - 20.0) < 3.0 * found.std
@@ -129,9 +133,7 @@ def test_a_torque_without_steps_is_interpolated_over_lost_messages() -> None:
     events = (CaptureEvent(CAPTURE * 1_000_000, EventKind.CAPTURE),)
     torque = excitation.sequence(configure(ExcitationParameters, {'shape': 'multisine'}), COUNT)
     items = list(simulator.records(simulator.simulate(PLANT, torque, events), events))
-    whole, found = (later(some)[-1].payload for some in (items, surviving(items, at_random(0.05))))
-    assert whole is not None
-    assert found is not None
+    whole, found = (held(some) for some in (items, surviving(items, at_random(0.05))))
     assert found.status is Status.TRACKING
     assert abs(found.mass - 20.0) < 3.0 * found.std
     assert found.std < 1.2 * whole.std

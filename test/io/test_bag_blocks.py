@@ -170,7 +170,7 @@ def test_a_garbled_message_among_thousands_is_named_and_costs_no_other(tmp_path)
 def test_the_memory_of_reading_does_not_grow_with_the_recording(tmp_path):
     raw = joint_state_record(0)
     peaks = []
-    for count in (20_000, 60_000):
+    for count in (10_000, 30_000):
         path = tmp_path / str(count)
         with BagWriter(path, flush_period=None) as writer:
             for k in range(count):
