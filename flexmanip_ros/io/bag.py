@@ -288,6 +288,8 @@ class _Recording:
                     yield raw.topic, raw.data
         except DamagedError as err:
             self._damage = str(err)
+        except OSError as err:  # no permission to read, or a disk that was taken out
+            self._damage = err.strerror or str(err)
 
     @property
     def is_damaged(self) -> bool:

@@ -17,6 +17,7 @@ import os
 import stat
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -46,7 +47,8 @@ def write_file(path: str | Path, fill: Callable[[Any], Any]) -> None:
             fill(file)
         os.replace(partial, path)
     except OSError as err:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # a name may be too long for it
+            partial.unlink()
         raise OutputError(f"'{path}' cannot be written: {err.strerror}", 'give another place') from err
 
 

@@ -399,8 +399,10 @@ def after_rows(state: StructuredState, m: mem.FilterState, taken: Rows, table: A
     slope, peak = state.slope, np.abs(taken.u).max(axis=0)
     if state.peak.size:
         peak = np.maximum(peak, state.peak)
-    if not taken.missing[-1]:
-        slope = taken.u[-1] - (taken.u[-2] if len(taken) > 1 else state.efforts[-1])
+    measured = np.flatnonzero(taken.missing == 0)
+    if len(measured):
+        last = int(measured[-1])
+        slope = taken.u[last] - (taken.u[last - 1] if last else state.efforts[-1])
     return state._replace(memory=m, cursor=taken.until, last_ns=int(taken.stamp_ns[-1]), efforts=efforts,
                           rates=table[-1, 1 + 2 * links:1 + 3 * links].copy(), slope=slope,
                           missing=int(taken.missing[-1]), peak=peak)

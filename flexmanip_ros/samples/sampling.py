@@ -189,6 +189,7 @@ def _regular(config: IdentifierParameters, clock: Clock, block: JointBlock, firs
     sums = clock.interval_sum_ns + np.concatenate([[0], np.cumsum(intervals[:-1])])
     counts = clock.interval_count + np.arange(len(stamps))
     regular = _is_on_time(config, intervals, sums, counts) & (intervals * 1e-9 <= config.max_time_jump)  # no far jump
+    regular &= intervals > 0  # with a large gap_factor a repeated or late stamp would be on time, too
     return len(stamps) if regular.all() else int(np.argmin(regular))
 
 

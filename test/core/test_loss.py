@@ -174,3 +174,27 @@ def test_blocks_give_the_bits_of_single_messages_with_loss(messages: list[JointR
     one = one_a_stamp([*found, *some])
     assert [(e.stamp_ns, repr(e.payload), repr(e.modes)) for e in alone] == [
         (e.stamp_ns, repr(e.payload), repr(e.modes)) for e in one]
+
+
+@pytest.mark.parametrize('delay', [0, 2])
+def test_bursts_of_loss_under_a_torque_that_always_changes_give_the_same_bits_in_groups_of_any_size(
+        delay: int) -> None:
+    """How a torque changed before a gap is known by the last sample that came, wherever a group of rows ends."""
+    config = configure(IdentifierParameters, {'model_rate': 0.1, 'arm.effort_delay': delay})
+    torque = excitation.sequence(configure(ExcitationParameters, {'shape': 'multisine'}), 700)
+    lost = np.zeros(COUNT, dtype=bool)
+    for k, first in enumerate(range(25, 700, 25)):
+        lost[first:first + 1 + k % 4] = True
+    items = surviving(list(simulator.records(simulator.simulate(PLANT, torque, ()))), lost)
+    found = []
+    for group in (1, 8, 2000):
+        state = pipeline.init()
+        for item in items:
+            state, _ = pipeline.step(config, state, item, group=group)
+        state, _ = pipeline.finish(config, state)
+        assert state.payload is not None
+        assert state.payload.estimator.structured is not None
+        memory = state.payload.estimator.structured.memory
+        assert memory is not None
+        found.append((memory.x.tobytes(), memory.S.tobytes()))
+    assert found[0] == found[1] == found[2]

@@ -7,7 +7,7 @@ import pytest
 
 from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.samples import sampling
-from flexmanip_ros.types import JointRecord
+from flexmanip_ros.types import JointBlock, JointRecord
 
 
 class Seen(NamedTuple):
@@ -218,3 +218,18 @@ def test_the_default_signals_of_one_link_shrink_to_those_that_come() -> None:
     clock, samples, _ = drive([record(k, ('joint1', 'link1_bend'), velocity=[]) for k in range(30)], config)
     assert clock.outputs == ('link1_bend/position',)
     assert len(samples) == 30
+
+
+def test_blocks_drop_repeated_and_late_stamps_whatever_gap_factor_is() -> None:
+    config = IdentifierParameters(payload_method='none', gap_factor=2.5)
+    stamps = 1_000_000_000 + 1_000_000 * np.arange(200)
+    stamps[100], stamps[150] = stamps[99], stamps[149] - 300_000
+    values = np.random.default_rng(0).standard_normal((3, 200, 4))
+    block = JointBlock(('joint1', 'joint2', 'link1_bend', 'link2_bend'), stamps, *values)
+    clock, log = sampling.Clock(), sampling.EMPTY
+    for k in range(200):
+        clock, log, _ = sampling.push(config, clock, log, block.record(k))
+    at_once, rows, _ = sampling.push_whole(config, sampling.Clock(), sampling.EMPTY, block)
+    assert at_once.counters == clock.counters
+    assert at_once.counters.accepted == 198
+    assert (rows.rows(0, rows.end).stamp_ns == log.rows(0, log.end).stamp_ns).all()
