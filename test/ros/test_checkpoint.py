@@ -9,6 +9,7 @@ from ros_harness import Ros
 from flexmanip_ros import messages
 from flexmanip_ros.ros import conversions
 from flexmanip_ros.ros.demo import compare
+from flexmanip_ros.types import CaptureEvent, EventKind
 
 
 def test_an_identifier_that_is_restarted_goes_on_as_if_it_had_only_missed_samples(
@@ -62,8 +63,12 @@ def test_a_state_of_other_parameters_or_damaged_or_old_is_not_used_and_the_node_
     old = Live(ros, checkpoint_file=str(file), payload_method='none', order=6)
     assert old.node.state.counters.received == 60
     late = recording(1)[0]._replace(stamp_ns=recording(1)[0].stamp_ns + 3600 * 10**9)
+    caught = CaptureEvent(late.stamp_ns - 10**9, EventKind.CAPTURE)  # it is latched, so it comes first
+    old.events.publish(conversions.header(caught))
+    ros.wait(lambda: old.node.state.stamp_of(EventKind.CAPTURE) is not None)
     old.joint_states.publish(conversions.joint_state(late))
     ros.wait(lambda: old.node.state.counters.received == 1, what='a fresh start')
+    assert old.node.state.stamp_of(EventKind.CAPTURE) == caught.stamp_ns
     ros.remove(old.node)
     file.write_bytes(file.read_bytes()[:-7])
     damaged = Live(ros, checkpoint_file=str(file), payload_method='none', order=6)

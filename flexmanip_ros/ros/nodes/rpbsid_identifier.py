@@ -146,6 +146,9 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self._background = Deferred()
         self._checkpoints: CheckpointWriter | None = None
         self._resumed = False
+        """Whether the state is a saved one whose age is not known yet, as no joint state has come."""
+        self._heard: list[CaptureEvent] = []
+        """The events since then; they count whatever the age of the saved state is."""
         self._logged: dict[str, object] = {}
         """What was last logged, by kind: status, trusted payload and missing announcement."""
         self._latest: JointRecord | None = None
@@ -180,7 +183,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self.get_logger().warning(str(error))
             return
         if state is not None:
-            self.state, self._resumed = state, True
+            self.state, self._resumed, self._heard = state, True, []
             self.estimate = state.model.estimate if state.model is not None else None
             self.get_logger().info(f'resumed after {state.counters.accepted} samples')
 
@@ -289,6 +292,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self._reject(topic, str(error))
             return
         self.get_logger().info(f'{topic}: {event.kind.value} at {event.stamp_ns * 1e-9:.6f}')
+        if self._resumed:
+            self._heard.append(event)
         self._step(event)
 
     def _step(self, item: JointBlock | CaptureEvent) -> None:
@@ -332,11 +337,13 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def _check_age(self, stamp_ns: int) -> None:
         """Drop a saved state that is too old for these samples: the arm may hold something else by now."""
-        self._resumed = False
+        heard, self._resumed, self._heard = self._heard, False, []
         if too_old(self.config, self.state, stamp_ns):
             self.get_logger().warning(
                 'the saved state is older than checkpoint_max_age; the identifier starts with nothing known')
             self._forget()
+            for event in heard:
+                self._step(event)
 
     def _reject(self, reason: str, words: str, count: int = 1) -> None:
         self.rejected += count
