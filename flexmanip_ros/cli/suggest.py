@@ -182,6 +182,7 @@ def choose_signals(signals: list[Found], given: Mapping[str, Any]
     is_arm = any(name.startswith('arm.') for name in given)
     chosen['payload_method'] = given.get('payload_method', DEFAULTS.payload_method if is_arm else 'none')
     chosen['angles'] = given.get('angles', DEFAULTS.angles if chosen['payload_method'] != 'none' else ())
+    _check_there('angles', tuple(name for name in chosen['angles'] if name), signals)
     reasons.append(('payload_method', chosen['payload_method'] + (
         ': given' if 'payload_method' in given else ': the parameters arm.* are given' if is_arm
         else ': a recording does not tell the parameters arm.*')))

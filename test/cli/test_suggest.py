@@ -167,9 +167,14 @@ def test_signals_whose_names_say_what_they_are_are_taken_by_name():
 
 
 def test_a_given_arm_keeps_its_payload_method():
-    signals = _found('joint1/effort', 'joint2/effort', 'link1_bend/position')
+    signals = _found('joint1/effort', 'joint2/effort', 'joint1/position', 'joint2/position', 'link1_bend/position')
     assert choose_signals(signals, {'arm.tip_mass': 3.0})[0]['payload_method'] == 'structured'
     assert choose_signals(signals, {})[0]['payload_method'] == 'none'
+
+
+def test_a_given_arm_whose_angles_are_not_there_is_told_so():
+    with pytest.raises(ParameterError, match=r"'joint1/position' of parameter 'angles' is not in the messages"):
+        choose_signals(_found('shoulder/effort', 'shoulder/position'), {'arm.tip_mass': 3.0})
 
 
 def test_without_an_effort_that_moves_the_inputs_are_asked_for():
