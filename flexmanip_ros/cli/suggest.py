@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from flexmanip_ros import pipeline
 from flexmanip_ros.cli import console
 from flexmanip_ros.errors import BagError, ParameterError
 from flexmanip_ros.io import bag
@@ -96,7 +97,7 @@ def suggest(source: str, place: str, given: Mapping[str, Any], topics: bag.Topic
         recording = _recording(source, topics, until_s, shown)
     signals = observe(recording.blocks)
     chosen, reasons = choose_signals(signals, given)
-    config = configure(IdentifierParameters, chosen)
+    config = configure(IdentifierParameters, {**given, **chosen})
     collected, dt = _collect(config, recording)
     for name, values in (('inputs', collected.u), ('outputs', collected.y)):
         if not np.any(np.ptp(values, axis=0) > 0.0):
@@ -182,7 +183,6 @@ def choose_signals(signals: list[Found], given: Mapping[str, Any]
     is_arm = any(name.startswith('arm.') for name in given)
     chosen['payload_method'] = given.get('payload_method', DEFAULTS.payload_method if is_arm else 'none')
     chosen['angles'] = given.get('angles', DEFAULTS.angles if chosen['payload_method'] != 'none' else ())
-    _check_there('angles', tuple(name for name in chosen['angles'] if name), signals)
     reasons.append(('payload_method', chosen['payload_method'] + (
         ': given' if 'payload_method' in given else ': the parameters arm.* are given' if is_arm
         else ': a recording does not tell the parameters arm.*')))
@@ -224,6 +224,7 @@ def _collect(config: IdentifierParameters, recording: _Recording) -> tuple[Signa
     for block in recording.blocks:
         clock, log, _ = sampling.push_whole(config, clock, log, block)
     clock, log, _ = sampling.flush(config, clock, log)
+    pipeline.check_used(pipeline.State(clock))
     whole = sampling.signals(config, clock, log)
     if len(whole.stamp_ns) < 2:
         raise ParameterError(f'{len(whole.stamp_ns)} samples are too few to choose parameters from',

@@ -137,6 +137,7 @@ def test_a_recording_of_other_joints_names_them_and_the_command(recording, capsy
 @pytest.mark.parametrize(('arguments', 'words'), [
     (['--set=inputs=[motor/effort]'], 'the signals there are: gauge/effort'),
     (['--set=inputs=[lamp/effort]'], 'no signal of inputs moves'),
+    (['--set=arm.tip_mass=3.0'], "'joint1/position' of parameter 'angles' is not in the messages"),
     (['--set=ordre=4'], "did you mean 'order'"),
     (['--set=order=1000'], "parameter 'order'"),
     (['--validate-from', '0'], 'no sample before 0 s'),
@@ -167,14 +168,18 @@ def test_signals_whose_names_say_what_they_are_are_taken_by_name():
 
 
 def test_a_given_arm_keeps_its_payload_method():
-    signals = _found('joint1/effort', 'joint2/effort', 'joint1/position', 'joint2/position', 'link1_bend/position')
+    signals = _found('joint1/effort', 'joint2/effort', 'link1_bend/position')
     assert choose_signals(signals, {'arm.tip_mass': 3.0})[0]['payload_method'] == 'structured'
     assert choose_signals(signals, {})[0]['payload_method'] == 'none'
 
 
-def test_a_given_arm_whose_angles_are_not_there_is_told_so():
-    with pytest.raises(ParameterError, match=r"'joint1/position' of parameter 'angles' is not in the messages"):
-        choose_signals(_found('shoulder/effort', 'shoulder/position'), {'arm.tip_mass': 3.0})
+def test_an_arm_of_one_link_needs_no_angle_of_a_second(tmp_path, capsys):
+    path = _bag(tmp_path / 'bag', tuple(
+        item._replace(names=('joint1', 'link1_bend', 'lamp')) for item in _machine(2500)))
+    place = tmp_path / 'one.yaml'
+    _json(capsys, path, '--suggest', place, '--set=arm.link_length=[0.41]', '--set=arm.linear_density=[1.0]',
+          '--set=arm.bending_stiffness=[5.0]')
+    assert load(IdentifierParameters, 'rpbsid_identifier', place).payload_method == 'structured'
 
 
 def test_without_an_effort_that_moves_the_inputs_are_asked_for():
