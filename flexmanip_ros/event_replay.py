@@ -116,12 +116,15 @@ def insert(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog,
            first_ns: int, background: Background) -> EventReplay[E]:
     """Take an event: let it wait for its stamp, rewind to it, or apply it now where it is too old for a rewind.
 
-    first_ns: stamp of the first sample [ns].
+    One that is too old, and has an event after it that was applied, is only counted: what the arm holds now is known
+    from the later event. first_ns: stamp of the first sample [ns].
     """
     previous = replay.stamp_of(event.kind)
     if previous is not None and abs(event.stamp_ns - previous) <= config.event_merge_time * 1e9:
         return replay._replace(repeated_events=replay.repeated_events + 1)
-    replay = replay._replace(latest=(*(e for e in replay.latest if e.kind is not event.kind), event))
+    superseded = any(event.stamp_ns < taken.stamp_ns <= replay.last_ns for taken in replay.latest)
+    before = replay.latest
+    replay = replay._replace(latest=(*(e for e in before if e.kind is not event.kind), event))
     if event.stamp_ns > replay.last_ns:
         return _wait(replay, event)
     if event.stamp_ns > replay.snapshots[0].before_ns:
@@ -129,6 +132,8 @@ def insert(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog,
     replay = replay._replace(late_events=replay.late_events + 1)
     if all(taken.stamp_ns <= first_ns for taken in replay.latest):
         return _restart(config, replay)
+    if superseded:
+        return replay._replace(latest=before)
     late_ns = replay.last_ns + 1 - event.stamp_ns
     return _wait(replay, event._replace(stamp_ns=replay.last_ns + 1, std_s=math.hypot(event.std_s, late_ns * 1e-9)))
 

@@ -122,8 +122,8 @@ class IdentifierParameters:
         5.0, 'models and modes a second; just after an event one comes with every estimate', unit='Hz', low=0.01,
         high=10000.0, live=True)
     gap_factor: float = parameter(
-        1.5, 'an interval between stamps longer than this many sample times is a gap, and so is one shorter by this '
-        'factor', low=1.05, high=1000.0, live=True)
+        1.5, 'an interval between stamps longer than this many sample times is a gap, and so is one shorter than 2 '
+        'minus this many', low=1.05, high=1000.0, live=True)
     max_gap: float = parameter(
         0.2, 'samples that are missing for longer than this begin the motion anew; over fewer the estimators go on',
         unit='s', low=0.0, high=10.0, live=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from flexmanip_ros.parameters import IdentifierParameters, flatten
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, flatten, leaves
 from flexmanip_ros.payload.interval import moves
 from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.payload.structured import StructuredState
@@ -27,8 +27,9 @@ FIELDS = {
     Kind.BEND_OFFSET: 'bend_offset', Kind.TORQUE_DELAY: 'torque_delay', Kind.TORQUE_LAG: 'torque_lag',
     Kind.BEND_DELAY: 'bend_delay'}
 """The parameter arm.* that takes it."""
-POSITIVE = (Kind.VISCOUS, Kind.COULOMB, Kind.ROTOR, Kind.TORQUE_DELAY, Kind.TORQUE_LAG)
-"""Kinds that no parameter can give below zero."""
+RANGES = {leaf.name: (-np.inf if leaf.low is None else leaf.low, np.inf if leaf.high is None else leaf.high)
+          for leaf in leaves(ArmParameters)}
+"""Least and greatest value of each parameter arm.*."""
 
 
 def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple[ArmParameter, ...]:
@@ -69,7 +70,8 @@ def as_parameters(config: IdentifierParameters, found: Sequence[ArmParameter]) -
     """Return every parameter of the arm by dotted name: as it was found, and what it does not teach as it was given.
 
     The damping ratio is one parameter: the mean of the links, each weighted by its information. A delay of the bends
-    that is less than two deviations below zero is none.
+    that is less than two deviations below zero is none. A value beyond the range that is declared for its parameter
+    becomes the nearest one in it, as no node would take it.
     """
     by_name = {one.name: one for one in found}
     values: dict[str, Any] = flatten(config.arm, 'arm.')
@@ -78,18 +80,18 @@ def as_parameters(config: IdentifierParameters, found: Sequence[ArmParameter]) -
         each = given if isinstance(given, tuple) else (given,)
         here = [by_name.get(NAMES[kind].format(link + 1)) for link in range(len(each))]
         if any(here):
-            new = tuple(before if one is None else float(f'{_possible(kind, one):.6g}')
+            new = tuple(before if one is None else _possible(field, one)
                         for one, before in zip(here, each, strict=True))
             values[f'arm.{field}'] = new if isinstance(given, tuple) else new[0]
     ratios = [one for one in found if one.name.endswith('_damping_ratio')]
     if ratios:
         weights = np.array([one.std for one in ratios]) ** -2.0
         mean = float(weights @ np.array([one.value for one in ratios]) / weights.sum())
-        values['arm.damping_ratio'] = max(float(f'{mean:.6g}'), 0.0)
+        values['arm.damping_ratio'] = _possible('damping_ratio', ArmParameter('', mean, 0.0))
     return values
 
 
-def _possible(kind: Kind, one: ArmParameter) -> float:
-    """Return the value as a parameter can have it."""
-    nearly_zero = kind is Kind.BEND_DELAY and one.value > -2.0 * one.std
-    return max(one.value, 0.0) if kind in POSITIVE or nearly_zero else one.value
+def _possible(field: str, one: ArmParameter) -> float:
+    """Return the value to six digits, within the range of its parameter."""
+    nearly_zero = field == 'bend_delay' and -2.0 * one.std < one.value < 0.0
+    return float(np.clip(0.0 if nearly_zero else float(f'{one.value:.6g}'), *RANGES[field]))

@@ -9,7 +9,7 @@ import textwrap
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any, Generic, TypeVar
 
@@ -105,8 +105,8 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
     def deactivated(self) -> None:
         """Cease to work; what was published before stays. ``active`` becomes false after this call."""
 
-    def configuration_changed(self, config: Config) -> None:
-        """Apply parameters that were changed while the node runs."""
+    def configuration_changed(self, config: Config, names: Collection[str]) -> None:
+        """Apply parameters of these names that were set while the node runs, to whatever values."""
 
     def report(self, report: Report) -> None:
         """Fill the node's diagnostic entry; never called before ``make_entities``."""

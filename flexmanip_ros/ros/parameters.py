@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -33,11 +33,11 @@ _LARGEST_INT = 2**63 - 1
 class NodeParameters(Generic[Config]):
     """The parameters of one node, kept as a valid configuration at all times.
 
-    ``on_change`` is called with the new configuration after a set of changes was accepted.
+    ``on_change`` is called after a set of changes was accepted, with the new configuration and the names that were set.
     """
 
     def __init__(
-        self, node: Node, cls: type[Config], on_change: Callable[[Config], None] | None = None
+        self, node: Node, cls: type[Config], on_change: Callable[[Config, Collection[str]], None] | None = None
     ) -> None:
         """Declare every parameter of ``cls``; raises ParameterError naming the one that is wrong."""
         self._cls = cls
@@ -62,11 +62,12 @@ class NodeParameters(Generic[Config]):
         return SetParametersResult(successful=True)
 
     def _apply(self, changes: list[Parameter]) -> None:
-        if not self._changed(changes):
+        names = self._changed(changes).keys()
+        if not names:
             return
         self.config = self._candidate(changes)
         if self._on_change is not None:
-            self._on_change(self.config)
+            self._on_change(self.config, names)
 
 
 def descriptor(leaf: Leaf) -> ParameterDescriptor:

@@ -115,6 +115,17 @@ def test_an_event_too_old_to_go_back_for_is_applied_at_once_and_counted() -> Non
     assert taken.std_s == pytest.approx((taken.stamp_ns - 100 * MS) * 1e-9)  # it is applied so much too late
 
 
+def test_an_event_too_old_to_go_back_for_does_not_undo_a_later_one() -> None:
+    items = with_event(records(700), 200.0, 200)
+    release = CaptureEvent(100 * MS, EventKind.RELEASE)
+    state, found = step_through([*items[:600], release, *items[600:]])
+    _, without = step_through(items)
+    assert state.payload is not None
+    assert state.payload.late_events == 1
+    assert state.payload.stamp_of(EventKind.RELEASE) is None
+    assert [one.payload for one in found] == [one.payload for one in without]
+
+
 def test_an_event_announced_twice_counts_once() -> None:
     items = with_event(with_event(records(300), 200.0, 150), 200.0, 150)
     state, twice = step_through(items)

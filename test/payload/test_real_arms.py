@@ -21,8 +21,8 @@ from flexmanip_ros.io import bag
 from flexmanip_ros.io.parameter_file import read
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
 from flexmanip_ros.payload import structured
-from flexmanip_ros.payload.arm_parameters import taught
-from flexmanip_ros.types import Payload, Status
+from flexmanip_ros.payload.arm_parameters import as_parameters, taught
+from flexmanip_ros.types import ArmParameter, Payload, Status
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -102,6 +102,16 @@ def test_a_floating_arm_with_every_fault_learns_frictions_that_can_be_and_knows_
     learned = [one for one in taught(config, state) if 'friction' in one.name]
     assert len(learned) == 4
     assert all(one.value > -3.5 * one.std for one in learned)
+
+
+def test_what_is_saved_of_an_arm_is_within_the_ranges_of_its_parameters() -> None:
+    far = {'link1_bending_stiffness': -1.0, 'joint1_torque_lag': 0.4, 'torque_delay': 0.5, 'bend_delay': -0.1,
+           'link2_bend_gain': 50.0, 'joint2_torque_gain': 0.01, 'link1_damping_ratio': 1.8,
+           'joint1_rotor_inertia': -0.2}
+    saved = as_parameters(IdentifierParameters(), [ArmParameter(name, value, 1e-3) for name, value in far.items()])
+    config = configure(ArmParameters, {name.removeprefix('arm.'): value for name, value in saved.items()})
+    assert (config.torque_delay, config.bend_delay, config.damping_ratio) == (0.2, -0.02, 0.99)
+    assert (config.torque_lag, config.rotor_inertia) == ((0.1, 0.0), (0.0, 0.0))
 
 
 def test_hubs_do_not_bias_a_light_payload() -> None:

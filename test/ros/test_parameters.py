@@ -92,13 +92,13 @@ def test_a_parameter_of_another_node_of_the_package_is_let_pass(ros: Ros) -> Non
 
 def test_a_set_of_changes_is_taken_as_a_whole_or_refused_with_the_reason(ros: Ros) -> None:
     node = ros.add(Node('declaring', context=ros.context))
-    seen: list[ExcitationParameters] = []
-    parameters = NodeParameters(node, ExcitationParameters, seen.append)
+    seen: list[tuple[ExcitationParameters, list[str]]] = []
+    parameters = NodeParameters(node, ExcitationParameters, lambda config, names: seen.append((config, sorted(names))))
     good = [Parameter('amplitude', value=[1.0, 2.0]), Parameter('offset', value=[0.5, 0.5])]
     request = SetParametersAtomically.Request(parameters=[item.to_parameter_msg() for item in good])
     assert ros.call(SetParametersAtomically, 'declaring/set_parameters_atomically', request).result.successful
     assert (parameters.config.amplitude, parameters.config.offset) == ((1.0, 2.0), (0.5, 0.5))
-    assert seen == [parameters.config]
+    assert seen == [(parameters.config, ['amplitude', 'offset'])]
     bad = [Parameter('offset', value=[0.0, 0.0]), Parameter('amplitude', value=[-1.0, 2.0])]
     request = SetParametersAtomically.Request(parameters=[item.to_parameter_msg() for item in bad])
     result = ros.call(SetParametersAtomically, 'declaring/set_parameters_atomically', request).result

@@ -142,6 +142,35 @@ def test_the_arm_is_brought_to_a_new_setpoint_live(ros: Ros) -> None:
     assert plant.dropped_commands == 0
 
 
+def test_a_setpoint_ends_holding_the_present_angles_whatever_its_value_and_also_before_activation(ros: Ros) -> None:
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
+    node = start(ros)
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+
+    def sample(k: int) -> None:
+        before = len(heard)
+        states.publish(joint_state(k))
+        ros.wait(lambda: len(heard) == before + 1)
+
+    def set_default() -> None:
+        (result,) = node.set_parameters([Parameter('setpoint', value=[0.0, 0.0])])
+        assert result.successful
+
+    sample(0)
+    assert node.state.setpoint is None
+    set_default()
+    sample(1)
+    assert node.state.setpoint.tolist() == [0.0, 0.0]
+    for again, expected in ((lambda: None, None), (set_default, [0.0, 0.0])):
+        before = len(heard)
+        node.trigger_deactivate()
+        ros.wait(lambda before=before: len(heard) == before + 1, what='the zero torque')
+        again()
+        node.trigger_activate()
+        sample(2)
+        assert (None if node.state.setpoint is None else node.state.setpoint.tolist()) == expected
+
+
 def test_a_parameter_that_is_no_setpoint_moves_nothing(ros: Ros) -> None:
     heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
     node = start(ros, setpoint=[0.5, 0.3], hold_present=False)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,6 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._arrived = np.inf
         self._meter = Meter()
         self._reader = JointStateReader()
-        self._setpoint = self.config.setpoint
         self._goal: Array | None = None
         self._names: tuple[str, ...] = ()
         self._places: list[int] = []
@@ -83,20 +83,21 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         return f'{names} at {self.config.rate:g} Hz'
 
     def activated(self) -> None:
-        """Hold the joints from the next sample on."""
+        """Hold the joints from the next sample on, or go to the setpoint that was set since the node was inactive."""
         self.state = controller.init(self.config)
-        self._last_ns, self._arrived, self._goal = None, np.inf, None
+        self._last_ns, self._arrived = None, np.inf
         if self._estimate is not None:
             self._judge(self._estimate)
 
     def deactivated(self) -> None:
         """Send zero torque once."""
+        self._goal = None
         self._send(np.zeros(len(self.config.joints)))
 
-    def configuration_changed(self, config: ControllerParameters) -> None:
-        """Go to a new setpoint with the next sample, as a parameter may be set while another thread takes a sample."""
-        if config.setpoint != self._setpoint:
-            self._setpoint, self._goal = config.setpoint, np.asarray(config.setpoint)
+    def configuration_changed(self, config: ControllerParameters, names: Collection[str]) -> None:
+        """Go to a setpoint with the next sample, as a parameter may be set while another thread takes a sample."""
+        if 'setpoint' in names:
+            self._goal = np.asarray(config.setpoint)
 
     def _on_joint_states(self, raw: bytes) -> None:
         if not self.active or self.state is None:

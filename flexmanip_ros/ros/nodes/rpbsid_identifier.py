@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import partial
 from itertools import chain, islice
 from typing import Any
@@ -208,7 +208,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self._checkpoints.join()
             self._checkpoints.save(self.config, self.state)
 
-    def configuration_changed(self, config: IdentifierParameters) -> None:
+    def configuration_changed(self, config: IdentifierParameters, names: Collection[str]) -> None:
         """Continue with the changed parameters; the samples before the change are taken with the former ones."""
         if self.active:
             self._take_samples()
