@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, flatten, leaves
+from flexmanip_ros.payload.filter_state import HELD, SANDWICH
 from flexmanip_ros.payload.interval import moves
 from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.payload.structured import StructuredState
@@ -36,13 +37,15 @@ def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple
     """Return value and standard deviation of each parameter that ``payload.learn`` names, in SI units; empty before.
 
     A parameter that was taken as known, as the simplest arm fits, has its given value and its prior deviation. Where
-    the parameters move further than their variances say, the deviations are larger by that.
+    the parameters move further than their variances say, or the residuals of the empty arm's fit are no white noise,
+    the deviations are larger by that.
     """
     if state is None or state.model is None or state.memory is None:
         return ()
     model, m = state.model, state.memory
+    factor = moves(m) if m.counts[HELD] else max(moves(m), float(m.score[SANDWICH]))
     found = []
-    x, S = m.x[model.payload:].copy(), math.sqrt(moves(m)) * m.S[model.payload:]
+    x, S = m.x[model.payload:].copy(), math.sqrt(factor) * m.S[model.payload:]
     late = model.motion.kind == Kind.TORQUE_LAG
     mirrored = late & (x < 0.0)
     if mirrored.any():  # what the filter means by a lag below zero, see ``late_torque``

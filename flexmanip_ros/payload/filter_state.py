@@ -26,7 +26,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
  IN_SPECTRUM, SPECTRA) = range(22)
 # Elements of ``score``.
-SHIFT, DOUBT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES = range(9)
+SHIFT, DOUBT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES, SANDWICH = range(10)
 
 
 class FilterState(NamedTuple):
@@ -56,13 +56,14 @@ class FilterState(NamedTuple):
     reads the same samples, as it has not converged; TRIED: iterations over the same samples so far; REFITS: fits begun
     again since the event."""
     score: Array
-    """(9,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
+    """(10,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
     squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
     EMPTY_ARM_BIAS: payload that the arm seemed to hold before the event, when it was empty, in the filter's standard
     deviations; EXCESS_BIAS: the same over the deviation that its moves give, with the error of the inertia; COST: of
     the samples read in this iteration, COST_BEFORE: of the last accepted one; LAMBDA: damping of Levenberg and
     Marquardt; MOVES: mean of the squared moves of payload and arm parameters, over the variance that the filter says,
-    see ``judge_moves``."""
+    see ``judge_moves``; SANDWICH: factor, at least 1, by which the variances of the last fit of the empty arm are too
+    small, see ``sandwich``."""
     moved: Array
     """(nx, 2) mean and variance of payload and arm parameters when their moves were last judged, with the process noise
     since then in the variance; see ``judge_moves``."""
@@ -86,6 +87,10 @@ class FilterState(NamedTuple):
     """(nx, nx) information gathered in the iteration."""
     g: Array
     """(nx,) gradient gathered in the iteration."""
+    batch: Array
+    """(nx,) that gradient at the end of the last batch of samples."""
+    B: Array
+    """(nx, nx) sum over the batches of b b', b the part of the gradient that comes from one batch; lower triangle."""
     innovation: Array
     """(m, 2) the latest, and its variance before the update."""
     power: Array
@@ -96,10 +101,10 @@ def memory(nx: int, m: int) -> FilterState:
     """Allocate for nx states and m sensors."""
     return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)),
-        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(22, dtype=np.int64), score=np.zeros(9),
+        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(22, dtype=np.int64), score=np.zeros(10),
         moved=np.zeros((nx, 2)), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
         normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
-        g=np.zeros(nx), innovation=np.zeros((m, 2)), power=np.ones(m))
+        g=np.zeros(nx), batch=np.zeros(nx), B=np.zeros((nx, nx)), innovation=np.zeros((m, 2)), power=np.ones(m))
 
 
 def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
@@ -108,11 +113,11 @@ def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
     horizon False: what belongs to a complete moving horizon is shared; then only an event writes it.
     """
     (x, S, noise, recent, spectrum, counts, score, moved, x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g,
-     innovation, power) = state
+     batch, B, innovation, power) = state
     if horizon or counts[STORED] < HORIZON:
         x0, S0, xi = x0.copy(), S0.copy(), xi.copy()
         accepted, normal, gradient = accepted.copy(), normal.copy(), gradient.copy()
-        xr, Sr, N, g = xr.copy(), Sr.copy(), N.copy(), g.copy()
+        xr, Sr, N, g, batch, B = xr.copy(), Sr.copy(), N.copy(), g.copy(), batch.copy(), B.copy()
     return FilterState(
         x.copy(), S.copy(), noise.copy(), recent.copy(), spectrum.copy(), counts.copy(), score.copy(), moved.copy(),
-        x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g, innovation.copy(), power.copy())
+        x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g, batch, B, innovation.copy(), power.copy())

@@ -37,6 +37,7 @@ from flexmanip_ros.payload.filter_state import (
     POWER,
     REFITS,
     REJECTED,
+    SANDWICH,
     SHIFT,
     SINCE_EVENT,
     SINCE_NOISE,
@@ -47,6 +48,7 @@ from flexmanip_ros.payload.filter_state import (
     WHITE,
 )
 from flexmanip_ros.payload.measurement_update import (
+    BATCH,
     judge_moves,
     learn_noise,
     measure,
@@ -139,11 +141,13 @@ def begin_iteration(m: FilterState) -> None:
     m.score[COST] = 0.0
     for i in range(nx):
         m.g[i] = 0.0
+        m.batch[i] = 0.0
         m.xr[i] = m.x0[i] + dot(m.S0[i], m.xi)
         m.score[COST] += m.xi[i] * m.xi[i]
         for c in range(nx):
             m.Sr[i, c] = m.S0[i, c]
             m.N[i, c] = 0.0
+            m.B[i, c] = 0.0
     for i in range(m.noise.shape[0]):
         m.noise[i, FIT] = 0.0
     m.counts[ITERATED] = 0
@@ -182,6 +186,14 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
             for b in range(a + 1):
                 m.N[a, b] += scaled * f[b]
     m.counts[ITERATED] += 1
+    if measured and m.counts[HELD] == 0 and m.counts[MEASURED] % (BATCH * sensors.block) == 0:
+        for a in range(used):
+            m.batch[a] = m.g[a] - m.batch[a]
+        for a in range(used):
+            for b in range(a + 1):
+                m.B[a, b] += m.batch[a] * m.batch[b]
+        for a in range(used):
+            m.batch[a] = m.g[a]
     if not m.score[COST] < LOST * (nx + m.noise.shape[0] * m.counts[ITERATED]):
         return 0
     # the cost only grows: a step may be rejected before its last sample
@@ -229,6 +241,10 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
             forward(m.N, m.Sr[i])
             for c in range(nx):
                 m.S[i, c] = m.Sr[i, c]
+        if m.counts[HELD] == 0:
+            m.score[SANDWICH] = sandwich(sensors, m)
+        else:
+            widen_by_empty_arm(sensors, m)
         variance = dot(m.S[payload], m.S[payload])
         m.score[SHIFT] = abs(shift) / np.sqrt(max(variance, 1e-300))
         m.score[DOUBT] = np.sqrt(variance + shift * shift) / max(m.x[payload], 1e-300)
@@ -236,6 +252,60 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
                 and phase_std(motion, m, sensors.period * m.counts[ITERATED]) < LINEAR):
             m.counts[STORED] = HORIZON
     return True
+
+
+@inner
+def sandwich(sensors: MeasurementModel, m: FilterState) -> float:
+    """Return the factor, at least 1, by which the variances of a fit are too small; m.N: factor of I + N.
+
+    The variance by batch means (sandwich of Huber and White): where the residuals are no white noise, the gradient is
+    a sum of parts b of batches that are nearly independent, so the variance of xi by them is W B W, W = (I + N)^-1,
+    B = sum b b'. The fit says W N W instead. The factor is the mean over payload and arm parameters of the ratio.
+    """
+    nx, row = m.x.size, sensors.f
+    length = BATCH * sensors.block
+    whole = m.counts[MEASURED] // length
+    if whole == 0:
+        return 1.0
+    total, known = 0.0, 0
+    for i in range(2 * sensors.H.shape[1], nx):
+        for c in range(nx):
+            row[c] = m.S0[i, c]
+        forward(m.N, row)
+        backward(m.N, row)
+        said = dot(row, m.S0[i]) - dot(row, row)
+        found = 0.0
+        for a in range(nx):
+            for b in range(a):
+                found += 2.0 * row[a] * m.B[a, b] * row[b]
+            found += row[a] * m.B[a, a] * row[a]
+        if said > 0.0:
+            total += found / said
+            known += 1
+    factor: float = total / max(known, 1) * m.counts[MEASURED] / (whole * length)
+    return max(1.0, factor)
+
+
+@inner
+def widen_by_empty_arm(sensors: MeasurementModel, m: FilterState) -> None:
+    """Add to the covariance of a fit with an object what its prior lacks: the variances of the empty arm's fit.
+
+    If these are too small by the factor g, the prior of xi has the covariance g I, and xi the variance W + (g - 1) W W,
+    W = (I + N)^-1. The estimate stays, as the fit weighs the prior by what the empty arm's fit said.
+    """
+    nx = m.x.size
+    root = np.sqrt(max(m.score[SANDWICH] - 1.0, 0.0))
+    if root == 0.0:
+        return
+    for i in range(nx):
+        for c in range(sensors.noise.shape[1]):
+            sensors.noise[i, c] = 0.0
+        for c in range(nx):
+            sensors.f[c] = m.S[i, c]
+        backward(m.N, sensors.f)
+        for c in range(nx):
+            sensors.noise[i, c] = root * sensors.f[c]
+    absorb_noise(m.S, sensors.noise, sensors.W)
 
 
 @inner
