@@ -54,9 +54,9 @@ def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple
         S[delay] += 2.0 * S[mirrored].sum(axis=0) / late.sum()
         x[mirrored] *= -1.0
     for c, (kind, link) in enumerate(zip(map(Kind, model.motion.kind), model.motion.link.tolist(), strict=True)):
-        if kind not in NAMES or not model.prior[c]:
+        if kind not in NAMES or not model.motion.prior[c]:
             continue
-        value, std = float(x[c]), float(np.linalg.norm(S[c])) or float(model.prior[c])
+        value, std = float(x[c]), float(np.linalg.norm(S[c])) or float(model.motion.prior[c])
         if kind is Kind.STIFFNESS:
             value = config.arm.bending_stiffness[link] * float(np.exp(value))
             std *= value

@@ -215,7 +215,7 @@ def _quantities(config: IdentifierParameters, model: Model, x: Array, body: Arra
     motion, first = model.motion, 2 * model.motion.arm.stiffness.size
     unit, found = np.eye(x.size + 3), {}
     for c, (kind, link) in enumerate(zip(map(Kind, motion.kind), motion.link.tolist(), strict=True)):
-        if kind in NAMES and model.prior[c]:
+        if kind in NAMES and model.motion.prior[c]:
             scale = {Kind.STIFFNESS: config.arm.bending_stiffness, Kind.TORQUE_GAIN: config.arm.torque_gain,
                      Kind.BEND_GAIN: config.arm.bend_gain}.get(kind, (1.0, 1.0))[link]
             found[NAMES[kind].format(link + 1)] = scale * unit[first + c]

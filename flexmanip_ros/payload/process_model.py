@@ -100,6 +100,10 @@ class ProcessModel(NamedTuple):
     """(np,) what each entry of p is."""
     link: NDArray[np.int64]
     """(np,) number of the link or joint that each entry of p belongs to."""
+    prior: Array
+    """(np,) prior standard deviation of each entry of p."""
+    given: Array
+    """(np,) prior mean of each."""
     frozen: bool
     """Keep the mass matrix of the working point (a linear plant) instead of following the configuration."""
     M0: Array

@@ -135,10 +135,6 @@ class Model(NamedTuple):
     """Indices of the angles that are appended to the outputs."""
     slowest: float
     """Lowest pinned frequency of a link [Hz]."""
-    prior: Array
-    """(np,) prior standard deviation of each entry of p."""
-    given: Array
-    """(np,) prior mean of each."""
 
     @property
     def payload(self) -> int:
@@ -164,8 +160,7 @@ def build(config: IdentifierParameters) -> Model | None:
                  or role.link + 2 * (role.quantity // 2) not in measured)
     roles = tuple(known.outputs[i] for i in kept) + tuple(Role(Quantity.ANGLE, i) for i in extra)
     model = motion(config)
-    return Model(model, roles, kept, extra, min(pinned_frequencies(config.arm)), priors(config, model),
-                 _given(config.arm, model))
+    return Model(model, roles, kept, extra, min(pinned_frequencies(config.arm)))
 
 
 def pinned_frequencies(arm: ArmParameters) -> tuple[float, ...]:
@@ -220,9 +215,10 @@ def motion(config: IdentifierParameters) -> ProcessModel:
     if frozen:  # no forces of higher order than the displacements
         arm = arm._replace(along=np.zeros_like(arm.along))
     lightest = config.arm.tip_mass + config.arm.linear_density[-1] * config.arm.link_length[-1] / 3
-    return ProcessModel(
+    made = ProcessModel(
         arm=arm, work=workspace(nominal), kind=np.array([kind for kind, _ in kinds], dtype=np.int64),
-        link=np.array([link for _, link in kinds], dtype=np.int64), frozen=frozen,
+        link=np.array([link for _, link in kinds], dtype=np.int64), prior=np.zeros(size), given=np.zeros(size),
+        frozen=frozen,
         M0=np.zeros((n, n)), Mp=np.zeros((4, n, n)), stiffness=nominal.stiffness, damping=unit, rotary=nominal.rotary,
         scale=lightest, least=_least(nominal, lightest),
         least_rotor=_least_rotor(nominal), substeps=STEP_ANGLE / fastest_mode(config.arm), payload=np.zeros(4),
@@ -232,6 +228,7 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         k=np.zeros((20, n)), dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)),
         G=np.zeros((n, 2 * size)), F=np.zeros((n, 2 * n)), X=np.zeros((2 * n, 2 * n)), Y=np.zeros((n, n)),
         scratch=spread_scratch(n, size, nx))
+    return made._replace(prior=priors(config, made), given=_given(config.arm, made))
 
 
 def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Array) -> MeasurementModel:
@@ -261,7 +258,8 @@ def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Ar
 
 def torque_reach(model: Model, dt: float) -> int:
     """Return how many efforts, one a sample time dt [s], the torques may depend on: those of the prior, at most."""
-    latest = {kind: float(np.max((model.given + 3.0 * model.prior)[model.motion.kind == kind], initial=0.0))
+    motion = model.motion
+    latest = {kind: float(np.max((motion.given + 3.0 * motion.prior)[motion.kind == kind], initial=0.0))
               for kind in (Kind.TORQUE_DELAY, Kind.TORQUE_LAG)}
     return min(efforts_needed(latest[Kind.TORQUE_DELAY], latest[Kind.TORQUE_LAG], dt), MOST_EFFORTS)
 
@@ -404,7 +402,7 @@ def first(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Arr
             shape = arm.output[links + role.link, links + role.link * k]
             m.x[links + role.link * k] = y[i] * shape / (shape ** 2 + 0.1)
     m.x[:links] = chords(config.arm, angles)
-    m.x[2 * n:] = model.given
+    m.x[2 * n:] = model.motion.given
     std = np.zeros(m.x.size)
     std[:links], std[n:n + links] = ANGLE_STD, RATE_STD
     if arm.floating:  # only angles relative to the base are seen
@@ -415,7 +413,7 @@ def first(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Arr
         std[part] = BEND_STD * L / np.arange(1, k + 1) ** 2
         # a mode's rate is its bending times its frequency, which grows as j^2
         std[n + part.start:n + part.stop] = BEND_STD * L * (np.pi / L) ** 2 * np.sqrt(EI / rho)
-    std[2 * n:] = model.prior
+    std[2 * n:] = model.motion.prior
     m.S[:] = np.diag(std)
 
 
@@ -424,7 +422,7 @@ def take_as_known(model: Model, m: mem.FilterState, beyond: Kind = Kind.DAMPING)
     n = model.motion.arm.stiffness.size
     for c, kind in enumerate(model.motion.kind):
         if kind > beyond and kind != Kind.MODE:
-            m.x[2 * n + c] = model.given[c]
+            m.x[2 * n + c] = model.motion.given[c]
             m.S[2 * n + c] = 0.0
 
 
@@ -536,7 +534,7 @@ def diffusion(config: IdentifierParameters, model: Model, m: mem.FilterState) ->
     # a rate is then forgotten over T: what it gains in T equals what T seconds of samples tell of it
     gained[n:n + links] = 1e-4 / T
     gained[n + links:2 * n] = 1e-5 / T * np.array(config.arm.link_length).max()
-    gained[2 * n:] = DRIFT_SHARE / T * model.prior
+    gained[2 * n:] = DRIFT_SHARE / T * model.motion.prior
     body = body_std(config, model)[:model.body] / PAYLOAD_STD
     gained[model.payload:model.payload + model.body] = (1e-4 if m.counts[mem.HELD] else 1e-3) / T * body
     return gained

@@ -109,8 +109,8 @@ def test_bounds_of_arm_body_and_spin_are_those_of_differences_of_the_simulated_a
     rest = simulator.init(PLANT).x
     names = ('bending_stiffness', 'joint_viscous_friction', 'joint_coulomb_friction', 'rotor_inertia', 'torque_gain',
              'bend_gain', 'bend_offset')
-    prior = model.prior[4:].reshape(7, 2) * [ARM.bending_stiffness, *[(1.0, 1.0)] * 3, ARM.torque_gain, ARM.bend_gain,
-                                             (1.0, 1.0)]
+    prior = model.motion.prior[4:].reshape(7, 2) * [
+        ARM.bending_stiffness, *[(1.0, 1.0)] * 3, ARM.torque_gain, ARM.bend_gain, (1.0, 1.0)]
     body, inertial = structured_model.body_std(settings, model), payload_array(25.0, 1.0, (0.1, 0.06))
     sides = []
     for sign in (1.0, -1.0):
