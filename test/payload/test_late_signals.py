@@ -1,4 +1,4 @@
-"""Torques that come late: where the first fit shows it they are learned, and the payload is read as without."""
+"""Signals that come late: learned where the empty arm shows it, and then the payload is read as without."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from recording import BENDS, config, event, record
+from scipy.stats import multivariate_normal
 
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
+from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured
 from flexmanip_ros.payload.arm_parameters import taught
+from flexmanip_ros.payload.moving_horizon import condition, evidence_against_delays
+from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Payload, Status
 
@@ -54,3 +58,46 @@ def test_pieces_of_a_recording_give_the_same_bits() -> None:
     one, other = (read(GIVEN, rows, piece) for piece in (3000, 250))
     assert np.array_equal(one[0].memory.x, other[0].memory.x)
     assert one[1] == other[1]
+
+
+FAULTY = replace(IDEAL, torque_gain=(1.04, 1.04), bend_gain=(0.98, 0.98), bend_offset=(5e-4, 5e-4))
+
+
+def test_delays_that_the_empty_arm_does_not_show_are_not_learned() -> None:
+    """The arm has modes that the model lacks, which look like a delay of 0.1 ms."""
+    rows = record(6.0, (event(3.0),), outputs=BENDS, arm=replace(FAULTY, modes=5), seed=0)
+    empty, found = read(GIVEN, rows)
+    assert {one.name: one.value for one in taught(GIVEN, empty)}['torque_delay'] == 0.0
+    late = empty.model.motion.kind > Kind.MODE
+    assert not empty.memory.S[empty.model.payload:][late].any()
+    assert empty.memory.S[empty.model.payload:][empty.model.motion.kind == Kind.TORQUE_GAIN].any()
+    assert found.mass == pytest.approx(20.0, rel=3e-3)
+    assert found.lower < 20.0 < found.upper
+
+
+def test_the_evidence_against_delays_is_the_density_of_none_after_the_samples_over_that_before() -> None:
+    state = structured.advance(GIVEN, structured.init(GIVEN), record(1.0, outputs=BENDS, arm=DELAY, seed=0))
+    motion, m = state.model.motion, mem.copy(state.memory)
+    late = np.flatnonzero(motion.kind > Kind.MODE)
+    rng = np.random.default_rng(2)
+    m.S[:] = np.tril(rng.normal(size=m.S.shape)) * 1e-4
+    m.x[state.model.payload:] = rng.normal(size=late.max() + 1) * 1e-4
+    m.score[mem.SANDWICH] = 3.0
+    rows = state.model.payload + late
+    after = multivariate_normal(m.x[rows], 3.0 * m.S[rows] @ m.S[rows].T)
+    before = multivariate_normal(motion.given[late], np.diag(motion.prior[late] ** 2))
+    expected = after.logpdf(motion.given[late]) - before.logpdf(motion.given[late])
+    assert evidence_against_delays(motion, state.sensors, m) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_state_given_one_of_its_entries_is_that_of_a_gaussian() -> None:
+    rng = np.random.default_rng(3)
+    x, S = rng.normal(size=6), np.tril(rng.normal(size=(6, 6)))
+    P, rest = S @ S.T, [0, 1, 2, 4, 5]
+    mean = x[rest] + P[rest, 3] / P[3, 3] * (0.5 - x[3])
+    covariance = P[np.ix_(rest, rest)] - np.outer(P[rest, 3], P[rest, 3]) / P[3, 3]
+    condition(x, S, 3, 0.5, np.zeros(6))
+    assert x[3] == 0.5
+    assert not S[3].any()
+    np.testing.assert_allclose(x[rest], mean, rtol=1e-12)
+    np.testing.assert_allclose((S @ S.T)[np.ix_(rest, rest)], covariance, atol=1e-12)
