@@ -158,10 +158,10 @@ def test_the_same_work_goes_to_a_dask_cluster(scenario_file, tmp_path, capsys, m
         assert 'has no workers' in capsys.readouterr().err
         started += [subprocess.Popen([*common, 'worker', address, '--nthreads', '1', '--no-nanny',
                                       '--no-dashboard', '--host', '127.0.0.1',
-                                      '--death-timeout', '20'], **quiet) for _ in range(2)]
+                                      '--death-timeout', '20'], **quiet)]
         far, near = tmp_path / 'far.csv', tmp_path / 'near.csv'
-        assert run(scenario_file, '--runs', 4, '--scheduler', address, '--output', far) == 0
-        assert run(scenario_file, '--runs', 4, '--workers', 0, '--output', near) == 0
+        assert run(scenario_file, '--runs', 2, '--scheduler', address, '--output', far) == 0
+        assert run(scenario_file, '--runs', 2, '--workers', 0, '--output', near) == 0
         assert without_cost(rows_of(far)) == without_cost(rows_of(near))
     finally:
         for process in reversed(started):

@@ -22,7 +22,7 @@ from flexmanip_ros.studies.trial import inject
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord
 
 Item = JointRecord | CaptureEvent
-COUNT = 2000
+COUNT = 1400
 CAPTURE = CaptureEvent(START + 1_000_000_000, EventKind.CAPTURE)
 
 

@@ -1,4 +1,4 @@
-"""The pages in docs/ make a site without a warning, and a broken link in them fails the build."""
+"""A broken link in docs/ fails the build of the site; `.ci/run` builds it without a warning."""
 
 from __future__ import annotations
 
@@ -45,14 +45,6 @@ def build(folder: Path) -> subprocess.CompletedProcess[str]:
     command = [str(BUILDER), '-W', '--keep-going', '--nitpicky', '--quiet', '-b', 'html', '-d', 'doctrees', 'docs',
                'html']
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=170)
-
-
-@needs_sphinx
-def test_the_site_builds_without_a_warning(copy: Path) -> None:
-    done = build(copy)
-    assert done.returncode == 0, done.stderr
-    pages = {path.relative_to(copy / 'docs').with_suffix('.html') for path in (copy / 'docs').rglob('*.md')}
-    assert [page for page in pages if not (copy / 'html' / page).is_file()] == []
 
 
 @needs_sphinx

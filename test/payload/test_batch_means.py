@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recording import event, record, run
+from recording import record, run
 
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
@@ -19,7 +19,6 @@ from flexmanip_ros.samples.sample_log import Rows
 
 ARM = ArmParameters(damping_ratio=0.003)
 CONFIG = IdentifierParameters(arm=ARM)
-CAUGHT = event(2.0)
 
 
 def scores(before: structured.StructuredState, state: structured.StructuredState, samples: Rows) -> np.ndarray:
@@ -69,9 +68,8 @@ def test_the_factor_is_the_variance_by_batch_means_over_that_of_the_fit() -> Non
 
 def test_an_arm_that_is_the_model_is_as_sure_as_its_fit() -> None:
     """The fit of an empty arm assumes twice the white noise, so chance hardly brings the factor above one."""
-    for seed in (1, 2, 3):
-        samples = record(4.0, (CAUGHT,), arm=ARM, seed=seed)
-        assert run(CONFIG, samples, (CAUGHT,)).memory.score[mem.SANDWICH] == 1.0
+    for seed in (1, 2):
+        assert run(CONFIG, record(2.0, arm=ARM, seed=seed)).memory.score[mem.SANDWICH] == 1.0
 
 
 def test_with_an_object_the_variance_is_that_of_a_prior_that_is_too_small_by_the_factor() -> None:

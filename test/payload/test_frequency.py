@@ -71,8 +71,7 @@ def identified(payload: float, seed: int, model: str, **values: object) -> list[
     return [one for one in pipeline.run(settings, simulator.records(run, (capture,))) if one.stamp_ns > 2.5e9]
 
 
-@pytest.mark.parametrize('payload', [5.0, 20.0, 60.0])
-@pytest.mark.parametrize('seed', [1, 2])
+@pytest.mark.parametrize(('payload', 'seed'), [(5.0, 1), (20.0, 2), (60.0, 1)])
 def test_a_linear_arm_is_weighed_by_its_frequencies_to_one_percent(payload, seed):
     point = list(PlantParameters().initial_angles)
     found = identified(payload, seed, 'linear', **{'payload.dynamics': 'linear', 'payload.working_point': point})
@@ -81,7 +80,7 @@ def test_a_linear_arm_is_weighed_by_its_frequencies_to_one_percent(payload, seed
     assert found[-1].payload.mass == pytest.approx(payload, rel=0.01)
 
 
-@pytest.mark.parametrize('payload', [5.0, 20.0, 60.0])
+@pytest.mark.parametrize('payload', [5.0, 60.0])
 def test_on_a_moving_arm_the_interval_reckons_with_the_way_it_went(payload):
     found = identified(payload, 3, 'nonlinear')
     assert all(one.payload.lower <= payload <= one.payload.upper for one in found)
