@@ -122,9 +122,8 @@ def insert(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog,
     previous = replay.stamp_of(event.kind)
     if previous is not None and abs(event.stamp_ns - previous) <= config.event_merge_time * 1e9:
         return replay._replace(repeated_events=replay.repeated_events + 1)
-    superseded = any(event.stamp_ns < taken.stamp_ns <= replay.last_ns for taken in replay.latest)
-    before = replay.latest
-    replay = replay._replace(latest=(*(e for e in before if e.kind is not event.kind), event))
+    known = replay.latest
+    replay = replay._replace(latest=(*(e for e in known if e.kind is not event.kind), event))
     if event.stamp_ns > replay.last_ns:
         return _wait(replay, event)
     if event.stamp_ns > replay.snapshots[0].before_ns:
@@ -132,8 +131,8 @@ def insert(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog,
     replay = replay._replace(late_events=replay.late_events + 1)
     if all(taken.stamp_ns <= first_ns for taken in replay.latest):
         return _restart(config, replay)
-    if superseded:
-        return replay._replace(latest=before)
+    if any(event.stamp_ns < taken.stamp_ns <= replay.last_ns for taken in known):
+        return replay._replace(latest=known)
     late_ns = replay.last_ns + 1 - event.stamp_ns
     return _wait(replay, event._replace(stamp_ns=replay.last_ns + 1, std_s=math.hypot(event.std_s, late_ns * 1e-9)))
 

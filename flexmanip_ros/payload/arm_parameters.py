@@ -28,9 +28,6 @@ FIELDS = {
     Kind.BEND_OFFSET: 'bend_offset', Kind.TORQUE_DELAY: 'torque_delay', Kind.TORQUE_LAG: 'torque_lag',
     Kind.BEND_DELAY: 'bend_delay'}
 """The parameter arm.* that takes it."""
-RANGES = {leaf.name: (-np.inf if leaf.low is None else leaf.low, np.inf if leaf.high is None else leaf.high)
-          for leaf in leaves(ArmParameters)}
-"""Least and greatest value of each parameter arm.*."""
 
 
 def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple[ArmParameter, ...]:
@@ -83,18 +80,20 @@ def as_parameters(config: IdentifierParameters, found: Sequence[ArmParameter]) -
         each = given if isinstance(given, tuple) else (given,)
         here = [by_name.get(NAMES[kind].format(link + 1)) for link in range(len(each))]
         if any(here):
-            new = tuple(before if one is None else _possible(field, one)
+            new = tuple(before if one is None else _possible(field, one.value, one.std)
                         for one, before in zip(here, each, strict=True))
             values[f'arm.{field}'] = new if isinstance(given, tuple) else new[0]
     ratios = [one for one in found if one.name.endswith('_damping_ratio')]
     if ratios:
         weights = np.array([one.std for one in ratios]) ** -2.0
         mean = float(weights @ np.array([one.value for one in ratios]) / weights.sum())
-        values['arm.damping_ratio'] = _possible('damping_ratio', ArmParameter('', mean, 0.0))
+        values['arm.damping_ratio'] = _possible('damping_ratio', mean)
     return values
 
 
-def _possible(field: str, one: ArmParameter) -> float:
-    """Return the value to six digits, within the range of its parameter."""
-    nearly_zero = field == 'bend_delay' and -2.0 * one.std < one.value < 0.0
-    return float(np.clip(0.0 if nearly_zero else float(f'{one.value:.6g}'), *RANGES[field]))
+def _possible(field: str, value: float, std: float = 0.0) -> float:
+    """Return a value of a parameter arm.*, to six digits and within its declared range; std: its deviation."""
+    (leaf,) = (leaf for leaf in leaves(ArmParameters) if leaf.name == field)
+    nearly_zero = field == 'bend_delay' and -2.0 * std < value < 0.0
+    return float(np.clip(0.0 if nearly_zero else float(f'{value:.6g}'),
+                         -np.inf if leaf.low is None else leaf.low, np.inf if leaf.high is None else leaf.high))

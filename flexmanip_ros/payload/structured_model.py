@@ -218,9 +218,8 @@ def motion(config: IdentifierParameters) -> ProcessModel:
     made = ProcessModel(
         arm=arm, work=workspace(nominal), kind=np.array([kind for kind, _ in kinds], dtype=np.int64),
         link=np.array([link for _, link in kinds], dtype=np.int64), prior=np.zeros(size), given=np.zeros(size),
-        frozen=frozen,
-        M0=np.zeros((n, n)), Mp=np.zeros((4, n, n)), stiffness=nominal.stiffness, damping=unit, rotary=nominal.rotary,
-        scale=lightest, least=_least(nominal, lightest),
+        frozen=frozen, M0=np.zeros((n, n)), Mp=np.zeros((4, n, n)), stiffness=nominal.stiffness, damping=unit,
+        rotary=nominal.rotary, scale=lightest, least=_least(nominal, lightest),
         least_rotor=_least_rotor(nominal), substeps=STEP_ANGLE / fastest_mode(config.arm), payload=np.zeros(4),
         effort=np.zeros(links), gain=np.ones(links), late=np.zeros((links, 2)), slope=np.zeros((links, 2)),
         driven=np.zeros(links), coulomb=nominal.coulomb.copy(), share=np.full(links, np.nan),

@@ -48,8 +48,9 @@ def test_two_workers_give_the_bits_of_one(output, tmp_path):
     assert [row | {COST: ''} for row in alone] == [row | {COST: ''} for row in together]
 
 
-def test_a_method_that_shares_an_identifier_gets_what_a_pass_of_its_own_gives():
-    case, name = experiments.PAYLOADS[0], 'structured'
+@pytest.mark.parametrize('name', ['paper', 'structured'])
+def test_methods_that_share_an_identifier_get_what_a_pass_of_their_own_gives(name):
+    case = experiments.PAYLOADS[0]
     shared = case_run.run(case, 0)[1][name]
     made = experiments.scenario(case, next(known for known in experiments.METHODS if known.name == name))
     run = made.configuration(0, name)

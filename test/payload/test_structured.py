@@ -279,7 +279,7 @@ def test_absurd_numbers_restart_the_filter_and_say_so(caught):
     assert found.status in (Status.DIVERGED, Status.INCONSISTENT, Status.WARMING_UP)
 
 
-@pytest.mark.parametrize('scale', [1e3, 1e6])
+@pytest.mark.parametrize('scale', [1e3, 1e6, 1e12])
 def test_signals_in_other_units_are_told_from_a_start(caught, scale):
     wrong = altered(caught, y=scale * caught.y, angles=scale * caught.angles)
     found = structured.estimate(config(), run(config(), wrong, (event(1.5),)))

@@ -47,6 +47,7 @@ def interrupts(monkeypatch: pytest.MonkeyPatch) -> Any:
     ('simulate_bag', KILL, 1.4),
     ('identify_bag', TERM, 1.2),
     ('identify_bag to a bag', INT, 1.4),
+    ('monte_carlo', TERM, 2.5),
     ('monte_carlo', KILL, 2.5),
 ])
 def test_a_signal_ends_a_program_cleanly_and_leaves_whole_files(

@@ -83,7 +83,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         return f'{names} at {self.config.rate:g} Hz'
 
     def activated(self) -> None:
-        """Hold the joints from the next sample on, or go to the setpoint that was set since the node was inactive."""
+        """Hold the joints from the next sample on, or go to the setpoint that was set while it was inactive."""
         self.state = controller.init(self.config)
         self._last_ns, self._arrived = None, np.inf
         if self._estimate is not None:
