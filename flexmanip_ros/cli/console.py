@@ -155,25 +155,25 @@ def require_scikit_fem() -> None:
 
 def run(prog: str, body: Callable[[], int]) -> int:
     """Run a program; return its exit status: 2 after an error of the package, 130 when interrupted, 1 for a defect."""
-    with _signals_as_interrupt(), warnings.catch_warnings():
-        warnings.simplefilter('ignore')  # the status reports numbers out of range; stderr is for one line
-        try:
+    try:  # around all of it, as a signal may come while a context manager ends
+        with _signals_as_interrupt(), warnings.catch_warnings():
+            warnings.simplefilter('ignore')  # the status reports numbers out of range; stderr is for one line
             return body()
-        except FlexmanipError as error:
-            print_error(prog, error)
-            return BAD_INPUT
-        except KeyboardInterrupt:
-            print_error(prog, 'interrupted')
-            return INTERRUPTED
-        except BrokenPipeError:
-            sys.stderr.close()  # the reader of the output has ended
-            return SUCCESS
-        except Exception as error:
-            if os.environ.get(TRACEBACK):
-                raise
-            print_error(prog, f'a defect of this program: {type(error).__name__}: {error}; '
-                     f'please report it with the recording ({TRACEBACK}=1 shows where)')
-            return DEFECT
+    except FlexmanipError as error:
+        print_error(prog, error)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print_error(prog, 'interrupted')
+        return INTERRUPTED
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of the output has ended
+        return SUCCESS
+    except Exception as error:
+        if os.environ.get(TRACEBACK):
+            raise
+        print_error(prog, f'a defect of this program: {type(error).__name__}: {error}; '
+                    f'please report it with the recording ({TRACEBACK}=1 shows where)')
+        return DEFECT
 
 
 def is_postponed(number: int, frame: FrameType | None) -> bool:

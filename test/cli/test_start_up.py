@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from typing import Any
 
 import pytest
@@ -62,3 +63,13 @@ def test_an_interrupt_while_llvm_calls_back_comes_once_the_kernel_is_loaded() ->
 
     assert console.run('program', body) == console.INTERRUPTED
     assert said == ['to its end']
+
+
+def test_an_interrupt_at_the_end_of_the_work_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Ending(warnings.catch_warnings):
+        def __exit__(self, *reason: object) -> None:
+            super().__exit__(*reason)
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(console.warnings, 'catch_warnings', Ending)
+    assert console.run('program', lambda: console.SUCCESS) == console.INTERRUPTED
