@@ -1,7 +1,8 @@
 """Compile the kernels: run each once, so that the cache on disk is full before the first sample comes.
 
-Use: ``python -m flexmanip_ros.cli.warm_up``. `make setup` and `colcon build` do it. Two processes compile side by side,
-the payload's kernels in one and all others in the other: they share no code but the equations of motion.
+Use: ``python -m flexmanip_ros.cli.warm_up``. `make setup` and `colcon build` do it. Two processes compile side by side.
+The payload's filter takes longest: one process compiles its prediction, and then the filter, which finds the steps of
+the fit in the cache, as the other process compiles them first.
 """
 
 from __future__ import annotations
@@ -11,8 +12,12 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from flexmanip_ros.samples.sample_log import Rows
 
 SAMPLES = 1200
 """Number of samples, enough for the prediction-error fit to begin."""
@@ -58,25 +63,56 @@ def simulator_and_identifier() -> None:
     validation.predict_ahead(model, u, y, 2)
 
 
-def payload() -> None:
-    """Estimate a payload from small random signals, and look for captures in them."""
-    from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
-    from flexmanip_ros.payload import capture_detection, structured
+def small_signals() -> Rows:
+    """Return samples of the default arm that are small random numbers."""
     from flexmanip_ros.samples.sample_log import log_of
-    from flexmanip_ros.types import CaptureEvent, EventKind
 
     signals = 1e-4 * np.random.default_rng(0).standard_normal((SAMPLES, 8))
     stamps = np.arange(SAMPLES) * PERIOD_NS
-    rows = log_of(signals[:, :2], signals[:, 2:6], signals[:, 6:], stamps).rows(0, SAMPLES)
+    return log_of(signals[:, :2], signals[:, 2:6], signals[:, 6:], stamps).rows(0, SAMPLES)
+
+
+def steps_of_the_fit() -> None:
+    """Compile what the payload's filter calls now and then."""
+    from flexmanip_ros.numerics.compiled import compile_for
+    from flexmanip_ros.parameters import IdentifierParameters
+    from flexmanip_ros.payload import capture_detection_kernel, filter_state, gauss_newton, moving_horizon
+    from flexmanip_ros.payload.structured_model import build, diffusion, sensors
+
     config = IdentifierParameters()
-    state = structured.advance(config, structured.init(config), rows.between(0, SAMPLES // 2))
+    model = build(config)
+    assert model is not None
+    memory = filter_state.memory(model.payload + model.motion.kind.size, len(model.roles))
+    fit = model.motion, sensors(config, model, 1e-3, diffusion(config, model, memory)), memory
+    compile_for(moving_horizon.keep_possible, model.motion, memory, 0.0)
+    for step in (gauss_newton.close_horizon, gauss_newton.finish_iteration, gauss_newton.reject_step):
+        compile_for(step, *fit)
+    compile_for(moving_horizon.diffuse, *fit, 0.0)
+    compile_for(capture_detection_kernel.traces, *fit, capture_detection_kernel.UNWATCHED, np.zeros((1, 1)), 0.0)
+
+
+def payload() -> None:
+    """Estimate a payload from small random signals, and look for captures in them."""
+    from flexmanip_ros.numerics.compiled import compile_for
+    from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
+    from flexmanip_ros.payload import capture_detection, process_model, structured
+    from flexmanip_ros.types import CaptureEvent, EventKind
+
+    rows = small_signals()
+    stamps = rows.stamp_ns
+    config = IdentifierParameters()
+    state = structured.init(config)
+    assert state.model is not None
+    compile_for(process_model.predict, state.model.motion, np.zeros(1), np.zeros((1, 1)), 0, np.zeros((1, 1)), 0.0, 0.0)
+    state = structured.advance(config, state, rows.between(0, SAMPLES // 2))
     state = structured.event(config, state, CaptureEvent(int(stamps[SAMPLES // 2]), EventKind.CAPTURE))
     structured.estimate(config, structured.advance(config, state, rows.since(SAMPLES // 2)))
     trigger = TriggerParameters()
     capture_detection.advance(trigger, capture_detection.init(trigger), rows)
 
 
-PARTS: dict[str, Callable[[], None]] = {'payload': payload, 'simulator and identifier': simulator_and_identifier}
+PARTS: dict[str, tuple[Callable[[], None], ...]] = {
+    'payload': (payload,), 'simulator and identifier': (steps_of_the_fit, simulator_and_identifier)}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -84,7 +120,8 @@ def main(argv: list[str] | None = None) -> int:
     begin = time.perf_counter()
     named = (sys.argv[1:] if argv is None else argv)[:1]
     if named:
-        PARTS[named[0]]()
+        for run in PARTS[named[0]]:
+            run()
         print(f'  compiled: {named[0]} ({time.perf_counter() - begin:.0f} s)', flush=True)
         return 0
     print(f'compiling {len(PARTS)} parts side by side, about a minute the first time: {", ".join(PARTS)}', flush=True)

@@ -12,8 +12,8 @@ from flexmanip_ros.identification import realization, uncertainty
 from flexmanip_ros.identification.batch_fit import Recursion
 from flexmanip_ros.identification.factor import POWER, WEIGHT, WEIGHT2
 from flexmanip_ros.identification.moments import Realized, realize, triangle
+from flexmanip_ros.identification.pbsid import observability_controllability, open_loop_weight
 from flexmanip_ros.identification.uncertainty import Identified, Tangent
-from flexmanip_ros.identification.varx import observability_controllability, open_loop_weight
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.types import Array, StateSpace, Status
 

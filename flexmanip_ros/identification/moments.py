@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from flexmanip_ros.identification.varx import observability_controllability, open_loop_weight
+from flexmanip_ros.identification.pbsid import observability_controllability, open_loop_weight
 from flexmanip_ros.types import Array
 
 RIDGE = 1e-8

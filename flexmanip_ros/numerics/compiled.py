@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from numba import njit
+from numba import njit, typeof
 from numba.extending import register_jitable
 
 Function = TypeVar('Function', bound=Callable[..., Any])
@@ -64,6 +64,12 @@ def library(function: Function) -> Function:
     counted: dict[str, Any] = {'_nrt': True, 'forceinline': False}
     compiled: Function = njit(cache=True, nogil=True, **counted)(function)
     return compiled
+
+
+def compile_for(function: Callable[..., Any], *values: Any) -> None:
+    """Compile a kernel for arguments of the types of these values, without running it."""
+    compiled: Any = function
+    compiled.compile(tuple(typeof(value) for value in values))
 
 
 _OPTIONS: dict[str, Any] = {'nogil': True, '_nrt': False, 'no_cfunc_wrapper': True}

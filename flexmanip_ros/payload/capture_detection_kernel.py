@@ -132,7 +132,7 @@ def transition(motion: ProcessModel, flow: Array, state: Array, dt: float) -> No
                 flow[i, c] = value
 
 
-@inner
+@kernel
 def traces(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr: GlrState, prior: Array, dt: float
            ) -> None:
     """Compute the traces of an onset from the linearization; prior: (3, 3) deviations by order and component."""

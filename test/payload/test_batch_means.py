@@ -12,8 +12,8 @@ from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured
 from flexmanip_ros.payload.arm_parameters import taught
+from flexmanip_ros.payload.gauss_newton import widen_by_empty_arm
 from flexmanip_ros.payload.measurement_update import BATCH, observe
-from flexmanip_ros.payload.moving_horizon import widen_by_empty_arm
 from flexmanip_ros.payload.process_model import predict
 from flexmanip_ros.samples.sample_log import Rows
 

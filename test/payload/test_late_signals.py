@@ -13,7 +13,7 @@ from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured
 from flexmanip_ros.payload.arm_parameters import taught
-from flexmanip_ros.payload.moving_horizon import condition, evidence_against_delays
+from flexmanip_ros.payload.gauss_newton import condition, evidence_against_delays
 from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Payload, Status

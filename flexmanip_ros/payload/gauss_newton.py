@@ -1,0 +1,348 @@
+"""Compiled steps of the Gauss-Newton iteration over the moving horizon (``moving_horizon``).
+
+An iteration has summed the normal equations I + N and the gradient g over the samples since the event, for the state xi
+at the event in units of its arrival cost. Its step is damped (Levenberg and Marquardt) and kept within the bounds of
+the parameters. Where it has read all samples, the filter goes on from its minimum, and a fit that has converged closes
+the horizon. Kernels of their own, as each runs once an iteration, not once a sample.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from flexmanip_ros.numerics.compiled import inner, kernel
+from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, factor_information, forward, least_distance
+from flexmanip_ros.payload.filter_state import (
+    AGAIN,
+    BEFORE,
+    COST,
+    COST_BEFORE,
+    DOUBT,
+    ENOUGH,
+    FIT,
+    HELD,
+    HORIZON,
+    ITERATED,
+    ITERATING,
+    LAMBDA,
+    MEASURED,
+    POWER,
+    REJECTED,
+    SANDWICH,
+    SHIFT,
+    SLOW,
+    STORED,
+    TRIED,
+    USED,
+)
+from flexmanip_ros.payload.measurement_update import BATCH
+from flexmanip_ros.payload.process_model import INERTIA, MODE, STEP_ANGLE, STIFFNESS, gather_bounds, keep_inertia
+from flexmanip_ros.types import Array
+
+if TYPE_CHECKING:
+    from flexmanip_ros.payload.filter_state import FilterState
+    from flexmanip_ros.payload.measurement_update import MeasurementModel
+    from flexmanip_ros.payload.process_model import ProcessModel
+
+LINEAR = 0.25
+"""Standard deviation of a mode's phase [rad] up to which the motion is linear in the phase: its sine is, to 1 %.
+Beyond, the filter that goes on from the fit underestimates its covariance, and may lock on to a phase that is off by 2
+pi."""
+AT_REST = 0.5
+"""A fit has converged when its last step moved the payload by less than this share of its standard deviation."""
+CONVERGED = 0.02
+"""Decrease of the cost for each sample below which a step counts as converged, and the horizon may grow."""
+FITS = 1.5
+"""Cost over that of white noise up to which a step counts as converged, too."""
+TRUSTED = 2.0
+"""Standard deviations by which a step of the moving-horizon estimation moves the filter's state at most."""
+LEVENBERG = 1.0
+"""Damping with which a rejected step is taken again after a capture: that of the arrival cost. The cost of what is held
+has a narrow valley that bends, and damping in proportion to the information hardly lets a step go along it."""
+MARQUARDT = 1e-3
+"""The same for an empty arm, in proportion to the information, as its priors are rough."""
+VERY_STRONG = 5.0
+"""Logarithm of a Bayes factor that is very strong evidence (Kass and Raftery 1995)."""
+FADING, FADED = 8.0, 1e-3
+"""Factor by which a rejected step raises the damping and an accepted one lowers it (Marquardt 1963); share of the first
+damping below which it is set to zero, where it hardly shortens a step. Were it zero after the first accepted step,
+every second step of a fit in a valley that bends would be rejected."""
+REJECTIONS = 8
+"""Number of times that a step that raises the cost is shortened."""
+
+
+@inner
+def begin_iteration(m: FilterState) -> None:
+    """Start a Gauss-Newton iteration at the event, linearized at the estimate of the last one."""
+    nx = m.x.size
+    m.score[COST] = 0.0
+    for i in range(nx):
+        m.g[i] = 0.0
+        m.batch[i] = 0.0
+        m.xr[i] = m.x0[i] + dot(m.S0[i], m.xi)
+        m.score[COST] += m.xi[i] * m.xi[i]
+        for c in range(nx):
+            m.Sr[i, c] = m.S0[i, c]
+            m.N[i, c] = 0.0
+            m.B[i, c] = 0.0
+    for i in range(m.noise.shape[0]):
+        m.noise[i, FIT] = 0.0
+    m.counts[ITERATED] = 0
+    m.counts[MEASURED] = 0
+    m.counts[ITERATING] = 1
+
+
+@kernel
+def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
+    """Accept the iteration and take the next step. Where it has read all samples, the filter goes on from there."""
+    nx = m.x.size
+    for i in range(nx):
+        m.accepted[i] = m.xi[i]
+        m.gradient[i] = m.g[i] - m.xi[i]
+        for c in range(i + 1):
+            m.normal[i, c] = m.N[i, c]
+    fits = m.score[COST] < FITS * (nx + m.noise.shape[0] * m.counts[MEASURED])
+    enough = CONVERGED * m.counts[ITERATED]
+    # two steps may undo each other for ever where the valley bends
+    still = (m.counts[BEFORE] == m.counts[ITERATED] and m.score[LAMBDA] <= first_damping(m)
+             and m.score[COST_BEFORE] - m.score[COST] < enough)
+    m.counts[BEFORE] = m.counts[ITERATED]
+    m.score[COST_BEFORE] = m.score[COST]
+    m.score[LAMBDA] = m.score[LAMBDA] / FADING if m.score[LAMBDA] > FADED * first_damping(m) else 0.0
+    m.counts[REJECTED] = 0
+    m.counts[ITERATING] = 0
+    if not damped_step(motion, sensors, m):
+        return False
+    gained = dot(m.g, m.gradient)
+    m.counts[AGAIN] = 0 if fits or still or gained < enough else 1
+    m.counts[TRIED] = m.counts[TRIED] + 1 if m.counts[AGAIN] else 0
+    if m.counts[ITERATED] == m.counts[STORED]:
+        if not factor_information(m.N):
+            return False
+        for i in range(m.noise.shape[0]):
+            m.noise[i, POWER] = m.noise[i, FIT] / max(m.counts[MEASURED], 1)
+            m.noise[i, SLOW] = m.noise[i, POWER]
+        # the step was not seen to lower the cost yet: the filter takes no more of it than it can tell
+        part = min(1.0, TRUSTED / np.sqrt(max(gained, 1e-300)))
+        payload = 2 * sensors.H.shape[1]
+        shift = dot(m.Sr[payload], m.g)
+        for i in range(nx):
+            m.x[i] = m.xr[i] + part * dot(m.Sr[i], m.g)
+            forward(m.N, m.Sr[i])
+            for c in range(nx):
+                m.S[i, c] = m.Sr[i, c]
+        if m.counts[HELD] == 0:
+            m.score[SANDWICH] = sandwich(sensors, m)
+        else:
+            widen_by_empty_arm(sensors, m)
+        variance = dot(m.S[payload], m.S[payload])
+        m.score[SHIFT] = abs(shift) / np.sqrt(max(variance, 1e-300))
+        m.score[DOUBT] = np.sqrt(variance + shift * shift) / max(m.x[payload], 1e-300)
+        if (m.counts[ITERATED] >= ENOUGH and gained < 0.5 * nx and m.score[SHIFT] < AT_REST
+                and phase_std(motion, m, sensors.period * m.counts[ITERATED]) < LINEAR):
+            close_horizon(motion, sensors, m)
+    return True
+
+
+@inner
+def sandwich(sensors: MeasurementModel, m: FilterState) -> float:
+    """Return the factor, at least 1, by which the variances of a fit are too small; m.N: factor of I + N.
+
+    The variance by batch means (sandwich of Huber and White): where the residuals are no white noise, the gradient is
+    a sum of parts b of batches that are nearly independent, so the variance of xi by them is W B W, W = (I + N)^-1,
+    B = sum b b'. The fit says W N W instead. The factor is the mean over payload and arm parameters of the ratio.
+    """
+    nx, row = m.x.size, sensors.f
+    length = BATCH * sensors.block
+    whole = m.counts[MEASURED] // length
+    if whole == 0:
+        return 1.0
+    total, known = 0.0, 0
+    for i in range(2 * sensors.H.shape[1], nx):
+        for c in range(nx):
+            row[c] = m.S0[i, c]
+        forward(m.N, row)
+        backward(m.N, row)
+        said = dot(row, m.S0[i]) - dot(row, row)
+        found = 0.0
+        for a in range(nx):
+            for b in range(a):
+                found += 2.0 * row[a] * m.B[a, b] * row[b]
+            found += row[a] * m.B[a, a] * row[a]
+        if said > 0.0:
+            total += found / said
+            known += 1
+    factor: float = total / max(known, 1) * m.counts[MEASURED] / (whole * length)
+    return max(1.0, factor)
+
+
+@inner
+def widen_by_empty_arm(sensors: MeasurementModel, m: FilterState) -> None:
+    """Add to the covariance of a fit with an object what its prior lacks: the variances of the empty arm's fit.
+
+    If these are too small by the factor g, the prior of xi has the covariance g I, and xi the variance W + (g - 1) W W,
+    W = (I + N)^-1. The estimate stays, as the fit weighs the prior by what the empty arm's fit said.
+    """
+    nx = m.x.size
+    root = np.sqrt(max(m.score[SANDWICH] - 1.0, 0.0))
+    if root == 0.0:
+        return
+    for i in range(nx):
+        for c in range(sensors.noise.shape[1]):
+            sensors.noise[i, c] = 0.0
+        for c in range(nx):
+            sensors.f[c] = m.S[i, c]
+        backward(m.N, sensors.f)
+        for c in range(nx):
+            sensors.noise[i, c] = root * sensors.f[c]
+    absorb_noise(m.S, sensors.noise, sensors.W)
+
+
+@inner
+def evidence_against_delays(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> float:
+    """Return the logarithm of the Bayes factor of signals that are as late as given, over that of unknown delays.
+
+    It is the density of the given delays after the samples over that before (Savage and Dickey). 0: all are known.
+    """
+    L, departure, first = sensors.L, sensors.f, m.x.size - motion.kind.size
+    for i in range(m.x.size):
+        departure[i] = 0.0
+        for c in range(i + 1):
+            L[i, c] = 0.0
+    for a in range(motion.kind.size):
+        if motion.kind[a] > MODE and dot(m.S[first + a], m.S[first + a]) > 0.0:
+            departure[a] = (m.x[first + a] - motion.given[a]) / motion.prior[a]
+            L[a, a] = -1.0  # ``factor_information`` adds one
+            for b in range(a + 1):
+                if motion.kind[b] > MODE:
+                    scale = motion.prior[a] * motion.prior[b]
+                    L[a, b] += m.score[SANDWICH] * dot(m.S[first + a], m.S[first + b]) / max(scale, 1e-300)
+    if not factor_information(L):
+        return 0.0
+    forward(L, departure)
+    ratio: float = -0.5 * dot(departure, departure)
+    for a in range(m.x.size):
+        ratio -= np.log(L[a, a])
+    return ratio
+
+
+@inner
+def condition(x: Array, S: Array, row: int, value: float, f: Array) -> None:
+    """Condition a state on the value of one of its entries; f: scratch."""
+    for c in range(f.size):
+        f[c] = S[row, c]
+    variance, e = dot(f, f), value - x[row]
+    for i in range(x.size if variance > 0.0 else 0):
+        gain = dot(S[i], f) / variance
+        x[i] += gain * e
+        for c in range(f.size):
+            S[i, c] -= gain * f[c]
+    x[row] = value
+    for c in range(f.size):
+        S[row, c] = 0.0
+
+
+@kernel
+def close_horizon(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> None:
+    """Close the horizon; where an empty arm shows no late signal, fit its samples again with the given delays.
+
+    What the shape functions lack looks like a delay of some 0.1 ms. A delay that is learned and not there shifts the
+    mass that is caught later, by 0.5 % for 0.1 ms.
+    """
+    again = (m.counts[HELD] == 0 and m.counts[STORED] < HORIZON
+             and evidence_against_delays(motion, sensors, m) > VERY_STRONG)
+    if not again:
+        m.counts[STORED] = HORIZON
+        return
+    first = m.x.size - motion.kind.size
+    for c in range(motion.kind.size):
+        if motion.kind[c] > MODE:
+            condition(m.x, m.S, first + c, motion.given[c], sensors.f)
+            condition(m.x0, m.S0, first + c, motion.given[c], sensors.f)
+    for counter in (ITERATED, ITERATING, BEFORE, REJECTED, AGAIN, TRIED):
+        m.counts[counter] = 0
+    m.score[LAMBDA] = 0.0
+
+
+@inner
+def phase_std(motion: ProcessModel, m: FilterState, duration: float) -> float:
+    """Standard deviation [rad] of the angle by which the fastest mode turns in a time [s], as far as stiffness tells.
+
+    The angle is w T, with w^2 in proportion to the stiffness, so its deviation is w T / 2 times that of the stiffness's
+    logarithm, given the mass: changes of both that leave the frequency as it is do not count. A damped mode forgets its
+    phase after an angle of one over the damping ratio.
+    """
+    first, links, k = m.x.size - motion.kind.size, motion.arm.length.size, motion.arm.kappa
+    square, ratio = 0.0, np.inf
+    for c in range(motion.kind.size):
+        if motion.kind[c] == STIFFNESS or motion.kind[c] == MODE:
+            told = dot(m.S[first + c], m.S[first]) ** 2 / max(dot(m.S[first], m.S[first]), 1e-300)
+            square = max(square, dot(m.S[first + c], m.S[first + c]) - told)
+    for i in range(links):
+        ratio = min(ratio, motion.arm.damping[links + i * k] / motion.damping[links + i * k])
+    angle = min(STEP_ANGLE / motion.substeps * duration, 1.0 / max(ratio, 1e-9))
+    deviation: float = 0.5 * angle * np.sqrt(square)
+    return deviation
+
+
+@inner
+def first_damping(m: FilterState) -> float:
+    """Return the damping after the first rejected step."""
+    return LEVENBERG if m.counts[HELD] == 1 else MARQUARDT
+
+
+@inner
+def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
+    """Set xi to the accepted one plus a step of Levenberg and Marquardt, m.g, within the bounds of p.
+
+    Where the step would leave the bounds it ends at the least quadratic cost within them (``least_distance`` in the
+    metric of that cost). The inertia is moved by itself afterwards, as its bound is curved.
+    """
+    nx = m.xi.size
+    L, p = sensors.L, motion.p
+    for i in range(nx):
+        m.g[i] = m.gradient[i]
+        for c in range(i + 1):
+            L[i, c] = m.normal[i, c]
+        L[i, i] += m.score[LAMBDA] * (1.0 if m.counts[HELD] == 1 else 1.0 + L[i, i])
+    if not factor_information(L):
+        return False
+    forward(L, m.g)
+    backward(L, m.g)
+    for i in range(nx):
+        m.xi[i] = m.accepted[i] + m.g[i]
+    first = nx - p.size
+    for c in range(p.size):
+        p[c] = m.x0[first + c] + dot(m.S0[first + c], m.xi)
+    count = gather_bounds(motion, p, m.S0, 0.0)
+    for i in range(count):
+        forward(L, motion.bounds.rows[i])
+    if count > 0 and least_distance(motion.bounds, count):
+        backward(L, motion.bounds.shortest)
+        for i in range(nx):
+            m.xi[i] += motion.bounds.shortest[i]
+            m.g[i] += motion.bounds.shortest[i]
+        for c in range(p.size):
+            p[c] = m.x0[first + c] + dot(m.S0[first + c], m.xi)
+    lacks, own = keep_inertia(motion, p), m.counts[USED] - 1
+    while lacks > 0.0 and own >= 0 and m.S0[first + INERTIA, own] == 0.0:  # its own column is the last in its row
+        own -= 1
+    if lacks > 0.0 and own >= 0:
+        m.xi[own] += lacks / m.S0[first + INERTIA, own]
+        m.g[own] += lacks / m.S0[first + INERTIA, own]
+    return True
+
+
+@kernel
+def reject_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
+    """Take a shorter step from the accepted xi, nearer to the gradient, and begin the iteration again."""
+    m.counts[REJECTED] += 1
+    m.score[LAMBDA] = FADING * m.score[LAMBDA] if m.score[LAMBDA] > 0.0 else first_damping(m)
+    if m.counts[REJECTED] > REJECTIONS:  # a valley that bends: go on from here
+        m.score[COST_BEFORE] = 1e300
+    if not damped_step(motion, sensors, m):
+        return False
+    begin_iteration(m)
+    return True
