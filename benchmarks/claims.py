@@ -281,6 +281,10 @@ def payload_linear(rows: list[dict[str, Any]]) -> Claims:
         for k, (after, high) in enumerate(zip(('0.25', '1', '3'), most, strict=True)):
             yield Claim(f'arm {arm}, {after} s: error over bound, worst of {len(of_arm)} cases',
                         max(row['ratio'][k] for row in of_arm), high=high)
+    covered = [row['coverage'] for row in rows if row['arm'] == 'all learned']
+    for k, after in enumerate(('0.25', '1', '3')):
+        yield Claim(f'all learned, {after} s: coverage, mean of {len(covered)} cases',
+                    sum(row[k] for row in covered) / max(len(covered), 1), 0.93, 0.97)
     # docs/lab/payload.md: "at most 0.04 % (100 kg at 0/0 degrees: 0.066 %)"
     known = {(*row['degrees'], row['payload']): row['mean_relative_percent_4_to_6_s'] for row in rows
              if row['arm'] == 'known'}
