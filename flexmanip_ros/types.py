@@ -107,9 +107,9 @@ class Status(Enum):
 
     WARMING_UP = 'not enough samples yet'
     TRACKING = 'tracking'
-    POORLY_EXCITED = 'the signals carry too little information; move the arm or raise the torque'
-    ILL_CONDITIONED = 'the regression is nearly singular; lower the order or the past window'
-    ORDER_TOO_LOW = 'the signals hold more dynamics than the order; raise the order'
+    POORLY_EXCITED = 'the signals carry too little information'
+    ILL_CONDITIONED = 'the regression is nearly singular'
+    ORDER_TOO_LOW = 'the signals hold more dynamics than the order'
     INCONSISTENT = 'the residuals do not fit the model; the interval was widened'
     UNOBSERVABLE = 'these signals cannot give a payload'
     DIVERGED = 'numbers left the finite range; the estimator restarted'

@@ -7,7 +7,7 @@ it is first trusted. With the executable `demo` the same nodes share one process
 """
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
@@ -29,7 +29,22 @@ ARGUMENTS = (
 )
 
 CHOICES = {'view': ('true', 'false', 'True', 'False', '1', '0')}
-"""launch tells of another word only once some nodes have been started, and leaves them running."""
+NUMBERS = {'rate': float, 'payload_mass': float, 'capture_time': float, 'release_time': float, 'view_port': int}
+"""launch tells of a bad value of these only once some nodes have been started, and leaves them running."""
+
+
+def check_numbers(context):
+    """Stop the launch before the first node when an argument is no number."""
+    for name, kind in NUMBERS.items():
+        given = LaunchConfiguration(name).perform(context)
+        try:
+            kind(given)
+        except ValueError:
+            raise RuntimeError(f"{name}:={given} is no number; give one, such as {name}:={DEFAULTS[name]}") from None
+    return []
+
+
+DEFAULTS = {name: default for name, default, _ in ARGUMENTS}
 
 
 def _number(name):
@@ -47,6 +62,7 @@ def generate_launch_description():
     return LaunchDescription([
         *(DeclareLaunchArgument(name, default_value=default, description=words, choices=CHOICES.get(name))
           for name, default, words in ARGUMENTS),
+        OpaqueFunction(function=check_numbers),
         _node('rpbsid_identifier', {
             'payload_method': ParameterValue(LaunchConfiguration('payload_method'), value_type=str)},
             prefix=LaunchConfiguration('prefix')),

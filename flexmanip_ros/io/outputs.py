@@ -123,17 +123,22 @@ def columns(estimates: Sequence[Estimate], start_ns: int | None = None) -> dict[
 
 
 def matrices(estimates: Sequence[Estimate]) -> dict[str, Array]:
-    """Return A (T, n, n), B, C, D, K and dt (T,); rows without a model are NaN. Empty without any model."""
-    model = next((estimate.model for estimate in estimates if estimate.model is not None), None)
-    if model is None:
-        return {}
-    shapes = {name: getattr(model, name).shape for name in 'ABCDK'}
+    """Return A (T, n, n), B, C, D, K and dt (T,); rows without a model are NaN. Empty without any model.
+
+    n is the largest order in the run. A model of a smaller order fills the upper left part, the rest is NaN.
+    """
+    models = [estimate.model for estimate in estimates]
+    shapes = {name: np.max([getattr(model, name).shape for model in models if model is not None], axis=0)
+              for name in 'ABCDK'} if any(models) else {}
     found = {name: np.full((len(estimates), *shape), np.nan) for name, shape in shapes.items()}
-    found['dt'] = np.full(len(estimates), np.nan)
-    for row, estimate in enumerate(estimates):
-        if estimate.model is not None:
-            for name in (*shapes, 'dt'):
-                found[name][row] = getattr(estimate.model, name)
+    if shapes:
+        found['dt'] = np.full(len(estimates), np.nan)
+    for row, model in enumerate(models):
+        if model is not None:
+            found['dt'][row] = model.dt
+            for name in shapes:
+                matrix = getattr(model, name)
+                found[name][row, :matrix.shape[0], :matrix.shape[1]] = matrix
     return found
 
 

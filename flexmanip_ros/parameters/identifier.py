@@ -59,7 +59,7 @@ class PayloadParameters:
         check_all(self)
         unknown = [name for name in self.learn if name not in LEARNABLE]
         if unknown:
-            raise ParameterError(f"parameter 'learn' names {', '.join(map(repr, unknown))}",
+            raise ParameterError(f"parameter 'payload.learn' names {', '.join(map(repr, unknown))}",
                                  f"choose from {', '.join(LEARNABLE)}")
 
 

@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexmanip_ros.numerics.compiled import inner, kernel
-from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, factor_information, forward, least_distance
+from flexmanip_ros.numerics.square_root import backward, dot, factor_information, forward, least_distance
 from flexmanip_ros.payload.filter_state import (
     AGAIN,
     BEFORE,
     COST,
     COST_BEFORE,
     DOUBT,
+    EFFECTIVE,
     ENOUGH,
     FIT,
     HELD,
@@ -134,9 +135,12 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
             for c in range(nx):
                 m.S[i, c] = m.Sr[i, c]
         if m.counts[HELD] == 0:
-            m.score[SANDWICH] = sandwich(sensors, m)
-        else:
-            widen_by_empty_arm(sensors, m)
+            found = sandwich(sensors, m)
+            m.score[SANDWICH] = max(found, 1.0)
+            if found < 1.0:  # its noise was assumed too large
+                weigh_parts(sensors, m, found, 1.0)
+        elif m.score[SANDWICH] > 1.0:
+            weigh_parts(sensors, m, 1.0, m.score[SANDWICH])
         variance = dot(m.S[payload], m.S[payload])
         m.score[SHIFT] = abs(shift) / np.sqrt(max(variance, 1e-300))
         m.score[DOUBT] = np.sqrt(variance + shift * shift) / max(m.x[payload], 1e-300)
@@ -148,11 +152,12 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
 
 @inner
 def sandwich(sensors: MeasurementModel, m: FilterState) -> float:
-    """Return the factor, at least 1, by which the variances of a fit are too small; m.N: factor of I + N.
+    """Return the variance of a fit due to noise, over what the fit says; m.N: factor of I + N.
 
-    The variance by batch means (sandwich of Huber and White): where the residuals are no white noise, the gradient is
-    a sum of parts b of batches that are nearly independent, so the variance of xi by them is W B W, W = (I + N)^-1,
-    B = sum b b'. The fit says W N W instead. The factor is the mean over payload and arm parameters of the ratio.
+    By batch means (sandwich of Huber and White): where the residuals are no white noise, the gradient is a sum of parts
+    b of batches that are nearly independent, so the variance of xi due to noise is W B W, W = (I + N)^-1, B = sum b b'.
+    The fit says W N W. The factor is the mean over payload and arm parameters of the ratio. White residuals would give
+    one between the least and the largest ratio of a sensor's residual power to the assumed one; less is chance.
     """
     nx, row = m.x.size, sensors.f
     length = BATCH * sensors.block
@@ -174,30 +179,41 @@ def sandwich(sensors: MeasurementModel, m: FilterState) -> float:
         if said > 0.0:
             total += found / said
             known += 1
-    factor: float = total / max(known, 1) * m.counts[MEASURED] / (whole * length)
-    return max(1.0, factor)
+    by_batches: float = total / max(known, 1) * m.counts[MEASURED] / (whole * length)
+    least = np.inf
+    for i in range(m.noise.shape[0]):
+        least = min(least, m.noise[i, FIT] / (m.noise[i, EFFECTIVE] * m.counts[MEASURED]))
+    return max(by_batches, least)
 
 
 @inner
-def widen_by_empty_arm(sensors: MeasurementModel, m: FilterState) -> None:
-    """Add to the covariance of a fit with an object what its prior lacks: the variances of the empty arm's fit.
+def weigh_parts(sensors: MeasurementModel, m: FilterState, noise: float, prior: float) -> None:
+    """Set the covariance of a fit to one whose noise and prior have other variances, by these factors.
 
-    If these are too small by the factor g, the prior of xi has the covariance g I, and xi the variance W + (g - 1) W W,
-    W = (I + N)^-1. The estimate stays, as the fit weighs the prior by what the empty arm's fit said.
+    m.N: factor L of I + N. The fit says W = (I + N)^-1 of xi, of which W N W = W - W W is due to noise and W W to the
+    prior. L^-T C is a square root of noise W N W + prior W W if C C' = noise I + (prior - noise) L^-1 L^-T. The
+    estimate stays.
     """
-    nx = m.x.size
-    root = np.sqrt(max(m.score[SANDWICH] - 1.0, 0.0))
-    if root == 0.0:
+    nx, L, row = m.x.size, sensors.L, sensors.f
+    for c in range(nx):
+        for r in range(nx):
+            row[r] = 0.0
+        row[c] = 1.0
+        backward(m.N, row)
+        forward(m.N, row)
+        for r in range(c, nx):
+            L[r, c] = (prior - noise) * row[r]
+        L[c, c] += noise - 1.0  # ``factor_information`` adds one
+    if not factor_information(L):
         return
     for i in range(nx):
-        for c in range(sensors.noise.shape[1]):
-            sensors.noise[i, c] = 0.0
         for c in range(nx):
-            sensors.f[c] = m.S[i, c]
-        backward(m.N, sensors.f)
+            row[c] = m.S[i, c]
         for c in range(nx):
-            sensors.noise[i, c] = root * sensors.f[c]
-    absorb_noise(m.S, sensors.noise, sensors.W)
+            value = 0.0
+            for r in range(c, nx):
+                value += row[r] * L[r, c]
+            m.S[i, c] = value
 
 
 @inner

@@ -29,6 +29,9 @@ from flexmanip_ros.types import QUANTILE, Array, Payload, Status
 
 UNKNOWN_STD = 0.3
 """Relative standard deviation above which the payload counts as unknown; the prior's is then published at least."""
+UNTOLD = math.sqrt(0.5)
+"""Deviation of an empty arm's payload over its prior deviation, above which samples tell less of it than the prior: it
+may hold something that was not announced."""
 FEW = 50
 """Samples after an event before anything is claimed."""
 POWER_LIMIT = 2.0
@@ -79,8 +82,12 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     spread = (widening ** 2) * (m.S[state:state + model.body] @ m.S[state:state + model.body].T)
     considered = inertia_error(config, model, max(float(body[0]), 0.0) if held else 0.0)
     spread[0, 0] += (reckoned * considered) ** 2
+    prior = float(structured_model.body_std(config, model)[0])
     if not held:
-        return empty(float(body[0]), math.sqrt(spread[0, 0]), considered, consistency, status)
+        std = math.sqrt(spread[0, 0])
+        if status is Status.TRACKING and std > UNTOLD * structured_model.EMPTY_STD * model.motion.scale:
+            return Payload(0.0, prior, 0.0, QUANTILE * prior, consistency, Status.POORLY_EXCITED)
+        return empty(float(body[0]), std, considered, consistency, status)
     if consistency > (POWER_LIMIT if m.counts[REFITS] else UNKNOWN_POWER):
         return Payload(max(float(body[0]), 0.0), math.inf, 0.0, math.inf, consistency, status)
     known_point = model.body > 1 and not spread[1:, 1:].any()
@@ -89,8 +96,9 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
                                      structured_model.body_std(config, model))
     mass, std = max(float(body[0]), 0.0), math.sqrt(spread[0, 0])
     # a linearization is too sure of a payload that is hardly excited, or was not known where it was made
-    if std > UNKNOWN_STD * mass or (fitting and m.score[DOUBT] > UNKNOWN_STD):
-        std = max(std, float(structured_model.body_std(config, model)[0]))
+    least = 0.0 if fitting else structured_model.EMPTY_STD * model.motion.scale  # a gripper may close on nothing
+    if std > UNKNOWN_STD * max(mass, least) or (fitting and m.score[DOUBT] > UNKNOWN_STD):
+        std = max(std, prior)
         status = Status.POORLY_EXCITED if status is Status.TRACKING else status
     found = Payload(mass, std, max(0.0, mass - QUANTILE * std), mass + QUANTILE * std, consistency, status)
     return found if model.body == 1 or known_point else with_body(found, body, spread)

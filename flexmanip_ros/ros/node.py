@@ -24,7 +24,7 @@ from rclpy.executors import Executor
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
@@ -230,9 +230,10 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
 
     def _incompatible(self, topic: str, event: Any) -> None:
         self._count(topic, 'incompatible_publishers', event.total_count)
+        policy = QoSPolicyKind(event.last_policy_kind).name.lower()
         self.get_logger().error(
-            f"a publisher of '{topic}' offers a quality of service this node cannot take; set "
-            f'qos_overrides.{self.resolve_topic_name(topic)}.subscription.reliability or a similar parameter')
+            f"a publisher of '{topic}' offers a {policy} that this node cannot take; publish with another one, or set "
+            f'qos_overrides.{self.resolve_topic_name(topic)}.subscription.{policy}')
 
     def stamp_of(self, raw: bytes) -> int | None:
         """Return the header stamp [ns] of a serialized JointState; log an error and return None if it is not CDR."""

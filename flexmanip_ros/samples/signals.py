@@ -161,7 +161,8 @@ def _missing(group: str, signal: str, record: JointRecord) -> Rejection:
     if joint not in record.names:
         return Rejection(
             'missing_signal', f"'{signal}' of parameter '{group}' is not in the messages",
-            f'the joints there are: {", ".join(record.names) or "none"}; set {group} to match')
+            f'the joints there are: {", ".join(record.names) or "none"}; set {group} to match. All signals come in one '
+            'JointState: merge those of several publishers')
     return Rejection(
         'missing_signal', f"'{signal}' of parameter '{group}': the messages carry no {field}",
         f'set {group} to the fields that are there')

@@ -35,14 +35,18 @@ ADVICE: Mapping[Status, str] = {
     Status.DIVERGED: 'check the units of the signals and the parameters arm.*',
 }
 """What a user can do next, for each status."""
+MODEL_ADVICE = 'check inputs and outputs, or let --suggest choose order and windows'
+"""The same for a model of which no payload is asked, and which is INCONSISTENT."""
 
 
 def status_text(status: Status, config: IdentifierParameters | None = None) -> str:
     """Return a status in words, with its reason where the configuration shows it, and what to do next."""
-    reason = ''
+    reason, advice = '', ADVICE[status]
     if status is Status.UNOBSERVABLE and config is not None:
         reason = f': {unobservable_reason(config)}'
-    return f'{status.value.partition(";")[0]}{reason}; {ADVICE[status]}'
+    if status is Status.INCONSISTENT and config is not None and config.payload_method == 'none':
+        advice = MODEL_ADVICE
+    return f'{status.value.partition(";")[0]}{reason}; {advice}'
 
 
 @dataclass(frozen=True)
@@ -132,7 +136,7 @@ def result_rows(summary: Summary, config: IdentifierParameters, modes: Sequence[
 
 
 def _text(value: float | None) -> str:
-    return 'unknown' if value is None else f'{value:.6g}'
+    return 'unknown' if value is None or math.isnan(value) else f'{value:.6g}'
 
 
 def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -> Summary:

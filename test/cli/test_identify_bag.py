@@ -16,9 +16,10 @@ from flexmanip_ros.cli.identify_bag import main
 from flexmanip_ros.cli.simulate_bag import main as simulate
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.bag_writer import BagWriter
+from flexmanip_ros.io.outputs import matrices
 from flexmanip_ros.io.parameter_file import read
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, PlantParameters, configure, flatten
-from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, Status
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, StateSpace, Status
 
 START = 1_700_000_000_000_000_000
 KEYS = ['samples', 'gaps', 'sample_time_s', 'wall_s', 'status', 'frequencies_hz', 'damping_ratios',
@@ -106,6 +107,19 @@ def test_a_table_holds_what_the_pipeline_says(recording, capsys, tmp_path):
     assert float(rows[-1]['frequency1_hz']) == estimates[-1].modes[0].frequency_hz
     assert rows[-1]['payload_mass_kg'] == ''
     assert rows[-1]['status'] == estimates[-1].status.name
+
+
+def test_models_of_different_orders_share_a_table() -> None:
+    """Of an arm that moves a larger order becomes two states a displacement once every configuration has its model."""
+    def estimate(order: int) -> Estimate:
+        model = StateSpace(np.eye(order), np.ones((order, 1)), np.ones((2, order)), np.zeros((2, 1)),
+                           np.ones((order, 2)), 1e-3)
+        return Estimate(0, Status.TRACKING, model, (), None)
+
+    stored = matrices([estimate(6), estimate(4)])
+    assert stored['A'].shape == (2, 6, 6)
+    np.testing.assert_array_equal(stored['A'][1, :4, :4], np.eye(4))
+    assert np.isnan(stored['A'][1, 4:]).all()
 
 
 def test_an_interrupt_reports_and_writes_what_was_identified_until_then(recording, capsys, tmp_path, monkeypatch):

@@ -105,6 +105,20 @@ def test_every_argument_is_declared_described_and_used(described: list[Any]) -> 
     assert all(item.kwargs['description'] for item in arguments)
 
 
+@pytest.mark.parametrize('described', [ROOT / 'launch' / 'demo.launch.py'], indirect=True, ids=['demo.launch.py'])
+def test_an_argument_that_is_no_number_ends_the_launch_before_the_first_node(described: list[Any]) -> None:
+    """launch itself would leave the nodes running that it has started by then."""
+    given = {item.args[0]: item.kwargs['default_value'] for item in described
+             if isinstance(item, DeclareLaunchArgument)}
+    kinds = [type(item) for item in described]
+    assert kinds.index(OpaqueFunction) < kinds.index(Node)
+    (check,) = [item.kwargs['function'] for item in described if isinstance(item, OpaqueFunction)]
+    assert check(given) == []
+    for name in ('rate', 'payload_mass', 'capture_time', 'release_time', 'view_port'):
+        with pytest.raises(RuntimeError, match=f'{name}:=heavy is no number'):
+            check({**given, name: 'heavy'})
+
+
 @pytest.mark.parametrize('described', [ROOT / 'launch' / 'view.launch.py'], indirect=True, ids=['view.launch.py'])
 def test_the_view_has_the_arm_of_the_parameters_and_a_layout_that_is_installed(described: list[Any]) -> None:
     arguments = {item.args[0]: item.kwargs for item in described if isinstance(item, DeclareLaunchArgument)}

@@ -38,6 +38,10 @@ def test_every_status_is_a_sentence_with_what_to_do_next(status):
     assert advice
 
 
+def test_the_advice_for_a_model_without_a_payload_is_about_the_model():
+    assert 'arm.' not in status_text(Status.INCONSISTENT, IdentifierParameters(payload_method='none'))
+
+
 def test_signals_that_give_no_payload_are_said_with_the_reason():
     config = IdentifierParameters(angles=())
     assert 'angles does not name the position of two joints' in status_text(Status.UNOBSERVABLE, config)

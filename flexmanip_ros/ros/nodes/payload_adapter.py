@@ -180,7 +180,7 @@ def fill(request: Any, inertia: Inertia, transition_time: float = 0.0) -> Any:
             return request
     mass = next((name for name in ('mass', 'payload') if fields.get(name) in ('float', 'double')), None)
     if mass is None:
-        raise ParameterError(f'a request with {", ".join(fields)} has no place for a payload',
+        raise ParameterError(f'a request with {", ".join(fields) or "no fields"} has no place for a payload',
                              'give a service_type with a geometry_msgs/Inertia or a mass')
     setattr(request, mass, float(inertia.m))
     com = inertia.com

@@ -39,6 +39,8 @@ LONG_GAP = 10
 """Longest gap, in sample times, that the filter bridges with its prediction; after a longer one it starts again."""
 CLOCK_SET_BACK_NS = 1_000_000_000
 """Step back of the stamps [ns] beyond which the clock is a new one (a simulation that began again)."""
+AT_LIMIT_S = 0.5
+"""Time at the limits of the torque, less the time within them, after which the log warns [s]: no move takes that."""
 LARGEST = 1e6
 """Bound on an angle, bend or rate, in SI units, that no arm exceeds; joint states beyond it are dropped."""
 
@@ -61,6 +63,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._goal: Array | None = None
         self._names: tuple[str, ...] = ()
         self._places: list[int] = []
+        self._at_limit = 0
 
     def make_entities(self) -> None:
         """Create the publisher, the subscriptions, and the timer that notices when joint states cease."""
@@ -126,6 +129,16 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
                 self.state = controller.goto(self.state, goal)
             self.state, torque = controller.step(self.config, self.state, measured)
             self._send(torque)
+            self._watch_limits(torque)
+
+    def _watch_limits(self, torque: Array) -> None:
+        """Warn when the torques are at their limits more often than not, counted over ``AT_LIMIT_S``."""
+        at_limit = bool(np.any(np.abs(torque) >= np.asarray(self.config.effort_limit)))
+        self._at_limit = max(0, self._at_limit + (1 if at_limit else -1))
+        if self._at_limit == round(AT_LIMIT_S * self.config.rate):
+            self.get_logger().warning(
+                'the torques stay at effort_limit: the arm is not held. Check rate and the parameters arm.*; an arm '
+                'without damping (arm.damping_ratio 0) becomes unstable in its fastest modes')
 
     def _is_late(self, stamp_ns: int) -> bool:
         """Return whether a sample is not newer than the last, and drop it; a long step back counts as a new clock."""

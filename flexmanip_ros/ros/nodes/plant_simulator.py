@@ -191,6 +191,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
                 self.samples = max(self.samples, self._grid.latest() + 1)
             self._restart()
         response.success, response.message = True, 'the arm is at its start, at rest and empty'
+        self.get_logger().info(f'reset: {response.message}')
         return response
 
     def report(self, report: Report) -> None:
