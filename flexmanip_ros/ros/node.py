@@ -150,8 +150,10 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         self._transition(self._deactivate)
 
     def _configure(self) -> None:
-        arm = arm_line(self)
-        if arm:
+        arm, is_doubtful = arm_line(self)
+        if is_doubtful:
+            self.get_logger().warning(arm)
+        elif arm:
             self.get_logger().info(arm)
         from flexmanip_ros.cli import first_use  # it loads numba, which --help does not need
         with first_use.announced(lambda: self.get_logger().warning(first_use.WORDS)):

@@ -131,14 +131,15 @@ def _reject_unknown(node: Node, known: dict[str, Leaf]) -> None:
         raise ParameterError(f"unknown parameter '{name}'", hint)
 
 
-def arm_line(node: Any) -> str:
+def arm_line(node: Any) -> tuple[str, bool]:
     """Return a log line on the arm parameters of a node and where they come from; empty for a node without an arm.
 
+    The second value: whether a parameter file was given that sets none of them.
     rclpy keeps the overrides given at start by name, not by origin: parameter files and ``-p`` look the same.
     """
     arm = getattr(node.config, 'arm', None)
     if arm is None:
-        return ''
+        return '', False
     given = any(name.startswith('arm.') for name in parameter_overrides(node))
     defaults = flatten(type(arm)())
     changed = [f'arm.{name}' for name, value in flatten(arm).items() if value != defaults[name]]
@@ -161,4 +162,4 @@ def arm_line(node: Any) -> str:
     if len(arm.link_length) > 1:
         links, masses = 'links', f'masses {arm.joint_mass:g} kg at joint 2 and {arm.tip_mass:g} kg at the tip'
     return (f'arm: {links} of {both(arm.link_length)} m, {both(arm.linear_density)} kg/m, '
-            f'{both(arm.bending_stiffness)} N m^2, {masses}; {origin}')
+            f'{both(arm.bending_stiffness)} N m^2, {masses}; {origin}', bool(files) and not given)

@@ -143,7 +143,8 @@ def test_a_node_logs_its_arm_and_where_it_comes_from(
     log('4 kg at the tip; set at start: arm.tip_mass')
     monkeypatch.setattr(sys, 'argv', ['capture_trigger', '--ros-args', '--params-file', 'other.yaml'])
     ros.managed(CaptureTrigger(context=ros.context, namespace='three'))
-    log('all defaults: other.yaml sets no parameter arm.* of /three/capture_trigger')
+    said = log('all defaults: other.yaml sets no parameter arm.* of /three/capture_trigger')
+    assert next(line for line in said.splitlines() if 'other.yaml' in line).startswith('[WARN]')
 
 
 def test_a_node_that_compiles_kernels_says_so_while_it_does(
@@ -181,6 +182,15 @@ def test_the_identifier_logs_what_it_does_waits_for_and_finds(ros: Ros, log: Cal
     assert abs(mass - 20.0) < 2.0 or mass == 0.0
     assert ros.call(Trigger, 'rpbsid_identifier/reset').success
     log('reset: everything identified so far is forgotten')
+
+
+def test_an_event_with_a_stamp_of_another_clock_is_warned_of(ros: Ros, log: Callable[[str], str]) -> None:
+    live = Live(ros)
+    live.send(*recording(300))
+    log('status TRACKING')
+    live.events.publish(conversions.header(CAPTURE._replace(stamp_ns=0)))
+    log('capture_event: capture at 0.000000, ')
+    log(' s before the last sample: stamp an event with the time of its samples')
 
 
 def test_an_unannounced_capture_is_hinted_at_once(ros: Ros, log: Callable[[str], str]) -> None:

@@ -69,6 +69,8 @@ TOPICS = {
     messages.STATUS: (DiagnosticArray, qos.latched), messages.ARM_PARAMETERS: (Float64MultiArray, qos.latched),
 }
 """Message type and quality of service of each output topic."""
+FAR_EVENT_NS = 10_000_000_000
+"""Time between an event and the last sample beyond which the stamp is probably of another clock, or zero [ns]."""
 ARM = 'arm'
 ARM_RATE = 25.0
 """Rate at which the markers of the arm are published [Hz]."""
@@ -291,7 +293,14 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         except FlexmanipError as error:
             self._reject(topic, str(error))
             return
-        self.get_logger().info(f'{topic}: {event.kind.value} at {event.stamp_ns * 1e-9:.6f}')
+        words = f'{topic}: {event.kind.value} at {event.stamp_ns * 1e-9:.6f}'
+        last_ns = self.state.clock.last_ns
+        if last_ns is not None and abs(event.stamp_ns - last_ns) > FAR_EVENT_NS:
+            where = 'before' if event.stamp_ns < last_ns else 'after'
+            self.get_logger().warning(f'{words}, {abs(event.stamp_ns - last_ns) * 1e-9:.0f} s {where} the last sample: '
+                                      'stamp an event with the time of its samples')
+        else:
+            self.get_logger().info(words)
         if self._resumed:
             self._heard.append(event)
         self._step(event)
