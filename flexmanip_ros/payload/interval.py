@@ -23,6 +23,7 @@ from flexmanip_ros.payload.filter_state import (
     SHIFT,
     STORED,
 )
+from flexmanip_ros.payload.gauss_newton import FITS
 from flexmanip_ros.payload.measurement_update import MeasurementModel, misfit, white_variance
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import QUANTILE, Array, Payload, Status
@@ -74,7 +75,7 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     status = Status.TRACKING
     if consistency > POWER_LIMIT or restless > WIDENING_LIMIT or abs(m.score[mem.EXCESS_BIAS]) > MOST_BIAS:
         status = Status.INCONSISTENT
-    if m.counts[mem.SINCE_EVENT] < FEW:
+    if m.counts[mem.SINCE_EVENT] < FEW or (fitting and status is Status.TRACKING and is_behind(m)):
         status = Status.WARMING_UP
     if restarts and m.counts[mem.SEEN] < SETTLED:
         status = Status.DIVERGED
@@ -102,6 +103,15 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         status = Status.POORLY_EXCITED if status is Status.TRACKING else status
     found = Payload(mass, std, max(0.0, mass - QUANTILE * std), mass + QUANTILE * std, consistency, status)
     return found if model.body == 1 or known_point else with_body(found, body, spread)
+
+
+def is_behind(m: mem.FilterState) -> bool:
+    """Whether the fit of an open horizon neither fits nor has read half of the samples: the object may be another one.
+
+    So it is where an object was lost in a gap: the fit begins with a mass that was known exactly.
+    """
+    costs = m.score[mem.COST_BEFORE] > FITS * (m.xi.size + len(m.noise) * m.counts[mem.BEFORE])
+    return bool((costs and m.counts[mem.AGAIN] == 1) or 2 * m.counts[mem.BEFORE] <= m.counts[STORED])
 
 
 def moves(m: mem.FilterState) -> float:

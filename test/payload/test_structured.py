@@ -388,3 +388,19 @@ def test_a_gripper_that_closes_on_nothing_is_known_to_hold_nothing(seed):
     found = structured.estimate(settings, run(settings, samples, (event(3.0),)))
     assert found.status is Status.TRACKING
     assert found.upper < 0.1
+
+
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_an_object_that_is_lost_in_a_gap_is_not_trusted_any_more(seed):
+    """The fit after the gap begins with a mass that was known exactly, so it neither fits nor moves."""
+    settings = IdentifierParameters(arm=ARM)
+    held, left = record(3.0, (event(1.0),), seed=seed), record(1.0, seed=seed + 10)
+    samples = joined(held, altered(left, stamp_ns=left.stamp_ns + 10_000_000_000), gap=True)
+    state = run(settings, samples.between(0, len(held)), (event(1.0),))
+    assert structured.estimate(settings, state).status is Status.TRACKING
+    wrong = 0
+    for row in range(len(held), len(samples), 20):
+        state = structured.advance(settings, state, samples.between(row, row + 20))
+        found = structured.estimate(settings, state)
+        wrong += found.status is Status.TRACKING and found.lower > 0.0
+    assert wrong <= 5  # of 50
