@@ -108,8 +108,11 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
 def is_behind(m: mem.FilterState) -> bool:
     """Whether the fit of an open horizon neither fits nor has read half of the samples: the object may be another one.
 
-    So it is where an object was lost in a gap: the fit begins with a mass that was known exactly.
+    So it is where an object was lost in a gap: the fit begins with a mass that was known exactly. A horizon that lost
+    messages have begun again is not judged before ``FEW`` samples.
     """
+    if m.counts[STORED] < FEW:
+        return False
     costs = m.score[mem.COST_BEFORE] > FITS * (m.xi.size + len(m.noise) * m.counts[mem.BEFORE])
     return bool((costs and m.counts[mem.AGAIN] == 1) or 2 * m.counts[mem.BEFORE] <= m.counts[STORED])
 
