@@ -20,7 +20,6 @@ from flexmanip_ros.payload.filter_state import (
     COST,
     COST_BEFORE,
     DOUBT,
-    EFFECTIVE,
     ENOUGH,
     FIT,
     HELD,
@@ -135,12 +134,9 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
             for c in range(nx):
                 m.S[i, c] = m.Sr[i, c]
         if m.counts[HELD] == 0:
-            found = sandwich(sensors, m)
-            m.score[SANDWICH] = max(found, 1.0)
-            if found < 1.0:  # its noise was assumed too large
-                weigh_parts(sensors, m, found, 1.0)
+            m.score[SANDWICH] = sandwich(sensors, m)
         elif m.score[SANDWICH] > 1.0:
-            weigh_parts(sensors, m, 1.0, m.score[SANDWICH])
+            widen_prior(sensors, m, m.score[SANDWICH])
         variance = dot(m.S[payload], m.S[payload])
         m.score[SHIFT] = abs(shift) / np.sqrt(max(variance, 1e-300))
         m.score[DOUBT] = np.sqrt(variance + shift * shift) / max(m.x[payload], 1e-300)
@@ -152,12 +148,11 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
 
 @inner
 def sandwich(sensors: MeasurementModel, m: FilterState) -> float:
-    """Return the variance of a fit due to noise, over what the fit says; m.N: factor of I + N.
+    """Return the factor, at least 1, by which the variances of a fit are too small; m.N: factor of I + N.
 
-    By batch means (sandwich of Huber and White): where the residuals are no white noise, the gradient is a sum of parts
-    b of batches that are nearly independent, so the variance of xi due to noise is W B W, W = (I + N)^-1, B = sum b b'.
-    The fit says W N W. The factor is the mean over payload and arm parameters of the ratio. White residuals would give
-    one between the least and the largest ratio of a sensor's residual power to the assumed one; less is chance.
+    The variance by batch means (sandwich of Huber and White): where the residuals are no white noise, the gradient is
+    a sum of parts b of batches that are nearly independent, so the variance of xi by them is W B W, W = (I + N)^-1,
+    B = sum b b'. The fit says W N W instead. The factor is the mean over payload and arm parameters of the ratio.
     """
     nx, row = m.x.size, sensors.f
     length = BATCH * sensors.block
@@ -179,20 +174,17 @@ def sandwich(sensors: MeasurementModel, m: FilterState) -> float:
         if said > 0.0:
             total += found / said
             known += 1
-    by_batches: float = total / max(known, 1) * m.counts[MEASURED] / (whole * length)
-    least = np.inf
-    for i in range(m.noise.shape[0]):
-        least = min(least, m.noise[i, FIT] / (m.noise[i, EFFECTIVE] * m.counts[MEASURED]))
-    return max(by_batches, least)
+    factor: float = total / max(known, 1) * m.counts[MEASURED] / (whole * length)
+    return max(1.0, factor)
 
 
 @inner
-def weigh_parts(sensors: MeasurementModel, m: FilterState, noise: float, prior: float) -> None:
-    """Set the covariance of a fit to one whose noise and prior have other variances, by these factors.
+def widen_prior(sensors: MeasurementModel, m: FilterState, factor: float) -> None:
+    """Set the covariance of a fit with an object to that of a prior whose variances were too small by a factor.
 
-    m.N: factor L of I + N. The fit says W = (I + N)^-1 of xi, of which W N W = W - W W is due to noise and W W to the
-    prior. L^-T C is a square root of noise W N W + prior W W if C C' = noise I + (prior - noise) L^-1 L^-T. The
-    estimate stays.
+    If they are too small by the factor g, the prior of xi has the covariance g I, and xi the variance W + (g - 1) W W,
+    W = (I + N)^-1. With L the factor of I + N in m.N, L^-T C is its square root if C C' = I + (g - 1) L^-1 L^-T. The
+    estimate stays, as the fit weighs the prior by what the empty arm's fit said.
     """
     nx, L, row = m.x.size, sensors.L, sensors.f
     for c in range(nx):
@@ -202,9 +194,8 @@ def weigh_parts(sensors: MeasurementModel, m: FilterState, noise: float, prior: 
         backward(m.N, row)
         forward(m.N, row)
         for r in range(c, nx):
-            L[r, c] = (prior - noise) * row[r]
-        L[c, c] += noise - 1.0  # ``factor_information`` adds one
-    if not factor_information(L):
+            L[r, c] = (factor - 1.0) * row[r]
+    if not factor_information(L):  # adds one
         return
     for i in range(nx):
         for c in range(nx):
