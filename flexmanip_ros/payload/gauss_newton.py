@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexmanip_ros.numerics.compiled import inner, kernel
-from flexmanip_ros.numerics.square_root import backward, dot, factor_information, forward, least_distance
+from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, factor_information, forward, least_distance
 from flexmanip_ros.payload.filter_state import (
     AGAIN,
     BEFORE,
@@ -135,8 +135,8 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
                 m.S[i, c] = m.Sr[i, c]
         if m.counts[HELD] == 0:
             m.score[SANDWICH] = sandwich(sensors, m)
-        elif m.score[SANDWICH] > 1.0:
-            widen_prior(sensors, m, m.score[SANDWICH])
+        else:
+            widen_by_empty_arm(sensors, m)
         variance = dot(m.S[payload], m.S[payload])
         m.score[SHIFT] = abs(shift) / np.sqrt(max(variance, 1e-300))
         m.score[DOUBT] = np.sqrt(variance + shift * shift) / max(m.x[payload], 1e-300)
@@ -179,32 +179,25 @@ def sandwich(sensors: MeasurementModel, m: FilterState) -> float:
 
 
 @inner
-def widen_prior(sensors: MeasurementModel, m: FilterState, factor: float) -> None:
-    """Set the covariance of a fit with an object to that of a prior whose variances were too small by a factor.
+def widen_by_empty_arm(sensors: MeasurementModel, m: FilterState) -> None:
+    """Add to the covariance of a fit with an object what its prior lacks: the variances of the empty arm's fit.
 
-    If they are too small by the factor g, the prior of xi has the covariance g I, and xi the variance W + (g - 1) W W,
-    W = (I + N)^-1. With L the factor of I + N in m.N, L^-T C is its square root if C C' = I + (g - 1) L^-1 L^-T. The
-    estimate stays, as the fit weighs the prior by what the empty arm's fit said.
+    If these are too small by the factor g, the prior of xi has the covariance g I, and xi the variance W + (g - 1) W W,
+    W = (I + N)^-1. The estimate stays, as the fit weighs the prior by what the empty arm's fit said.
     """
-    nx, L, row = m.x.size, sensors.L, sensors.f
-    for c in range(nx):
-        for r in range(nx):
-            row[r] = 0.0
-        row[c] = 1.0
-        backward(m.N, row)
-        forward(m.N, row)
-        for r in range(c, nx):
-            L[r, c] = (factor - 1.0) * row[r]
-    if not factor_information(L):  # adds one
+    nx = m.x.size
+    root = np.sqrt(max(m.score[SANDWICH] - 1.0, 0.0))
+    if root == 0.0:
         return
     for i in range(nx):
+        for c in range(sensors.noise.shape[1]):
+            sensors.noise[i, c] = 0.0
         for c in range(nx):
-            row[c] = m.S[i, c]
+            sensors.f[c] = m.S[i, c]
+        backward(m.N, sensors.f)
         for c in range(nx):
-            value = 0.0
-            for r in range(c, nx):
-                value += row[r] * L[r, c]
-            m.S[i, c] = value
+            sensors.noise[i, c] = root * sensors.f[c]
+    absorb_noise(m.S, sensors.noise, sensors.W)
 
 
 @inner

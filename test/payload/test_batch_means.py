@@ -12,7 +12,7 @@ from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured
 from flexmanip_ros.payload.arm_parameters import taught
-from flexmanip_ros.payload.gauss_newton import widen_prior
+from flexmanip_ros.payload.gauss_newton import widen_by_empty_arm
 from flexmanip_ros.payload.measurement_update import BATCH, observe
 from flexmanip_ros.payload.process_model import predict
 from flexmanip_ros.samples.sample_log import Rows
@@ -92,6 +92,7 @@ def test_with_an_object_the_variance_is_that_of_a_prior_that_is_too_small_by_the
     W = np.linalg.inv(np.eye(nx) + half @ half.T)
     m.N[:] = np.linalg.cholesky(np.eye(nx) + half @ half.T)
     m.S[:] = np.linalg.solve(m.N, now.T).T
-    widen_prior(sensors, m, factor)
+    m.score[mem.SANDWICH] = factor
+    widen_by_empty_arm(sensors, m)
     expected = now @ W @ (factor * np.eye(nx) + half @ half.T) @ W @ now.T
     np.testing.assert_allclose(m.S @ m.S.T, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
