@@ -140,10 +140,12 @@ def is_fit_due(config: IdentifierParameters, refined: Refined) -> bool:
     """Whether the whole stretch is to be fitted now: at FIRST samples and each time their number has doubled.
 
     With a parameter-varying model from before an event the stretch is also fitted at ``SOON`` samples, where that model
-    may already hold.
+    may already hold. A fit from before a gap is replaced once the stretch has more than half of the samples behind it.
     """
     total = refined.total
     if not refined.batch or refined.request is not None or total <= 0:
+        return False
+    if refined.recursion is not None and 2 * total <= refined.recursion.weight:
         return False
     if total in SOON and refined.varying_before is not None:
         return parameter_varying.roles(config) is not None
@@ -244,7 +246,11 @@ def skip(refined: Refined) -> Refined:
 
 
 def break_window(refined: Refined) -> Refined:
-    """Begin another stretch where samples are missing: the fits are kept, their state is unknown."""
+    """Begin another stretch where samples are missing: the fits are kept, their state is unknown.
+
+    A fit of fewer than ``LONGEST`` samples may be a poor one, and blocks alone may not mend it. So the new stretch is
+    fitted as a whole, too.
+    """
     old = refined.recursion
     fresh = start(refined.end, refined.before, refined.varying_before)
     if refined.varying is not None:
@@ -257,7 +263,7 @@ def break_window(refined: Refined) -> Refined:
     root[:k - n, :k - n] = triangle(old.root[:k - n].T).T[:, :k - n]
     root[k - n:, k - n:] = 10.0 * np.eye(n)  # deviation 10 of an unknown state: signals have unit power
     theta = old.theta._replace(x=np.zeros(n))
-    return fresh._replace(batch=False, recursion=old._replace(theta=theta, root=root, lost=True))
+    return fresh._replace(batch=old.weight < LONGEST, recursion=old._replace(theta=theta, root=root, lost=True))
 
 
 MEMORY = 1_000_000.0

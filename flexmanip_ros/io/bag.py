@@ -347,7 +347,7 @@ class _Recording:
     def _choose(self, there: dict[str, str], *, complete: bool = True) -> bool:
         """Choose the topics to be read among ``there`` (topic -> type); return whether one of these is chosen."""
         if not self.joint_topic:
-            found = _resolve(self.topics.joint_states, there, JOINT_STATE, self.path)
+            found = _resolve(self.topics.joint_states, there, JOINT_STATE, self.path, '--joint-states')
             if found is None and complete:
                 listed = ', '.join(f'{name} ({kind})' for name, kind in sorted(there.items())) or 'none'
                 raise BagError(f"bag '{self.path}' has no topic '{self.topics.joint_states}'",
@@ -359,7 +359,7 @@ class _Recording:
         for name in self.topics.events:
             near = there if name.startswith('/') else {
                 topic: kind for topic, kind in there.items() if topic.rpartition('/')[0] in spaces}
-            event = _resolve(name, near, HEADER, self.path)
+            event = _resolve(name, near, HEADER, self.path, '--capture-event')
             if event is not None:
                 self._kinds[event] = HEADER
             elif complete and self.topics.events_required:
@@ -368,8 +368,8 @@ class _Recording:
         return any(topic in self._kinds for topic in there)
 
 
-def _resolve(wanted: str, there: dict[str, str], kind: str, path: Path) -> str | None:
-    """Find a topic by its name, in any namespace when that is unambiguous."""
+def _resolve(wanted: str, there: dict[str, str], kind: str, path: Path, option: str) -> str | None:
+    """Find a topic by its name, in any namespace when that is unambiguous; option: of the programs, to name one."""
     exact = wanted if wanted.startswith('/') else '/' + wanted
     names = [name for name in there if name in (wanted, exact)]
     if not names and not wanted.startswith('/'):
@@ -378,7 +378,7 @@ def _resolve(wanted: str, there: dict[str, str], kind: str, path: Path) -> str |
         return None
     if len(names) > 1:
         raise BagError(f"bag '{path}' has several topics '{wanted}': {', '.join(sorted(names))}",
-                       'give the full name with its leading slash')
+                       f'choose one: {option} {min(names)}')
     if there[names[0]] != kind:
         raise BagError(f"topic '{names[0]}' in bag '{path}' is {there[names[0]]}, not {kind}",
                        'name another topic, or record the right type')

@@ -209,7 +209,7 @@ class TableOutput(Output):
 
     def close(self) -> None:
         """Write the file."""
-        writer = write_csv if self.path.suffix == '.csv' else write_npz
+        writer = write_csv if self.path.suffix.lower() == '.csv' else write_npz
         writer(self.path, self.estimates, self.start_ns)
 
 
@@ -245,7 +245,7 @@ class BagOutput(Output):
 def open_output(path: str | Path, frame_id: str) -> Output:
     """Return the output for a name: a table where it ends in .csv or .npz, else a recording."""
     path = Path(path)
-    return TableOutput(path) if path.suffix in ('.csv', '.npz') else BagOutput(path, frame_id)
+    return TableOutput(path) if path.suffix.lower() in ('.csv', '.npz') else BagOutput(path, frame_id)
 
 
 Row = dict[str, Any]
@@ -263,9 +263,9 @@ class Journal:
         self.path = Path(path)
         self.journal = self.path.with_name(self.path.name + '.journal')
         self.rows: list[Row] = []
-        if self.path.suffix not in SUFFIXES:
+        if self.path.suffix.lower() not in SUFFIXES:
             raise OutputError(f"'{path}' is neither .csv nor .parquet", 'end the name in one of them')
-        if self.path.suffix == '.parquet':
+        if self.path.suffix.lower() == '.parquet':
             _parquet()
         check_place(self.path)
         head = json.dumps({'study': identity}, sort_keys=True)
@@ -334,7 +334,7 @@ class Journal:
         """Write the table, sorted by the columns in ``order``."""
         names = list(order)
         rows = sorted(self.rows, key=lambda row: tuple(_sortable(row.get(name)) for name in names))
-        if self.path.suffix == '.csv':
+        if self.path.suffix.lower() == '.csv':
             write_rows(self.path, rows)
         else:
             arrow, parquet = _parquet()

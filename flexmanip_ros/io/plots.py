@@ -17,6 +17,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
 
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples import sampling
@@ -120,7 +121,8 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int, truth: Se
             room = max(max(known_all) - min(known_all), 0.1 * max(known_all))
             ax.set_ylim(min(known_all) - room, max(known_all) + room)
         else:
-            limit(ax, _lowest(values[:, :, 0], values[:, :, 1]), [])
+            trusted = np.array([estimate.model_status is Status.TRACKING for estimate in estimates])
+            limit(ax, _lowest(values[:, :, 0], values[:, :, 1], trusted), [])
             ax.set_ylim(bottom=max(ax.get_ylim()[0], 0.0))
         _note_beyond(ax, values[-1, :, 0])
     ax.set_ylabel('frequency\n[Hz]')
@@ -135,10 +137,11 @@ def _band(ax: Any, x: Array, frequency: Array, std: Array, k: int) -> None:
             label=f'mode {k + 1}, 95 % band')
 
 
-def _lowest(values: Array, stds: Array) -> Array:
+def _lowest(values: Array, stds: Array, trusted: NDArray[np.bool_]) -> Array:
     """Return the frequencies (T, k) that set the range of a plot; those far above the lowest known one are NaN.
 
     Noise gives modes far above those of the arm; a range that includes them would hide the change at a capture.
+    trusted: (T,) rows in which the lowest mode is one of the arm, whatever it is later: a capture may quarter it.
     """
     settled, spread = values[values.shape[0] // 2:], stds[values.shape[0] // 2:]
     low = settled[np.isfinite(settled)]
@@ -147,7 +150,8 @@ def _lowest(values: Array, stds: Array) -> Array:
         low = known
     if low.size == 0:
         return values
-    return np.where(values <= MODES_APART * np.percentile(low, 5), values, np.nan)
+    lowest = np.where(trusted, values[:, 0], np.percentile(low, 5))
+    return np.where(values <= MODES_APART * lowest[:, None], values, np.nan)
 
 
 def _note_beyond(ax: Any, last: Array) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
@@ -83,6 +83,17 @@ def _leaves(cls: type, prefix: str) -> tuple[Leaf, ...]:
     return tuple(found)
 
 
+def suggestion(name: str, declared: Collection[str]) -> str:
+    """Return the hint for a name that is not declared: the nearest one, or those of its group, or all groups."""
+    near = difflib.get_close_matches(name, declared, n=1)
+    if near:
+        return f"did you mean '{near[0]}'?"
+    group = name.partition('.')[0] + '.'
+    inside = [item for item in declared if item.startswith(group)]
+    groups = {item if '.' not in item else item.partition('.')[0] + '.*' for item in declared}
+    return f'known are {", ".join(sorted(inside or groups))}'
+
+
 def configure(cls: type[Config], values: Mapping[str, Any]) -> Config:
     """Build a configuration from dotted names and values; names not given keep their default.
 
@@ -91,9 +102,7 @@ def configure(cls: type[Config], values: Mapping[str, Any]) -> Config:
     declared = {leaf.name: leaf for leaf in leaves(cls)}
     for name in values:
         if name not in declared:
-            near = difflib.get_close_matches(name, declared, n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f'known are {", ".join(sorted(declared))}'
-            raise ParameterError(f"unknown parameter '{name}'", hint)
+            raise ParameterError(f"unknown parameter '{name}'", suggestion(name, declared))
     checked = {name: check(declared[name], value) for name, value in values.items()}
     return _build(cls, checked, '')
 

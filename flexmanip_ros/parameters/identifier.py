@@ -74,7 +74,8 @@ class IdentifierParameters:
         'output signals, each NAME/FIELD of JointState')
     angles: tuple[str, ...] = parameter(
         ('joint1/position', 'joint2/position'), "the signals of the arm's configuration, one a joint; ['']: none")
-    order: int = parameter(4, 'order n of the model', low=1, high=60)
+    order: int = parameter(
+        4, 'order n of the model; the model of every configuration has two states a displacement', low=1, high=60)
     past_window: int = parameter(10, 'past window p', unit='samples', low=1, high=200)
     future_window: int = parameter(5, 'future window f', unit='samples', low=1, high=200)
     forgetting_factor: tuple[float, ...] = parameter(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import sys
 from collections.abc import Callable, Collection, Iterable
 from itertools import pairwise
@@ -18,7 +17,7 @@ from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io.parameter_file import STANDARD
 from flexmanip_ros.parameters import Leaf, check, configure, flatten, leaves
 from flexmanip_ros.parameters.document import limits, package_names
-from flexmanip_ros.parameters.field import LINKS
+from flexmanip_ros.parameters.field import LINKS, suggestion
 from flexmanip_ros.ros.rclpy_workarounds import declare, parameter_overrides
 
 Config = TypeVar('Config')
@@ -126,9 +125,7 @@ def _reject_unknown(node: Node, known: dict[str, Leaf]) -> None:
     for name in parameter_overrides(node):
         if name in known or STANDARD.match(name) or name in package_names():
             continue
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean '{near[0]}'?" if near else f'see ros2 param list /{node.get_name()} or --help'
-        raise ParameterError(f"unknown parameter '{name}'", hint)
+        raise ParameterError(f"unknown parameter '{name}'", suggestion(name, known))
 
 
 def arm_line(node: Any) -> tuple[str, bool]:

@@ -93,7 +93,7 @@ def test_without_json_the_result_is_written_for_people(recording, capsys):
 
 
 def test_a_table_holds_what_the_pipeline_says(recording, capsys, tmp_path):
-    for name in ('out.csv', 'out.npz'):
+    for name in ('out.csv', 'out.npz', 'OUT.CSV'):
         assert _run(capsys, recording, *SETTINGS, '--output', tmp_path / name)[0] == 0
     estimates = list(pipeline.run(configure(IdentifierParameters, OTHER), bag.read(recording)))
     with np.load(tmp_path / 'out.npz', allow_pickle=False) as stored:
@@ -101,6 +101,7 @@ def test_a_table_holds_what_the_pipeline_says(recording, capsys, tmp_path):
         assert stored['A'].shape == (len(estimates), 2, 2)
         np.testing.assert_array_equal(stored['A'][-1], estimates[-1].model.A)
         assert stored['frequency_hz'][-1] == estimates[-1].modes[0].frequency_hz
+    assert (tmp_path / 'OUT.CSV').read_bytes() == (tmp_path / 'out.csv').read_bytes()
     with (tmp_path / 'out.csv').open(encoding='utf-8') as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(estimates)

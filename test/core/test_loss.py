@@ -129,6 +129,17 @@ def test_a_burst_in_which_both_torques_change_does_not_widen_the_interval_for_go
     assert found.std < 2.0 * known.std
 
 
+def test_a_gap_soon_after_a_capture_does_not_leave_a_poor_model_for_good(
+        messages: list[JointRecord | CaptureEvent]) -> None:
+    """Bursts hide steps of the torque 0.25 s after the start and 0.5 s after the capture, when fits are young."""
+    lost = np.zeros(COUNT, dtype=bool)
+    lost[237:291] = lost[2455:2540] = True
+    found = later(surviving(messages, lost))
+    assert tracked([one for one in found if one.stamp_ns >= (CAPTURE + 1600) * 1_000_000]) >= 0.95
+    true = frequencies(vibration_model(PLANT.arm, np.array(PLANT.initial_angles), 20.0)[0])
+    assert [mode.frequency_hz for mode in found[-1].modes] == pytest.approx(true[:2].tolist(), rel=0.03)  # it has turned
+
+
 def test_a_torque_without_steps_is_interpolated_over_lost_messages() -> None:
     events = (CaptureEvent(CAPTURE * 1_000_000, EventKind.CAPTURE),)
     torque = excitation.sequence(configure(ExcitationParameters, {'shape': 'multisine'}), COUNT)

@@ -141,7 +141,9 @@ def test_a_namespace_is_found_and_two_are_asked_about(tmp_path):
         writer.write('/left/joint_states', START, joint_state_record(0))
         writer.write('/right/joint_states', START, joint_state_record(0))
         writer.write('/right/capture_event', START, CaptureEvent(START, EventKind.CAPTURE))
-    assert 'several topics' in good_part(tmp_path / 'two')[1]
+    said = good_part(tmp_path / 'two')[1]
+    assert 'several topics' in said
+    assert '--joint-states /left/joint_states' in said
     assert len(list(bag.read(tmp_path / 'two', bag.Topics('/left/joint_states')))) == 1
     assert len(list(bag.read(tmp_path / 'two', bag.Topics('/right/joint_states')))) == 2
 

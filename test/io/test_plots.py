@@ -39,6 +39,15 @@ def test_a_mode_of_the_noise_does_not_hide_what_a_capture_changes(truth):
     assert said == ['outside: 50.0 Hz']
 
 
+def test_the_mode_of_an_empty_arm_is_seen_where_the_object_takes_it_to_a_tenth():
+    estimates = [Estimate(k * 10_000_000, Status.TRACKING, None, (Mode(10.0 if k < 40 else 1.0, 0.01, 0.01),), None)
+                 for k in range(200)]
+    ax, said = _drawn(estimates)
+    assert ax.get_ylim()[1] > 10.0
+    assert ax.get_ylim()[0] < 1.0
+    assert said == []
+
+
 def test_nothing_is_said_of_modes_outside_when_there_are_none():
     assert _drawn(_estimates())[1] == []
 

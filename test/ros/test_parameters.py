@@ -74,6 +74,8 @@ def test_what_is_no_list_is_not_taken_for_an_empty_one(ros: Ros, given: object) 
     ('arm.joint_mass', math.nan, "'arm.joint_mass'"),
     ('payload_method', 'magic', 'choose one of none, block, frequency, structured'),
     ('ordr', 4, "unknown parameter 'ordr'; did you mean 'order'?"),
+    ('zzz', 4, 'known are angles, arm.*, base_frame'),
+    ('payload.zzzzzzzzzzzz', 4, 'known are payload.'),
     ('publish_rate', 100, "'publish_rate' is of type integer; give a number with a decimal point"),
     ('future_window', 11, 'cannot exceed past_window (10)'),
     ('inputs', ['joint1'], 'write NAME/FIELD'),
