@@ -122,7 +122,9 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int, truth: Se
             ax.set_ylim(min(known_all) - room, max(known_all) + room)
         else:
             trusted = np.array([estimate.model_status is Status.TRACKING for estimate in estimates])
-            limit(ax, _lowest(values[:, :, 0], values[:, :, 1], trusted), [])
+            shown = _lowest(values[:, :, 0], values[:, :, 1], trusted)
+            known = shown[trusted][np.isfinite(shown[trusted])]
+            limit(ax, shown, np.percentile(known, [2, 98]).tolist() if known.size else [])
             ax.set_ylim(bottom=max(ax.get_ylim()[0], 0.0))
         _note_beyond(ax, values[-1, :, 0])
     ax.set_ylabel('frequency\n[Hz]')

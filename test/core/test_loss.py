@@ -137,7 +137,7 @@ def test_a_gap_soon_after_a_capture_does_not_leave_a_poor_model_for_good(
     found = later(surviving(messages, lost))
     assert tracked([one for one in found if one.stamp_ns >= (CAPTURE + 1600) * 1_000_000]) >= 0.95
     true = frequencies(vibration_model(PLANT.arm, np.array(PLANT.initial_angles), 20.0)[0])
-    assert [mode.frequency_hz for mode in found[-1].modes] == pytest.approx(true[:2].tolist(), rel=0.03)  # it has turned
+    assert [mode.frequency_hz for mode in found[-1].modes] == pytest.approx(true[:2].tolist(), rel=0.03)  # it turns
 
 
 def test_a_torque_without_steps_is_interpolated_over_lost_messages() -> None:
