@@ -112,7 +112,7 @@ class Status(Enum):
     ORDER_TOO_LOW = 'the signals hold more dynamics than the order'
     INCONSISTENT = 'the residuals do not fit the model; the interval was widened'
     UNOBSERVABLE = 'these signals cannot give a payload'
-    DIVERGED = 'numbers left the finite range; the estimator restarted'
+    DIVERGED = 'the computed motion went far from the samples; the estimator began again'
 
 
 @dataclass(frozen=True, eq=False)

@@ -176,7 +176,7 @@ ADVICE = {
     Status.INCONSISTENT: 'check the parameters of the arm; announce each capture and release, or set '
                          'trigger_mode:=auto at launch',
     Status.UNOBSERVABLE: 'correct inputs, outputs and angles, or set payload_method to none',
-    Status.DIVERGED: 'check units and signs of the signals',
+    Status.DIVERGED: 'check units and signs of the signals, and the times of events',
 }
 """What a user can do about each status."""
 UNANNOUNCED = ('nothing is known of the payload and no capture was announced: publish capture_event, call '

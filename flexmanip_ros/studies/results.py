@@ -32,7 +32,7 @@ ADVICE: Mapping[Status, str] = {
     Status.ORDER_TOO_LOW: 'raise the order',
     Status.INCONSISTENT: 'check the parameters arm.* and the time of the capture',
     Status.UNOBSERVABLE: 'add the torques, angles and bends of both links to inputs, outputs and angles',
-    Status.DIVERGED: 'check the units of the signals and the parameters arm.*',
+    Status.DIVERGED: 'check the units of the signals, the parameters arm.* and the times of events',
 }
 """What a user can do next, for each status."""
 MODEL_ADVICE = 'check inputs and outputs, or let --suggest choose order and windows'
