@@ -6,17 +6,11 @@ forces are the sum of m J^T A: M collects m J^T J, E collects m J^T a. The root 
 whose J and a in inertial axes it takes over.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from flexmanip_ros.arm.manipulator import Manipulator, Workspace
 from flexmanip_ros.numerics.compiled import inlined, inner
-
-if TYPE_CHECKING:
-    from flexmanip_ros.arm.manipulator import Manipulator, Workspace
-    from flexmanip_ros.types import Array
+from flexmanip_ros.types import Array
 
 STICTION_RATE = 2e-3
 """Joint rate [rad/s] at which the Coulomb friction F tanh(rate / STICTION_RATE) reaches 76 % of its value F."""

@@ -5,18 +5,12 @@ sum of m (dJ^T A + J^T dA). It is gathered link by link from the tip to the base
 root, and the derivatives Fq (by q) and Fv (by q') of F, to the tip of the link before.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from flexmanip_ros.arm.equations_of_motion import curvature_and_slope, shortening_gradient
+from flexmanip_ros.arm.manipulator import Manipulator, Workspace
 from flexmanip_ros.numerics.compiled import inner
-
-if TYPE_CHECKING:
-    from flexmanip_ros.arm.manipulator import Manipulator, Workspace
-    from flexmanip_ros.types import Array
+from flexmanip_ros.types import Array
 
 
 @inner

@@ -6,9 +6,7 @@ and a ramp of force in two directions and of moment: nine numbers. The six of th
 the window (generalized likelihood ratio); all nine date the onset (``capture_detection.onset``).
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,15 +22,12 @@ from flexmanip_ros.payload.filter_state import (
     REJECTED,
     STORED,
     USED,
+    FilterState,
 )
+from flexmanip_ros.payload.measurement_update import MeasurementModel
 from flexmanip_ros.payload.moving_horizon import take
-from flexmanip_ros.payload.process_model import SERIES, STEP_ANGLE, predict
+from flexmanip_ros.payload.process_model import SERIES, STEP_ANGLE, ProcessModel, predict
 from flexmanip_ros.types import Array
-
-if TYPE_CHECKING:
-    from flexmanip_ros.payload.filter_state import FilterState
-    from flexmanip_ros.payload.measurement_update import MeasurementModel
-    from flexmanip_ros.payload.process_model import ProcessModel
 
 DIRECTIONS = 3
 """Number of components of what acts on the tip: force along x and y, moment."""

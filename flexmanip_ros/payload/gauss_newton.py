@@ -6,10 +6,6 @@ the parameters. Where it has read all samples, the filter goes on from its minim
 the horizon. Kernels of their own, as each runs once an iteration, not once a sample.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from flexmanip_ros.numerics.compiled import inner, kernel
@@ -36,15 +32,19 @@ from flexmanip_ros.payload.filter_state import (
     STORED,
     TRIED,
     USED,
+    FilterState,
 )
-from flexmanip_ros.payload.measurement_update import BATCH
-from flexmanip_ros.payload.process_model import INERTIA, MODE, STEP_ANGLE, STIFFNESS, gather_bounds, keep_inertia
+from flexmanip_ros.payload.measurement_update import BATCH, MeasurementModel
+from flexmanip_ros.payload.process_model import (
+    INERTIA,
+    MODE,
+    STEP_ANGLE,
+    STIFFNESS,
+    ProcessModel,
+    gather_bounds,
+    keep_inertia,
+)
 from flexmanip_ros.types import Array
-
-if TYPE_CHECKING:
-    from flexmanip_ros.payload.filter_state import FilterState
-    from flexmanip_ros.payload.measurement_update import MeasurementModel
-    from flexmanip_ros.payload.process_model import ProcessModel
 
 LINEAR = 0.25
 """Standard deviation of a mode's phase [rad] up to which the motion is linear in the phase: its sine is, to 1 %.

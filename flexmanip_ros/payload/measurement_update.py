@@ -1,8 +1,6 @@
 """Compiled update of the structured estimator with a sample, and what its innovations say of the noise."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,11 +31,9 @@ from flexmanip_ros.payload.filter_state import (
     USED,
     WEIGHT,
     WHITE,
+    FilterState,
 )
 from flexmanip_ros.types import Array
-
-if TYPE_CHECKING:
-    from flexmanip_ros.payload.filter_state import FilterState
 
 OUTLIER = 4.0
 """Standard deviations beyond which an innovation has less weight (Huber)."""

@@ -7,10 +7,6 @@ filter, its minimum replaces the filter's state, and the next iteration is linea
 state at the event, with mean x0 and covariance S0 S0'.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from flexmanip_ros.arm.equations_of_motion import solve
@@ -42,6 +38,7 @@ from flexmanip_ros.payload.filter_state import (
     TRIED,
     USED,
     WHITE,
+    FilterState,
 )
 from flexmanip_ros.payload.gauss_newton import (
     AT_REST,
@@ -54,6 +51,7 @@ from flexmanip_ros.payload.gauss_newton import (
 )
 from flexmanip_ros.payload.measurement_update import (
     BATCH,
+    MeasurementModel,
     judge_moves,
     learn_noise,
     measure,
@@ -63,16 +61,12 @@ from flexmanip_ros.payload.measurement_update import (
 )
 from flexmanip_ros.payload.process_model import (
     INERTIA,
+    ProcessModel,
     gather_bounds,
     keep_inertia,
     predict,
 )
 from flexmanip_ros.types import Array
-
-if TYPE_CHECKING:
-    from flexmanip_ros.payload.filter_state import FilterState
-    from flexmanip_ros.payload.measurement_update import MeasurementModel
-    from flexmanip_ros.payload.process_model import ProcessModel
 
 FIRST_ITERATION = 8
 """Samples after an event before the first Gauss-Newton iteration: fewer tell less than the prior."""

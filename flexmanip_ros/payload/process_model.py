@@ -5,10 +5,8 @@ The state is x = [q (n), qd (n), p]. p holds what is not known of payload and ar
 root S (nx, nx). Over a step S becomes F S, with F the derivative of the new state by the old one.
 """
 
-from __future__ import annotations
-
 from enum import IntEnum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +14,10 @@ from numpy.typing import NDArray
 from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, balance, inertial_forces, solve
 from flexmanip_ros.arm.jacobian import add_body_forces, complete_jacobian, force_jacobian, solve_columns
 from flexmanip_ros.arm.late_torque import late_torque
+from flexmanip_ros.arm.manipulator import Manipulator, Workspace
 from flexmanip_ros.numerics.compiled import inner, kernel
-from flexmanip_ros.numerics.square_root import dot, multiply
+from flexmanip_ros.numerics.square_root import Bounds, dot, multiply
 from flexmanip_ros.types import Array
-
-if TYPE_CHECKING:
-    from flexmanip_ros.arm.manipulator import Manipulator, Workspace
-    from flexmanip_ros.numerics.square_root import Bounds
 
 SERIES = 12
 """Terms of the exponential series where its cost does not matter: the rest is 1e-9 for a mode that turns by 1 rad."""

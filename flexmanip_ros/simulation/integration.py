@@ -1,18 +1,14 @@
 """Compiled time stepping: the nonlinear arm by Runge-Kutta methods, linear plants exactly."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import DOP853
 
 from flexmanip_ros.arm.equations_of_motion import acceleration, hold
+from flexmanip_ros.arm.manipulator import Manipulator, Workspace
 from flexmanip_ros.numerics.compiled import kernel, merged
 from flexmanip_ros.types import Array
-
-if TYPE_CHECKING:
-    from flexmanip_ros.arm.manipulator import Manipulator, Workspace
 
 LIMIT = 1e6
 """Magnitude beyond which a coordinate or rate counts as diverged."""
