@@ -6,8 +6,6 @@ on stamps alone. An event older than ``rewind_time`` is applied at once and coun
 sample (latched, received only now) holds for all samples: the payload's estimator begins again with it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Generic, NamedTuple, Protocol, Self, TypeVar

@@ -4,8 +4,6 @@ Nothing here imports ROS. ``ros/conversions`` and ``io/bag_writer`` each turn th
 message classes, so both carry the same numbers.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple

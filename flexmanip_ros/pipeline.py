@@ -5,8 +5,6 @@ identifier), take the rows of this log in groups, each with its own cursor. The 
 messages that came. A replay calls ``run`` with a recording. The same messages give the same estimates bit for bit.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace

@@ -4,8 +4,6 @@ The torque's response to a unit step of the effort is 1 - exp(-(t - delay) / lag
 torques that are held over a sample, so the functions below give the mean torque over each sample.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

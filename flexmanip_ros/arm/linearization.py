@@ -1,7 +1,5 @@
 """Mass matrix and momentum of the arm, and its linear vibration model at a working point (paper eqs. 12-23)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

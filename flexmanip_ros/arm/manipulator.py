@@ -20,8 +20,6 @@ its load. So its inertia is increased until its frequency is the highest one of 
 scaling, Olovsson et al. 2005).
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any, NamedTuple
 

@@ -4,8 +4,6 @@ The programs import numpy, scipy, numba, rosbags and matplotlib only after their
 ``--help`` and a mistake in the arguments are answered at once.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import math

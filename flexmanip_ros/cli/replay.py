@@ -1,7 +1,5 @@
 """The replay of a recording: its messages through the pipeline to a result, a table or recording, and a report."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, nullcontext

@@ -1,7 +1,5 @@
 """What a recording holds, and the parameter file that suits it: ``identify_bag --suggest``."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

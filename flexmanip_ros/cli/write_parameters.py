@@ -3,8 +3,6 @@
 Use: ``python -m flexmanip_ros.cli.write_parameters [REPOSITORY]``; it writes into a checkout only.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path

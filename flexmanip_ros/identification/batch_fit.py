@@ -1,7 +1,5 @@
 """The prediction-error fit of a whole stretch: starting points, noise model, and uncertainty of the result."""
 
-from __future__ import annotations
-
 import itertools
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ Inputs and outputs pass the same linear-phase filter, so the linear relation bet
 between the kept samples is lost; a direct term takes up most of its effect.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

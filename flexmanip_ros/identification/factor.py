@@ -1,7 +1,5 @@
 """Recursive factor of the moments of [z; u; y], compiled: intake of a sample, forgetting, one Givens update."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Score test for a drift of the arm's frequencies along a stretch that was fitted with one constant model."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

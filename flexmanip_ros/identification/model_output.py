@@ -1,7 +1,5 @@
 """From the estimator's memory to a published model: units, basis, uncertainty and status."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

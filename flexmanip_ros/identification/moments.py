@@ -6,8 +6,6 @@ moments (R M')' (R M'), so R M' takes the place of their data matrix. The recurs
 with the same weights to round-off: no state comes from an earlier estimate of the parameters.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Compiled kernel of the paper's recursion: three recursive least-squares estimators in series."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ eqs. 22-37 with all samples at once) and shares no arithmetic with the factor of
 sample by sample, and the matrices are regressed on them.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

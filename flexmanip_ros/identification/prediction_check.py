@@ -5,8 +5,6 @@ noise. The fourth differences of an output give this noise without a model. A fr
 prediction 0.25 s ahead little, so the frequencies have a test of their own (``frequency_errors``).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Prediction-error (maximum-likelihood) fit of the innovation form, started from the subspace model."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

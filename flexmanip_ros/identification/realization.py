@@ -1,7 +1,5 @@
 """Changes of basis and of time: similarity, balancing, discrete to continuous (paper section 3.2)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Scores of a fixed model on data that it was not identified from."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Compiled parts of the parameter-varying model: low-pass filter, and simulation with its derivatives."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

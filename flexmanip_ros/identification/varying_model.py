@@ -1,7 +1,5 @@
 """The parameter-varying model at one configuration: matrices, their uncertainty and their status."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Start of the parameter-varying fit, from the fit of one configuration or from the model before an event."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

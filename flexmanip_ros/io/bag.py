@@ -7,8 +7,6 @@ that holds such a sequence, compressed. A fault inside a compressed chunk costs 
 itself returns the rows before the first missing page.
 """
 
-from __future__ import annotations
-
 import re
 import sqlite3
 import struct

@@ -5,8 +5,6 @@ same. So the messages of a recording are decoded many at a time as rows of one n
 names and lengths are equal. That takes about 0.1 us a message, the general decoder about 6 us.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from typing import NamedTuple

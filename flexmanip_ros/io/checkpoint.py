@@ -5,8 +5,6 @@ rows of the sample log among them) and one text, ``tree``: JSON that says which 
 where. Reading makes only values of this package (NamedTuples, dataclasses, enumerations), so no file can run code.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib

@@ -1,7 +1,5 @@
 """Read ROS parameter files and ``name=value`` overrides as dotted names and values."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections.abc import Iterable, Mapping

@@ -4,8 +4,6 @@ Every axis has its unit, and every event is marked. The colours are those of ``v
 only here and in other modules that draw.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Two reports as HTML pages in one file: of one run of identify_bag, and of a study of monte_carlo."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Iterable, Sequence

@@ -5,8 +5,6 @@ request, a value with a pure ``solve``, and takes the result at a later sample t
 the numbers do not depend on the thread that solved the request, nor on when it was ready.
 """
 
-from __future__ import annotations
-
 from collections.abc import Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Protocol, TypeVar

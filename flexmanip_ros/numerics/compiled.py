@@ -3,8 +3,6 @@
 Compiled functions are cached on disk at first use; those that are older than the sources are deleted at import.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections.abc import Callable

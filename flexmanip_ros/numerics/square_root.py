@@ -1,7 +1,5 @@
 """Compiled square-root algebra of a Gaussian: covariance = S S', S (nx, nx) of any shape."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -9,8 +9,6 @@ that keep it near its working point, and the square wave of joint 2. This torque
 payload, so the link sags at the capture.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterator, Sequence

@@ -6,8 +6,6 @@ dB, the sample rate 1 kHz. The torques are square waves. Errors are averaged ove
 lost: the arm is the reference arm of the parameters.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -3,8 +3,6 @@
 Every method has one colour and one marker in all figures; links and frequencies differ by the line style.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 

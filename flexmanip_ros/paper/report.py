@@ -3,8 +3,6 @@
 ``summary`` returns one line for each case and method, from the rows of all runs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Parameters of the arm, which a user measures or looks up, and of the simulation: sensors, drives, torques, demo."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """YAML files and a table for people, made from the declared parameters so that they cannot go stale."""
 
-from __future__ import annotations
-
 import re
 import textwrap
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Declaration of parameters: one dataclass field holds the default, description, unit and range of each."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import math

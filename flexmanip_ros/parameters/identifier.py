@@ -1,7 +1,5 @@
 """Parameters of the identifier and its payload estimators (node ``rpbsid_identifier``, program ``identify_bag``)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields
 from typing import Any
 

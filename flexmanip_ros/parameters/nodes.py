@@ -1,7 +1,5 @@
 """Parameters of the nodes around the identifier: controller, payload adapter, capture trigger and live page."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from flexmanip_ros.errors import ParameterError

@@ -1,7 +1,5 @@
 """What the arm taught: values of its parameters with their deviations, and the same as parameters to be given."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

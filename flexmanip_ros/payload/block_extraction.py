@@ -1,7 +1,5 @@
 """Payload from the blocks of the identified model: mass matrix, truncation, and its interval."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Captures and releases told from the signals alone: generalized likelihood ratio on the innovations."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple

@@ -7,8 +7,6 @@ from them by the block extraction, so the bound belongs to that formula (name it
 ``everything``: the same from before the capture on, and bounds of all that is unknown of arm and object.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What the structured estimator remembers: arrays of constant size, copied before a call writes them."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

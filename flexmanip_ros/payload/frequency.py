@@ -5,8 +5,6 @@ where the misfit sum_i ((f_i(m) - f_i) / std_i)^2 is least. Its 95 % interval is
 payloads whose misfit is at most 3.84 above the least, so it may reach to infinity on one side.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

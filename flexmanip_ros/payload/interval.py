@@ -1,7 +1,5 @@
 """The 95 % interval of the payload and its status, from covariance, moves and the consistency of the innovations."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The structured estimator before its first step: which signals it reads, its model of the arm, its first state."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from enum import IntEnum

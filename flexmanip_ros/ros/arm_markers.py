@@ -3,8 +3,6 @@
 The marker messages are created once and refilled for each publication: filling takes 0.1 ms, publishing 0.2 ms.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

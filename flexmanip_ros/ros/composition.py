@@ -1,7 +1,5 @@
 """All nodes of the demonstration, and a recorder, in one process on one executor, over DDS."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from functools import partial

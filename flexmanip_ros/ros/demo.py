@@ -5,8 +5,6 @@ folder below OUTPUT gets the bag (mcap) and the picture; replaying that bag must
 bit.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

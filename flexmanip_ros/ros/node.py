@@ -1,7 +1,5 @@
 """Base class and main program of every node: parameters, lifecycle, topics, diagnostics and log lines."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys

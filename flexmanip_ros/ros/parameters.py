@@ -1,7 +1,5 @@
 """A configuration class as ROS parameters: declared with descriptions and ranges, read, and changed together."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Collection, Iterable
 from itertools import pairwise

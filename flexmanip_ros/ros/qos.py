@@ -1,7 +1,5 @@
 """QoS profiles of all topics. The standard ``qos_overrides`` parameters can change each of them."""
 
-from __future__ import annotations
-
 from functools import partial
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy

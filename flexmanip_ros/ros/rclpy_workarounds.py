@@ -3,8 +3,6 @@
 Each piece says what happens without it, and names the upstream issue where one is known.
 """
 
-from __future__ import annotations
-
 import faulthandler
 import gc
 import inspect

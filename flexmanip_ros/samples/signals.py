@@ -1,7 +1,5 @@
 """Position of the configured signals in a message: matched by name, in any order, extra joints ignored."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

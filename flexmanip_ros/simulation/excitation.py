@@ -1,7 +1,5 @@
 """Torques that excite the arm; the largest within an allowed angle, and the payload accuracy to expect from them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

@@ -10,8 +10,6 @@ displacement y_i(x) from the posture at rest includes the link's rigid motion. J
 transversely and axially. The geometry stays that of the working point.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

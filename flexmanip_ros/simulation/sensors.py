@@ -1,7 +1,5 @@
 """Sensors of the simulated arm: what they measure, their dynamics and noise."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.special import ndtri
 

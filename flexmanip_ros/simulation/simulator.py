@@ -5,8 +5,6 @@ that stamp on. An event changes the state before the sample it belongs to: the s
 event's instant is the first after the jump; an event between two stamps acts at the later one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache

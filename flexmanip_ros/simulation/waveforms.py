@@ -1,7 +1,5 @@
 """Unit waveforms of the torques: square wave, multisine, pseudo-random binary sequence, chirp."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

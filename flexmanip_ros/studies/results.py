@@ -4,8 +4,6 @@ The scores of many runs are here too: the error of the payload, how often its 95
 the least error possible (Cramer-Rao bound).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace

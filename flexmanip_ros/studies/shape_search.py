@@ -5,8 +5,6 @@ The models of every order, future window and direct term are computed from sums 
 folds predicts a fold a given time ahead.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise, product

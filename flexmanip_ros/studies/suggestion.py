@@ -5,8 +5,6 @@ cross-validation on these moments. What they cannot tell (forgetting, refinement
 it runs through the recording and predicts the samples that follow.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -3,8 +3,6 @@
 Faults of networks and publishers can be put into the messages of the simulation.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence

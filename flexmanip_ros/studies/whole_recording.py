@@ -5,8 +5,6 @@ between events, from all samples of the stretch. ``sweep``: the frequencies over
 in each configuration.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

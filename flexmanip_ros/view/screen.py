@@ -6,8 +6,6 @@ recording a single frame with everything. Times are the stamps in seconds since 
 rows of float32 in base64: each value has seven digits, and NaN stays NaN, which the page draws as a gap.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import math

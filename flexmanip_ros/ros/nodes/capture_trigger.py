@@ -12,8 +12,6 @@ publishes   capture_event     std_msgs/Header         stamp: the instant, frame_
 services    capture_trigger/capture, capture_trigger/release   std_srvs/Trigger
 """
 
-from __future__ import annotations
-
 import math
 import sys
 import time

@@ -8,8 +8,6 @@ Sample k of the torque belongs k / rate seconds after activation, or after the f
 When the node is deactivated or stopped it sends zero torque once.
 """
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

@@ -11,8 +11,6 @@ publishes   /diagnostics      diagnostic_msgs/DiagnosticArray  1 Hz
 A recording: live_view BAG [--params FILE.yaml] [--set name=value] [--speed 2] [--port 8765], without ROS.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from typing import Any

@@ -11,8 +11,6 @@ A payload is sent once it has been trusted for `settle_time`, and again when its
 `min_change`, its centre of mass or radius of gyration by `min_displacement`.
 """
 
-from __future__ import annotations
-
 import importlib
 import math
 import sys

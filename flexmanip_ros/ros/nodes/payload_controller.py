@@ -13,8 +13,6 @@ the node is deactivated or stopped, it sends zero torque once. An example of a c
 controller.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Collection

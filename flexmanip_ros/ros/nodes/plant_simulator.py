@@ -10,8 +10,6 @@ Stamps form the uniform grid activation + k / rate: after a late timer the node 
 A command of the wrong size or with a value that is not finite is dropped whole.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from typing import Any

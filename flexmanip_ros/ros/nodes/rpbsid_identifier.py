@@ -17,8 +17,6 @@ publishes   ~/model           std_msgs/Float64MultiArray  [[A, B, K], [C, D, I]]
 services    rpbsid_identifier/reset   std_srvs/Trigger   forget everything
 """
 
-from __future__ import annotations
-
 import math
 import sys
 import time
