@@ -1,5 +1,6 @@
 """Captures and releases told from the signals alone: generalized likelihood ratio on the innovations."""
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -215,7 +216,10 @@ PIECE = 256
 
 
 class Watch(NamedTuple):
-    """The detector of a recording: its clock and sample log, and the row that it takes next."""
+    """The detector of a stream of messages: its clock and sample log, and the row that it takes next.
+
+    config: how the signals are sampled; trigger: what is detected in them, with the outputs that came once known.
+    """
 
     config: IdentifierParameters
     clock: sampling.Clock = sampling.Clock()
@@ -231,6 +235,18 @@ class Watch(NamedTuple):
             return False
         return bool(self.state.glr.clock[kernel.QUIET] > round(SETTLE / self.state.dt))
 
+    @property
+    def statistic(self) -> tuple[float, float]:
+        """The latest test statistic of the detection and its threshold."""
+        return (0.0, math.inf) if self.state is None else statistic(self.state)
+
+
+def watching(trigger: TriggerParameters) -> Watch:
+    """Start to look for the events of a trigger."""
+    config = IdentifierParameters(inputs=trigger.inputs, outputs=trigger.outputs, angles=trigger.angles,
+                                  arm=trigger.arm, payload=trigger.payload)
+    return Watch(config, trigger=trigger)
+
 
 def watch(config: IdentifierParameters) -> Watch:
     """Start to look. Raises ParameterError when the configured signals cannot show a capture."""
@@ -242,7 +258,9 @@ def watch(config: IdentifierParameters) -> Watch:
     if structured.init(config).model is None:
         raise ParameterError('captures cannot be found in these signals',
                              'add the torques, angles and bends of both links to inputs, angles and outputs')
-    return Watch(config)
+    return Watch(config, trigger=TriggerParameters(
+        mode='auto', inputs=config.inputs, outputs=config.outputs, angles=config.angles, arm=config.arm,
+        payload=config.payload))
 
 
 @dataclass
@@ -267,7 +285,7 @@ def with_detected(start: Watch, items: Iterable[Item], findings: Findings | None
         if isinstance(item, CaptureEvent):
             yield item
         elif isinstance(item, JointRecord):
-            now, events = _look(now, item)
+            now, events = look(now, item)
             findings.events += events
             findings.watched += now.is_on
             yield item
@@ -275,21 +293,21 @@ def with_detected(start: Watch, items: Iterable[Item], findings: Findings | None
         else:
             for first in range(0, len(item.stamp_ns), PIECE):
                 piece = item.part(slice(first, first + PIECE))
-                after, events = _look(now, piece)
+                after, events = look(now, piece)
                 if not events and after.clock.counters.resets == now.clock.counters.resets:
                     now = after
                     findings.watched += len(piece.stamp_ns) * now.is_on
                     yield piece
                     continue
                 for k in range(len(piece.stamp_ns)):
-                    now, events = _look(now, piece.record(k))
+                    now, events = look(now, piece.record(k))
                     findings.events += events
                     findings.watched += now.is_on
                     yield piece.part(slice(k, k + 1))
                     yield from events
 
 
-def _look(now: Watch, item: JointRecord | JointBlock) -> tuple[Watch, tuple[CaptureEvent, ...]]:
+def look(now: Watch, item: JointRecord | JointBlock) -> tuple[Watch, tuple[CaptureEvent, ...]]:
     """Take a message, or a block of them without a reset; return the events that it revealed."""
     config, trigger, state, cursor = now.config, now.trigger, now.state, now.cursor
     if isinstance(item, JointRecord):
@@ -299,9 +317,7 @@ def _look(now: Watch, item: JointRecord | JointBlock) -> tuple[Watch, tuple[Capt
     if clock.outputs is None:
         return now._replace(clock=clock, log=log), ()
     if state is None or reset:
-        trigger = TriggerParameters(
-            mode='auto', inputs=config.inputs, outputs=clock.outputs, angles=config.angles,
-            arm=config.arm, payload=config.payload)
+        trigger = replace(trigger, outputs=clock.outputs)
         state, cursor = init(trigger), 0
     state, events = advance(trigger, state, log.rows(cursor, log.end))
     return Watch(config, clock, log.from_row(first_needed(state)), trigger, state, log.end), events

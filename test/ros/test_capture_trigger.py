@@ -99,7 +99,7 @@ def test_mode_auto_finds_a_capture_and_tells_it_where_the_plant_does_not_listen(
     for k, record in enumerate(simulator.records(run)):
         publisher.publish(joint_state_message(record))
         if k % 200 == 199:
-            ros.wait(lambda k=k: node._detector.clock.counters.received == k + 1)
+            ros.wait(lambda k=k: node._watch.clock.counters.received == k + 1)
     ros.wait(lambda: detected, what='the detected capture')
     assert detected[0].frame_id == 'capture'
     assert abs(stamp_ns(detected[0].stamp) - capture.stamp_ns) < 30_000_000

@@ -15,7 +15,6 @@ services    capture_trigger/capture, capture_trigger/release   std_srvs/Trigger
 import math
 import sys
 import time
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,13 +24,12 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
+from flexmanip_ros.parameters import TriggerParameters
 from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, header
 from flexmanip_ros.ros.diagnostics import Meter, Report
 from flexmanip_ros.ros.node import FlexmanipNode, run
-from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.signals import joints
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, events_at
 
@@ -42,42 +40,12 @@ WARM_UP_SAMPLES = 1500
 """Number of made-up samples, enough to call every compiled function of the detector."""
 
 
-class Detector:
-    """The detector of mode auto: it finds the events that the joint states reveal."""
-
-    def __init__(self, config: TriggerParameters) -> None:
-        self._config = self._settled = config
-        self._sampling = IdentifierParameters(
-            inputs=config.inputs, outputs=config.outputs, angles=config.angles, arm=config.arm, payload=config.payload)
-        self.clock, self._log, self._cursor = sampling.Clock(), sampling.EMPTY, 0
-        self._state: capture_detection.DetectionState | None = None
-
-    def take(self, record: JointRecord) -> tuple[CaptureEvent, ...]:
-        """Process one message; return the events found with it, each with the stamp of its onset."""
-        self.clock, self._log, reset = sampling.push(self._sampling, self.clock, self._log, record)
-        if self.clock.outputs is None:
-            return ()
-        if self._state is None or reset:
-            self._settled = replace(self._config, outputs=self.clock.outputs)
-            self._state, self._cursor = capture_detection.init(self._settled), 0
-        rows = self._log.rows(self._cursor, self._log.end)
-        self._cursor = self._log.end
-        self._state, events = capture_detection.advance(self._settled, self._state, rows)
-        self._log = self._log.from_row(capture_detection.first_needed(self._state))
-        return events
-
-    @property
-    def statistic(self) -> tuple[float, float]:
-        """The latest test statistic of the detection and its threshold."""
-        return (0.0, math.inf) if self._state is None else capture_detection.statistic(self._state)
-
-
 def warm_up(config: TriggerParameters) -> None:
     """Run the detector once on made-up samples, so that nothing is compiled while real ones come."""
-    detector, names = Detector(config), joints(config)
+    watch, names = capture_detection.watching(config), joints(config)
     for k in range(WARM_UP_SAMPLES):
         wave = np.array([math.sin(0.05 * k * (i + 1)) for i in range(len(names))]) * 1e-3
-        detector.take(JointRecord(k * 1_000_000, names, wave, wave * 0.0, wave * 1e3))
+        watch, _ = capture_detection.look(watch, JointRecord(k * 1_000_000, names, wave, wave * 0.0, wave * 1e3))
 
 
 class CaptureTrigger(FlexmanipNode[TriggerParameters]):
@@ -92,7 +60,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         """Stamp of the joint state before the last one [ns]."""
         self._arrived = -1.0
         self._pending: tuple[CaptureEvent, ...] = ()
-        self._detector: Detector | None = None
+        self._watch: capture_detection.Watch | None = None
         self._reader = JointStateReader()
         self.detected = self.announced = 0
         """Number of events published on capture_detected, and on capture_event."""
@@ -121,7 +89,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
 
     def activated(self) -> None:
         """Count time from the next sample on; in mode auto, look for events from there on."""
-        self._detector = Detector(self.config) if self.config.mode == 'auto' else None
+        self._watch = capture_detection.watching(self.config) if self.config.mode == 'auto' else None
         self._first_ns = self._last_ns = self._before_ns = self.latest = None
         self._pending = ()
 
@@ -139,8 +107,8 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
             while self._pending and stamp >= self._pending[0].stamp_ns - int(self.config.lead_time * 1e9):
                 self._announce(self._pending[0])
                 self._pending = self._pending[1:]
-            if self._detector is not None:
-                self._detect(self._detector, raw)
+            if self._watch is not None:
+                self._watch = self._detect(self._watch, raw)
 
     def _is_new_recording(self, stamp: int) -> bool:
         """Return whether the stamp went back to a new recording, not from a single wrong stamp to the right ones."""
@@ -148,20 +116,21 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
             return False
         return self._before_ns is None or not 0 <= stamp - self._before_ns <= LOOPED_NS
 
-    def _detect(self, detector: Detector, raw: bytes) -> None:
+    def _detect(self, before: capture_detection.Watch, raw: bytes) -> capture_detection.Watch:
         """Publish the events that the sample reveals (mode auto)."""
-        dropped = detector.clock.counters.dropped
         try:
             record = self._reader(raw)
         except SignalError as error:
             self.log_throttled('encoding', f'message dropped: {error}')
-            return
-        for event in detector.take(record):
+            return before
+        watch, events = capture_detection.look(before, record)
+        for event in events:
             self._publish(self.detected_publisher, event, 'detected ')
             self.detected += 1
-        rejection = detector.clock.rejection
-        if detector.clock.counters.dropped > dropped and rejection is not None:
+        rejection = watch.clock.rejection
+        if watch.clock.counters.dropped > before.clock.counters.dropped and rejection is not None:
             self.log_throttled(rejection.reason, f'message dropped: {rejection.problem}; {rejection.remedy}')
+        return watch
 
     def _begin(self, stamp: int) -> None:
         """Plan the events of mode time from the first stamp."""
@@ -210,9 +179,9 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         """Report the rate of the joint states and the number of announced events."""
         report.values.update(self._meter.window(), mode=self.config.mode, announced=self.announced,
                              pending=len(self._pending))
-        if self._detector is not None:
-            statistic, threshold = self._detector.statistic
-            report.values.update(detected=self.detected, dropped=self._detector.clock.counters.dropped,
+        if self._watch is not None:
+            statistic, threshold = self._watch.statistic
+            report.values.update(detected=self.detected, dropped=self._watch.clock.counters.dropped,
                                  statistic=statistic, threshold=threshold)
         if self.active and report.values['rate_hz'] == 0.0:
             report.silent('joint_states')
