@@ -10,7 +10,7 @@ import numpy as np
 
 from flexmanip_ros import event_replay
 from flexmanip_ros.event_replay import EventReplay
-from flexmanip_ros.identification import prediction_check, rpbsid
+from flexmanip_ros.identification import parameter_varying, prediction_check, rpbsid
 from flexmanip_ros.identification.factor import FILLED, REJECTED
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.numerics.background import INLINE, Background
@@ -18,6 +18,7 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, frequency, structured
 from flexmanip_ros.payload.arm_parameters import taught
 from flexmanip_ros.samples.sample_log import Rows, SampleLog
+from flexmanip_ros.samples.signals import relative_angle
 from flexmanip_ros.types import ArmParameter, Array, CaptureEvent, Estimate, Payload, Status
 
 NO_ANGLES: Array = np.empty(0)
@@ -66,6 +67,8 @@ class ModelEstimator(NamedTuple):
     """Range of the configuration since the last event, see ``block_extraction.extend_range``."""
     since_ns: int = 0
     """Stamp of the last event; 0 before the first."""
+    turned: Array = NO_ANGLES
+    """Smallest and largest angle between the links since the last event [rad]; (0,) where the model has no angles."""
 
     def first_needed(self, cursor: int) -> int:
         """Return the first row of the sample log that will be read again."""
@@ -73,13 +76,15 @@ class ModelEstimator(NamedTuple):
 
     def advance(self, config: IdentifierParameters, rows: Rows, background: Background) -> ModelEstimator:
         """Take the next rows of the log. One call with N rows gives the bits of N calls with one."""
-        return ModelEstimator(rpbsid.advance(config, self.rpbsid, rows, background), rows.angles[-1].copy(),
-                              block_extraction.extend_range(config, self.configuration_range, rows), self.since_ns)
+        return ModelEstimator(
+            rpbsid.advance(config, self.rpbsid, rows, background), rows.angles[-1].copy(),
+            block_extraction.extend_range(config, self.configuration_range, rows), self.since_ns,
+            self.turned if parameter_varying.roles(config) is None else extended(config, self.turned, rows))
 
     def event(self, config: IdentifierParameters, event: CaptureEvent, background: Background) -> ModelEstimator:
         """Take an event: the arm caught or released an object before the next row."""
         return self._replace(rpbsid=rpbsid.restart(config, self.rpbsid, background), configuration_range=NO_ANGLES,
-                             since_ns=event.stamp_ns)
+                             since_ns=event.stamp_ns, turned=NO_ANGLES)
 
     def restart(self, config: IdentifierParameters, events: Sequence[CaptureEvent]) -> ModelEstimator:
         """Keep the model: every sample came after these events, so it is that of the arm with its present payload."""
@@ -89,6 +94,15 @@ class ModelEstimator(NamedTuple):
     def outliers(self) -> int:
         """Number of rejected samples: a value was not finite, or far beyond all earlier ones."""
         return int(self.rpbsid.counts[REJECTED])
+
+
+def extended(config: IdentifierParameters, turned: Array, rows: Rows) -> Array:
+    """Return the smallest and largest angle between the links (2,) [rad] after more rows."""
+    if rows.angles.shape[1] != 2:
+        return turned
+    angles = np.concatenate([turned, relative_angle(config, rows.angles)])
+    known = angles[np.isfinite(angles)]
+    return np.array([known.min(), known.max()]) if known.size else turned
 
 
 def init(config: IdentifierParameters) -> tuple[PayloadEstimator, ModelEstimator]:
@@ -159,7 +173,10 @@ class ModelRequest:
         payload: Payload | None = None
         found, without = _identified(config, identifier.rpbsid, self.dt, self.rows)
         if found is not None and config.decimation == 1:
-            found = prediction_check.judged(found, self.rows, config.outputs)
+            role = parameter_varying.roles(config)
+            found = prediction_check.judged(
+                found, self.rows, config.outputs, 0 if role is None else len(role.displacements),
+                float(np.ptp(identifier.turned)) if identifier.turned.size else 0.0)
         if config.payload_method == 'block' and found is not None:
             payload = block_extraction.estimate(config, found, identifier.angles, identifier.configuration_range)
         if found is None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from flexmanip_ros.identification.uncertainty import REAL, Identified, modes
 from flexmanip_ros.identification.validation import simulate
 from flexmanip_ros.samples.sample_log import Rows
-from flexmanip_ros.types import Array, Mode, StateSpace, Status
+from flexmanip_ros.types import QUANTILE, Array, Mode, StateSpace, Status
 
 Complex = NDArray[np.complex128]
 
@@ -54,6 +54,9 @@ DAMPED = 0.3
 LOOSE = 0.1
 """Largest standard deviation of the damping ratio of a known mode. It was 0.01 to 0.06 for the damped mode of the
 measured ist_arm after the first second, and 0.106 to 0.29 for modes that the plant did not have."""
+MOST_TURN = 0.2
+"""Largest range of the angle between the links since the last event, vibration included, in which a model of one
+configuration may hold [rad]. Half of it changes a frequency of two links by up to 1 %; encoders swing by the rest."""
 MOST_MODES = 4
 """Number of modes that are judged, from the lowest frequency on."""
 MOST_SKEW = 1e8
@@ -129,6 +132,19 @@ def swing(poles: Complex, turns: Complex, gains: Complex, U: Array, Z: Complex, 
                 z += gains[i, j] * U[k, j]
 
 
+def eigen(A: Array) -> tuple[Complex, Complex]:
+    """Eigenvalues (n,) and eigenvectors (n, n) of A."""
+    values, right = np.linalg.eig(A + 0j)
+    return np.asarray(values, dtype=np.complex128), np.asarray(right, dtype=np.complex128)
+
+
+def light_modes(values: Complex) -> tuple[Complex, list[int]]:
+    """Logarithms (n,) of the poles, and the places of those of the lowest lightly damped modes, by frequency."""
+    logs: Complex = np.log(np.where(values == 0.0, 1e-300, values))
+    swings = (logs.imag > REAL) & (-logs.real < DAMPED * np.abs(logs))
+    return logs, sorted(np.flatnonzero(swings).tolist(), key=lambda k: float(logs[k].imag))[:MOST_MODES]
+
+
 def frequency_errors(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np.bool_] | None = None
                      ) -> tuple[Array, Array]:
     """Relative errors (g,) of the model's lowest frequencies that the samples show, and half their 95 % intervals.
@@ -139,16 +155,14 @@ def frequency_errors(model: StateSpace, U: Array, Y: Array, horizon: int, seen: 
     Student's t, as the stretches are few. Empty where there is no mode, nan where there are fewer than 3 stretches.
     seen: as in ``missed``.
     """
-    values, right = np.linalg.eig(model.A + 0j)
-    logs = np.log(np.where(values == 0.0, 1e-300, values))
-    swings = (logs.imag > REAL) & (-logs.real < DAMPED * np.abs(logs))
-    chosen = sorted(np.flatnonzero(swings), key=lambda k: float(logs[k].imag))[:MOST_MODES]
+    values, right = eigen(model.A)
+    logs, chosen = light_modes(values)
     g, n = len(chosen), model.order
     if not g or not np.linalg.cond(right) < MOST_SKEW:
         return np.zeros(0), np.zeros(0)
     left, power = np.linalg.inv(right), np.var(Y, axis=0)
     unit = 1.0 / np.sqrt(np.where(power > 0.0, power, 1.0))
-    shape, turns = (model.C @ right) * unit[:, None], 1j * logs.imag
+    shape, turns = (model.C @ right) * unit[:, None], np.asarray(1j * logs.imag, dtype=np.complex128)
     Z, S = np.empty((2, len(Y), n), dtype=np.complex128)
     swing(values, turns, left @ (model.B + 0j), np.ascontiguousarray(U), Z, S)
     rest = (Y - U @ model.D.T) * unit - np.real(Z @ shape.T)
@@ -223,6 +237,22 @@ def widened(found: Identified, share: float) -> Identified:
     return found._replace(spread=np.hstack([found.spread, more]))
 
 
+def with_errors(found: Identified, error: Array, chance: Array) -> Identified:
+    """Return the model with bands that contain the errors of its frequencies that the last samples show beyond chance.
+
+    error, chance: (g,) see ``frequency_errors``. A relative error e adds a deviation of e over the normal quantile.
+    """
+    values, right = eigen(found.model.A)
+    logs, chosen = light_modes(values)
+    left = np.linalg.inv(right)
+    more = np.zeros((len(found.spread), len(chosen)))
+    for column, k in enumerate(chosen):
+        if abs(error[column]) > chance[column]:
+            turn = 2j * logs[k].imag * values[k] * error[column] / QUANTILE
+            more[:found.model.A.size, column] = (turn * np.outer(right[:, k], left[k])).real.ravel()
+    return found._replace(spread=np.hstack([found.spread, more]))
+
+
 def is_vague(oscillations: Sequence[Mode]) -> bool:
     """Whether the frequency of a low lightly damped mode, or the damping ratio of any low mode, is too uncertain.
 
@@ -234,18 +264,29 @@ def is_vague(oscillations: Sequence[Mode]) -> bool:
             or any(mode.damping_ratio_std > LOOSE for mode in oscillations[:MOST_MODES]))
 
 
-def judged(found: Identified, rows: Rows, outputs: tuple[str, ...]) -> Identified:
+def lacks_modes(oscillations: Sequence[Mode], bends: int) -> bool:
+    """Whether there are fewer lightly damped modes than measured bends: a mode that died out is not in the samples."""
+    return sum(abs(mode.damping_ratio) < DAMPED for mode in oscillations) < bends
+
+
+def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int = 0, turned: float = 0.0) -> Identified:
     """Return the model with the status that its predictions of the last samples give; outputs: the outputs' names.
+
+    bends: number of measured bends, where the model is to be one of every configuration; turned: range of the angle
+    between the links since the last event [rad].
 
     INCONSISTENT: the predictions miss over half of the outputs' mean power, or the last samples show another frequency.
     ORDER_TOO_LOW: they miss over half of one output. POORLY_EXCITED, in the first ``EARLY`` samples WARMING_UP: a mode
-    of a model of one configuration is too uncertain, or the last samples do not show its frequency.
+    of a model of one configuration is too uncertain, or the last samples do not show its frequency. Where the model is
+    to be one of every configuration, so it is, too, with fewer lightly damped modes than bends (the arm rests, say),
+    and while there is but the model of one configuration of an arm that has turned (``MOST_TURN``).
 
     Where there are outputs other than rates, the rates count in the mean power alone. Rates contain modes above the
     order, which displacements hardly show, and would reject right models of the first modes.
 
-    The spread of a model of one configuration is widened by what the model leaves of the samples. Nothing else shows
-    the errors from a fit to two periods, or from an arm that turns.
+    The spread of a model of one configuration is widened by what the model leaves of the samples, and by the errors of
+    its frequencies that the last samples show. Nothing else shows the errors from a fit to two periods, or from an arm
+    that turns.
     """
     if found.status is not Status.TRACKING:
         return found
@@ -257,7 +298,10 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...]) -> Identifie
     model = replace(found.model, C=found.model.C[chosen], D=found.model.D[chosen])
     seen = rows.missing == 0
     unknown = Status.WARMING_UP if found.samples < EARLY else Status.POORLY_EXCITED
-    if found.configurations is None:  # ``varying_model.judge`` has those of every configuration
+    of_one = found.configurations is None
+    if bends and (lacks_modes(modes(found), bends) or (of_one and turned > MOST_TURN)):
+        return found._replace(status=unknown)
+    if of_one:  # ``varying_model.judge`` has those of every configuration
         last = slice(max(0, len(rows) - round(found.samples)), None)
         if len(seen[last]) > STRETCHES * model.order:
             with np.errstate(over='ignore', invalid='ignore'):
@@ -283,6 +327,8 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...]) -> Identifie
         error, chance = frequency_errors(model, rows.u, rows.y[:, chosen], stretch, seen)
     if np.any(np.abs(error) - chance > OFF):
         return found._replace(status=Status.INCONSISTENT)
-    if found.configurations is None and np.any(chance > UNSHOWN):
+    if of_one and np.any(np.abs(error) > chance):
+        found = with_errors(found, error, chance)
+    if of_one and (np.any(chance > UNSHOWN) or is_vague(modes(found))):
         return found._replace(status=unknown)
     return found

@@ -385,3 +385,26 @@ def test_missing_samples_cost_no_more_than_the_blocks_they_are_in() -> None:
     for one in late:
         assert np.all(np.abs([mode.frequency_hz for mode in one.modes] / truth(run, one) - 1.0) < 0.015)
         assert all(mode.frequency_std_hz < 0.01 * mode.frequency_hz for mode in one.modes)
+
+
+def test_a_frequency_error_that_the_last_samples_show_is_within_the_band() -> None:
+    u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
+    _, y = swinging((5.6, 6.1), u)
+    rows, model = log_of(u, y).rows(0, len(u)), swinging((5.6, 6.1 * 1.012))[0]
+    found = Identified(model, 1e-6 * np.eye(44, 1), np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=512.0)
+    judged = prediction_check.judged(found, rows, ('a/position', 'b/position'))
+    assert judged.status is Status.TRACKING
+    for mode, known in zip(modes(judged), (5.6, 6.1), strict=True):
+        assert abs(mode.frequency_hz - known) < 1.96 * mode.frequency_std_hz < 0.02 * known
+
+
+@pytest.mark.parametrize(('damping', 'bends', 'turned', 'said'), [
+    (0.005, 2, 0.1, Status.TRACKING), (0.005, 2, 0.3, Status.POORLY_EXCITED), (0.005, 0, 0.3, Status.TRACKING),
+    (0.5, 2, 0.1, Status.POORLY_EXCITED), (0.5, 0, 0.1, Status.TRACKING)])
+def test_a_model_of_one_configuration_shows_each_bend_s_mode_and_holds_until_the_arm_turns(
+        damping: float, bends: int, turned: float, said: Status) -> None:
+    u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
+    model, y = swinging((5.6, 6.1), u, damping)
+    found = Identified(model, 1e-6 * np.eye(44, 1), np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=1e4)
+    rows = log_of(u, y).rows(0, len(u))
+    assert prediction_check.judged(found, rows, ('a/position', 'b/position'), bends, turned).status is said
