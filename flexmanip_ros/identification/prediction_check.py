@@ -237,19 +237,18 @@ def widened(found: Identified, share: float) -> Identified:
     return found._replace(spread=np.hstack([found.spread, more]))
 
 
-def with_errors(found: Identified, error: Array, chance: Array) -> Identified:
-    """Return the model with bands that contain the errors of its frequencies that the last samples show beyond chance.
+def with_errors(found: Identified, errors: Array) -> Identified:
+    """Return the model with bands that contain these relative errors (g,) of its frequencies, see ``frequency_errors``.
 
-    error, chance: (g,) see ``frequency_errors``. A relative error e adds a deviation of e over the normal quantile.
+    An error e adds a deviation of e over the normal quantile.
     """
     values, right = eigen(found.model.A)
     logs, chosen = light_modes(values)
     left = np.linalg.inv(right)
     more = np.zeros((len(found.spread), len(chosen)))
     for column, k in enumerate(chosen):
-        if abs(error[column]) > chance[column]:
-            turn = 2j * logs[k].imag * values[k] * error[column] / QUANTILE
-            more[:found.model.A.size, column] = (turn * np.outer(right[:, k], left[k])).real.ravel()
+        turn = 2j * logs[k].imag * values[k] * errors[column] / QUANTILE
+        more[:found.model.A.size, column] = (turn * np.outer(right[:, k], left[k])).real.ravel()
     return found._replace(spread=np.hstack([found.spread, more]))
 
 
@@ -286,7 +285,8 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
 
     The spread of a model of one configuration is widened by what the model leaves of the samples, and by the errors of
     its frequencies that the last samples show. Nothing else shows the errors from a fit to two periods, or from an arm
-    that turns.
+    that turns. Where the arm may turn and the fit is of more than twice the time that is looked at, the errors count
+    with their intervals: such a fit is a mean over configurations, and the last samples alone tell the present one.
     """
     if found.status is not Status.TRACKING:
         return found
@@ -327,8 +327,10 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
         error, chance = frequency_errors(model, rows.u, rows.y[:, chosen], stretch, seen)
     if np.any(np.abs(error) - chance > OFF):
         return found._replace(status=Status.INCONSISTENT)
-    if of_one and np.any(np.abs(error) > chance):
-        found = with_errors(found, error, chance)
+    shown = np.abs(error)
+    errors = shown + chance if bends and found.samples * dt > 2.0 * LAST_S else np.where(shown > chance, shown, 0.0)
+    if of_one and errors.any():
+        found = with_errors(found, errors)
     if of_one and (np.any(chance > UNSHOWN) or is_vague(modes(found))):
         return found._replace(status=unknown)
     return found
