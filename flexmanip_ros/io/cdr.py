@@ -75,6 +75,14 @@ def joint_record(raw: bytes, layout: Layout | None) -> tuple[JointRecord, Layout
         np.frombuffer(raw, '<f8', c, at_c) if c else _EMPTY), layout
 
 
+def refilled(message: bytearray, layout: Layout, record: JointRecord) -> bytes:
+    """Return a message of this layout with the stamp and the numbers of a record of the same names and lengths."""
+    STAMP.pack_into(message, START, *divmod(record.stamp_ns, 1_000_000_000))
+    for start, values in zip(layout.starts, record[2:], strict=True):
+        message[start:start + values.nbytes] = values.tobytes()
+    return bytes(message)
+
+
 _EMPTY = np.empty(0)
 _EMPTY.setflags(write=False)
 
