@@ -79,7 +79,7 @@ class ModelEstimator(NamedTuple):
         return ModelEstimator(
             rpbsid.advance(config, self.rpbsid, rows, background), rows.angles[-1].copy(),
             block_extraction.extend_range(config, self.configuration_range, rows), self.since_ns,
-            self.turned if parameter_varying.roles(config) is None else extended(config, self.turned, rows))
+            extended(config, self.turned, rows))
 
     def event(self, config: IdentifierParameters, event: CaptureEvent, background: Background) -> ModelEstimator:
         """Take an event: the arm caught or released an object before the next row."""
@@ -97,8 +97,8 @@ class ModelEstimator(NamedTuple):
 
 
 def extended(config: IdentifierParameters, turned: Array, rows: Rows) -> Array:
-    """Return the smallest and largest angle between the links (2,) [rad] after more rows."""
-    if rows.angles.shape[1] != 2:
+    """Return the smallest and largest angle between the links (2,) [rad] after more rows; see ``turned``."""
+    if parameter_varying.roles(config) is None or rows.angles.shape[1] != 2:
         return turned
     angles = np.concatenate([turned, relative_angle(config, rows.angles)])
     known = angles[np.isfinite(angles)]

@@ -219,22 +219,34 @@ def unfitted(model: StateSpace, U: Array, Y: Array, seen: NDArray[np.bool_]) -> 
     return math.sqrt(float(np.mean(np.where(beyond, rest - noise, 0.0))))
 
 
+def with_pole_errors(found: Identified, values: Complex, right: Complex, errors: Sequence[tuple[int, complex]]
+                     ) -> Identified:
+    """Return the model with its spread widened by errors of its poles; as it is where no spread is known.
+
+    values (n,), right (n, n): eigenvalues and eigenvectors of A; errors: the place of a pole, and a deviation of the
+    logarithm of that pole and its conjugate.
+    """
+    if not found.spread.size or not np.linalg.cond(right) < MOST_SKEW:
+        return found
+    left, more = np.linalg.inv(right), np.zeros((len(found.spread), len(errors)))
+    for column, (k, error) in enumerate(errors):
+        moved = 2.0 * error * values[k] * np.outer(right[:, k], left[k])
+        more[:found.model.A.size, column] = moved.real.ravel()
+    return found._replace(spread=np.hstack([found.spread, more]))
+
+
 def widened(found: Identified, share: float) -> Identified:
     """Return the model with its spread widened by the pole errors that explain a share of the amplitude.
 
     share: what the model leaves, see ``unfitted``. A pole error d [rad a sample] changes the phase or the logarithm of
     the amplitude of the motion by d k after k samples; over N samples this has the root mean square d N / sqrt(3).
     """
-    A = found.model.A
-    values, right = np.linalg.eig(A)
-    if share == 0.0 or not found.samples > 0.0 or not found.spread.size or not np.linalg.cond(right) < MOST_SKEW:
+    if share == 0.0 or not found.samples > 0.0:
         return found
-    left, off = np.linalg.inv(right), math.sqrt(3.0) * share / found.samples
-    more = np.zeros((len(found.spread), 2 * np.count_nonzero(values.imag > 0.0)))
-    for column, k in enumerate(np.flatnonzero(values.imag > 0.0)):
-        turn = 2.0 * off * values[k] * np.outer(right[:, k], left[k])
-        more[:A.size, 2 * column:2 * column + 2] = np.column_stack([(1j * turn).real.ravel(), turn.real.ravel()])
-    return found._replace(spread=np.hstack([found.spread, more]))
+    values, right = np.linalg.eig(found.model.A)
+    off = math.sqrt(3.0) * share / found.samples
+    swinging = np.flatnonzero(values.imag > 0.0).tolist()
+    return with_pole_errors(found, values, right, [(k, error) for k in swinging for error in (1j * off, off)])
 
 
 def with_errors(found: Identified, errors: Array) -> Identified:
@@ -244,12 +256,8 @@ def with_errors(found: Identified, errors: Array) -> Identified:
     """
     values, right = eigen(found.model.A)
     logs, chosen = light_modes(values)
-    left = np.linalg.inv(right)
-    more = np.zeros((len(found.spread), len(chosen)))
-    for column, k in enumerate(chosen):
-        turn = 2j * logs[k].imag * values[k] * errors[column] / QUANTILE
-        more[:found.model.A.size, column] = (turn * np.outer(right[:, k], left[k])).real.ravel()
-    return found._replace(spread=np.hstack([found.spread, more]))
+    return with_pole_errors(found, values, right, [
+        (k, 1j * logs[k].imag * error / QUANTILE) for k, error in zip(chosen, errors.tolist(), strict=True)])
 
 
 def is_vague(oscillations: Sequence[Mode]) -> bool:
@@ -276,9 +284,9 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
 
     INCONSISTENT: the predictions miss over half of the outputs' mean power, or the last samples show another frequency.
     ORDER_TOO_LOW: they miss over half of one output. POORLY_EXCITED, in the first ``EARLY`` samples WARMING_UP: a mode
-    of a model of one configuration is too uncertain, or the last samples do not show its frequency. Where the model is
-    to be one of every configuration, so it is, too, with fewer lightly damped modes than bends (the arm rests, say),
-    and while there is but the model of one configuration of an arm that has turned (``MOST_TURN``).
+    of a model of one configuration is too uncertain, or the last samples do not show its frequency. Where the model
+    should be one of every configuration, the same status means that it has fewer lightly damped modes than there are
+    bends, or that it is still of one configuration and the links have turned by more than ``MOST_TURN``.
 
     Where there are outputs other than rates, the rates count in the mean power alone. Rates contain modes above the
     order, which displacements hardly show, and would reject right models of the first modes.
@@ -327,10 +335,12 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
         error, chance = frequency_errors(model, rows.u, rows.y[:, chosen], stretch, seen)
     if np.any(np.abs(error) - chance > OFF):
         return found._replace(status=Status.INCONSISTENT)
+    if not of_one or not np.all(np.isfinite(chance)):  # nan: too few stretches
+        return found
     shown = np.abs(error)
     errors = shown + chance if bends and found.samples * dt > 2.0 * LAST_S else np.where(shown > chance, shown, 0.0)
-    if of_one and errors.any():
+    if errors.any():
         found = with_errors(found, errors)
-    if of_one and (np.any(chance > UNSHOWN) or is_vague(modes(found))):
+    if np.any(chance > UNSHOWN) or (errors.any() and is_vague(modes(found))):
         return found._replace(status=unknown)
     return found

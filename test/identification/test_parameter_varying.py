@@ -408,3 +408,15 @@ def test_a_model_of_one_configuration_shows_each_bend_s_mode_and_holds_until_the
     found = Identified(model, 1e-6 * np.eye(44, 1), np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=1e4)
     rows = log_of(u, y).rows(0, len(u))
     assert prediction_check.judged(found, rows, ('a/position', 'b/position'), bends, turned).status is said
+
+
+def test_samples_that_show_no_frequency_leave_the_band_of_a_model_as_it_is() -> None:
+    u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
+    model, y = swinging((5.6, 6.1), u)
+    missing = np.zeros(len(u), dtype=np.int64)
+    missing[:len(u) // 2 + 250] = 1  # two stretches of 250 samples are left, and three are needed
+    rows = log_of(u, y, missing=missing).rows(0, len(u))
+    found = Identified(model, 1e-6 * np.eye(44, 1), np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=1e4)
+    assert np.isnan(prediction_check.frequency_errors(model, u, y, 250, missing == 0)[0]).all()
+    judged = prediction_check.judged(found, rows, ('a/position', 'b/position'), 2, 0.1)
+    assert np.isfinite(judged.spread).all()
