@@ -52,6 +52,11 @@ def write_file(path: str | Path, fill: Callable[[Any], Any]) -> None:
         raise OutputError(f"'{path}' cannot be written: {err.strerror}", 'give another place') from err
 
 
+def ending(path: str | Path) -> str:
+    """Return the ending of a name with its point, in lower case."""
+    return Path(path).suffix.lower()
+
+
 def check_place(path: str | Path, *endings: str) -> None:
     """Raise OutputError when a file cannot be written there, or its name has none of the endings, if any are given.
 
@@ -70,7 +75,7 @@ def check_place(path: str | Path, *endings: str) -> None:
         raise OutputError(f"directory '{folder}' does not exist", 'make it first, or give another place')
     if not os.access(folder, os.W_OK):
         raise OutputError(f"directory '{folder}' cannot be written", 'give another place')
-    if endings and Path(path).suffix.lower() not in endings:
+    if endings and ending(path) not in endings:
         raise OutputError(f"'{path}' does not end in {' or '.join(endings)}", 'give such a name')
 
 
@@ -209,7 +214,7 @@ class TableOutput(Output):
 
     def close(self) -> None:
         """Write the file."""
-        writer = write_csv if self.path.suffix.lower() == '.csv' else write_npz
+        writer = write_csv if ending(self.path) == '.csv' else write_npz
         writer(self.path, self.estimates, self.start_ns)
 
 
@@ -245,7 +250,7 @@ class BagOutput(Output):
 def open_output(path: str | Path, frame_id: str) -> Output:
     """Return the output for a name: a table where it ends in .csv or .npz, else a recording."""
     path = Path(path)
-    return TableOutput(path) if path.suffix.lower() in ('.csv', '.npz') else BagOutput(path, frame_id)
+    return TableOutput(path) if ending(path) in ('.csv', '.npz') else BagOutput(path, frame_id)
 
 
 Row = dict[str, Any]
@@ -263,9 +268,9 @@ class Journal:
         self.path = Path(path)
         self.journal = self.path.with_name(self.path.name + '.journal')
         self.rows: list[Row] = []
-        if self.path.suffix.lower() not in SUFFIXES:
+        if ending(self.path) not in SUFFIXES:
             raise OutputError(f"'{path}' is neither .csv nor .parquet", 'end the name in one of them')
-        if self.path.suffix.lower() == '.parquet':
+        if ending(self.path) == '.parquet':
             _parquet()
         check_place(self.path)
         head = json.dumps({'study': identity}, sort_keys=True)
@@ -334,7 +339,7 @@ class Journal:
         """Write the table, sorted by the columns in ``order``."""
         names = list(order)
         rows = sorted(self.rows, key=lambda row: tuple(_sortable(row.get(name)) for name in names))
-        if self.path.suffix.lower() == '.csv':
+        if ending(self.path) == '.csv':
             write_rows(self.path, rows)
         else:
             arrow, parquet = _parquet()
