@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from identification_moving_arm import frequencies
-from identification_status import renamed
+from identification_status import LATELY_S, misses, renamed
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm.manipulator import payload_array
@@ -32,7 +32,7 @@ from flexmanip_ros.parameters import (
 )
 from flexmanip_ros.payload.structured_model import chords
 from flexmanip_ros.simulation import excitation, sensors, simulator
-from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointBlock, Status
+from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointBlock, Mode, Status
 
 ARM = ArmParameters(damping_ratio=0.005)
 ROUGH = replace(ARM, joint_viscous_friction=(8.0, 1.5), joint_coulomb_friction=(2.0, 0.4), rotor_inertia=(3.0, 0.4))
@@ -121,15 +121,11 @@ def held(run: Run, stamp_ns: int) -> float:
     return next((mass for stamp, mass in reversed(run.caught) if stamp <= stamp_ns), 0.0)
 
 
-def is_wrong(plant: PlantParameters, run: Run, stamp_ns: int, modes: Sequence[Any]) -> bool:
-    """Whether a band misses the truth at this stamp by three times its width, or a mode is not there."""
-    if len(modes) < 2:
-        return True
+def is_wrong(plant: PlantParameters, run: Run, stamp_ns: int, modes: Sequence[Mode]) -> bool:
+    """Whether a reading misses the truth of the half second before this stamp, see ``misses``."""
     row = int(np.searchsorted(run.stamp_ns, stamp_ns))
-    lately = run.position[max(0, row - round(0.5 * plant.rate)):row + 1, :2]
-    known = frequencies(plant, chords(plant.arm, lately.mean(axis=0)), held(run, stamp_ns))
-    return any(abs(mode.frequency_hz - f) > 3.0 * 1.96 * mode.frequency_std_hz
-               for mode, f in zip(modes, known, strict=False))
+    lately = run.position[max(0, row - round(LATELY_S * plant.rate)):row + 1, :2]
+    return misses(modes, frequencies(plant, chords(plant.arm, lately.mean(axis=0)), held(run, stamp_ns)))
 
 
 def row_of(name: str, plant: PlantParameters, run: Run, items: list[JointBlock | CaptureEvent]) -> dict[str, Any]:

@@ -28,7 +28,17 @@ from flexmanip_ros.payload.structured_model import chords
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, StateSpace, Status
+from flexmanip_ros.types import (
+    Array,
+    CaptureEvent,
+    Estimate,
+    EventKind,
+    JointBlock,
+    JointRecord,
+    Mode,
+    StateSpace,
+    Status,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get('FLEXMANIP_DATA', ROOT.parent / 'shared' / 'data'))
@@ -149,10 +159,14 @@ def row_of(case: Case) -> dict[str, Any]:
     return {'case': case.name, 'readings': len(found), **counts}
 
 
+def misses(modes: Sequence[Mode], truth: Array) -> bool:
+    """Whether the band of a frequency misses the truth (2,) [Hz] by three times its width, or a mode is not there."""
+    return len(modes) != len(truth) or any(abs(mode.frequency_hz - known) > 3.0 * 1.96 * mode.frequency_std_hz
+                                           for mode, known in zip(modes, truth, strict=True))
+
+
 def band_misses(case: Case, held: float, estimate: Estimate) -> bool:
-    """Whether the band of a frequency misses the truth by three times its width, or a mode is not there."""
-    if len(estimate.modes) != 2:
-        return True
+    """Whether a reading misses the truth of the last half second, see ``misses``."""
     lately = []
     for item in case.items:
         if isinstance(item, JointBlock):
@@ -160,9 +174,8 @@ def band_misses(case: Case, held: float, estimate: Estimate) -> bool:
             joints = [k for k, name in enumerate(item.names) if 'bend' not in name]
             lately.append(item.position[np.ix_(rows, joints)])
     arm = PlantParameters().arm
-    truth = frequencies(PlantParameters(), chords(arm, np.concatenate(lately).mean(axis=0)), held)
-    return any(abs(mode.frequency_hz - known) > 3.0 * 1.96 * mode.frequency_std_hz
-               for mode, known in zip(estimate.modes, truth, strict=True))
+    return misses(estimate.modes,
+                  frequencies(PlantParameters(), chords(arm, np.concatenate(lately).mean(axis=0)), held))
 
 
 def prediction_fails(case: Case, estimate: Estimate, signals: Signals, since_ns: int) -> bool:

@@ -55,15 +55,10 @@ def test_the_policy_allows_exactly_what_a_node_opens(ros: Ros, cls: Any) -> None
     # The driver's service type is not installed here; a parameter service stands at its place.
     given = {PayloadAdapter: overrides(target_node='driver'), LiveView: overrides(port=0)}.get(cls)
     node = ros.managed(cls(context=ros.context, overrides=given))
-
-    def real() -> dict[str, set[str]]:
-        found = opened(node)
-        if cls is PayloadAdapter:
-            found['request'] = {name.replace('/driver/set_parameters', '/' + DRIVER) for name in found['request']}
-        return found
-
-    ros.wait(lambda: real() == allowed(node.get_name()))  # the graph learns of its own node with a delay
-    assert real() == allowed(node.get_name())
+    real = opened(node)
+    if cls is PayloadAdapter:
+        real['request'] = {name.replace('/driver/set_parameters', '/' + DRIVER) for name in real['request']}
+    assert real == allowed(node.get_name())
 
 
 def test_every_node_has_an_enclave_of_its_own() -> None:
