@@ -22,8 +22,11 @@ from flexmanip_ros.errors import FlexmanipError, ModelError
 SUCCESS, DEFECT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 LONGEST = 1e9
 """Largest time that is accepted [s]; larger ones overflow a stamp in nanoseconds."""
-LOADING_S = 0.05
-"""Time after which a signal that came while a kernel was loaded is sent again [s]; loading takes milliseconds."""
+POSTPONED_S = 0.05
+"""Time after which a postponed signal is sent again [s]; a kernel is loaded and a message written in milliseconds."""
+UNINTERRUPTED = ('llvmlite.', 'flexmanip_ros.io.bag_writer')
+"""Modules in which no signal is handled. An exception in a callback of LLVM, which loads a kernel, is printed and lost,
+or ends the process with SIGSEGV; one between two writes to a recording leaves a file without its end."""
 TRACEBACK = 'FLEXMANIP_TRACEBACK'
 """Environment variable; where it is set, a defect prints its traceback."""
 
@@ -175,13 +178,10 @@ def run(prog: str, body: Callable[[], int]) -> int:
 
 
 def is_postponed(number: int, frame: FrameType | None) -> bool:
-    """Return whether a signal came in a callback of LLVM that loads a kernel; it is sent again after ``LOADING_S``.
-
-    An exception in such a callback is printed and lost, or ends the process with SIGSEGV.
-    """
+    """Return whether a signal came in one of the modules ``UNINTERRUPTED``; it is sent again after ``POSTPONED_S``."""
     while frame is not None:
-        if frame.f_globals.get('__name__', '').startswith('llvmlite.'):
-            send_again(number, LOADING_S)
+        if frame.f_globals.get('__name__', '').startswith(UNINTERRUPTED):
+            send_again(number, POSTPONED_S)
             return True
         frame = frame.f_back
     return False

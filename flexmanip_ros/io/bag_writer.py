@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import threading
 import time
 from pathlib import Path
@@ -58,7 +57,6 @@ class BagWriter:
         self._lock = threading.Lock()
         self._flush_period = np.inf if flush_period is None else flush_period
         self._flushed = time.monotonic()
-        existed = self.path.exists()
         try:
             self._writer = Writer(self.path, version=9, storage_plugin=storage)
             self._writer.open()
@@ -66,12 +64,6 @@ class BagWriter:
             raise BagError(f"bag '{path}' exists already", 'remove it or give another name') from err
         except OSError as err:
             raise BagError(f"bag '{path}' cannot be written: {err.strerror}", 'give another place') from err
-        except KeyboardInterrupt:  # no message is in it, and a file without its end is no recording
-            with contextlib.suppress(Exception):
-                self._writer.close()
-            if not existed:
-                shutil.rmtree(self.path, ignore_errors=True)
-            raise
         self._open = True
 
     def write(self, topic: str, log_ns: int, value: Value, *, latched: bool = False) -> None:

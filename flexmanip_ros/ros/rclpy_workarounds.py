@@ -52,8 +52,9 @@ def interrupt_on_signals(*, again: bool = False) -> list[int]:
     """Let SIGINT and SIGTERM raise KeyboardInterrupt; call it again after an executor was made.
 
     Return a list to which each received signal is added, because an exception in a callback from C is printed and
-    lost. A signal that comes while a kernel is loaded is handled later, see ``console.is_postponed``. again: each
-    signal is sent again every ``AGAIN_S`` until signals are ignored, in case a callback from C lost its exception.
+    lost. A signal that comes while a kernel is loaded or a recording written is handled later, see
+    ``console.is_postponed``. again: each signal is sent again every ``AGAIN_S`` until signals are ignored, in case a
+    callback from C lost its exception.
 
     rclpy's own handlers end the context before a node can send its last message, such as zero torque. With
     ``SignalHandlerOptions.NO`` alone, SIGTERM ends the process at once, and the events executor sets handlers of its

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import sqlite3
+import time
 from contextlib import suppress
 
 import pytest
@@ -12,6 +14,7 @@ from recordings import START, good_part, joint_state_record, storage_file, write
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from flexmanip_ros.cli import console
 from flexmanip_ros.errors import BagError
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.bag_writer import BagWriter
@@ -43,17 +46,26 @@ def test_a_recording_without_its_metadata_is_read_and_says_so(tmp_path):
     assert 'ros2 bag reindex' in line
 
 
-def test_an_interrupt_while_a_recording_is_opened_leaves_no_file_without_an_end(tmp_path, monkeypatch):
-    opening = Writer.open
+@pytest.mark.parametrize('moment', ['open', 'add_connection', 'write', 'close'])
+def test_an_interrupt_while_a_recording_is_written_leaves_a_whole_one(moment, tmp_path, monkeypatch):
+    before = getattr(Writer, moment)
 
-    def interrupted(writer):
-        opening(writer)
-        raise KeyboardInterrupt
+    def interrupted(writer, *given, **named):
+        monkeypatch.setattr(Writer, moment, before)  # one signal
+        signal.raise_signal(signal.SIGINT)
+        return before(writer, *given, **named)
 
-    monkeypatch.setattr(Writer, 'open', interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        BagWriter(tmp_path / 'bag')
-    assert not (tmp_path / 'bag').exists()
+    def body():
+        with BagWriter(tmp_path / 'bag') as writer:
+            for k in range(100):
+                writer.write('/joint_states', START + k, joint_state_record(k))
+        limit = time.monotonic() + 10.0
+        while time.monotonic() < limit:
+            time.sleep(0.01)
+
+    monkeypatch.setattr(Writer, moment, interrupted)
+    assert console.run('program', body) == console.INTERRUPTED
+    assert len(list(bag.read(tmp_path / 'bag'))) == 100
 
 
 def test_a_missing_topic_is_answered_with_those_that_are_there(tmp_path):
