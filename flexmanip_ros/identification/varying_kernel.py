@@ -10,6 +10,10 @@ from flexmanip_ros.types import Array
 TERMS = 6
 """Number of terms in the exponential series of a step. At 0.3 rad a step the terms left out are 1e-7 of the series."""
 
+LARGEST = 30.0
+"""Largest |zeta| that is told apart: there k is 0 or 1 to 1e-13. A trial step of a fit may lead anywhere, and at k = 1
+the functions are infinite."""
+
 
 @njit(cache=True, nogil=True)
 def low_pass(rows: Array, Ad: Array, Bd: Array, Cd: Array, state: Array, every: int, out: Array, second: Array) -> None:
@@ -129,7 +133,7 @@ def basis(c: float, zeta: float) -> tuple[Array, Array, Array, Array]:
     couples one coordinate of link 1 with those of link 2. So the inverse of the mass matrix is exactly linear in these
     three functions, for any number of modes.
     """
-    k = 1.0 / (1.0 + math.exp(-zeta))
+    k = 1.0 / (1.0 + math.exp(-min(max(zeta, -LARGEST), LARGEST)))
     dk, below = k * (1.0 - k), 1.0 - k * c * c
     value = np.array([1.0, c / below, c * c / below])
     by_c = np.array([0.0, (1.0 + k * c * c) / below ** 2, 2.0 * c / below ** 2])

@@ -82,8 +82,9 @@ joint that sticks takes three, wrong parameters may take hundreds."""
 GROWTH = 4
 """One over the share by which the horizon must grow before a converged fit is repeated: a quarter; less hardly moves
 it."""
-LOST = 1e4
-"""Cost for each measurement beyond which a trajectory is given up: it says nothing of the arm."""
+LOST = 1e12
+"""Cost for each measurement beyond which a trajectory is given up: a million standard deviations of the noise. The best
+encoders tell a million positions apart, so no arm is further from any estimate of it."""
 TELLS = 50
 """Samples after which the cost tells whether a fit is one: that of white noise then varies by 0.1 of itself."""
 UNFIT = 2.0

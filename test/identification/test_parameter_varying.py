@@ -213,6 +213,12 @@ def test_the_memory_is_constant(run: Run) -> None:
     assert run.state.log.end - run.state.log.start < 4096
 
 
+@pytest.mark.parametrize('zeta', [-1e6, -800.0, 40.0, 1e6])
+def test_the_functions_of_the_configuration_are_finite_wherever_a_trial_step_leads(zeta: float) -> None:
+    for c in (-1.0, 0.0, 0.3, 1.0):
+        assert all(np.isfinite(part).all() for part in basis(c, zeta))
+
+
 @pytest.mark.parametrize('zeta', [-1.0, 0.8, 3.0])
 def test_the_inverse_mass_matrix_is_exact_in_the_functions_of_the_configuration(zeta: float) -> None:
     first, second = np.array([[2.0, 0.3], [0.3, 1.0]]), np.array([[3.0, 0.2], [0.2, 0.5]])
