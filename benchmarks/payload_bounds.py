@@ -21,7 +21,13 @@ from parts import payload_trials as trials
 
 from flexmanip_ros.arm.capture import body_jacobian, tip_angle, tip_jacobian
 from flexmanip_ros.arm.linearization import mass_matrix
-from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, IdentifierParameters, PlantParameters
+from flexmanip_ros.parameters import (
+    ArmParameters,
+    ExcitationParameters,
+    IdentifierParameters,
+    PayloadParameters,
+    PlantParameters,
+)
 from flexmanip_ros.payload import cramer_rao, structured
 from flexmanip_ros.payload.arm_parameters import taught
 from flexmanip_ros.payload.process_model import set_parameters
@@ -74,7 +80,7 @@ def run(seed: int, noise: np.ndarray) -> tuple[list[dict[str, float]], bool]:
     plant = replace(PLANT, noise='std', noise_std=tuple(noise.tolist()), seed=seed)
     record = simulator.simulate(plant, excitation.sequence(ExcitationParameters(), END), (EVENT,))
     rows = trials.as_samples(record.position, record.velocity, record.effort, 1e-3)
-    config = IdentifierParameters(arm=TOLD)
+    config = IdentifierParameters(arm=TOLD, payload=PayloadParameters(event_time_std=0.0))  # as the bounds
     state = structured.advance(config, structured.init(config), rows.between(0, CAPTURE))
     found = [{one.name: one.value for one in taught(config, state)}]
     state = structured.event(config, state, EVENT)

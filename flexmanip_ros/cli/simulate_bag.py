@@ -89,7 +89,7 @@ def _main(given: argparse.Namespace) -> int:
     if not 0.0 < given.duration <= 1e6:
         raise ParameterError(f'--duration is {given.duration:g}', 'give seconds above 0, up to 1e6')
     count = max(round(given.duration * plant.rate), 1)
-    events = _events(given)
+    events = simulator.on_samples(plant, _events(given), START_NS)
     target = Path(given.bag)
     if not target.name:
         raise BagError(f"'{given.bag}' is no name for a recording", 'give the name of a directory to make')

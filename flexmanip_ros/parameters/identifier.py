@@ -35,8 +35,8 @@ class PayloadParameters:
     capture_speed: float = parameter(
         0.3, 'expected speed of the object relative to the tip at a capture', unit='m/s', low=0.0, high=100.0)
     event_time_std: float = parameter(
-        0.0, 'method structured: standard deviation of the stamps of events (a gripper that reports late); those found '
-        'in the signals have one of their own besides', unit='s', low=0.0, high=0.1)
+        0.001, 'method structured: standard deviation of the stamps of events; a gripper driver that reports within a '
+        'millisecond or two; those found in the signals have one of their own besides', unit='s', low=0.0, high=0.02)
     model_error: float = parameter(
         0.003, "relative error of the arm's inertia that widens the interval where a sensor shows more than its noise",
         low=0.0, high=1.0)

@@ -455,7 +455,7 @@ def jump(config: IdentifierParameters, model: Model, m: mem.FilterState, instant
 
     A body of unknown mass changes the rates by an impulse p at the tip of the arm as it was: q' jumps by M^-1 J' p,
     with p the expected mass times the expected speed, and the moment likewise. If the impulse is later than the stamp
-    by t, q is off by t M^-1 J' p. t and p are independent, so the variance of q is that of the rates times
+    by t, q is off by t M^-1 J' p. t and p are independent, so the variance of q is that of these rates times
     instant_std^2 [s^2].
     """
     motion = model.motion
@@ -479,8 +479,8 @@ def jump(config: IdentifierParameters, model: Model, m: mem.FilterState, instant
     columns[n:2 * n] = np.hstack([rates, np.diag(other)])
     if instant_std == 0.0:
         return columns
-    moved = np.zeros_like(columns)
-    moved[:n] = instant_std * columns[n:2 * n]
+    moved = np.zeros((m.x.size, rates.shape[1]))
+    moved[:n] = instant_std * rates
     return np.hstack([columns, moved])
 
 

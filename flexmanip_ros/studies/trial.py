@@ -90,7 +90,8 @@ def describe(error: BaseException) -> str:
 def messages(scenario: Scenario, run: Run, seed: int) -> list[JointRecord | CaptureEvent]:
     """Return the messages that the estimators of a run receive."""
     count = max(round(scenario.duration * run.plant.rate), 1)
-    events = events_at(0, run.capture_time, scenario.release_time, scenario.duration)
+    events = simulator.on_samples(
+        run.plant, events_at(0, run.capture_time, scenario.release_time, scenario.duration))
     trajectory = simulator.simulate(run.plant, excitation.sequence(run.excitation, count), events)
     rng = np.random.default_rng([seed, 1 << 20])  # another random stream than those of `vary`
     return inject(simulator.records(trajectory, events), scenario.faults, rng)
