@@ -11,7 +11,7 @@ import numpy as np
 from flexmanip_ros import event_replay
 from flexmanip_ros.event_replay import EventReplay
 from flexmanip_ros.identification import parameter_varying, prediction_check, rpbsid
-from flexmanip_ros.identification.factor import FILLED, REJECTED
+from flexmanip_ros.identification.factor import FILLED, REJECTED, USED
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.numerics.background import INLINE, Background
 from flexmanip_ros.parameters import IdentifierParameters
@@ -176,7 +176,8 @@ class ModelRequest:
             role = parameter_varying.roles(config)
             found = prediction_check.judged(
                 found, self.rows, config.outputs, 0 if role is None else len(role.displacements),
-                float(np.ptp(identifier.turned)) if identifier.turned.size else 0.0)
+                float(np.ptp(identifier.turned)) if identifier.turned.size else 0.0,
+                float(identifier.rpbsid.counts[USED]))
         if config.payload_method == 'block' and found is not None:
             payload = block_extraction.estimate(config, found, identifier.angles, identifier.configuration_range)
         if found is None:

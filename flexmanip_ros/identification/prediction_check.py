@@ -48,7 +48,7 @@ UNSHOWN = 0.1
 """Half 95 % interval of a relative frequency error above which the samples do not show the frequency. It was at most
 0.066 in 4762 readings of right models, and 0.21 to 0.41 for a mode that the plant did not have."""
 EARLY = 4096
-"""Number of samples behind a model below which uncertain modes mean WARMING_UP, not POORLY_EXCITED."""
+"""Number of samples since the last event below which uncertain modes mean WARMING_UP, not POORLY_EXCITED."""
 DAMPED = 0.3
 """Damping ratio above which the frequency of a mode is not judged."""
 LOOSE = 0.1
@@ -276,11 +276,13 @@ def lacks_modes(oscillations: Sequence[Mode], bends: int) -> bool:
     return sum(abs(mode.damping_ratio) < DAMPED for mode in oscillations) < bends
 
 
-def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int = 0, turned: float = 0.0) -> Identified:
+def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int = 0, turned: float = 0.0,
+           since: float = 0.0) -> Identified:
     """Return the model with the status that its predictions of the last samples give; outputs: the outputs' names.
 
     bends: number of measured bends, where the model is to be one of every configuration; turned: range of the angle
-    between the links since the last event [rad].
+    between the links since the last event [rad]; since: number of samples since then, where they are more than those
+    behind the model. An arm at rest adds none to a model.
 
     INCONSISTENT: the predictions miss over half of the outputs' mean power, or the last samples show another frequency.
     ORDER_TOO_LOW: they miss over half of one output. POORLY_EXCITED, in the first ``EARLY`` samples WARMING_UP: a mode
@@ -305,7 +307,7 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
     chosen = ~rates | rates.all()
     model = replace(found.model, C=found.model.C[chosen], D=found.model.D[chosen])
     seen = rows.missing == 0
-    unknown = Status.WARMING_UP if found.samples < EARLY else Status.POORLY_EXCITED
+    unknown = Status.WARMING_UP if max(found.samples, since) < EARLY else Status.POORLY_EXCITED
     of_one = found.configurations is None
     if bends and (lacks_modes(modes(found), bends) or (of_one and turned > MOST_TURN)):
         return found._replace(status=unknown)

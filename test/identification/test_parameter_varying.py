@@ -338,6 +338,8 @@ def test_a_damped_mode_is_tracking_only_if_its_damping_ratio_is_known(deviation:
     assert prediction_check.judged(found, rows, ('a/position', 'b/position')).status is said
     early = prediction_check.judged(found._replace(samples=1000.0), rows, ('a/position', 'b/position')).status
     assert early is (said if said is Status.TRACKING else Status.WARMING_UP)
+    resting = prediction_check.judged(found._replace(samples=1000.0), rows, ('a/position', 'b/position'), since=9000.0)
+    assert resting.status is said  # it is no longer warming up: no later sample told anything
 
 
 def test_a_mode_that_the_last_samples_do_not_show_is_not_tracking() -> None:
