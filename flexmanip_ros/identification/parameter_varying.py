@@ -2,13 +2,15 @@
 
 The state is x = [w; w'] with the measured displacements w, so its basis stays the same as the arm turns:
 
-    w'' = -(1 - mu a) G(c) w - D w' + H(c) tau,   y = w + E(c) tau + F tau'' + b,   c = cos(theta2 - theta1)
+    w'' = -G(c) w - D w' + H(c) tau + s Q(c) [p; p''] + R t,   y = w + E(c) tau + F tau'' + b
 
-G, H and E are linear in three functions of c (``varying_kernel.basis``). a is the square of the angular amplitude of
-the links' vibration, and mu is the coefficient by which the stiffness falls with a. The published model is that of
-small vibrations, a = 0. D has a constant term and one term for the rate of each link. b is a slow offset. E and F stand
-for the modes above those of the model. All signals pass one low-pass filter with a corner above the modes. Each block
-of ``BLOCK`` samples updates parameters and state together, as in ``recursive_fit``.
+c = cos(theta2 - theta1) and s = sin(theta2 - theta1). G, H, E and Q are linear in three functions of c
+(``varying_kernel.basis``). p are the products of two displacements, t those of three: links that swing by an angle in
+proportion to w turn the configuration to and fro, so the mass matrix has terms with s w. Measured displacements stand
+for w in p and t, so the model stays linear in its state. The published model is that of small vibrations, without p and
+t. D has a constant term and one term for the rate of each link. b is a slow offset. E and F stand for the modes above
+those of the model. All signals, p and t too, pass one low-pass filter with a corner above the modes. Each block of
+``BLOCK`` samples updates parameters and state together, as in ``recursive_fit``.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cache
+from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 import numpy as np
@@ -37,13 +40,16 @@ MOST_TRIALS, SHORTER = 3, 0.3
 """Largest number of trial steps per iteration of a fit, and factor that shortens a step that would raise the cost."""
 VARIES, KNOWN = 0.12, 1.0
 """Prior deviations, as shares of the largest entry: of the parts of G and H that vary with c, and of constant parts."""
-UNEVEN = 0.005
+UNEVEN = 1e-4
 """Prior deviation, as a share of the largest entry, of the parts of G that no arm of two links has. With link 2
 pointing the other way, c and the displacements of link 2 change sign. So the entries of G of one link are even
 functions of c, and those that couple the links are odd."""
-SOFT = 0.2
-"""Prior deviation of mu. Duffing's equation x'' + (1 + x^2) x = 0 has |mu| = 3/4, the default arm with 20 kg has 0.2.
-With a larger prior deviation mu fits other errors of the model, until the arm has swung with several amplitudes."""
+SQUARES, CUBES = 2.0, 0.2
+"""Prior deviations of Q for each radian, and of R for each square radian, of the angle through which the links swing.
+Within a radian G changes by about as much as it is large, and a joint swings to and fro within it."""
+MOST_SWING = 0.04
+"""Largest square of the swing's amplitude [rad^2] for which the products of two and three displacements suffice. At
+0.05 (74 mm of bending, default arm) fits that begin there are off by 5 % in frequency, below 0.04 by 0.4 %."""
 DIRECT, DAMPED, TURNING, OFFSET, SHARED = 0.05, 0.05, 2.0, 0.3, 1.0
 """Prior deviations of E and F, of the constant term of D, of its terms with the rates, of b and of zeta. They hold for
 signals of unit power and time in units of 1 / shift."""
@@ -88,7 +94,9 @@ class Varying(NamedTuple):
     every: one of so many filtered samples is kept; filtered: (4, r + h + 2) state of the filter; dt: sample time [s];
     angle: relative angle of the links after the last block [rad]; blocks: number taken; strikes: number of bad blocks
     in a row; lost: samples were missing, so filter and state restart; settling: kept samples until the restarted filter
-    has settled; gain: (n, m) published K.
+    has settled; gain: (n, m) published K; turn: angle through which the links swing with displacements of unit power
+    [rad, rms]; power: (h, h) covariance of the scaled displacements, and swing: see ``Block``, averages over the last
+    blocks.
     """
 
     shift: float
@@ -110,6 +118,9 @@ class Varying(NamedTuple):
     lost: bool
     settling: int
     gain: Array
+    turn: float
+    power: Array
+    swing: float
 
 
 class Block(NamedTuple):
@@ -117,11 +128,14 @@ class Block(NamedTuple):
 
     c: cos(theta2 - theta1) in the middle; by_s: change of c from there to the end; rates: (3,) factors on the terms of
     D; angle: theta2 - theta1 at the end [rad]; swing: squared amplitude of the angle through which a link swings with
-    the displacements, summed over the links [rad^2]; as for a sinusoid it is twice the mean square.
+    the displacements, summed over the links [rad^2]; as for a sinusoid it is twice the mean square; P (N, d): [p; p'';
+    t]; bend (N, d): its changes from row to row; sine: sin(theta2 - theta1) in the middle.
     """
 
     U: Array
     slope: Array
+    P: Array
+    bend: Array
     V: Array
     Y: Array
     s: Array
@@ -131,6 +145,7 @@ class Block(NamedTuple):
     rates: Array
     angle: float
     swing: float
+    sine: float
 
 
 def roles(config: IdentifierParameters) -> Roles | None:
@@ -162,14 +177,24 @@ def shown(config: IdentifierParameters) -> Roles | None:
     return Roles(places, tuple(states))
 
 
+def pairs(h: int) -> int:
+    """Return the number of products of two of h displacements."""
+    return h * (h + 1) // 2
+
+
+def thirds(h: int) -> int:
+    """Return the number of products of three of h displacements."""
+    return h * (h + 1) * (h + 2) // 6
+
+
 @cache
 def parts(h: int, r: int) -> dict[str, tuple[slice, tuple[int, ...]]]:
-    """Return the slice of theta and the shape of each of its parts G, H, E, F, D, b, mu and zeta.
+    """Return the slice of theta and the shape of each of its parts G, H, E, F, D, b, Q, R and zeta.
 
-    G, H, E have one matrix for each function of c, D has one for each factor of ``Block.rates``.
+    G, H, E, Q have one matrix for each function of c, D has one for each factor of ``Block.rates``.
     """
     shapes = {'G': (FUNCTIONS, h, h), 'H': (FUNCTIONS, h, r), 'E': (FUNCTIONS, h, r), 'F': (h, r), 'D': (3, h, h),
-              'b': (h,), 'mu': (1,), 'zeta': (1,)}
+              'b': (h,), 'Q': (FUNCTIONS, h, 2 * pairs(h)), 'R': (h, thirds(h)), 'zeta': (1,)}
     found, at = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)
@@ -190,65 +215,69 @@ def shares(h: int) -> Array:
     return np.array([np.where(own, KNOWN, UNEVEN), np.where(own, UNEVEN, VARIES), np.where(own, VARIES, UNEVEN)])
 
 
-def prior(G: Array, H: Array) -> Array:
-    """(k,) prior standard deviations around matrices G (h, h), H (h, r) of one configuration."""
+def prior(G: Array, H: Array, turn: float) -> Array:
+    """(k,) prior standard deviations around matrices G (h, h), H (h, r) of one configuration; turn: see ``Varying``."""
     h, r = H.shape
     share = np.array([KNOWN, VARIES, VARIES])
     return np.concatenate([
         np.abs(G).max() * shares(h).ravel(), np.repeat(share * np.abs(H).max(), h * r),
         np.repeat(DIRECT * np.array([1.0, 0.3, 0.3]), h * r), np.full(h * r, DIRECT),
-        np.full(h * h, DAMPED), np.full(2 * h * h, TURNING), np.full(h, OFFSET), np.full(1, SOFT), np.full(1, SHARED)])
+        np.full(h * h, DAMPED), np.full(2 * h * h, TURNING), np.full(h, OFFSET),
+        np.full(2 * FUNCTIONS * h * pairs(h), SQUARES * turn), np.full(h * thirds(h), CUBES * turn ** 2),
+        np.full(1, SHARED)])
 
 
-def walk(theta: Array, h: int, r: int, size: Array) -> Array:
+def walk(theta: Array, h: int, r: int, size: Array, turn: float) -> Array:
     """(k + 2h,) standard deviations of the random walk in a block; size: (h,) those of the displacements."""
-    found = WALK * prior(part(theta, 'G', h, r)[0], part(theta, 'H', h, r)[0])
+    found = WALK * prior(part(theta, 'G', h, r)[0], part(theta, 'H', h, r)[0], turn)
     found[parts(h, r)['b'][0]] = OFFSET_WALK * size
     return np.concatenate([found, STATE_WALK * size, STATE_WALK * size])
 
 
-def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, swing: float = 0.0
-          ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """G, G1, H, H1, D, E of ``simulate_block`` at the configuration c.
-
-    by_s, rates, swing: see ``Block``.
-    """
+def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, sine: float = 0.0
+          ) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
+    """G, G1, H, H1, D, E, Q of ``simulate_block`` at the configuration c; by_s, rates, sine: see ``Block``."""
     value, by_c, _, _ = basis(c, float(theta[-1]))
     G, H, E = (part(theta, name, h, r) for name in 'GHE')
     D = np.tensordot(rates, part(theta, 'D', h, r), 1)
     direct = np.hstack([np.tensordot(value, E, 1), part(theta, 'F', h, r), part(theta, 'b', h, r)[:, None]])
-    less = 1.0 - float(part(theta, 'mu', h, r)[0]) * swing
-    return (less * np.tensordot(value, G, 1), less * np.tensordot(by_c * by_s, G, 1), np.tensordot(value, H, 1),
-            np.tensordot(by_c * by_s, H, 1), D, direct)
+    by_products = np.hstack([sine * np.tensordot(value, part(theta, 'Q', h, r), 1), part(theta, 'R', h, r)])
+    return (np.tensordot(value, G, 1), np.tensordot(by_c * by_s, G, 1), np.tensordot(value, H, 1),
+            np.tensordot(by_c * by_s, H, 1), D, direct, by_products)
 
 
-def to_local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, swing: float = 0.0) -> Array:
+def to_local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, sine: float = 0.0) -> Array:
     """(l, k + 2h) derivative of [local parameters; state] with respect to [theta; state]; see ``local``."""
     value, by_c, by_zeta, by_both = basis(c, float(theta[-1]))
     at = {name: where.start for name, (where, _) in parts(h, r).items()}
-    a, b, q, k = h * h, h * r, 2 * r + 1, len(theta)
+    a, b, q, k, d, t = h * h, h * r, 2 * r + 1, len(theta), 2 * pairs(h), thirds(h)
     at_e = 3 * a + 2 * b
-    T = np.zeros((at_e + h * q + 2 * h, k + 2 * h))
-    less = 1.0 - float(part(theta, 'mu', h, r)[0]) * swing
+    at_q = at_e + h * q
+    T = np.zeros((at_q + h * (d + t) + 2 * h, k + 2 * h))
     for i in range(FUNCTIONS):
         j = np.arange(a)
-        T[j, at['G'] + i * a + j], T[a + j, at['G'] + i * a + j] = less * value[i], less * by_c[i] * by_s
+        T[j, at['G'] + i * a + j], T[a + j, at['G'] + i * a + j] = value[i], by_c[i] * by_s
         T[2 * a + 2 * b + j, at['D'] + i * a + j] = rates[i]
         j = np.arange(b)
         T[2 * a + j, at['H'] + i * b + j], T[2 * a + b + j, at['H'] + i * b + j] = value[i], by_c[i] * by_s
         T[at_e + j // r * q + j % r, at['E'] + i * b + j] = value[i]
         if i == 0:
             T[at_e + j // r * q + r + j % r, at['F'] + j] = 1.0
+        j = np.arange(h * d)
+        T[at_q + j // d * (d + t) + j % d, at['Q'] + i * h * d + j] = sine * value[i]
+    j = np.arange(h * t)
+    T[at_q + j // t * (d + t) + d + j % t, at['R'] + j] = 1.0
     j = np.arange(h)
     T[at_e + j * q + 2 * r, at['b'] + j] = 1.0
     G, H, E = (part(theta, name, h, r).reshape(FUNCTIONS, -1) for name in 'GHE')
-    T[:a, at['mu']], T[a:2 * a, at['mu']] = -swing * value @ G, -swing * by_s * by_c @ G
-    T[:a, at['zeta']], T[a:2 * a, at['zeta']] = less * by_zeta @ G, less * by_s * by_both @ G
+    T[:a, at['zeta']], T[a:2 * a, at['zeta']] = by_zeta @ G, by_s * by_both @ G
     T[2 * a:2 * a + b, at['zeta']], T[2 * a + b:2 * a + 2 * b, at['zeta']] = by_zeta @ H, by_s * by_both @ H
     j = np.arange(b)
     T[at_e + j // r * q + j % r, at['zeta']] = by_zeta @ E
+    j = np.arange(h * d)
+    T[at_q + j // d * (d + t) + j % d, at['zeta']] = sine * by_zeta @ part(theta, 'Q', h, r).reshape(FUNCTIONS, -1)
     j = np.arange(2 * h)
-    T[at_e + h * q + j, k + j] = 1.0
+    T[at_q + h * (d + t) + j, k + j] = 1.0
     return T
 
 
@@ -265,10 +294,21 @@ def _filter(v: Varying) -> tuple[Array, Array, Array]:
 
 
 def signals_of(config: IdentifierParameters, rows: Rows, role: Roles) -> Array:
-    """(N, r + h + 2) inputs, displacements, relative angle of the links and absolute angle of the first."""
-    relative = relative_angle(config, rows.angles)
-    columns = rows.u, rows.y[:, list(role.displacements)], relative, rows.angles[:, 0]
+    """(N, ``width``) inputs, displacements, relative angle of the links, absolute angle of the first, and products."""
+    relative, Y = relative_angle(config, rows.angles), rows.y[:, list(role.displacements)]
+    columns = rows.u, Y, relative, rows.angles[:, 0], products(Y, 2), products(Y, 3)
     return np.ascontiguousarray(np.column_stack(columns))
+
+
+def width(h: int, r: int) -> int:
+    """Return the number of columns of ``signals_of``."""
+    return r + h + 2 + pairs(h) + thirds(h)
+
+
+def products(Y: Array, count: int) -> Array:
+    """Products of each ``count`` of the columns of Y (..., h), repetitions included, in the last axis."""
+    chosen = np.array(list(combinations_with_replacement(range(Y.shape[-1]), count)))
+    return np.asarray(np.prod(Y[..., chosen], axis=-1))
 
 
 def passed(v: Varying, signals: Array, anew: bool) -> tuple[Array, Array, Array]:
@@ -296,18 +336,31 @@ def block_of(v: Varying, out: Array, second: Array) -> Block:
     r, h, n = len(v.scale_u), len(v.scale_y), len(out)
     U, Y = out[:, :r] * v.scale_u, out[:, r:r + h] * v.scale_y
     s = np.asarray((np.arange(n) - 0.5 * (n - 1)) / (0.5 * n), dtype=np.float64)
-    lines = straight(s, Y, out[:, r + h:])
+    lines = straight(s, Y, out[:, r + h:r + h + 2])
     half, turns = 0.5 * n * v.every * v.dt, Y @ lines[2:]
     middle, relative, first = float(lines[0, 0]), float(lines[1, 0]) / half, float(lines[1, 1]) / half
     bent = math.sin(middle) / v.shift
-    slope = np.zeros_like(U)
-    slope[:-1] = U[1:] - U[:-1]
-    slope[-1] = slope[-2]
     V = np.column_stack([U, second[:, :r] * (v.scale_u / v.shift ** 2), np.ones(n)])
+    first_of_three = r + h + 2 + pairs(h)
+    two, square = slice(r + h + 2, first_of_three), products(v.scale_y, 2)
+    P = np.ascontiguousarray(np.hstack([
+        out[:, two] * square, second[:, two] * (square / v.shift ** 2),
+        out[:, first_of_three:] * products(v.scale_y, 3)]))
     return Block(
-        np.ascontiguousarray(U), slope, V, np.ascontiguousarray(Y), s, v.every * v.dt * v.shift, math.cos(middle),
-        -math.sin(middle) * relative * half, np.array([1.0, bent * first, bent * (first + relative)]),
-        middle + relative * half, 2.0 * float(np.var(turns[:, 1]) + np.var(turns.sum(axis=1))))
+        np.ascontiguousarray(U), steps(U), P, steps(P), V, np.ascontiguousarray(Y), s, v.every * v.dt * v.shift,
+        math.cos(middle), -math.sin(middle) * relative * half,
+        np.array([1.0, bent * first, bent * (first + relative)]), middle + relative * half,
+        2.0 * swing_power(turns), math.sin(middle))
+
+
+def swing_power(turns: Array) -> float:
+    """Mean square of the angle through which the links swing [rad^2]; turns (N, 2): relative angle, angle of link 1."""
+    return float(np.var(turns[:, 1]) + np.var(turns.sum(axis=1)))
+
+
+def steps(U: Array) -> Array:
+    """(N, r) changes of U (N, r) from each row to the next; of the last row that before."""
+    return np.diff(U, axis=0, append=2.0 * U[-1:] - U[-2:-1])
 
 
 class Run(NamedTuple):
@@ -326,14 +379,14 @@ class Run(NamedTuple):
 
 def _run(v: Varying, block: Block, theta: Array, x: Array, noise: Array) -> Run:
     h, r = len(v.scale_y), len(v.scale_u)
-    width = 3 * h * h + 2 * h * r + h * (2 * r + 1) + 2 * h
-    N, g, moments, X = np.zeros((width, width)), np.zeros(width), np.zeros((h, h)), np.zeros((2 * h, width))
-    X[:, width - 2 * h:] = np.eye(2 * h)
+    size = 3 * h * h + 2 * h * r + h * (2 * r + 1) + h * (2 * pairs(h) + thirds(h)) + 2 * h
+    N, g, moments, X = np.zeros((size, size)), np.zeros(size), np.zeros((h, h)), np.zeros((2 * h, size))
+    X[:, size - 2 * h:] = np.eye(2 * h)
     end = x.copy()
     whiten = np.linalg.inv(np.linalg.cholesky(noise))
-    G, G1, H, H1, D, E = local(theta, h, r, block.c, block.by_s, block.rates, block.swing)
-    simulate_block(block.U, block.slope, block.V, block.Y, block.s, block.dt, G, G1, H, H1, D, E, end, whiten, N, g,
-                   moments, X)
+    matrices = local(theta, h, r, block.c, block.by_s, block.rates, block.sine)
+    simulate_block(block.U, block.slope, block.P, block.bend, block.V, block.Y, block.s, block.dt, *matrices, end,
+                   whiten, N, g, moments, X)
     return Run(N, g, moments, X, end)
 
 
@@ -362,7 +415,7 @@ def updated(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
     h, r, k = len(v.scale_y), len(v.scale_u), len(v.theta)
     root = v.root
     if v.blocks:
-        root = triangle(np.hstack([root, np.diag(walk(v.theta, h, r, np.std(blocks[0].Y, axis=0)))]).T).T
+        root = triangle(np.hstack([root, np.diag(walk(v.theta, h, r, np.std(blocks[0].Y, axis=0), v.turn))]).T).T
     after_gap = bool(v.blocks) and not v.x.any()
     first = _first_state(v, blocks[0], noise) if after_gap else v.x
     fit = _fitted(v, blocks, noise, white, iterations, root, first)
@@ -371,10 +424,13 @@ def updated(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
     theta, runs, after, missed = fit
     block, run, Y = blocks[-1], runs[-1], np.vstack([block.Y for block in blocks])
     moments = np.sum([one.moments for one in runs], axis=0) / len(Y)
-    after[k:] = run.X @ to_local(theta, h, r, block.c, block.by_s, block.rates, block.swing) @ after
+    after[k:] = run.X @ to_local(theta, h, r, block.c, block.by_s, block.rates, block.sine) @ after
     fresh = max(1.0 / (v.blocks + 1.0), 1.0 / NOISE_BLOCKS)
     known = (1.0 - fresh) * v.noise + fresh * moments if v.blocks else moments
     share, chi2, strikes = v.share, v.chi2, 0
+    lately = 1.0 / min(v.blocks + 1, SHARE_BLOCKS)
+    power = v.power + (np.cov(Y.T, bias=True).reshape(h, h) - v.power) * lately
+    swing = v.swing + (block.swing - v.swing) * lately
     if not v.blocks:
         share, chi2 = np.sqrt(np.diag(moments) / np.var(Y, axis=0)), float(np.mean(np.diag(moments) / np.diag(white)))
     elif not after_gap:  # after a gap the state is unknown, so the block has no prediction
@@ -382,8 +438,8 @@ def updated(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
         strikes = v.strikes + 1 if float(missed.share.max()) > UNPREDICTED else 0
         share, chi2 = share + (missed.share - share) * part_of, chi2 + (missed.chi2 - chi2) * part_of
     return v._replace(theta=theta, x=run.end, root=after if len(blocks) == 1 else triangle(after.T).T, noise=known,
-                      share=share, chi2=chi2, angle=block.angle,
-                      blocks=v.blocks + 1, strikes=strikes)
+                      share=share, chi2=chi2, power=power, swing=swing, angle=block.angle, blocks=v.blocks + 1,
+                      strikes=strikes)
 
 
 def _fitted(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, iterations: int, root: Array, x: Array
@@ -421,7 +477,7 @@ def _fitted(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
             break
         information, gradient = np.zeros_like(root), np.zeros_like(z)
         for block, run, at in zip(blocks, runs, places, strict=True):
-            along = to_local(theta, h, r, block.c, block.by_s, block.rates, block.swing)
+            along = to_local(theta, h, r, block.c, block.by_s, block.rates, block.sine)
             if i == 0:
                 missed = _missed(block, run, noise, white, along[:, :k] @ root[:k])
             turned = along @ root[at]
@@ -495,7 +551,7 @@ def taken(v: Varying, signals: Array) -> Varying | None:
     out, second, state = passed(v, signals, v.lost)
     waiting = settling(v) if v.lost else v.settling
     if v.lost or waiting:
-        v = reopened(v, max(waiting - len(out), 0))._replace(angle=float(out[-1, -2]))
+        v = reopened(v, max(waiting - len(out), 0))._replace(angle=float(out[-1, len(v.scale_u) + len(v.scale_y)]))
         out, second = out[waiting:], second[waiting:]
     v = v._replace(filtered=state)
     if len(out) < BLOCK // v.every // 4:  # a gap follows, or the filter has just settled

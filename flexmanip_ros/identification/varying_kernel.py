@@ -45,22 +45,24 @@ def low_pass(rows: Array, Ad: Array, Bd: Array, Cd: Array, state: Array, every: 
 
 
 @njit(cache=True, nogil=True)
-def simulate_block(U: Array, slope: Array, V: Array, Y: Array, s: Array, dt: float, G: Array, G1: Array, H: Array,
-                   H1: Array, D: Array, E: Array, x: Array, whiten: Array, N: Array, g: Array, moments: Array,
-                   X: Array) -> None:
-    """Simulate w'' = -(G + s G1) w - D w' + (H + s H1) u, y = w + E v over N steps, with its derivatives.
+def simulate_block(U: Array, slope: Array, P: Array, bend: Array, V: Array, Y: Array, s: Array, dt: float, G: Array,
+                   G1: Array, H: Array, H1: Array, D: Array, E: Array, Q: Array, x: Array, whiten: Array, N: Array,
+                   g: Array, moments: Array, X: Array) -> None:
+    """Simulate w'' = -(G + s G1) w - D w' + (H + s H1) u + Q p, y = w + E v over N steps, with its derivatives.
 
-    U (N, r): u at the begin of each step; slope (N, r): change of u in the step; V (N, q): v; Y (N, h): measured y; s
-    (N,): position in the block, -1 to 1; x (2h,): [w; w'], on return at the end. The l local parameters are G, G1, H,
-    H1, D, E row by row, then x at the begin. X (2h, l): derivative of the state by them, [0 I] at the begin. N (l, l)
-    += J' J, g (l,) += J' e with whitened J and e = Y - y; moments (h, h) += e e' of the unwhitened e.
+    U (N, r): u at the begin of each step; slope (N, r): change of u in the step; P, bend (N, d): the same of p; V (N,
+    q): v; Y (N, h): measured y; s (N,): position in the block, -1 to 1; x (2h,): [w; w'], on return at the end. The l
+    local parameters are G, G1, H, H1, D, E, Q row by row, then x at the begin. X (2h, l): derivative of the state by
+    them, [0 I] at the begin. N (l, l) += J' J, g (l,) += J' e with whitened J and e = Y - y; moments (h, h) += e e' of
+    the unwhitened e.
     """
     h, r = H.shape
-    q, width = V.shape[1], X.shape[1]
+    d, q, width = P.shape[1], V.shape[1], X.shape[1]
     at_g1, at_h = h * h, 2 * h * h
     at_h1 = at_h + h * r
     at_d = at_h1 + h * r
     at_e = at_d + h * h
+    at_q = at_e + h * q
     J, residual = np.zeros((U.shape[0] * h, width)), np.zeros(U.shape[0] * h)
     e, t, t_next = np.empty(h), np.empty(2 * h), np.empty(2 * h)
     T, T_next = np.empty((2 * h, width)), np.empty((2 * h, width))
@@ -100,6 +102,8 @@ def simulate_block(U: Array, slope: Array, V: Array, Y: Array, s: Array, dt: flo
                 if order <= 2:
                     for b in range(r):
                         total += Hs[a, b] * (U[k, b] if order == 1 else slope[k, b])
+                    for b in range(d):
+                        total += Q[a, b] * (P[k, b] if order == 1 else bend[k, b])
                 t_next[h + a] = f * total
                 for j in range(width):
                     T_next[a, j] = f * T[h + a, j]
@@ -116,6 +120,8 @@ def simulate_block(U: Array, slope: Array, V: Array, Y: Array, s: Array, dt: flo
                         v = U[k, b] if order == 1 else slope[k, b]
                         T_next[h + a, at_h + a * r + b] += f * v
                         T_next[h + a, at_h1 + a * r + b] += f * s[k] * v
+                    for b in range(d):
+                        T_next[h + a, at_q + a * d + b] += f * (P[k, b] if order == 1 else bend[k, b])
             for i in range(2 * h):
                 x[i] += t_next[i]
                 t[i] = t_next[i]

@@ -6,7 +6,17 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.identification.batch_fit import BLOCK
-from flexmanip_ros.identification.parameter_varying import AT_REST, Roles, Varying, local, shown, straight, to_local
+from flexmanip_ros.identification.parameter_varying import (
+    AT_REST,
+    MOST_SWING,
+    Roles,
+    Varying,
+    local,
+    shown,
+    straight,
+    to_local,
+)
+from flexmanip_ros.identification.prediction_check import MOST_SKEW, VAGUE
 from flexmanip_ros.identification.uncertainty import Identified, Tangent, modes
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Rows
@@ -21,8 +31,6 @@ has an error of 0.08 degrees (rms, default arm), with four times as many samples
 degrees."""
 MISSED = 0.5
 """Largest share of an output's amplitude that the predictions of the last blocks may miss."""
-VAGUE = 0.008
-"""Relative standard deviation of a frequency above which the model is not published as tracking."""
 EARLY = 16
 """Number of blocks below which a frequency above ``VAGUE`` means WARMING_UP, not POORLY_EXCITED."""
 
@@ -76,7 +84,7 @@ class Configurations(NamedTuple):
 
 def judge(found: Identified, v: Varying) -> Status:
     """Return the status, from the predictions of samples before they were fitted and from the deviations."""
-    if float(v.share.max()) > MISSED:
+    if float(v.share.max()) > MISSED or v.swing > MOST_SWING:
         return Status.INCONSISTENT
     oscillations = modes(found)
     if len(oscillations) < len(v.scale_y):
@@ -86,13 +94,24 @@ def judge(found: Identified, v: Varying) -> Status:
     return Status.TRACKING
 
 
-def unmodelled(v: Varying) -> float:
-    """Return the relative error of the frequencies that explains what predictions over a block miss.
+def unmodelled(v: Varying, G: Array) -> tuple[Array, Array]:
+    """Return deviations of G and D (h, h, h), one for each mode, that explain what predictions over a block miss.
 
-    A relative frequency error e gives the phase error shift t e after a time t; over a block of duration T its root
-    mean square is shift T e / sqrt(3). Half of the missed power counts as phase error, half as amplitude error.
+    A relative frequency error e of a mode w gives the phase error w t e after a time t; over a block of duration T its
+    root mean square is w T e / sqrt(3), as a share of the mode's own amplitude. Half of the missed power counts as
+    phase error, half as amplitude error, and either may come from any one mode. So a mode that has a hundredth of the
+    power is ten times as uncertain as one that has all of it.
     """
-    return math.sqrt(3.0 / 2.0) * float(v.share.mean()) / (v.shift * BLOCK * v.dt)
+    values, V = np.linalg.eig(G)
+    if np.iscomplexobj(values) or not np.all(values > 0.0) or np.linalg.cond(V) > MOST_SKEW:
+        values, V = np.ones(len(G)), np.eye(len(G))
+    U = np.linalg.inv(V)
+    size = np.einsum('kp,pq,kq->k', U, v.power, U)
+    share = np.minimum(np.mean(V ** 2 * size / np.diag(v.power)[:, None], axis=0), 1.0)
+    w = np.sqrt(values)
+    error = np.sqrt(1.5 * np.mean(v.share ** 2) / np.maximum(share, 1e-12)) / (w * v.shift * BLOCK * v.dt)
+    shapes = np.einsum('ok,kp->kop', V, U)
+    return 2.0 * (error * values)[:, None, None] * shapes, 2.0 * (error * w)[:, None, None] * shapes
 
 
 def _matrices(read: Configurations, c: float, role: Roles, ratio: float) -> tuple[StateSpace, Tangent]:
@@ -100,13 +119,13 @@ def _matrices(read: Configurations, c: float, role: Roles, ratio: float) -> tupl
     v = read.varying
     h, r = len(v.scale_y), len(v.scale_u)
     m, n = len(role.states), 2 * h
-    G, _, H, _, D, E = local(v.theta, h, r, c, 0.0, AT_REST)
+    G, _, H, _, D, E, _ = local(v.theta, h, r, c, 0.0, AT_REST)
     a, b, q = h * h, h * r, 2 * r + 1
     L = to_local(v.theta, h, r, c, 0.0, AT_REST)[:, :len(v.theta)] @ (ratio * v.root[:len(v.theta)])
-    error = unmodelled(v)
-    more = np.zeros((len(L), 2))
-    more[:a, 0] = 2.0 * error * G.ravel()
-    more[2 * a + 2 * b:3 * a + 2 * b, 1] = 2.0 * error * np.eye(h).ravel()
+    of_G, of_D = unmodelled(v, G)
+    more = np.zeros((len(L), 2 * h))
+    more[:a, :h] = of_G.reshape(h, -1).T
+    more[2 * a + 2 * b:3 * a + 2 * b, h:] = of_D.reshape(h, -1).T
     L = np.hstack([L, more])
     M = np.zeros((n + r, n + r))
     M[:h, h:n], M[h:n, :h], M[h:n, h:n], M[h:n, n:] = np.eye(h), -G, -D, H

@@ -19,6 +19,7 @@ from flexmanip_ros.identification.parameter_varying import (
     lost,
     measured,
     noise_of,
+    parts,
     passed,
     prior,
     reopened,
@@ -26,7 +27,10 @@ from flexmanip_ros.identification.parameter_varying import (
     settling,
     shares,
     signals_of,
+    straight,
+    swing_power,
     updated,
+    width,
 )
 from flexmanip_ros.identification.prediction_check import DAMPED
 from flexmanip_ros.identification.realization import known_output_basis, slowest, to_continuous, transform
@@ -101,18 +105,27 @@ def start(config: IdentifierParameters, rows: Rows, old: Recursion | None, befor
     power = np.concatenate([np.mean(rows.u ** 2, axis=0), np.var(rows.y[:, list(role.displacements)], axis=0)])
     if not np.all(power > 0.0) or not np.all(np.isfinite(power)):
         return None
-    G, _, H, _, D, _ = local(begun.theta, h, r, c, 0.0, AT_REST)
+    G, _, H, _, D, _, _ = local(begun.theta, h, r, c, 0.0, AT_REST)
     unit = 1.0 / np.sqrt(power)
     more_u, more_y = unit[:r] / begun.scale_u, unit[r:] / begun.scale_y
     ratio = more_y[:, None] / more_y
-    theta, root = _around(G * ratio, H * more_y[:, None] / more_u, D * ratio, c)
-    if before is not None:  # the arm is the same, its object another
-        root[:len(theta), :len(theta)] *= SAME
-    return _fit_stretch(
-        config, begun._replace(dt=dt, theta=theta, root=root, scale_u=unit[:r], scale_y=unit[r:]), rows, role)
+    turn = _turn(config, rows, rows.y[:, list(role.displacements)] * unit[r:])
+    theta, root = _around(G * ratio, H * more_y[:, None] / more_u, D * ratio, c, turn)
+    if before is not None:  # the arm is the same, its object another; the products start anew
+        known = np.ones(len(theta))
+        known[:parts(h, r)['Q'][0].start], known[-1] = SAME, SAME
+        root[:len(theta), :len(theta)] *= known
+    return _fit_stretch(config, begun._replace(
+        dt=dt, theta=theta, root=root, scale_u=unit[:r], scale_y=unit[r:], turn=turn), rows, role)
 
 
-def _around(G: Array, H: Array, D: Array, c: float) -> tuple[Array, Array]:
+def _turn(config: IdentifierParameters, rows: Rows, Y: Array) -> float:
+    """Return the angle through which the links swing with displacements Y (N, h) [rad, rms]."""
+    angles = np.column_stack([relative_angle(config, rows.angles), rows.angles[:, 0]])
+    return math.sqrt(swing_power(Y @ straight(np.linspace(-1.0, 1.0, len(Y)), Y, angles)[2:]))
+
+
+def _around(G: Array, H: Array, D: Array, c: float, turn: float) -> tuple[Array, Array]:
     """Theta that is most likely under the prior among those that have these matrices at c, and the prior's root.
 
     The root is that of the covariance of [theta; state].
@@ -121,8 +134,9 @@ def _around(G: Array, H: Array, D: Array, c: float) -> tuple[Array, Array]:
     value, variance = basis(c, ZETA)[0][:, None, None], shares(h) ** 2
     g = variance * value / np.sum(variance * value ** 2, axis=0) * G
     b, d = (np.concatenate([X.ravel(), np.zeros(2 * X.size)]) for X in (H, D))
-    theta = np.concatenate([g.ravel(), b, np.zeros(4 * h * r), d, np.zeros(h), np.zeros(1), np.full(1, ZETA)])
-    return theta, np.diag(np.concatenate([prior(G, H), np.full(2 * h, UNKNOWN)]))
+    rest = sum(parts(h, r)[name][0].stop - parts(h, r)[name][0].start for name in 'bQR')
+    theta = np.concatenate([g.ravel(), b, np.zeros(4 * h * r), d, np.zeros(rest), np.full(1, ZETA)])
+    return theta, np.diag(np.concatenate([prior(G, H, turn), np.full(2 * h, UNKNOWN)]))
 
 
 def _from_recursion(old: Recursion, role: Roles, r: int, dt: float, c: float) -> Varying | None:
@@ -139,12 +153,12 @@ def _from_recursion(old: Recursion, role: Roles, r: int, dt: float, c: float) ->
     every = 2 ** max(math.floor(math.log2(1.0 / (dt * corner * FINE))), -1) if corner * dt > 0.0 else 0
     if every < 1:
         return None
-    theta, root = _around(G / shift ** 2, H / shift ** 2, D / shift, c)
+    theta, root = _around(G / shift ** 2, H / shift ** 2, D / shift, c, 0.0)
     return Varying(
         shift=shift, scale_u=scale[:r].copy(), scale_y=scale[r:][list(role.displacements)].copy(), theta=theta,
         x=np.zeros(2 * h), root=root, noise=np.zeros((h, h)), share=np.zeros(h), chi2=1.0, corner=corner,
-        every=every, filtered=np.zeros((4, r + h + 2)), dt=dt, angle=0.0, blocks=0, strikes=0, lost=False,
-        settling=0, gain=np.zeros((0, 0)))
+        every=every, filtered=np.zeros((4, width(h, r))), dt=dt, angle=0.0, blocks=0, strikes=0, lost=False,
+        settling=0, gain=np.zeros((0, 0)), turn=0.0, power=np.zeros((h, h)), swing=0.0)
 
 
 def _fit_stretch(config: IdentifierParameters, v: Varying, rows: Rows, role: Roles) -> Varying | None:
@@ -161,15 +175,15 @@ def _fit_stretch(config: IdentifierParameters, v: Varying, rows: Rows, role: Rol
 def _fit_at_once(v: Varying, signals: Array, missing: NDArray[np.int64]) -> Varying | None:
     """Fit growing stretches of signals (N, w), leaving out gaps and, after each, the settling time of the filter."""
     quiet, begin = settling(v), v
-    parts = [(first, last, *passed(v, signals[first:last], True)) for first, last in measured(v, signals, missing)]
+    stretches = [(first, last, *passed(v, signals[first:last], True)) for first, last in measured(v, signals, missing)]
     least = noise_of(signals, v)
     inside = slice(len(v.scale_u), len(v.scale_u) + len(v.scale_y))
-    if not any(len(out) >= quiet + FEWEST for _, _, out, *_ in parts):
+    if not any(len(out) >= quiet + FEWEST for _, _, out, *_ in stretches):
         return None
-    power = np.diag(np.var(np.vstack([out[quiet:, inside] for _, _, out, *_ in parts]) * v.scale_y, axis=0))
+    power = np.diag(np.var(np.vstack([out[quiet:, inside] for _, _, out, *_ in stretches]) * v.scale_y, axis=0))
     for count in sorted({min(length, len(signals)) for length in GROWTH}):
         blocks = []
-        for first, last, out, second, _ in parts:
+        for first, last, out, second, _ in stretches:
             end = (min(count, last) - first) // v.every
             if end >= quiet + FEWEST:
                 blocks.append(block_of(v, out[quiet:end], second[quiet:end]))
@@ -183,7 +197,7 @@ def _fit_at_once(v: Varying, signals: Array, missing: NDArray[np.int64]) -> Vary
         if found is None:
             return None
         begin, v = begin._replace(theta=found.theta), found
-    _, last, out, _, state = parts[-1]
+    _, last, out, _, state = stretches[-1]
     if len(out) < quiet + FEWEST:  # the filter has not settled since the last gap
         v = reopened(v, max(quiet - len(out), 0))
     return v._replace(filtered=state) if last == len(signals) else lost(v)
