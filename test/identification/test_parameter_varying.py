@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm import linearization
@@ -15,7 +16,8 @@ from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification import parameter_varying, prediction_check, rpbsid, validation
 from flexmanip_ros.identification.realization import to_discrete
 from flexmanip_ros.identification.uncertainty import Identified, modes
-from flexmanip_ros.identification.varying_kernel import basis
+from flexmanip_ros.identification.varying_kernel import basis, simulate_block
+from flexmanip_ros.identification.varying_model import Configurations
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.simulation import excitation, simulator
@@ -173,7 +175,7 @@ def test_an_order_above_twice_the_displacements_follows_the_arm_as_well(order: i
         np.testing.assert_allclose([mode.frequency_hz for mode in one.modes], known, rtol=0.01)
 
 
-def test_the_local_parameters_change_as_their_derivatives_say_softening_too() -> None:
+def test_the_local_parameters_change_as_their_derivatives_say_those_of_the_products_too() -> None:
     h, r, at = 2, 2, (0.4, 0.1, np.array([1.0, 0.2, 0.3]), 0.05)
     rng = np.random.default_rng(1)
     theta = rng.normal(size=sum(where.stop - where.start for where, _ in parameter_varying.parts(h, r).values()))
@@ -185,6 +187,36 @@ def test_the_local_parameters_change_as_their_derivatives_say_softening_too() ->
 
     along = parameter_varying.to_local(theta, h, r, *at)[:-2 * h, :len(theta)] @ step
     assert parts_at(theta + step) - parts_at(theta - step) == pytest.approx(2.0 * along, rel=1e-4, abs=1e-11)
+
+
+def test_a_simulated_block_is_the_solution_of_the_differential_equation_with_products() -> None:
+    rng = np.random.default_rng(2)
+    h, r, d, count, dt = 2, 2, 3, 12, 0.2
+    G, D, H, Q = np.array([[1.3, 0.1], [0.2, 0.8]]), 0.05 * np.eye(h), rng.normal(size=(h, r)), rng.normal(size=(h, d))
+    G1, H1, E, first = np.zeros((h, h)), np.zeros((h, r)), np.zeros((h, 1)), rng.normal(size=2 * h)
+    U, P, t = rng.normal(size=(count + 1, r)), rng.normal(size=(count + 1, d)), dt * np.arange(count + 1)
+
+    def rate(now: float, x: Array) -> Array:
+        u, p = (np.array([np.interp(now, t, column) for column in signal.T]) for signal in (U, P))
+        return np.concatenate([x[h:], -G @ x[:h] - D @ x[h:] + H @ u + Q @ p])
+
+    known = solve_ivp(rate, (0.0, t[-1]), first, t_eval=t, rtol=1e-10, atol=1e-12, max_step=0.1 * dt).y.T
+    size = 2 * (h * h + h * r) + h * h + h + h * d + 2 * h
+    x, X, moments = first.copy(), np.zeros((2 * h, size)), np.zeros((h, h))
+    X[:, -2 * h:] = np.eye(2 * h)
+    simulate_block(U[:-1], np.diff(U, axis=0), P[:-1], np.diff(P, axis=0), np.ones((count, 1)), known[:-1, :h].copy(),
+                   np.zeros(count), dt, G, G1, H, H1, D, E, Q, x, np.eye(h), np.zeros((size, size)), np.zeros(size),
+                   moments, X)
+    np.testing.assert_allclose(x, known[-1], rtol=1e-6)
+    assert np.all(np.abs(moments) < 1e-10)
+
+
+def test_a_model_is_not_trusted_while_the_links_swing_by_a_quarter_of_a_radian(run: Run) -> None:
+    read = identified(run).configurations
+    assert isinstance(read, Configurations)
+    here = np.array([0.3, 0.6])
+    assert read.at(here).status is Status.TRACKING
+    assert read._replace(varying=read.varying._replace(swing=0.25 ** 2)).at(here).status is Status.INCONSISTENT
 
 
 def test_a_replay_in_blocks_gives_the_bits_of_another_one() -> None:
