@@ -126,7 +126,8 @@ def describe(result: Result) -> list[str]:
     rows = result_rows(result.summary, result.config, result.modes, result.events)
     for part in result.summary.smoothed or ():
         told = ', '.join(f'{mode.frequency_hz:.4f} +- {QUANTILE * mode.frequency_std_hz:.2g} Hz' for mode in part.modes)
-        rows.append(('smoothed', f'{part.start_s:.3f} to {part.end_s:.3f} s, {part.method}: {told or "no mode"}'))
+        last = ', in the last one' if part.course else ''
+        rows.append(('smoothed', f'{part.start_s:.3f} to {part.end_s:.3f} s, {part.method}{last}: {told or "no mode"}'))
     return [f'{name:12s} {words}' for name, words in (*rows, *(('written', place) for place in result.written))]
 
 

@@ -43,18 +43,23 @@ class Found:
     rate: float
     broken: int
     """Number of values that are not finite."""
+    count: int
+    """Number of values."""
 
     @property
     def moves(self) -> bool:
-        """Whether the signal is finite and varies, so that it can be an input or an output."""
-        return self.broken == 0 and self.std > STILL * max(abs(self.low), abs(self.high))
+        """Whether the signal varies and most of it is finite, so that it can be an input or an output.
+
+        Messages with a value that is not finite are left out.
+        """
+        return 2 * self.broken < self.count and self.std > STILL * max(abs(self.low), abs(self.high))
 
     def text(self) -> str:
         """Return the signal as a line to print."""
-        what = f'{self.broken} values are not finite' if self.broken else (
-            f'{self.low:.4g} .. {self.high:.4g}, standard deviation {self.std:.3g}' if self.moves
-            else f'stands still at {self.low:.4g}')
-        return f'{self.name:28s} {self.rate:.4g} Hz   {what}'
+        what = (f'{self.low:.4g} .. {self.high:.4g}, standard deviation {self.std:.3g}'
+                if self.std > 0.0 else f'stands still at {self.low:.4g}')
+        broken = f'; {self.broken} of {self.count} values are not finite' if self.broken else ''
+        return f'{self.name:28s} {self.rate:.4g} Hz   {what}{broken}'
 
 
 @dataclass
@@ -157,7 +162,7 @@ def observe(blocks: list[JointBlock]) -> list[Found]:
         interval = float(np.median(np.diff(at))) * 1e-9 if len(at) > 1 else 0.0
         found.append(Found(
             name, *((float(good.min()), float(good.max()), float(good.std())) if len(good) else (0.0, 0.0, 0.0)),
-            1.0 / interval if interval > 0.0 else 0.0, len(values) - len(good)))
+            1.0 / interval if interval > 0.0 else 0.0, len(values) - len(good), len(values)))
     return found
 
 
@@ -174,6 +179,8 @@ def choose_signals(signals: list[Found], given: Mapping[str, Any]
         else:
             names, why = _inputs(moving) if name == 'inputs' else _outputs(moving, chosen['inputs'])
         if not names:
+            bad = ', '.join(signal.name for signal in signals if signal.broken and not signal.moves)
+            why += f'; most values are not finite of {bad}' if bad else ''
             raise ParameterError(f'nothing in the recording serves for {name}: they would be {why}',
                                  f'name them with --set {name}=[NAME/FIELD, ...]')
         chosen[name] = names

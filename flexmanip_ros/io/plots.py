@@ -342,12 +342,13 @@ def frequency_figure(made: Run) -> Figure:
     drawn, axes = figure([3.2, 0.35])
     _estimates(axes, made, with_payload=False)
     for part in made.smoothed:
-        for mode in part.modes:
-            wide = QUANTILE * mode.frequency_std_hz
-            axes[0].fill_between([part.start_s, part.end_s], mode.frequency_hz - wide, mode.frequency_hz + wide,
-                                 color=SMOOTHED_COLOUR, alpha=0.25, linewidth=0.0)
-            axes[0].plot([part.start_s, part.end_s], [mode.frequency_hz] * 2, color=SMOOTHED_COLOUR, linewidth=1.0,
-                         linestyle=LINES[1])
+        course = part.course or ((part.start_s, part.modes), (part.end_s, part.modes))
+        for k in range(len(part.modes)):
+            at = [(time, found[k]) for time, found in course if len(found) > k]
+            times, middle = [time for time, _ in at], np.array([mode.frequency_hz for _, mode in at])
+            wide = QUANTILE * np.array([mode.frequency_std_hz for _, mode in at])
+            axes[0].fill_between(times, middle - wide, middle + wide, color=SMOOTHED_COLOUR, alpha=0.25, linewidth=0.0)
+            axes[0].plot(times, middle, color=SMOOTHED_COLOUR, linewidth=1.0, linestyle=LINES[1])
     events(axes, made.events)
     return drawn
 

@@ -99,6 +99,8 @@ def unobservable_reason(config: IdentifierParameters) -> str:
         return 'angles does not name the position of two joints'
     if not known.torques:
         return 'inputs does not name the effort of both joints, in the order of angles'
+    if len(config.arm.link_length) == 1:
+        return f'the payload method {config.payload_method} needs an arm of two links'
     return 'the outputs do not show the bending of both links'
 
 

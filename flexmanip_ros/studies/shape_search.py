@@ -124,7 +124,8 @@ def search_shapes(search: Search, step: Callable[[], None]) -> Shape:
         _try(search, factor, past, _futures(search, past)[:1], directs, weights, _orders(search, COARSE))
         step()
     if not search.tried:
-        raise ParameterError('no model of these signals can be computed', 'check that every input and output moves')
+        raise ParameterError(f'no model of these {search.count} samples can be computed and scored',
+                             'record for longer; check that every input and output moves')
     for factor, past in _finalists(search):
         directs = _choices(search.given, 'direct_feedthrough', (True, False))
         weights = _choices(search.given, 'weighted_observability', (True, False))
@@ -216,7 +217,8 @@ def _try(search: Search, factor: int, past: int, futures: Sequence[int], directs
         for direct, weighted in product(directs, weights):
             shape = Shape(factor, past, future, direct, weighted, 0)
             found = shares(search, kept, sums, shape, able, PRIOR)
-            search.tried.update({shape._replace(order=n): share for n, share in found.items()})
+            search.tried.update({shape._replace(order=n): share for n, share in found.items()
+                                 if np.all(np.isfinite(share))})  # nan: a short recording leaves nothing to score
 
 
 def shares(search: Search, kept: list[Kept], sums: list[Array], shape: Shape, orders: Sequence[int], alpha: float

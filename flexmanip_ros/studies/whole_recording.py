@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.errors import ModelError, ParameterError
-from flexmanip_ros.identification import decimation, model_output, rpbsid, validation
-from flexmanip_ros.identification.batch_fit import fit_stretch
+from flexmanip_ros.identification import decimation, model_output, parameter_varying, rpbsid, validation
+from flexmanip_ros.identification.batch_fit import BLOCK, fit_stretch
+from flexmanip_ros.identification.prediction_check import MOST_TURN
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.identification.varying_model import Configurations
 from flexmanip_ros.parameters import IdentifierParameters
@@ -117,7 +118,8 @@ WHOLE = 0.8
 class Smoothed:
     """The model of a stretch of samples, times from the first stamp of the recording [s].
 
-    method: ``maximum likelihood``, ``subspace``, or ``none`` where there is no model.
+    method: ``maximum likelihood``, ``subspace``, ``every configuration`` where the arm turned (modes: those in the last
+    one), or ``none`` where there is no model.
     """
 
     start_s: float
@@ -126,6 +128,8 @@ class Smoothed:
     method: str
     status: Status
     modes: tuple[Mode, ...]
+    course: tuple[tuple[float, tuple[Mode, ...]], ...] = ()
+    """Where the arm turned: times [s], each with the modes of the same model in the configuration of that time."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the values by the names that the JSON of identify_bag has."""
@@ -147,7 +151,33 @@ def smooth(config: IdentifierParameters, signals: Signals, events_ns: Sequence[i
     count = len(signals.stamp_ns) if until_s is None else int(np.searchsorted(signals.time, until_s))
     inside = np.searchsorted(signals.stamp_ns[:count], sorted(events_ns)).tolist()
     borders = list(dict.fromkeys([0, *inside, count]))
-    return tuple(_stretch(config, signals, a, b, dt) for a, b in pairwise(borders))
+    return tuple(_of_every_configuration(config, signals, a, b, dt) or _stretch(config, signals, a, b, dt)
+                 for a, b in pairwise(borders))
+
+
+def _of_every_configuration(config: IdentifierParameters, signals: Signals, a: int, b: int, dt: float
+                            ) -> Smoothed | None:
+    """Return the model of every configuration that has read rows a to b; None where the arm hardly turned.
+
+    None also where there is no such model.
+    """
+    if parameter_varying.roles(config) is None or signals.angles.shape[1] != 2:
+        return None
+    relative = relative_angle(config, signals.angles[a:b])
+    if not np.nanmax(relative) - np.nanmin(relative) > MOST_TURN:
+        return None
+    log = log_of(signals.u[a:b], signals.y[a:b], signals.angles[a:b], signals.stamp_ns[a:b], signals.gap[a:b],
+                 signals.missing[a:b])
+    state = rpbsid.finish(config, rpbsid.advance(config, rpbsid.init(config), log.rows(0, b - a)))
+    found = rpbsid.identified(config, state, dt)
+    if found is None or not isinstance(found.configurations, Configurations):
+        return None
+    course = []
+    for first in range(0, b - a - BLOCK + 1, BLOCK):
+        angle = float(np.nanmean(relative[first:first + BLOCK]))
+        course.append((float(signals.time[a + first + BLOCK // 2]), modes(found.configurations.with_relative(angle))))
+    return Smoothed(float(signals.time[a]), float(signals.time[b - 1]), b - a, 'every configuration', found.status,
+                    course[-1][1], tuple(course))
 
 
 def _stretch(config: IdentifierParameters, signals: Signals, a: int, b: int, dt: float) -> Smoothed:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -157,7 +158,7 @@ def test_a_place_that_cannot_be_written_is_said_before_the_work(recording, capsy
 
 
 def _found(*names: str) -> list[Found]:
-    return [Found(name, -1.0, 1.0, 0.5, 100.0, 0) for name in names]
+    return [Found(name, -1.0, 1.0, 0.5, 100.0, 0, 100) for name in names]
 
 
 def test_signals_whose_names_say_what_they_are_are_taken_by_name():
@@ -185,6 +186,23 @@ def test_an_arm_of_one_link_needs_no_angle_of_a_second(tmp_path, capsys):
 def test_without_an_effort_that_moves_the_inputs_are_asked_for():
     with pytest.raises(ParameterError, match=r'--set inputs='):
         choose_signals(_found('a/position', 'b/velocity'), {})
+
+
+def test_a_recording_too_short_to_be_scored_asks_for_a_longer_one(tmp_path, capsys):
+    path = _bag(tmp_path / 'bag', _machine(65))
+    assert main([str(path), '--suggest', str(tmp_path / 'no.yaml')]) == 2
+    err = capsys.readouterr().err
+    assert 'record for longer' in err
+    assert err.count('\n') == 1
+
+
+def test_a_signal_that_is_not_finite_at_times_serves_and_one_that_mostly_is_not_is_named():
+    some, most = (replace(found, broken=broken) for found, broken in zip(
+        _found('a/effort', 'b/effort'), (30, 70), strict=True))
+    chosen, _ = choose_signals([some, most, *_found('c/position')], {})
+    assert chosen['inputs'] == ('a/effort',)
+    with pytest.raises(ParameterError, match='most values are not finite of b/effort'):
+        choose_signals([most, *_found('c/position')], {})
 
 
 def test_smooth_gives_each_stretch_its_modes_with_a_band(tmp_path, capsys):

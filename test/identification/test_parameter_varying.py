@@ -19,6 +19,7 @@ from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.identification.varying_kernel import basis, simulate_block
 from flexmanip_ros.identification.varying_model import Configurations
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
+from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.studies import whole_recording
@@ -143,6 +144,21 @@ def test_frequencies_over_configurations_are_right_where_the_arm_has_been_and_ba
     assert np.nanmedian(found.std[~seen]) > np.median(found.std[seen])
     _, labels = plots.configurations_figure(found).axes[0].get_legend_handles_labels()
     assert labels == ['configurations\nof the recording', 'mode 1, 95 % band', 'mode 2, 95 % band']
+
+
+def test_a_stretch_in_which_the_arm_turned_is_smoothed_by_the_model_of_every_configuration(run: Run) -> None:
+    trajectory, event, _ = record()
+    signals = sampling.collect(CONFIG, [event, *blocks(trajectory, 1000)])
+    _, found = whole_recording.smooth(CONFIG, signals, [event.stamp_ns], 1e-3)
+    assert found.method == 'every configuration'
+    assert found.modes == found.course[-1][1]
+    assert len(found.course) > 40
+    for time, oscillations in found.course:
+        row = round(time * 1000)
+        known = true_frequencies(float(run.chords[row, 1] - run.chords[row, 0]))
+        for mode, hertz in zip(oscillations, known, strict=True):
+            assert mode.frequency_hz == pytest.approx(hertz, rel=0.01)
+            assert abs(mode.frequency_hz - hertz) < 3.0 * 1.96 * mode.frequency_std_hz
 
 
 def test_deviations_of_frequencies_are_the_derivatives_of_the_matrices(run: Run) -> None:
