@@ -90,7 +90,8 @@ class Scenario:
         groups['plant'].setdefault('seed', seed)
         plant = configure(PlantParameters, groups['plant'])
         groups['excitation']['rate'] = plant.rate
-        torque = for_plant(configure(ExcitationParameters, groups['excitation']), plant)
+        arm = {name: value for name, value in groups['plant'].items() if name.startswith('arm.')}
+        torque = for_plant(configure(ExcitationParameters, {**arm, **groups['excitation']}), plant)
         identifier = configure(IdentifierParameters, groups['identifier'])
         return Run(plant, torque, identifier, capture, drawn)
 

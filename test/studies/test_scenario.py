@@ -44,6 +44,14 @@ def test_a_seed_makes_one_run_within_its_distributions(seed):
     assert run.plant.seed == seed
 
 
+def test_the_torques_are_those_of_the_plant_s_arm_with_one_link_as_well():
+    arm = {'link_length': [0.41], 'linear_density': [0.5], 'bending_stiffness': [5.0]}
+    run = scenario({'plant': {'arm': arm, 'initial_angles': [1.0]}, 'identifier': {'arm': arm},
+                    'excitation': {'amplitude': [0.3]}}).configuration(0, 'default')
+    assert run.excitation.arm == run.plant.arm
+    assert run.excitation.amplitude == (0.3,)
+
+
 def test_what_is_varied_does_not_depend_on_what_else_is():
     alone = scenario({'vary': {'plant.payload_mass': {'uniform': [0.0, 1.0]}}}).configuration(3, 'default')
     other = scenario({'vary': {'plant.payload_mass': {'uniform': [0.0, 1.0]},
