@@ -89,6 +89,10 @@ TELLS = 50
 """Samples after which the cost tells whether a fit is one: that of white noise then varies by 0.1 of itself."""
 UNFIT = 2.0
 """Cost over that of white noise beyond which a fit is rejected."""
+BY_CHANCE, UNTOLD = 5.0, 0.05
+"""The first fit after a capture is of a point mass. A body is fitted next where the point costs more than white noise
+by so many standard deviations (of chi square with n degrees of freedom: the root of 2 n), and by the share to which the
+white noise is known. Up to 30 dB a point in place of a body costs less than ``UNFIT``, and its mass is wrong."""
 TRIALS = 10
 """Iterations over the same samples after which a fit is given up: those that converge take three to nine."""
 STARTS = 2
@@ -225,7 +229,10 @@ def misfits(motion: ProcessModel, m: FilterState) -> bool:
     if m.counts[REFITS] >= most or early:
         return False
     expected = m.xi.size + m.noise.shape[0] * m.counts[MEASURED]
-    failed = bool(m.counts[AGAIN] == 1 or m.score[COST_BEFORE] > UNFIT * expected)
+    largest = UNFIT
+    if m.counts[HELD] == 1 and m.counts[REFITS] == 0:
+        largest = min(UNFIT, 1.0 + UNTOLD + BY_CHANCE * np.sqrt(2.0 / expected))
+    failed = bool(m.counts[AGAIN] == 1 or m.score[COST_BEFORE] > largest * expected)
     m.counts[REFITS] += failed
     return failed
 

@@ -200,6 +200,17 @@ def test_a_gripper_may_be_two_milliseconds_wrong_where_nothing_but_the_impact_te
     assert found.mass == pytest.approx(10.0, rel=0.01)
 
 
+@pytest.mark.parametrize('seed', [1, 2, 4])
+def test_a_body_is_not_taken_for_a_point_whose_residuals_are_one_and_a_half_times_the_noise(seed):
+    """With 25 dB a point that takes the body's place costs less than twice the noise; it has twice the mass."""
+    arm, capture = ArmParameters(), event(3.0)
+    samples = record(6.0, (capture,), payload_com=(-0.15, 0.1), payload_inertia=0.3, snr_db=25.0, arm=arm, seed=seed)
+    found = structured.estimate(config(arm), run(config(arm), samples, (capture,)))
+    assert found.mass == pytest.approx(20.0, rel=0.02)
+    assert abs(found.mass - 20.0) < 3.0 * found.std
+    assert found.com[:2] == pytest.approx((-0.15, 0.1), abs=0.006)
+
+
 @pytest.mark.parametrize(('seed', 'share'), [(1, 1.0), (4, 0.5)])
 def test_an_undamped_arm_is_not_lost_to_a_damping_below_zero(seed, share):
     """With such a damping its fast modes explode within the horizon: two of sixteen such arms were lost."""
