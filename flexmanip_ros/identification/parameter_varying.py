@@ -96,7 +96,7 @@ class Varying(NamedTuple):
     in a row; lost: samples were missing, so filter and state restart; settling: kept samples until the restarted filter
     has settled; gain: (n, m) published K; turn: angle through which the links swing with displacements of unit power
     [rad, rms]; power: (h, h) covariance of the scaled displacements, and swing: see ``Block``, averages over the last
-    blocks.
+    blocks; center: see ``signals_of``.
     """
 
     shift: float
@@ -121,6 +121,7 @@ class Varying(NamedTuple):
     turn: float
     power: Array
     swing: float
+    center: Array
 
 
 class Block(NamedTuple):
@@ -182,7 +183,7 @@ def pairs(h: int) -> int:
     return h * (h + 1) // 2
 
 
-def thirds(h: int) -> int:
+def triples(h: int) -> int:
     """Return the number of products of three of h displacements."""
     return h * (h + 1) * (h + 2) // 6
 
@@ -194,7 +195,7 @@ def parts(h: int, r: int) -> dict[str, tuple[slice, tuple[int, ...]]]:
     G, H, E, Q have one matrix for each function of c, D has one for each factor of ``Block.rates``.
     """
     shapes = {'G': (FUNCTIONS, h, h), 'H': (FUNCTIONS, h, r), 'E': (FUNCTIONS, h, r), 'F': (h, r), 'D': (3, h, h),
-              'b': (h,), 'Q': (FUNCTIONS, h, 2 * pairs(h)), 'R': (h, thirds(h)), 'zeta': (1,)}
+              'b': (h,), 'Q': (FUNCTIONS, h, 2 * pairs(h)), 'R': (h, triples(h)), 'zeta': (1,)}
     found, at = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)
@@ -223,7 +224,7 @@ def prior(G: Array, H: Array, turn: float) -> Array:
         np.abs(G).max() * shares(h).ravel(), np.repeat(share * np.abs(H).max(), h * r),
         np.repeat(DIRECT * np.array([1.0, 0.3, 0.3]), h * r), np.full(h * r, DIRECT),
         np.full(h * h, DAMPED), np.full(2 * h * h, TURNING), np.full(h, OFFSET),
-        np.full(2 * FUNCTIONS * h * pairs(h), SQUARES * turn), np.full(h * thirds(h), CUBES * turn ** 2),
+        np.full(2 * FUNCTIONS * h * pairs(h), SQUARES * turn), np.full(h * triples(h), CUBES * turn ** 2),
         np.full(1, SHARED)])
 
 
@@ -250,7 +251,7 @@ def to_local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, 
     """(l, k + 2h) derivative of [local parameters; state] with respect to [theta; state]; see ``local``."""
     value, by_c, by_zeta, by_both = basis(c, float(theta[-1]))
     at = {name: where.start for name, (where, _) in parts(h, r).items()}
-    a, b, q, k, d, t = h * h, h * r, 2 * r + 1, len(theta), 2 * pairs(h), thirds(h)
+    a, b, q, k, d, t = h * h, h * r, 2 * r + 1, len(theta), 2 * pairs(h), triples(h)
     at_e = 3 * a + 2 * b
     at_q = at_e + h * q
     T = np.zeros((at_q + h * (d + t) + 2 * h, k + 2 * h))
@@ -293,16 +294,20 @@ def _filter(v: Varying) -> tuple[Array, Array, Array]:
     return np.ascontiguousarray(step[:4, :4]), np.ascontiguousarray(step[:4, 4]), C
 
 
-def signals_of(config: IdentifierParameters, rows: Rows, role: Roles) -> Array:
-    """(N, ``width``) inputs, displacements, relative angle of the links, absolute angle of the first, and products."""
-    relative, Y = relative_angle(config, rows.angles), rows.y[:, list(role.displacements)]
+def signals_of(config: IdentifierParameters, rows: Rows, role: Roles, center: Array) -> Array:
+    """(N, ``width``) inputs, displacements, relative angle of the links, absolute angle of the first, and products.
+
+    center: (h,) mean of the displacements when the fit began. Without it the products would have linear terms, and
+    change G.
+    """
+    relative, Y = relative_angle(config, rows.angles), rows.y[:, list(role.displacements)] - center
     columns = rows.u, Y, relative, rows.angles[:, 0], products(Y, 2), products(Y, 3)
     return np.ascontiguousarray(np.column_stack(columns))
 
 
 def width(h: int, r: int) -> int:
     """Return the number of columns of ``signals_of``."""
-    return r + h + 2 + pairs(h) + thirds(h)
+    return r + h + 2 + pairs(h) + triples(h)
 
 
 def products(Y: Array, count: int) -> Array:
@@ -379,7 +384,7 @@ class Run(NamedTuple):
 
 def _run(v: Varying, block: Block, theta: Array, x: Array, noise: Array) -> Run:
     h, r = len(v.scale_y), len(v.scale_u)
-    size = 3 * h * h + 2 * h * r + h * (2 * r + 1) + h * (2 * pairs(h) + thirds(h)) + 2 * h
+    size = 3 * h * h + 2 * h * r + h * (2 * r + 1) + h * (2 * pairs(h) + triples(h)) + 2 * h
     N, g, moments, X = np.zeros((size, size)), np.zeros(size), np.zeros((h, h)), np.zeros((2 * h, size))
     X[:, size - 2 * h:] = np.eye(2 * h)
     end = x.copy()
@@ -522,7 +527,7 @@ def advance(config: IdentifierParameters, v: Varying, rows: Rows) -> Varying | N
     """Update the fit with a block of ``BLOCK`` samples; None where the fit ends, see ``STRIKES`` and ``updated``."""
     role = shown(config)
     assert role is not None
-    signals, end = signals_of(config, rows, role), 0
+    signals, end = signals_of(config, rows, role, v.center), 0
     for first, last in measured(v, signals, rows.missing):
         done = taken(lost(v) if first > end else v, signals[first:last])
         if done is None or done.strikes >= STRIKES:

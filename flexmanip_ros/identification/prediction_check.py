@@ -309,6 +309,7 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
     seen = rows.missing == 0
     unknown = Status.WARMING_UP if max(found.samples, since) < EARLY else Status.POORLY_EXCITED
     of_one = found.configurations is None
+    Y = rows.y if found.configurations is None else rows.y - found.configurations.offsets()
     if bends and (lacks_modes(modes(found), bends) or (of_one and turned > MOST_TURN)):
         return found._replace(status=unknown)
     if of_one:  # ``varying_model.judge`` has those of every configuration
@@ -327,14 +328,14 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
     if 3 * len(rows) < length(dt) or len(rows) < STRETCHES * max(stretch, found.model.order):
         return found
     with np.errstate(over='ignore', invalid='ignore'):
-        shares = missed(found.model, rows.u, rows.y, horizon, seen)
+        shares = missed(found.model, rows.u, Y, horizon, seen)
     heard = shares[~np.isnan(shares)]
     if heard.size and float(heard.mean()) > MISSED:
         return found._replace(status=Status.INCONSISTENT)
     if np.any(shares[chosen] > MISSED):
         return found._replace(status=Status.ORDER_TOO_LOW)
     with np.errstate(over='ignore', invalid='ignore'):
-        error, chance = frequency_errors(model, rows.u, rows.y[:, chosen], stretch, seen)
+        error, chance = frequency_errors(model, rows.u, Y[:, chosen], stretch, seen)
     if np.any(np.abs(error) - chance > OFF):
         return found._replace(status=Status.INCONSISTENT)
     if not of_one or not np.all(np.isfinite(chance)):  # nan: too few stretches

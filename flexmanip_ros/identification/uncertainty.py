@@ -20,6 +20,9 @@ class AnyConfiguration(Protocol):
     def at(self, angles: Array) -> Identified:
         """Return the model at measured angles (2,) [rad]."""
 
+    def offsets(self) -> Array:
+        """Return the offsets of the outputs (m,) that the fit found: of the sensors, or bends under gravity."""
+
 
 class Identified(NamedTuple):
     """A model with its uncertainty and status."""

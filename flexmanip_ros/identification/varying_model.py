@@ -12,6 +12,7 @@ from flexmanip_ros.identification.parameter_varying import (
     Roles,
     Varying,
     local,
+    part,
     shown,
     straight,
     to_local,
@@ -49,6 +50,15 @@ class Configurations(NamedTuple):
     def at(self, angles: Array) -> Identified:
         """Return the model at measured angles (2,) [rad], see ``with_relative``."""
         return self.with_relative(float(relative_angle(self.config, angles)))
+
+    def offsets(self) -> Array:
+        """Return the offsets of the outputs (m,) in their units; those of rates are zero."""
+        v, role = self.varying, shown(self.config)
+        assert role is not None
+        h = len(v.scale_y)
+        found = np.zeros(len(role.states))
+        found[list(role.displacements)] = v.center + part(v.theta, 'b', h, len(v.scale_u)) / v.scale_y
+        return found
 
     def now(self, rows: Rows) -> Identified:
         """Return the model at the configuration at the end of the latest rows, see ``straight``."""

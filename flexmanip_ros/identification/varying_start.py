@@ -19,6 +19,7 @@ from flexmanip_ros.identification.parameter_varying import (
     lost,
     measured,
     noise_of,
+    part,
     parts,
     passed,
     prior,
@@ -51,6 +52,8 @@ GROWTH = (256, 512, 640, 768, WINDOW)
 FEWEST = 24
 """Least number of kept samples in a block of a first fit, after the settling time of the filter."""
 ITERATIONS = 8
+CENTERED = 2
+"""Number of first fits, each around the offsets that the one before found: the mean of a few periods is no offset."""
 LATE = 16.0
 """Factor on the noise covariance in fits of fewer than ``WINDOW`` samples, whose starting model may be far off."""
 ZETA = 0.8
@@ -102,21 +105,23 @@ def start(config: IdentifierParameters, rows: Rows, old: Recursion | None, befor
         begun = _from_recursion(old, role, r, dt, c)
     if begun is None or begun.every < 1 or GROWTH[0] % begun.every:
         return None
-    power = np.concatenate([np.mean(rows.u ** 2, axis=0), np.var(rows.y[:, list(role.displacements)], axis=0)])
+    Y = rows.y[:, list(role.displacements)]
+    power = np.concatenate([np.mean(rows.u ** 2, axis=0), np.var(Y, axis=0)])
     if not np.all(power > 0.0) or not np.all(np.isfinite(power)):
         return None
     G, _, H, _, D, _, _ = local(begun.theta, h, r, c, 0.0, AT_REST)
     unit = 1.0 / np.sqrt(power)
     more_u, more_y = unit[:r] / begun.scale_u, unit[r:] / begun.scale_y
     ratio = more_y[:, None] / more_y
-    turn = _turn(config, rows, rows.y[:, list(role.displacements)] * unit[r:])
+    turn = _turn(config, rows, Y * unit[r:])
     theta, root = _around(G * ratio, H * more_y[:, None] / more_u, D * ratio, c, turn)
     if before is not None:  # the arm is the same, its object another; the products start anew
         known = np.ones(len(theta))
         known[:parts(h, r)['Q'][0].start], known[-1] = SAME, SAME
         root[:len(theta), :len(theta)] *= known
     return _fit_stretch(config, begun._replace(
-        dt=dt, theta=theta, root=root, scale_u=unit[:r], scale_y=unit[r:], turn=turn), rows, role)
+        dt=dt, theta=theta, root=root, scale_u=unit[:r], scale_y=unit[r:], turn=turn,
+        center=np.mean(Y, axis=0)), rows, role)
 
 
 def _turn(config: IdentifierParameters, rows: Rows, Y: Array) -> float:
@@ -158,15 +163,22 @@ def _from_recursion(old: Recursion, role: Roles, r: int, dt: float, c: float) ->
         shift=shift, scale_u=scale[:r].copy(), scale_y=scale[r:][list(role.displacements)].copy(), theta=theta,
         x=np.zeros(2 * h), root=root, noise=np.zeros((h, h)), share=np.zeros(h), chi2=1.0, corner=corner,
         every=every, filtered=np.zeros((4, width(h, r))), dt=dt, angle=0.0, blocks=0, strikes=0, lost=False,
-        settling=0, gain=np.zeros((0, 0)), turn=0.0, power=np.zeros((h, h)), swing=0.0)
+        settling=0, gain=np.zeros((0, 0)), turn=0.0, power=np.zeros((h, h)), swing=0.0,
+        center=np.zeros(h))
 
 
 def _fit_stretch(config: IdentifierParameters, v: Varying, rows: Rows, role: Roles) -> Varying | None:
     """Fit a whole stretch: its first ``WINDOW`` samples at once, the rest block by block."""
-    signals = signals_of(config, rows, role)
-    if not np.all(np.isfinite(signals)):
-        return None
-    begun = _fit_at_once(v, signals[:WINDOW], rows.missing[:WINDOW])
+    begun = None
+    for _ in range(CENTERED):
+        signals = signals_of(config, rows, role, v.center)
+        if not np.all(np.isfinite(signals)):
+            return None
+        begun = _fit_at_once(v, signals[:WINDOW], rows.missing[:WINDOW])
+        if begun is None:
+            return None
+        offset = part(begun.theta, 'b', len(v.scale_y), len(v.scale_u)) / v.scale_y
+        v = v._replace(center=v.center + offset)
     for row in range(rows.first + WINDOW, rows.until, BLOCK):
         begun = None if begun is None else advance(config, begun, rows.between(row, min(row + BLOCK, rows.until)))
     return begun

@@ -161,6 +161,20 @@ def test_a_stretch_in_which_the_arm_turned_is_smoothed_by_the_model_of_every_con
             assert abs(mode.frequency_hz - hertz) < 3.0 * 1.96 * mode.frequency_std_hz
 
 
+def test_offsets_of_the_bend_sensors_are_no_error_of_the_model(run: Run) -> None:
+    """Predictions without them were INCONSISTENT for ever; products with them would be terms of G."""
+    trajectory, event, _ = record()
+    position = trajectory.position + np.array([0.0, 0.0, 0.5, -0.5]) * trajectory.position.std(axis=0)
+    estimates, _ = identify(trajectory._replace(position=position), event, 1000)
+    last = [one for one in estimates if one.stamp_ns > (CAPTURE_S + 4.0) * 1e9]
+    tracking = [one for one in last if one.model_status is Status.TRACKING]
+    assert len(tracking) > 0.8 * len(last) > 8
+    for one in tracking:
+        for mode, hertz in zip(one.modes, truth(run, one), strict=True):
+            assert mode.frequency_hz == pytest.approx(hertz, rel=0.01)
+            assert abs(mode.frequency_hz - hertz) < 3.0 * 1.96 * mode.frequency_std_hz
+
+
 def test_deviations_of_frequencies_are_the_derivatives_of_the_matrices(run: Run) -> None:
     model = identified(run)
     n = model.model.order
