@@ -10,6 +10,7 @@ from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.batch_fit import BLOCK, Recursion
 from flexmanip_ros.identification.parameter_varying import (
     AT_REST,
+    MOST_SWING,
     UNKNOWN,
     Roles,
     Varying,
@@ -114,6 +115,8 @@ def start(config: IdentifierParameters, rows: Rows, old: Recursion | None, befor
     more_u, more_y = unit[:r] / begun.scale_u, unit[r:] / begun.scale_y
     ratio = more_y[:, None] / more_y
     turn = _turn(config, rows, Y * unit[r:])
+    if 2.0 * turn ** 2 > MOST_SWING:
+        return None
     theta, root = _around(G * ratio, H * more_y[:, None] / more_u, D * ratio, c, turn)
     if before is not None:  # the arm is the same, its object another; the products start anew
         known = np.ones(len(theta))
