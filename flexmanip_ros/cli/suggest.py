@@ -47,17 +47,24 @@ class Found:
     """Number of values."""
 
     @property
-    def moves(self) -> bool:
-        """Whether the signal varies and most of it is finite, so that it can be an input or an output.
+    def varies(self) -> bool:
+        """Whether its finite values vary."""
+        return self.std > STILL * max(abs(self.low), abs(self.high))
 
-        Messages with a value that is not finite are left out.
-        """
-        return 2 * self.broken < self.count and self.std > STILL * max(abs(self.low), abs(self.high))
+    @property
+    def finite(self) -> bool:
+        """Whether most of its values are finite; messages with another value are left out."""
+        return 2 * self.broken < self.count
+
+    @property
+    def moves(self) -> bool:
+        """Whether it can be an input or an output."""
+        return self.finite and self.varies
 
     def text(self) -> str:
         """Return the signal as a line to print."""
         what = (f'{self.low:.4g} .. {self.high:.4g}, standard deviation {self.std:.3g}'
-                if self.std > 0.0 else f'stands still at {self.low:.4g}')
+                if self.varies else f'stands still at {self.low:.4g}')
         broken = f'; {self.broken} of {self.count} values are not finite' if self.broken else ''
         return f'{self.name:28s} {self.rate:.4g} Hz   {what}{broken}'
 
@@ -179,7 +186,7 @@ def choose_signals(signals: list[Found], given: Mapping[str, Any]
         else:
             names, why = _inputs(moving) if name == 'inputs' else _outputs(moving, chosen['inputs'])
         if not names:
-            bad = ', '.join(signal.name for signal in signals if signal.broken and not signal.moves)
+            bad = ', '.join(signal.name for signal in signals if not signal.finite)
             why += f'; most values are not finite of {bad}' if bad else ''
             raise ParameterError(f'nothing in the recording serves for {name}: they would be {why}',
                                  f'name them with --set {name}=[NAME/FIELD, ...]')

@@ -91,7 +91,7 @@ class Varying(NamedTuple):
     shift: 1 over the unit of time [1/s]; scale_u (r,), scale_y (h,): factors on signals; theta: (k,) parameters, see
     ``parts``; x: (2h,) state; root: (k + 2h, k + 2h) S with S S' the covariance of [theta; x]; noise: (h, h) covariance
     of the residuals; share (h,), chi2: averages of ``Missed`` over the last blocks; corner: of the low-pass [Hz];
-    every: one of so many filtered samples is kept; filtered: (4, r + h + 2) state of the filter; dt: sample time [s];
+    every: one of so many filtered samples is kept; filtered: (4, ``width``) state of the filter; dt: sample time [s];
     angle: relative angle of the links after the last block [rad]; blocks: number taken; strikes: number of bad blocks
     in a row; lost: samples were missing, so filter and state restart; settling: kept samples until the restarted filter
     has settled; gain: (n, m) published K; turn: angle through which the links swing with displacements of unit power

@@ -168,16 +168,22 @@ def _of_every_configuration(config: IdentifierParameters, signals: Signals, a: i
         return None
     log = log_of(signals.u[a:b], signals.y[a:b], signals.angles[a:b], signals.stamp_ns[a:b], signals.gap[a:b],
                  signals.missing[a:b])
-    state = rpbsid.finish(config, rpbsid.advance(config, rpbsid.init(config), log.rows(0, b - a)))
-    found = rpbsid.identified(config, state, dt)
-    if found is None or not isinstance(found.configurations, Configurations):
+    found = _configurations(config, rpbsid.advance(config, rpbsid.init(config), log.rows(0, b - a)), dt)
+    if found is None:
         return None
     course = []
     for first in range(0, b - a - BLOCK + 1, BLOCK):
         angle = float(np.nanmean(relative[first:first + BLOCK]))
-        course.append((float(signals.time[a + first + BLOCK // 2]), modes(found.configurations.with_relative(angle))))
-    return Smoothed(float(signals.time[a]), float(signals.time[b - 1]), b - a, 'every configuration', found.status,
+        course.append((float(signals.time[a + first + BLOCK // 2]), modes(found.with_relative(angle))))
+    status = found.with_relative(found.varying.angle, present=True).status
+    return Smoothed(float(signals.time[a]), float(signals.time[b - 1]), b - a, 'every configuration', status,
                     course[-1][1], tuple(course))
+
+
+def _configurations(config: IdentifierParameters, state: rpbsid.RpbsidState, dt: float) -> Configurations | None:
+    """Return the model of every configuration after the last sample; None where it holds at one configuration only."""
+    found = rpbsid.identified(config, rpbsid.finish(config, state), dt)
+    return found.configurations if found is not None and isinstance(found.configurations, Configurations) else None
 
 
 def _stretch(config: IdentifierParameters, signals: Signals, a: int, b: int, dt: float) -> Smoothed:
@@ -277,15 +283,14 @@ def sweep(state: pipeline.State, angles: Array) -> Sweep | None:
     config, identifier = state.config, state.identifier
     if config is None or identifier is None or not len(angles):
         return None
-    last = rpbsid.finish(config, identifier.estimator.rpbsid)
-    found = rpbsid.identified(config, last, state.clock.dt)
-    if found is None or not isinstance(found.configurations, Configurations):
+    found = _configurations(config, identifier.estimator.rpbsid, state.clock.dt)
+    if found is None:
         return None
     relative = np.radians(np.arange(0.0, 180.0 + STEP_DEG, STEP_DEG))
     count = config.order // 2
     table = np.full((len(relative), count, 3), np.nan)
     for k, angle in enumerate(relative):
-        for i, mode in enumerate(modes(found.configurations.with_relative(float(angle)))[:count]):
+        for i, mode in enumerate(modes(found.with_relative(float(angle)))[:count]):
             table[k, i] = mode.frequency_hz, mode.frequency_std_hz, mode.damping_ratio
     seen = np.arccos(np.cos(relative_angle(config, angles)))
     return Sweep(relative, table[:, :, 0], table[:, :, 1], table[:, :, 2], np.array([seen.min(), seen.max()]))
