@@ -96,7 +96,7 @@ class Meter:
         self._taken = 1
 
     def window(self) -> Mapping[str, float]:
-        """Return rate of the messages [Hz] and callback time [us] since the last call, and start a new window."""
+        """Return rate of the messages [Hz] and times of the callback since the last call, and start a new window."""
         now = time.monotonic_ns()
         seconds = max(now - self._window_ns, 1) * 1e-9
         times_us = np.array(self._times_ns, dtype=np.float64) * 1e-3
@@ -108,6 +108,7 @@ class Meter:
             'callback_p50_us': float(np.percentile(times_us, 50)) if some else math.nan,
             'callback_p99_us': float(np.percentile(times_us, 99)) if some else math.nan,
             'callback_max_us': float(times_us.max()) if some else math.nan,
+            'callback_share': float(times_us.sum()) * 1e-6 / seconds,
         }
 
 

@@ -13,6 +13,7 @@ from rclpy.node import Node
 from ros_harness import Ros
 
 from flexmanip_ros.ros import conversions
+from flexmanip_ros.ros.nodes import rpbsid_identifier
 from flexmanip_ros.ros.rclpy_workarounds import Alarm
 
 
@@ -57,6 +58,15 @@ def test_diagnostics_come_once_a_second_while_samples_are_taken(ros: Ros) -> Non
     stamps = [conversions.stamp_ns(message.header.stamp) for message in _own(live.diagnostics)]
     # the median: after a stall of the machine the late one and the next come together, once
     assert 0.5e9 < median(b - a for a, b in pairwise(stamps)) < 1.5e9
+
+
+def test_samples_that_come_faster_than_they_are_computed_are_a_warning(
+    ros: Ros, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(rpbsid_identifier, 'BUSY', 1e-6)  # this machine may be fast
+    live = Live(ros, payload_method='none')
+    live.send(*recording()[:200])
+    ros.wait(lambda: any(rpbsid_identifier.TOO_SLOW in message.status[0].message for message in _own(live.diagnostics)))
 
 
 def _own(heard: list[DiagnosticArray]) -> list[DiagnosticArray]:

@@ -92,4 +92,5 @@ def test_a_meter_counts_times_and_begins_again() -> None:
     window = meter.window()
     assert window['rate_hz'] > 0.0
     assert 0.0 <= window['callback_p50_us'] <= window['callback_p99_us'] <= window['callback_max_us']
+    assert 0.0 <= window['callback_share'] <= 1.0
     assert meter.window()['rate_hz'] == 0.0

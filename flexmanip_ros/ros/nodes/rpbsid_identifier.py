@@ -86,6 +86,11 @@ SHORTEST_WAIT_S = 0.00025
 MOST_DOUBLED = 7
 """Number of times that ``SHORTEST_WAIT_S`` doubles, until it is more than ``LONGEST_WAIT_S``."""
 
+BUSY = 0.9
+"""Share of the time that the callback may take; beyond it samples wait, and are lost once 1000 do."""
+TOO_SLOW = ('samples come faster than they can be computed, and wait: publish joint states less often, or name fewer '
+            'parameters in payload.learn (small arms with Coulomb friction need many steps a sample)')
+
 WARM_UP_EVENT = 40
 """Number of samples before the event of the warm-up, more than are needed to learn the sample time."""
 WARM_UP_SAMPLES = WARM_UP_EVENT + 3 * batch_fit.BLOCK + 2 * recursive_fit.CHUNK
@@ -379,6 +384,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
                           rewinds=events.rewinds, outliers=identifier.estimator.outliers)
         if self.active and values['rate_hz'] == 0.0:
             report.silent('joint_states')
+        if values['callback_share'] > BUSY:
+            report.worse(WARN, TOO_SLOW)
         if self.rejected:
             report.worse(ERROR, f'{self.rejected} messages rejected')
         if counters.dropped:
