@@ -43,8 +43,9 @@ def to_continuous(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
 
 
 def _outside_log(poles: NDArray[Any]) -> bool:
-    """Whether a pole has no real logarithm: at zero or on the negative real axis."""
-    return bool(np.any((np.abs(poles.imag) < 1e-12 * np.abs(poles)) & (poles.real <= 0.0)))
+    """Whether a pole has no real logarithm: at zero, to the digits of a pole at 1, or on the negative real axis."""
+    negative = (np.abs(poles.imag) < 1e-12 * np.abs(poles)) & (poles.real <= 0.0)
+    return bool(np.any(negative | (np.abs(poles) < 1e-12)))
 
 
 def to_discrete(Ac: Array, Bc: Array, dt: float) -> tuple[Array, Array]:
