@@ -50,7 +50,7 @@ def ours(u: np.ndarray, y: np.ndarray, half: int, values: dict[str, object]) -> 
     stamps = (np.arange(len(u)) * round(DT * 1e9)).astype(np.int64)
     signals = Signals(stamps, u, y, np.empty((len(u), 0)), np.zeros(len(u), dtype=bool), np.zeros(len(u), dtype=int),
                       config.inputs, config.outputs)
-    scores = whole_recording.score(found.model, signals, half * DT)
+    scores = whole_recording.score(found.model, signals, half * DT, constant=found.constant)
     return {'simulation': scores.simulation.tolist(), 'prediction': scores.prediction.tolist()}
 
 

@@ -21,7 +21,7 @@ from identification_suggested import CASES
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.identification import decimation
-from flexmanip_ros.identification.validation import simulate
+from flexmanip_ros.identification.validation import affine, simulate
 from flexmanip_ros.io import bag
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
 from flexmanip_ros.payload.structured_model import chords
@@ -191,7 +191,7 @@ def prediction_fails(case: Case, estimate: Estimate, signals: Signals, since_ns:
     steps, r = max(1, round(AHEAD_S / model.dt)), signals.u.shape[1]
     if len(joint) < 3 * steps or signals.gap[first + 1:end].any():
         return False
-    shares = unexplained(model, joint[:, :r], joint[:, r:], steps)
+    shares = unexplained(*affine(model, estimate.constant, joint[:, :r]), joint[:, r:], steps)
     return bool(np.any(shares[~np.isnan(shares)] > 0.5))
 
 

@@ -188,7 +188,7 @@ class ModelRequest:
         return Estimate(
             self.stamp_ns, _overall(config, found.status, payload), found.model, oscillations, payload,
             excitation=found.excitation, condition=found.condition, singular_values=found.singular_values,
-            innovation_power=found.innovation_power, model_status=found.status)
+            innovation_power=found.innovation_power, model_status=found.status, constant=found.constant)
 
 
 def with_payload(config: IdentifierParameters, estimate: Estimate, payload: Payload | None) -> Estimate:

@@ -194,5 +194,7 @@ class Estimate(NamedTuple):
     """Whether model and modes were read at this stamp; False: they are those of an earlier estimate."""
     payload_is_new: bool = True
     """Whether no earlier estimate of this stamp contained the payload."""
+    constant: Array | None = None
+    """(n,) constant term of the model's state equation: offsets of sensors, bends under gravity."""
     arm_parameters: tuple[ArmParameter, ...] = ()
     """The learned arm parameters, in the first estimate of each second only."""

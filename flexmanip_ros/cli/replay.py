@@ -126,8 +126,9 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     signals = messages.signals() if messages.is_kept else None
     if request.validate_from is not None and signals is not None:
         progress.phase('scoring the model')
-        scores = whole_recording.score(None if last is None else last.model, signals, request.validate_from,
-                               factor=request.config.decimation, horizon_s=request.horizon)
+        scores = whole_recording.score(
+            None if last is None else last.model, signals, request.validate_from, factor=request.config.decimation,
+            horizon_s=request.horizon, constant=None if last is None else last.constant)
         summary = replace(summary, vaf_simulation_percent=tuple(scores.simulation.tolist()),
                           vaf_prediction_percent=tuple(scores.prediction.tolist()),
                           vaf_horizon_percent=tuple(scores.horizon.tolist()))

@@ -1,12 +1,15 @@
 """The prediction-error fit of a whole stretch: starting points, noise model, and uncertainty of the result."""
 
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
+from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.mode_drift import drift_of
 from flexmanip_ros.identification.moments import Realized, triangle
+from flexmanip_ros.identification.pbsid import pbsid
 from flexmanip_ros.identification.prediction_error import (
     Fit,
     Structure,
@@ -35,6 +38,9 @@ innovation covariance of a recursion is raised by the same share."""
 UNEXPLAINED = 0.5
 """Largest share of the outputs' power that a fit with K = 0 may leave; a fit that leaves more simulates nothing."""
 
+PIECES = 16
+"""Number of pieces of a stretch whose gradients are compared, see ``_widening``."""
+
 
 class Recursion(NamedTuple):
     """A fit that further blocks update.
@@ -42,10 +48,11 @@ class Recursion(NamedTuple):
     scale: (r + m,) factors on the signals; P: (d, k) coordinates, see ``Fit``; root: (k, k) S with S S' the covariance
     of these coordinates, the state last; covariance: (m, m) of the innovations, estimated from ``weight`` samples;
     widening: factor on standard deviations, see ``_widening``; strikes: bad blocks in a row; gain: (n, m) published K,
-    theta's own unless that is held; singular_values, condition: of the subspace model that the fit started from; lost:
-    the state is unknown; drift: logarithm of the factor by which the variances grow in a block because the plant
-    changes; trend: (k,) mean step of the coordinates in a block, over the last blocks; trend_share: the part of it that
-    chance does not explain (0 to 1); trend_lag: steps of ``trend`` by which the fit may lag behind the arm.
+    theta's own unless that is held; mean: (m,) see ``middle``; singular_values, condition: of the
+    subspace model that the fit started from; lost: the state is unknown; drift: logarithm of the factor by which the
+    variances grow in a block because the plant changes; trend: (k,) mean step of the coordinates in a block, over the
+    last blocks; trend_share: the part of it that chance does not explain (0 to 1); trend_lag: steps of ``trend`` by
+    which the fit may lag behind the arm.
     """
 
     theta: Theta
@@ -58,6 +65,7 @@ class Recursion(NamedTuple):
     widening: float
     strikes: int
     gain: Array
+    mean: Array
     singular_values: Array
     condition: float
     trend: Array
@@ -84,53 +92,94 @@ class Attempt(NamedTuple):
 
 def fit_stretch(
     samples: Array, starts: list[Realized], fits: list[Recursion], scale: Array, feedthrough: bool,
-    noise: str,
+    noise: str, constant: bool,
 ) -> Recursion | None:
     """Fit samples (N, r + m) from several starting points and keep the fit of least cost.
 
     starts: subspace models, each also tried with little damping; fits: earlier fits; a batch model of averaged samples
     is another starting point. scale: (r + m,) of the subspace models' signals; noise: ``sensor`` holds K = 0 while the
-    system is fitted, ``any`` frees K where that is the better model. None where no fit simulates the stretch.
+    system is fitted, ``any`` frees K where that is the better model; constant: whether the state's equation may have
+    a constant, an input of ones. A fit without one comes first: see ``_with_constant``. None where no fit simulates the
+    stretch.
     """
     m = starts[0].C.shape[0] if starts else 0
     if starts and not np.all(np.nanmax(samples[:, -m:], axis=0) > np.nanmin(samples[:, -m:], axis=0)):
         return None  # a constant output carries no information
     power = np.nansum((samples[:, -m:] * scale[-m:]) ** 2, axis=0)
-    floor, found = -np.inf, []
+    floors = [-np.inf]
     for realized in starts:
         moments = realized.residual.T @ realized.residual
         if np.all(np.diag(moments) <= CLEAN * power):
             return None
         size = np.linalg.slogdet(moments / len(samples) + 1e-300 * np.eye(m))[1]
-        floor = float(size) + realized.Xi.size * np.log(len(samples)) / len(samples)
-        begin, structure = candidate(
-            StateSpace(realized.A, realized.B, realized.C, realized.D, realized.K, 1.0), feedthrough)
-        found.append(_attempt(samples, begin, structure, scale, noise, floor))
-        light = lightly_damped(begin.A, LIGHT)
-        if light is not begin.A:
-            found.append(_attempt(samples, begin._replace(A=light), structure, scale, noise, floor))
-    slow = None
-    if starts:
-        slow = averaged(*_signals(interpolated(samples), scale, starts[0].B.shape[1]), starts[0].A.shape[0])
-    if slow is not None:
-        found.append(_attempt(samples, *candidate(slow, feedthrough), scale, noise, floor))
-    for k, old in enumerate(fits):
-        best = min((attempt.cost for attempt in found if attempt is not None), default=np.inf)
-        if k > 0 and best + 2.0 * float(np.sum(np.log(scale[-m:]))) < floor:
-            break  # below the cost of the long regression (VARX): good enough
-        begin = old.theta._replace(x=np.zeros_like(old.theta.x), K=old.gain)
-        own = floor + 2.0 * float(np.sum(np.log(old.scale[-m:] / scale[-m:]))) if starts else floor
-        found.append(_attempt(samples, begin, old.structure, old.scale, noise, own))
-    done = [attempt for attempt in found if attempt is not None]
-    if not done:
+        floors.append(float(size) + realized.Xi.size * np.log(len(samples)) / len(samples))
+
+    def likeliest(constant: bool) -> Attempt | None:
+        found = _attempts(samples, starts, fits, scale, feedthrough, noise, floors, constant)
+        return min(found, key=lambda attempt: attempt.cost, default=None)
+
+    best = likeliest(False)
+    if constant:
+        best = _with_constant(samples, best, lambda: likeliest(True))
+    if best is None:
         return None
-    recursion = _recursion(samples, _with_direct(samples, min(done, key=lambda attempt: attempt.cost)))
+    recursion = _recursion(samples, _with_direct(samples, best))
     if not starts:
         return recursion
     length = np.linalg.norm(starts[0].state, axis=0)
     return recursion._replace(
         singular_values=starts[0].singular_values,
         condition=float(np.linalg.cond(starts[0].state / np.where(length > 0.0, length, 1.0))))
+
+
+def _attempts(
+    samples: Array, starts: list[Realized], fits: list[Recursion], scale: Array, feedthrough: bool, noise: str,
+    floors: list[float], constant: bool,
+) -> list[Attempt]:
+    """Fit from every starting point, see ``fit_stretch``, with or without a constant.
+
+    With a constant the subspace models are those of the stretch about its means. floors: see ``_attempt``, before the
+    first subspace model and after each of them.
+    """
+    found, means = [], None
+    if starts:
+        filled, r = interpolated(samples) * scale, starts[0].B.shape[1]
+        U, Y = filled[:, :r], filled[:, r:]
+        means = (U.mean(axis=0), Y.mean(axis=0)) if constant else None
+    for realized, floor in zip(starts, floors[1:], strict=True):
+        model = _centred(U, Y, realized) if constant else StateSpace(
+            realized.A, realized.B, realized.C, realized.D, realized.K, 1.0)
+        if model is None:
+            continue
+        begin, structure = candidate(model, feedthrough, means)
+        found.append(_attempt(samples, begin, structure, scale, noise, floor))
+        light = lightly_damped(begin.A, LIGHT)
+        if light is not begin.A:
+            found.append(_attempt(samples, begin._replace(A=light), structure, scale, noise, floor))
+    floor = floors[-1]
+    slow = averaged(U, Y, starts[0].A.shape[0], constant) if starts else None
+    if slow is not None:
+        found.append(_attempt(samples, *candidate(slow, feedthrough, means), scale, noise, floor))
+    for k, old in enumerate(fits):
+        best, m = min((one.cost for one in found if one is not None), default=np.inf), len(old.covariance)
+        if k > 0 and best + 2.0 * float(np.sum(np.log(scale[-m:]))) < floor:
+            break  # below the cost of the long regression (VARX): good enough
+        n, r = len(old.theta.A), old.theta.D.shape[1]
+        B = np.hstack([old.theta.B, np.zeros((n, 1))])[:, :r + constant]
+        begin = old.theta._replace(B=np.ascontiguousarray(B), x=np.zeros(n), K=old.gain)
+        own = floor + 2.0 * float(np.sum(np.log(old.scale[-m:] / scale[-m:]))) if starts else floor
+        found.append(_attempt(samples, begin, old.structure, old.scale, noise, own))
+    return [attempt for attempt in found if attempt is not None]
+
+
+def _centred(U: Array, Y: Array, like: Realized) -> StateSpace | None:
+    """Return the batch subspace model of signals about their means, of the order and windows of another one."""
+    n, past = like.T.shape
+    m, width = Y.shape[1], U.shape[1] + Y.shape[1]
+    try:
+        return pbsid(U, Y, n=n, p=past // width, f=like.S.shape[1] // m, dt=1.0, centred=True)[0]
+    except ModelError:
+        return None
 
 
 def interpolated(samples: Array) -> Array:
@@ -145,14 +194,23 @@ def interpolated(samples: Array) -> Array:
     return filled
 
 
-def unexplained(covariance: Array, Y: Array) -> float:
-    """Share of the power of Y (N, m) in residuals of this covariance (m, m), the mean over the outputs."""
-    power = np.nanmean(Y ** 2, axis=0)
+def unexplained(covariance: Array, Y: Array, mean: Array) -> float:
+    """Share of the power of Y (N, m) about ``mean`` (m,) in residuals of this covariance (m, m), mean over outputs."""
+    power = np.nanmean((Y - mean) ** 2, axis=0)
     return float(np.mean(np.diag(covariance) / np.where(power > 0.0, power, np.inf)))
 
 
-def _signals(samples: Array, scale: Array, r: int) -> tuple[Array, Array]:
-    return np.ascontiguousarray(samples[:, :r] * scale[:r]), np.ascontiguousarray(samples[:, r:] * scale[r:])
+def middle(Y: Array, theta: Theta) -> Array:
+    """Return what the powers of Y (N, m) refer to: the mean, or zero for a model without constant terms."""
+    return np.nanmean(Y, axis=0) if theta.B.shape[1] > theta.D.shape[1] else np.zeros(Y.shape[1])
+
+
+def scaled(samples: Array, scale: Array, theta: Theta) -> tuple[Array, Array]:
+    """Return inputs (N, r), with a constant in the model (N, r + 1), and outputs (N, m) of samples (N, r + m)."""
+    r = theta.D.shape[1]
+    U = np.ones((len(samples), theta.B.shape[1]))
+    U[:, :r] = samples[:, :r] * scale[:r]
+    return U, np.ascontiguousarray(samples[:, r:] * scale[r:])
 
 
 def _attempt(
@@ -165,13 +223,13 @@ def _attempt(
     fit simulates, the order must also suffice: a cost below ``floor``, the penalized cost of the long regression
     (VARX). With too low an order a free K improves the next sample's prediction at the expense of all slower motion.
     """
-    n, r = begin.B.shape
-    U, Y = _signals(samples, scale, r)
+    n, r = len(begin.A), begin.D.shape[1]
+    U, Y = scaled(samples, scale, begin)
     m, count = Y.shape[1], len(U)
     penalty = _price(n * m, count)
     chosen = structure._replace(free_gain=False, only_gain=False)
     best = descend(U, Y, begin._replace(K=np.zeros_like(begin.K)), chosen, ITERATIONS)
-    simulates = best is not None and unexplained(best.covariance, Y) < UNEXPLAINED
+    simulates = best is not None and unexplained(best.covariance, Y, middle(Y, begin)) < UNEXPLAINED
     cost = np.inf if best is None else best.cost + (_price(m * r, count) if structure.free_direct else 0.0)
     wanted = False
     if noise == 'any' or simulates:
@@ -188,6 +246,30 @@ def _attempt(
     return Attempt(best, chosen, scale, cost - shift, wanted, begin.K)
 
 
+def _with_constant(samples: Array, best: Attempt | None, likeliest: Callable[[], Attempt | None]) -> Attempt | None:
+    """Free a constant where the likelihood gains more than its price.
+
+    best: fit without one, if any; likeliest: makes the best fit with one. It is called where that may be far from
+    ``best``: where a constant pays from there, and where an output's mean exceeds half its deviation, as such an offset
+    spoils the subspace models of signals that are not centred. Modes above the order and an arm that turns leave
+    correlated residuals. So the stretch counts as ``PIECES`` independent samples: this effective sample size takes the
+    place of N in Schwarz's criterion.
+    """
+    if best is None:
+        return likeliest()
+    n, r = len(best.fit.theta.A), best.fit.theta.D.shape[1]
+    begin = best.fit.theta._replace(B=np.hstack([best.fit.theta.B, np.zeros((n, 1))]))
+    other, price = descend(*scaled(samples, best.scale, begin), begin, best.structure, ITERATIONS), _price(n, PIECES)
+    found = [] if other is None else [best._replace(fit=other, cost=best.cost - best.fit.cost + other.cost)]
+    Y = samples[:, r:]
+    far = np.abs(np.nanmean(Y, axis=0)) > 0.5 * np.nanstd(Y, axis=0)
+    if far.any() or (found and found[0].cost + price < best.cost):
+        again = likeliest()
+        found += [] if again is None else [again]
+    freed = min(found, key=lambda attempt: attempt.cost, default=best)
+    return freed if freed.cost + price < best.cost else best
+
+
 def _with_direct(samples: Array, attempt: Attempt) -> Attempt:
     """Free D where the likelihood gains more than the price of D.
 
@@ -197,7 +279,7 @@ def _with_direct(samples: Array, attempt: Attempt) -> Attempt:
     fit, structure = attempt.fit, attempt.structure
     if structure.free_direct:
         return attempt
-    U, Y = _signals(samples, attempt.scale, fit.theta.B.shape[1])
+    U, Y = scaled(samples, attempt.scale, fit.theta)
     free = structure._replace(free_direct=True)
     other = descend(U, Y, fit.theta, free, ITERATIONS)
     if other is None or not other.cost + _price(fit.theta.D.size, len(U)) < fit.cost:
@@ -213,7 +295,7 @@ def _price(parameters: int, count: int) -> float:
 def _recursion(samples: Array, attempt: Attempt) -> Recursion:
     """Start the recursion from the best attempt; where a score test asks for K, K is fitted with the system held."""
     fit, structure = attempt.fit, attempt.structure
-    U, Y = _signals(samples, attempt.scale, fit.theta.B.shape[1])
+    U, Y = scaled(samples, attempt.scale, fit.theta)
     gain = None
     if attempt.wants_gain:
         alone = structure._replace(free_gain=True, only_gain=True)
@@ -230,7 +312,8 @@ def _recursion(samples: Array, attempt: Attempt) -> Recursion:
         root=root,
         covariance=fit.covariance + CLEAN * np.diag(np.nanmean(Y ** 2, axis=0)), weight=float(measured(Y)),
         widening=widening, strikes=0, gain=fit.theta.K if gain is None else gain,
-        singular_values=np.zeros(0), condition=float('nan'), trend=trend, trend_share=trend_share)
+        mean=middle(Y, fit.theta), singular_values=np.zeros(0), condition=float('nan'), trend=trend,
+        trend_share=trend_share)
 
 
 def _gain_alone(U: Array, Y: Array, theta: Theta, begin: Array, structure: Structure) -> Array | None:
@@ -259,7 +342,7 @@ def _gain_asked_for(U: Array, Y: Array, fit: Fit, structure: Structure, penalty:
     return gain > penalty * len(U)
 
 
-def _widening(U: Array, Y: Array, fit: Fit, structure: Structure, pieces: int = 16) -> float:
+def _widening(U: Array, Y: Array, fit: Fit, structure: Structure) -> float:
     """Scatter of the gradient over pieces of the stretch, as a factor >= 1 on its standard deviation.
 
     With white innovations the gradients of the pieces scatter as the information matrix predicts. Correlated or growing
@@ -269,7 +352,7 @@ def _widening(U: Array, Y: Array, fit: Fit, structure: Structure, pieces: int = 
     root = covariance_root(fit.information)
     sums = []
     X: Array | None = None
-    edges = np.linspace(0, len(U), pieces + 1).astype(int)
+    edges = np.linspace(0, len(U), PIECES + 1).astype(int)
     for a, b in itertools.pairwise(edges):
         _, gradient, _, X, end = derivatives(
             U[a:b], Y[a:b], theta, structure, fit.covariance, fit.directions, X)
@@ -278,5 +361,5 @@ def _widening(U: Array, Y: Array, fit: Fit, structure: Structure, pieces: int = 
     gradients = np.array(sums)
     freedom = fit.information.shape[0]
     power = float(np.sum(gradients ** 2)) / freedom
-    noise = np.sqrt(2.0 / (freedom * pieces))
+    noise = np.sqrt(2.0 / (freedom * PIECES))
     return float(np.sqrt(power)) if power > 1.0 + 4.0 * noise else 1.0

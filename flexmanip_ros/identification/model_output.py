@@ -90,19 +90,20 @@ def from_fit(
     known = recursion.widening * np.exp(0.5 * recursion.drift) * recursion.root[:k]
     spread = (P[:-n, :k] @ np.hstack([known, recursion.trend_lag * recursion.trend[:k, None]])).T
     free = (True, True, structure.free_gain, structure.free_output, structure.free_direct)
-    shapes = ((n, n), (n, r), (n, m), (m, n), (m, r))
+    shapes = ((n, n), theta.B.shape, (n, m), (m, n), (m, r))
     sizes = [a * b if is_free else 0 for (a, b), is_free in zip(shapes, free, strict=True)]
     parts = np.split(spread, np.cumsum(sizes)[:-1], axis=1)
     dA, dB, dK, dC, dD = (
         (part if part.size else np.zeros((len(spread), a * b))).reshape(-1, a, b)
         for part, (a, b) in zip(parts, shapes, strict=True))
-    along = Tangent(dA, dB, dC, dD, dK)
-    along = Tangent(*_in_units(*along, su, sy))
-    model = StateSpace(*_in_units(theta.A, theta.B, theta.C, theta.D, recursion.gain, su, sy), dt=dt)
-    model, moved_along = based(model, along, config.stable_model)
+    along = Tangent(*_in_units(dA, dB[:, :, :r], dC, dD, dK, su, sy))
+    model = StateSpace(*_in_units(theta.A, theta.B[:, :r], theta.C, theta.D, recursion.gain, su, sy), dt=dt)
+    model, moved_along, W = based(model, along, config.stable_model)
     assert moved_along is not None
+    constant = W @ theta.B[:, r:].sum(axis=1)  # the last column, if there is one
     return Identified(
-        model=model, spread=moved_along.flat(), singular_values=recursion.singular_values,
+        model=model, constant=constant, spread=moved_along.flat(),
+        singular_values=recursion.singular_values,
         excitation=excited, condition=recursion.condition, innovation_power=float(scalars[POWER]),
         status=Status.TRACKING, refined=True, samples=recursion.weight)
 
@@ -131,7 +132,7 @@ def publish(
     if parameters * entries <= LARGEST_SPREAD:
         along = uncertainty.tangent(R, realized, r, innovation * np.sqrt(scalars[WEIGHT2] / scalars[WEIGHT]))
         along = Tangent(*_in_units(*along, su, sy))
-    model, along = based(model, along, config.stable_model)
+    model, along, _ = based(model, along, config.stable_model)
     spread = along.flat() if along is not None else np.zeros((entries, 0))
     ratio = float(effective * np.log1p(realized.neglected).sum())
     too_low = ratio > SIGNIFICANT and float(realized.neglected.max()) > NEGLECTED
@@ -155,10 +156,11 @@ def _in_units(
     return A, B * su, C / sy[:, None], D * su / sy[:, None], K * sy
 
 
-def based(model: StateSpace, along: Tangent | None, stable: bool = False) -> tuple[StateSpace, Tangent | None]:
+def based(model: StateSpace, along: Tangent | None, stable: bool = False) -> tuple[StateSpace, Tangent | None, Array]:
     """Bring model and tangent to the published basis: y = C x with the known C, else balanced.
 
-    stable: poles outside the unit circle are moved onto it.
+    Return with them the matrix (n, n) that takes the old state to the new one. stable: poles outside the unit circle
+    are moved onto it.
     """
     if stable:
         model = replace(model, A=realization.stabilized(model.A))
@@ -170,7 +172,7 @@ def based(model: StateSpace, along: Tangent | None, stable: bool = False) -> tup
     if along is not None:
         dW = uncertainty.known_basis_tangent(model, along) if known else None
         along = uncertainty.move(model, along, W, dW)
-    return moved, along
+    return moved, along, W
 
 
 def judge(used: int, parameters: int, condition: float, unexplained: float, too_low: bool) -> Status:

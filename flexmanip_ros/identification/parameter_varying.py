@@ -160,6 +160,15 @@ def roles(config: IdentifierParameters) -> Roles | None:
     return None if at_one_point or not reads_angles(config) else shown(config)
 
 
+def has_constant(config: IdentifierParameters) -> bool:
+    """Return whether a fit may have a constant, for offsets of sensors and bends under gravity.
+
+    With x = y, or x = [w; w'] for displacements w, no state is left to stand for them. Other models represent an offset
+    by a slow pole. So their published matrices, which have no constant, predict the signals as they are measured.
+    """
+    return config.order == len(config.outputs) or roles(config) is not None
+
+
 def shown(config: IdentifierParameters) -> Roles | None:
     """Return the roles of the outputs from their names; None where these do not suit the order or the decimation."""
     names = config.outputs

@@ -80,12 +80,13 @@ def open_loop_weight(Xi: Array, f: int, r: int) -> Array:
 def pbsid(
     U: Array, Y: Array, *, n: int, p: int, f: int, dt: float,
     weighted: bool = True, fixed: bool = False, forgetting: float = 1.0, regularization: float = 0.0,
+    centred: bool = False,
 ) -> tuple[StateSpace, Array]:
     """Identify from inputs U (N, r) and outputs Y (N, m) of one record without gaps.
 
     forgetting: weight of a sample relative to the next one; regularization: ridge on the VARX parameters; fixed: S =
-    [I 0], otherwise the leading singular vectors. Returns the model, in the basis of its state, and the singular
-    values.
+    [I 0], otherwise the leading singular vectors; centred: every regression has an intercept. Returns the model, in the
+    basis of its state, and the singular values.
     Raises ModelError when the record is shorter than the window or carries fewer than n states.
     """
     r, m = U.shape[1], Y.shape[1]
@@ -95,7 +96,12 @@ def pbsid(
     if count < n + r + m + 1:
         raise ModelError(f'{U.shape[0]} samples are too few for a past window of {p}', 'give a longer record')
     root = np.sqrt(forgetting) ** np.arange(count - 1, -1, -1.0)[:, None]
-    u, y = U[p:], Y[p:]
+    weights = (root / np.linalg.norm(root)) ** 2
+
+    def about(signal: Array) -> Array:
+        return signal - np.sum(weights * signal, axis=0) if centred else signal
+
+    z, u, y = about(z), about(U[p:]), about(Y[p:])
     d = z.shape[1]
     stacked = np.vstack([root * z, np.sqrt(regularization) * np.eye(d)])
     target = np.vstack([root * y, np.zeros((d, m))])
@@ -106,10 +112,10 @@ def pbsid(
         raise ModelError(
             f'the record carries fewer than {n} states', 'lower the order or excite the plant more')
     S = np.eye(n, f * m) if fixed else (left[:, :n] / np.sqrt(values[:n])).T
-    following = windows @ (S @ G).T
-    x = following[:-1]
+    states = windows @ (S @ G).T
+    x, following = about(states[:-1]), about(states[1:])
     C = np.linalg.lstsq(root * x, root * y, rcond=None)[0].T
     e = y - x @ C.T
     known = np.hstack([x, u, e])
-    ABK = np.linalg.lstsq(root * known, root * following[1:], rcond=None)[0].T
+    ABK = np.linalg.lstsq(root * known, root * following, rcond=None)[0].T
     return StateSpace(ABK[:, :n], ABK[:, n:n + r], C, np.zeros((m, r)), ABK[:, n + r:], dt), values

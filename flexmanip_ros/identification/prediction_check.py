@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from flexmanip_ros.identification.uncertainty import REAL, Identified, modes
-from flexmanip_ros.identification.validation import simulate
+from flexmanip_ros.identification.validation import affine, simulate
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import QUANTILE, Array, Mode, StateSpace, Status
 
@@ -305,18 +305,18 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
         rows = rows.between(rows.first + 1 + int(gaps[-1]), rows.until)
     rates = np.array([name.endswith('/velocity') for name in outputs])
     chosen = ~rates | rates.all()
-    model = replace(found.model, C=found.model.C[chosen], D=found.model.D[chosen])
+    whole, U = affine(found.model, found.constant, rows.u)
+    model = replace(whole, C=whole.C[chosen], D=whole.D[chosen])
     seen = rows.missing == 0
     unknown = Status.WARMING_UP if max(found.samples, since) < EARLY else Status.POORLY_EXCITED
     of_one = found.configurations is None
-    Y = rows.y if found.configurations is None else rows.y - found.configurations.offsets()
     if bends and (lacks_modes(modes(found), bends) or (of_one and turned > MOST_TURN)):
         return found._replace(status=unknown)
     if of_one:  # ``varying_model.judge`` has those of every configuration
         last = slice(max(0, len(rows) - round(found.samples)), None)
         if len(seen[last]) > STRETCHES * model.order:
             with np.errstate(over='ignore', invalid='ignore'):
-                share = unfitted(model, rows.u[last], rows.y[last][:, chosen], seen[last])
+                share = unfitted(model, U[last], rows.y[last][:, chosen], seen[last])
             if not math.isfinite(share):
                 return found._replace(status=Status.INCONSISTENT)
             found = widened(found, share)
@@ -328,14 +328,14 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
     if 3 * len(rows) < length(dt) or len(rows) < STRETCHES * max(stretch, found.model.order):
         return found
     with np.errstate(over='ignore', invalid='ignore'):
-        shares = missed(found.model, rows.u, Y, horizon, seen)
+        shares = missed(whole, U, rows.y, horizon, seen)
     heard = shares[~np.isnan(shares)]
     if heard.size and float(heard.mean()) > MISSED:
         return found._replace(status=Status.INCONSISTENT)
     if np.any(shares[chosen] > MISSED):
         return found._replace(status=Status.ORDER_TOO_LOW)
     with np.errstate(over='ignore', invalid='ignore'):
-        error, chance = frequency_errors(model, rows.u, Y[:, chosen], stretch, seen)
+        error, chance = frequency_errors(model, U, rows.y[:, chosen], stretch, seen)
     if np.any(np.abs(error) - chance > OFF):
         return found._replace(status=Status.INCONSISTENT)
     if not of_one or not np.all(np.isfinite(chance)):  # nan: too few stretches

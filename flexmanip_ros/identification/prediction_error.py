@@ -18,12 +18,12 @@ GATHERED = 64
 
 @njit(cache=True, nogil=True)
 def innovation(u: Array, y: Array, C: Array, D: Array, x: Array, e: Array) -> None:
-    """Fill e (m,) = y - C x - D u."""
+    """Fill e (m,) = y - C x - D u; inputs beyond the columns of D have no direct term."""
     for o in range(e.size):
         total = y[o]
         for i in range(x.size):
             total -= C[o, i] * x[i]
-        for i in range(u.size):
+        for i in range(D.shape[1]):
             total -= D[o, i] * u[i]
         e[o] = total
 
@@ -58,7 +58,7 @@ def linearize(
     += e e' and X (n, d) = dx/dparameters, started at [0 I] by the caller. J is gathered for ``GATHERED`` samples, so
     J' J is one matrix product of the BLAS library.
     """
-    n, r, m = A.shape[0], B.shape[1], C.shape[0]
+    n, r, m, direct = A.shape[0], B.shape[1], C.shape[0], D.shape[1]
     d = N.shape[0]
     at_b = n * n
     at_k = at_b + n * r if free_system else 0
@@ -91,8 +91,8 @@ def linearize(
                     for i in range(n):
                         row[at_c + q * n + i] += w * x[i]
                 if free_direct:
-                    for i in range(r):
-                        row[at_d + q * r + i] += w * U[k, i]
+                    for i in range(direct):
+                        row[at_d + q * direct + i] += w * U[k, i]
         filled += 0 if absent else m
         if filled == GATHERED * m or (filled and k == U.shape[0] - 1):
             part = J[:filled]
@@ -119,8 +119,8 @@ def linearize(
                     for j in range(n):
                         moved[i, at_c + o * n + j] -= K[i, o] * x[j]
                 if free_direct:
-                    for j in range(r):
-                        moved[i, at_d + o * r + j] -= K[i, o] * U[k, j]
+                    for j in range(direct):
+                        moved[i, at_d + o * direct + j] -= K[i, o] * U[k, j]
         following(U[k], A, B, K, x, e, after)
         for i in range(n):
             x[i] = after[i]
@@ -191,7 +191,11 @@ DAMPING = 1e-9
 
 
 class Theta(NamedTuple):
-    """Model and state at the start of a stretch; scaled signals."""
+    """Model and state at the start of a stretch; scaled signals.
+
+    D: (m, r); B: (n, r), or (n, r + 1), whose last column multiplies an input of ones. This constant stands for offsets
+    of sensors, and for bends under gravity.
+    """
 
     A: Array
     B: Array
@@ -392,29 +396,38 @@ ROWS, PAST, RIDGE = 128, 8, 1e-3
 parameters."""
 
 
-def candidate(model: StateSpace, feedthrough: bool) -> tuple[Theta, Structure]:
-    """Starting point from a model of scaled signals; C is held at I where it is square and well conditioned."""
+def candidate(model: StateSpace, feedthrough: bool, means: tuple[Array, Array] | None) -> tuple[Theta, Structure]:
+    """Starting point from a model of scaled signals; C is held at I where it is square and well conditioned.
+
+    means: of inputs (r,) and outputs (m,), for a model of signals about their means. It gets a constant, and its
+    state shifted by s, where C s is the mean of y - D u.
+    """
     n, m = model.A.shape[0], model.C.shape[0]
-    theta = Theta(model.A, model.B, model.C, model.D, model.K, np.zeros(n))
+    shift, B = np.zeros(n), model.B
+    if means is not None:
+        u, y = means
+        shift = np.asarray(np.linalg.lstsq(model.C, y - model.D @ u, rcond=None)[0], dtype=np.float64)
+        B = np.column_stack([B, shift - model.A @ shift - B @ u])
+    theta = Theta(model.A, B, model.C, model.D, model.K, shift)
     if n == m and np.linalg.cond(model.C) < 1e6:
         W = model.C
         A = np.asarray(np.linalg.solve(W.T, (W @ model.A).T).T, dtype=np.float64)
-        theta = Theta(A, W @ model.B, np.eye(n), model.D, W @ model.K, np.zeros(n))
+        theta = Theta(A, W @ B, np.eye(n), model.D, W @ model.K, W @ shift)
         return _dense(theta), Structure(False, feedthrough, False)
     return _dense(theta), Structure(True, feedthrough, False)
 
 
-def averaged(U: Array, Y: Array, n: int) -> StateSpace | None:
+def averaged(U: Array, Y: Array, n: int, centred: bool) -> StateSpace | None:
     """Batch model of order n, with slow modes, from means over many samples of U (N, r), Y (N, m); None where it fails.
 
-    Its past window is ``PAST`` means long, and so spans whole periods of slow modes.
+    Its past window is ``PAST`` means long, and so spans whole periods of slow modes. centred: see ``pbsid``.
     """
     every = len(U) // ROWS
     if every < 2:
         return None
     u, y = (X[:every * ROWS].reshape(ROWS, every, -1).mean(axis=1) for X in (U, Y))
     try:
-        model, _ = pbsid(u, y, n=n, p=PAST, f=PAST, dt=float(every), regularization=RIDGE)
+        model, _ = pbsid(u, y, n=n, p=PAST, f=PAST, dt=float(every), regularization=RIDGE, centred=centred)
         A, B = to_discrete(*to_continuous(model.A, model.B, float(every)), 1.0)
     except (ModelError, np.linalg.LinAlgError):
         return None

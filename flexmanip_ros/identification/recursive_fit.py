@@ -10,7 +10,15 @@ import numpy as np
 import scipy
 
 from flexmanip_ros.identification import model_output, parameter_varying, varying_start
-from flexmanip_ros.identification.batch_fit import BLOCK, UNEXPLAINED, Recursion, arrive, fit_stretch, unexplained
+from flexmanip_ros.identification.batch_fit import (
+    BLOCK,
+    UNEXPLAINED,
+    Recursion,
+    arrive,
+    fit_stretch,
+    scaled,
+    unexplained,
+)
 from flexmanip_ros.identification.factor import Outcomes
 from flexmanip_ros.identification.moments import triangle
 from flexmanip_ros.identification.parameter_varying import Varying
@@ -47,10 +55,10 @@ PAUSE = 8192
 class FitRequest:
     """A fit to be made; ``background.Request``.
 
-    rows: samples of the fit, a slice of the sample log; R: (q, q) factor of the moments and scale: (r + m,), both None
-    for the update by a block; old: the previous fit, if any; older: the fit from before the last event, where that is
-    another one; later: samples from the last row until the result is taken; varying: the parameter-varying fit that the
-    block updates, or for a whole stretch that from before the last event.
+    rows: samples of the fit, a slice of the sample log; R: (q, q) factor of the moments and scale: (r +
+    m,), both None for the update by a block; old: the previous fit, if any; older: the fit from before the last event,
+    where that is another one; later: samples from the last row until the result is taken; varying: the
+    parameter-varying fit that the block updates, or for a whole stretch that from before the last event.
     """
 
     config: IdentifierParameters
@@ -315,7 +323,8 @@ def _stretch(request: FitRequest, R: Array, scale: Array) -> Recursion | None:
     found = fit_stretch(
         samples_of(request.rows), [realized for realized, _, _ in starts if realized is not None],
         [fit for fit in (request.old, request.older) if fit is not None],
-        starts[0][2], config.direct_feedthrough, 'sensor' if config.refinement == 'output_error' else 'any')
+        starts[0][2], config.direct_feedthrough, 'sensor' if config.refinement == 'output_error' else 'any',
+        parameter_varying.has_constant(config))
     if found is None or found.trend_share == 0.0:
         return found
     return found._replace(trend_lag=request.later / BLOCK + 1.0)  # the arm drifts on until the result is read
@@ -335,9 +344,7 @@ def _varying(request: FitRequest, found: Recursion | None) -> Varying | None:
 
 def _block(old: Recursion, samples: Array) -> Recursion | None:
     """Update parameters and state by one block, in square-root covariance form; None where the fit is to be dropped."""
-    r = old.theta.B.shape[1]
-    U = np.ascontiguousarray(samples[:, :r] * old.scale[:r])
-    Y = np.ascontiguousarray(samples[:, r:] * old.scale[r:])
+    U, Y = scaled(samples, old.scale, old.theta)
     k, count = old.root.shape[0], measured(Y)
     kept = old.root * np.sqrt(1.0 + len(U) / MEMORY) * np.exp(0.5 * old.drift)
     if old.trend_share > 0.0:
@@ -370,7 +377,7 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
         zeta = zeta + step
         theta = moved(old.theta, old.P @ (kept @ zeta), old.structure)
     covariance, end = run(U, Y, theta)
-    left = unexplained(covariance, Y)
+    left = unexplained(covariance, Y, old.mean)
     strikes = old.strikes + 1 if not left < UNEXPLAINED else 0
     if strikes >= 2 or not np.isfinite(left):
         return None

@@ -20,9 +20,6 @@ class AnyConfiguration(Protocol):
     def at(self, angles: Array) -> Identified:
         """Return the model at measured angles (2,) [rad]."""
 
-    def offsets(self) -> Array:
-        """Return the offsets of the outputs (m,) that the fit found: of the sensors, or bends under gravity."""
-
 
 class Identified(NamedTuple):
     """A model with its uncertainty and status."""
@@ -42,6 +39,9 @@ class Identified(NamedTuple):
     """Whether the model is a prediction-error fit, not a subspace model."""
     samples: float = 0.0
     """Effective number of samples behind the model."""
+    constant: Array | None = None
+    """(n,) constant of the state's equation: offsets of sensors, bends under gravity; None counts as 0. It is no part
+    of the spread."""
     configurations: AnyConfiguration | None = None
     """The model of every configuration, where ``model`` is that at one configuration."""
 

@@ -1,6 +1,7 @@
 """Scores of a fixed model on data that it was not identified from."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numba import njit
@@ -15,6 +16,14 @@ ROWS_A_STATE = 10
 """Least number of samples for each state in that record: with fewer the state fits the noise."""
 QUICKEST = 1e-3
 """Lower bound on the modulus of the slowest pole, for its time constant."""
+
+
+def affine(model: StateSpace, constant: Array | None, U: Array) -> tuple[StateSpace, Array]:
+    """Return the model with a further input of ones for its constant (n,), if any, and U (N, r) with that input."""
+    if constant is None:
+        return model, U
+    wider = replace(model, B=np.column_stack([model.B, constant]), D=np.column_stack([model.D, np.zeros(len(model.D))]))
+    return wider, np.column_stack([U, np.ones(len(U))])
 
 
 def vaf(y: Array, yhat: Array) -> Array:

@@ -51,15 +51,6 @@ class Configurations(NamedTuple):
         """Return the model at measured angles (2,) [rad], see ``with_relative``."""
         return self.with_relative(float(relative_angle(self.config, angles)))
 
-    def offsets(self) -> Array:
-        """Return the offsets of the outputs (m,) in their units; those of rates are zero."""
-        v, role = self.varying, shown(self.config)
-        assert role is not None
-        h = len(v.scale_y)
-        found = np.zeros(len(role.states))
-        found[list(role.displacements)] = v.center + part(v.theta, 'b', h, len(v.scale_u)) / v.scale_y
-        return found
-
     def now(self, rows: Rows) -> Identified:
         """Return the model at the configuration at the end of the latest rows, see ``straight``."""
         v, role = self.varying, shown(self.config)
@@ -67,7 +58,7 @@ class Configurations(NamedTuple):
         count = math.ceil(PERIODS * 2.0 * math.pi / (v.shift * self.dt))
         rows = rows.between(max(rows.first, rows.until - count), rows.until)
         here = rows.missing == 0
-        Y, angles = rows.y[:, list(role.displacements)], relative_angle(self.config, rows.angles)
+        Y, angles = rows.y[:, list(role.displacements)] - v.center, relative_angle(self.config, rows.angles)
         if np.count_nonzero(here) < count // 2:  # too few measured rows since a gap
             return self.with_relative(v.angle, present=True)
         s = np.linspace(-1.0, 0.0, len(rows))
@@ -85,8 +76,11 @@ class Configurations(NamedTuple):
         ratio = 1.0 if present else math.sqrt(max(self.varying.chi2, 1.0))
         model, along = _matrices(self, math.cos(angle), role, ratio)
         v = self.varying
+        rest = np.zeros(model.order)  # the state at rest: C = [I 0]
+        rest[list(role.displacements)] = v.center + part(v.theta, 'b', len(v.scale_y), len(v.scale_u)) / v.scale_y
         found = Identified(
-            model=model, spread=along.flat(), singular_values=self.singular_values, excitation=self.excitation,
+            model=model, constant=rest - model.A @ rest, spread=along.flat(),
+            singular_values=self.singular_values, excitation=self.excitation,
             condition=self.condition, innovation_power=self.innovation_power, status=Status.TRACKING,
             refined=True, samples=float(v.blocks * BLOCK), configurations=self)
         return found._replace(status=judge(found, v))

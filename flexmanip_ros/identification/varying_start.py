@@ -149,7 +149,7 @@ def _around(G: Array, H: Array, D: Array, c: float, turn: float) -> tuple[Array,
 
 def _from_recursion(old: Recursion, role: Roles, r: int, dt: float, c: float) -> Varying | None:
     fit, scale = old.theta, old.scale
-    found = from_model(StateSpace(fit.A, fit.B, fit.C, fit.D, fit.K, dt), role)
+    found = from_model(StateSpace(fit.A, fit.B[:, :r], fit.C, fit.D, fit.K, dt), role)
     if found is None:
         return None
     G, D, H = found

@@ -49,14 +49,14 @@ class Scores:
 
 
 def score(model: StateSpace | None, signals: Signals, start_s: float, *, factor: int = 1,
-          horizon_s: float = HORIZON_S) -> Scores:
+          horizon_s: float = HORIZON_S, constant: Array | None = None) -> Scores:
     """Score a fixed model (no further adaptation) on the samples from ``start_s`` [s] on, up to the first gap.
 
     The state at the start is estimated on the samples before it, by least squares over a free run of the
     model and of its predictor; simulation then uses no measured output.
-    factor: decimation of the model. Above 1, signals are filtered as the identifier filters them, and simulation and
-    one-step prediction are scored on the filtered signals. The prediction ``horizon_s`` [s] ahead is scored on the
-    samples as they were measured; it uses samples up to ``horizon_s`` before.
+    constant: (n,) of the model, see ``Identified``. factor: its decimation. Above 1, signals are filtered as the
+    identifier filters them, and simulation and one-step prediction are scored on the filtered signals. The prediction
+    ``horizon_s`` [s] ahead is scored on the samples as they were measured; it uses samples up to ``horizon_s`` before.
     Raises ParameterError when nothing is left to score, ModelError when there is no model.
     """
     time = signals.time
@@ -81,14 +81,14 @@ def score(model: StateSpace | None, signals: Signals, start_s: float, *, factor:
         raise ParameterError(f'validation from {start_s:g} s leaves no samples to score at a decimation of {factor}',
                              'choose an earlier time')
     r = signals.u.shape[1]
-    U, Y = kept[:, :r], kept[:, r:]
+    (model, U), Y = validation.affine(model, constant, kept[:, :r]), kept[:, r:]
     u, y = U[split:], Y[split:]
     seen = signals.missing[before:after][rows] <= factor // 2  # what was interpolated is not scored
     steps = max(1, round(horizon_s / model.dt)) + lag
     x0 = validation.state_at_end(model, U[:split], Y[:split])
     with np.errstate(all='ignore'):  # an unstable model overflows and scores 0
         simulated = validation.simulate(model, u, x0)
-        filtered = validation.state_at_end(_predictor(model), kept[:split], Y[:split])
+        filtered = validation.state_at_end(_predictor(model), np.hstack([U, Y])[:split], Y[:split])
         predicted = validation.predict(model, u, y, filtered)
         ahead = validation.predict_ahead(model, u, y, steps, filtered)
     target, later = measured[rows[split + steps - 1:]], seen[split + steps - 1:]
@@ -236,7 +236,7 @@ def _fit(config: IdentifierParameters, state: rpbsid.RpbsidState, samples: Array
         longer = replace(config, future_window=config.past_window)
         starts.append(model_output.from_factor(longer, state.memory[0], state.scale))
     fit = fit_stretch(samples, [realized for realized, _, _ in starts if realized is not None], [], starts[0][2],
-                      config.direct_feedthrough, noise)
+                      config.direct_feedthrough, noise, parameter_varying.has_constant(config))
     if fit is None:
         return None
     d = state.memory[4].shape[1]

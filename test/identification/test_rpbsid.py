@@ -5,10 +5,12 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from linear_arm import configuration, random_system, record, run, sorted_poles, start
 
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.identification import rpbsid
+from flexmanip_ros.identification import rpbsid, validation
 from flexmanip_ros.identification.factor import FILLED, REJECTED, USED
 from flexmanip_ros.identification.pbsid import pbsid
 from flexmanip_ros.identification.realization import markov
@@ -69,6 +71,28 @@ def test_recursion_equals_batch(n, r, m, beta):
     assert np.abs(sorted_poles(found.model.A) - sorted_poles(batch.A)).max() < 1e-5
     size = np.abs(markov(batch, 10)).max()
     assert np.abs(markov(found.model, 10) - markov(batch, 10)).max() < 1e-5 * size
+
+
+@given(st.lists(st.floats(-10.0, 10.0), min_size=5, max_size=5))
+@settings(max_examples=4)
+def test_offsets_of_sensors_and_torques_change_no_model(offsets: list[float]):
+    """offsets: of two inputs and three outputs, in units of their deviations."""
+    rng = np.random.default_rng(6)
+    u, y = record(random_system(3, 2, 3, rng), 600, 0.0, rng)
+    y = y + 0.05 * np.std(y, axis=0) * rng.standard_normal(y.shape)
+    size = np.concatenate([u.std(axis=0), y.std(axis=0)]) * offsets
+    config = configuration(2, 3, order=3, past_window=6, future_window=3)
+    plain, moved = (
+        rpbsid.identified(config, rpbsid.finish(config, run(config, u + du, y + dy).state), 0.01)
+        for du, dy in ((0.0, 0.0), (size[:2], size[2:])))
+    assert plain is not None
+    assert moved is not None
+    response = markov(plain.model, 10)
+    assert np.abs(markov(moved.model, 10) - response).max() < 2e-3 * np.abs(response).max()  # a parameter more
+    wider, U = validation.affine(moved.model, moved.constant, u + size[:2])
+    rest = (y + size[2:] - validation.simulate(wider, U))[100:]  # from any first state, which dies out
+    assert np.all(rest.std(axis=0) < 0.1 * y.std(axis=0))
+    assert np.all(np.abs(rest.mean(axis=0)) < 0.02 * y.std(axis=0))
 
 
 def test_estimators_agree_on_long_clean_records():

@@ -54,7 +54,7 @@ def test_change_of_basis_carries_the_tangent():
     base = tuple(np.zeros((1, *getattr(system, name).shape)) for name in 'ABCDK')
     for part in base[:3]:
         part[:] = rng.standard_normal(part.shape)
-    moved, along = based(system, Tangent(*base))
+    moved, along, _ = based(system, Tangent(*base))
     assert along is not None
     assert np.allclose(moved.C, [[1, 0, 0, 0], [0, 1, 0, 0]], atol=1e-9)
     step = 1e-6
