@@ -37,9 +37,12 @@ CLEAN = 1e-20
 innovation covariance of a recursion is raised by the same share."""
 UNEXPLAINED = 0.5
 """Largest share of the outputs' power that a fit with K = 0 may leave; a fit that leaves more simulates nothing."""
-
 PIECES = 16
-"""Number of pieces of a stretch whose gradients are compared, see ``_widening``."""
+"""Number of pieces of a stretch whose gradients are compared, see ``_widening``; also the effective sample size where
+residuals are correlated, see ``_with_constant``."""
+LARGE_MEAN = 0.5
+"""Mean of an output, in its standard deviations, above which subspace models of signals that are not centred are poor
+starting points: with 1 the poles of a random system of order 3 were real instead of complex."""
 
 
 class Recursion(NamedTuple):
@@ -48,11 +51,11 @@ class Recursion(NamedTuple):
     scale: (r + m,) factors on the signals; P: (d, k) coordinates, see ``Fit``; root: (k, k) S with S S' the covariance
     of these coordinates, the state last; covariance: (m, m) of the innovations, estimated from ``weight`` samples;
     widening: factor on standard deviations, see ``_widening``; strikes: bad blocks in a row; gain: (n, m) published K,
-    theta's own unless that is held; mean: (m,) see ``middle``; singular_values, condition: of the
-    subspace model that the fit started from; lost: the state is unknown; drift: logarithm of the factor by which the
-    variances grow in a block because the plant changes; trend: (k,) mean step of the coordinates in a block, over the
-    last blocks; trend_share: the part of it that chance does not explain (0 to 1); trend_lag: steps of ``trend`` by
-    which the fit may lag behind the arm.
+    theta's own unless that is held; mean: (m,) see ``middle``; singular_values, condition: of the subspace model that
+    the fit started from; lost: the state is unknown; drift: logarithm of the factor by which the variances grow in a
+    block because the plant changes; trend: (k,) mean step of the coordinates in a block, over the last blocks;
+    trend_share: the part of it that chance does not explain (0 to 1); trend_lag: steps of ``trend`` by which the fit
+    may lag behind the arm.
     """
 
     theta: Theta
@@ -178,7 +181,7 @@ def _centred(U: Array, Y: Array, like: Realized) -> StateSpace | None:
     m, width = Y.shape[1], U.shape[1] + Y.shape[1]
     try:
         return pbsid(U, Y, n=n, p=past // width, f=like.S.shape[1] // m, dt=1.0, centred=True)[0]
-    except ModelError:
+    except (ModelError, np.linalg.LinAlgError):  # other starting points may do
         return None
 
 
@@ -250,10 +253,9 @@ def _with_constant(samples: Array, best: Attempt | None, likeliest: Callable[[],
     """Free a constant where the likelihood gains more than its price.
 
     best: fit without one, if any; likeliest: makes the best fit with one. It is called where that may be far from
-    ``best``: where a constant pays from there, and where an output's mean exceeds half its deviation, as such an offset
-    spoils the subspace models of signals that are not centred. Modes above the order and an arm that turns leave
-    correlated residuals. So the stretch counts as ``PIECES`` independent samples: this effective sample size takes the
-    place of N in Schwarz's criterion.
+    ``best``: where a constant pays from there, and where an output has a large mean (``LARGE_MEAN``). Modes above the
+    order and an arm that turns leave correlated residuals. So the stretch counts as ``PIECES`` independent samples:
+    this effective sample size takes the place of N in Schwarz's criterion.
     """
     if best is None:
         return likeliest()
@@ -262,7 +264,7 @@ def _with_constant(samples: Array, best: Attempt | None, likeliest: Callable[[],
     other, price = descend(*scaled(samples, best.scale, begin), begin, best.structure, ITERATIONS), _price(n, PIECES)
     found = [] if other is None else [best._replace(fit=other, cost=best.cost - best.fit.cost + other.cost)]
     Y = samples[:, r:]
-    far = np.abs(np.nanmean(Y, axis=0)) > 0.5 * np.nanstd(Y, axis=0)
+    far = np.abs(np.nanmean(Y, axis=0)) > LARGE_MEAN * np.nanstd(Y, axis=0)
     if far.any() or (found and found[0].cost + price < best.cost):
         again = likeliest()
         found += [] if again is None else [again]
