@@ -153,7 +153,7 @@ def _start(config: IdentifierParameters, theta: Array) -> tuple[Model, FilterSta
     model = build(config)
     if model is None:
         raise ModelError('the configured signals cannot give a payload', 'name both torques and both angles')
-    m = memory(2 * model.motion.arm.stiffness.size + model.motion.kind.size, len(model.roles))
+    m = memory(2 * model.motion.arm.stiffness.size + model.motion.kind.size, len(model.roles), len(theta))
     structured_model.first(config, model, m, np.zeros(len(model.roles)))
     structured_model.freeze(config, model, theta)
     m.x[:model.payload] = 0.0

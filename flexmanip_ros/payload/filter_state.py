@@ -22,9 +22,10 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
 # Elements of ``counts``.
 (HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, MOVED, SEEN, BEFORE,
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
- IN_SPECTRUM, SPECTRA) = range(22)
+ IN_SPECTRUM, SPECTRA, LINEARIZED) = range(23)
 # Elements of ``score``.
-SHIFT, DOUBT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES, SANDWICH = range(10)
+(SHIFT, DOUBT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES, SANDWICH,
+ WHITENED, MISFIT) = range(12)
 
 
 class FilterState(NamedTuple):
@@ -42,7 +43,7 @@ class FilterState(NamedTuple):
     """(m, 3, TONES) of its fourth differences: both states of Goertzel's filter, mean power over that of white noise
     of unit variance."""
     counts: NDArray[np.int64]
-    """(22,) counters and flags (1: yes).
+    """(23,) counters and flags (1: yes).
 
     Filter: HELD: the arm holds something; LEARNED: it was seen empty before; SEEN: samples measured, at most 2000;
     SINCE_EVENT: those since the last event; IN_A_ROW: those since the last one that was missing; SINCE_NOISE: samples
@@ -52,16 +53,18 @@ class FilterState(NamedTuple):
     ITERATING: an iteration is under way; ITERATED, MEASURED: samples that it has read, and those of them that were not
     missing; BEFORE: samples of the last accepted iteration; REJECTED: steps rejected since then; AGAIN: the next one
     reads the same samples, as it has not converged; TRIED: iterations over the same samples so far; REFITS: fits begun
-    again since the event."""
+    again since the event; LINEARIZED: the iteration
+    carries a linearized Kalman filter."""
     score: Array
-    """(10,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
+    """(12,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
     squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
     EMPTY_ARM_BIAS: payload that the arm seemed to hold before the event, when it was empty, in the filter's standard
     deviations; EXCESS_BIAS: the same over the deviation that its moves give, with the error of the inertia; COST: of
     the samples read in this iteration, COST_BEFORE: of the last accepted one; LAMBDA: damping of Levenberg and
     Marquardt; MOVES: mean of the squared moves of payload and arm parameters, over the variance that the filter says,
     see ``judge_moves``; SANDWICH: factor, at least 1, by which the variances of the last fit of the empty arm are too
-    small, see ``sandwich``."""
+    small, see ``sandwich``; WHITENED: sum of the squared normalised innovations of the linearized filter in
+    this iteration; MISFIT: that of the last accepted iteration, without a linearized filter its COST."""
     moved: Array
     """(nx, 2) mean and variance of payload and arm parameters when their moves were last judged, with the process noise
     since then in the variance; see ``judge_moves``."""
@@ -80,7 +83,8 @@ class FilterState(NamedTuple):
     xr: Array
     """(nx,) present state of the trajectory about which the Gauss-Newton iteration linearizes."""
     Sr: Array
-    """(nx, nx) its derivative by xi."""
+    """(nx, 2 nx + 1) its derivative by xi (USED columns); then, of the linearized filter, square root of the covariance
+    (USED columns) and mean departure from it (one column)."""
     N: Array
     """(nx, nx) information gathered in the iteration."""
     g: Array
@@ -89,20 +93,24 @@ class FilterState(NamedTuple):
     """(nx,) that gradient at the end of the last batch of samples."""
     B: Array
     """(nx, nx) sum over the batches of b b', b the part of the gradient that comes from one batch; lower triangle."""
+    friction: Array
+    """(2, L) variance of the share of Coulomb friction, summed over the samples since its process noise was added: in
+    the filter, and in the linearized one."""
     innovation: Array
     """(m, 2) the latest, and its variance before the update."""
     power: Array
     """(m,) mean squared normalised innovation of each sensor since the event, slowly forgotten."""
 
 
-def memory(nx: int, m: int) -> FilterState:
-    """Allocate for nx states and m sensors."""
+def memory(nx: int, m: int, links: int) -> FilterState:
+    """Allocate for nx states, m sensors and the joints of ``links`` links."""
     return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)),
-        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(22, dtype=np.int64), score=np.zeros(10),
+        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(23, dtype=np.int64), score=np.zeros(12),
         moved=np.zeros((nx, 2)), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
-        normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, nx)), N=np.zeros((nx, nx)),
-        g=np.zeros(nx), batch=np.zeros(nx), B=np.zeros((nx, nx)), innovation=np.zeros((m, 2)), power=np.ones(m))
+        normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, 2 * nx + 1)),
+        N=np.zeros((nx, nx)), g=np.zeros(nx), batch=np.zeros(nx), B=np.zeros((nx, nx)),
+        friction=np.zeros((2, links)), innovation=np.zeros((m, 2)), power=np.ones(m))
 
 
 def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
@@ -111,11 +119,12 @@ def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
     horizon False: what belongs to a complete moving horizon is shared; then only an event writes it.
     """
     (x, S, noise, recent, spectrum, counts, score, moved, x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g,
-     batch, B, innovation, power) = state
+     batch, B, friction, innovation, power) = state
     if horizon or counts[STORED] < HORIZON:
         x0, S0, xi = x0.copy(), S0.copy(), xi.copy()
         accepted, normal, gradient = accepted.copy(), normal.copy(), gradient.copy()
         xr, Sr, N, g, batch, B = xr.copy(), Sr.copy(), N.copy(), g.copy(), batch.copy(), B.copy()
     return FilterState(
         x.copy(), S.copy(), noise.copy(), recent.copy(), spectrum.copy(), counts.copy(), score.copy(), moved.copy(),
-        x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g, batch, B, innovation.copy(), power.copy())
+        x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g, batch, B, friction.copy(), innovation.copy(),
+        power.copy())

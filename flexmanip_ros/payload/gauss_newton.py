@@ -23,7 +23,9 @@ from flexmanip_ros.payload.filter_state import (
     ITERATED,
     ITERATING,
     LAMBDA,
+    LINEARIZED,
     MEASURED,
+    MISFIT,
     POWER,
     REJECTED,
     SANDWICH,
@@ -32,10 +34,12 @@ from flexmanip_ros.payload.filter_state import (
     STORED,
     TRIED,
     USED,
+    WHITENED,
     FilterState,
 )
 from flexmanip_ros.payload.measurement_update import BATCH, MeasurementModel
 from flexmanip_ros.payload.process_model import (
+    COULOMB,
     INERTIA,
     MODE,
     STEP_ANGLE,
@@ -71,20 +75,40 @@ damping below which it is set to zero, where it hardly shortens a step. Were it 
 every second step of a fit in a valley that bends would be rejected."""
 REJECTIONS = 8
 """Number of times that a step that raises the cost is shortened."""
+FRICTION = 3.0
+"""Standard deviations of a Coulomb friction above zero from which on there is one: chance hardly explains more."""
 
 
 @inner
-def begin_iteration(m: FilterState) -> None:
+def has_friction(motion: ProcessModel, m: FilterState) -> bool:
+    """Whether a joint has Coulomb friction beyond chance."""
+    first, found = m.x.size - motion.kind.size, False
+    for c in range(motion.kind.size):
+        if motion.kind[c] == COULOMB:
+            found |= m.x[first + c] > FRICTION * np.sqrt(dot(m.S[first + c], m.S[first + c]))
+    return found
+
+
+@inner
+def begin_iteration(motion: ProcessModel, m: FilterState) -> None:
     """Start a Gauss-Newton iteration at the event, linearized at the estimate of the last one."""
-    nx = m.x.size
+    nx, used = m.x.size, m.counts[USED]
     m.score[COST] = 0.0
+    m.score[WHITENED] = 0.0
+    m.counts[LINEARIZED] = has_friction(motion, m)
+    for i in range(motion.effort.size):
+        m.friction[1, i] = 0.0
     for i in range(nx):
         m.g[i] = 0.0
         m.batch[i] = 0.0
-        m.xr[i] = m.x0[i] + dot(m.S0[i], m.xi)
+        departure = dot(m.S0[i], m.xi)
+        m.xr[i] = m.x0[i] + departure
         m.score[COST] += m.xi[i] * m.xi[i]
-        for c in range(nx):
+        for c in range(used):
             m.Sr[i, c] = m.S0[i, c]
+            m.Sr[i, used + c] = m.S0[i, c]
+        m.Sr[i, 2 * used] = -departure
+        for c in range(nx):
             m.N[i, c] = 0.0
             m.B[i, c] = 0.0
     for i in range(m.noise.shape[0]):
@@ -110,6 +134,7 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
              and m.score[COST_BEFORE] - m.score[COST] < enough)
     m.counts[BEFORE] = m.counts[ITERATED]
     m.score[COST_BEFORE] = m.score[COST]
+    m.score[MISFIT] = m.score[WHITENED] if m.counts[LINEARIZED] == 1 else m.score[COST]
     m.score[LAMBDA] = m.score[LAMBDA] / FADING if m.score[LAMBDA] > FADED * first_damping(m) else 0.0
     m.counts[REJECTED] = 0
     m.counts[ITERATING] = 0
@@ -126,13 +151,18 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
             m.noise[i, SLOW] = m.noise[i, POWER]
         # the step was not seen to lower the cost yet: the filter takes no more of it than it can tell
         part = min(1.0, TRUSTED / np.sqrt(max(gained, 1e-300)))
-        payload = 2 * sensors.H.shape[1]
-        shift = dot(m.Sr[payload], m.g)
+        payload, used = 2 * sensors.H.shape[1], m.counts[USED]
+        shift = dot(m.Sr[payload, :used], m.g[:used])
         for i in range(nx):
-            m.x[i] = m.xr[i] + part * dot(m.Sr[i], m.g)
-            forward(m.N, m.Sr[i])
+            m.x[i] = m.xr[i] + part * dot(m.Sr[i, :used], m.g[:used])
+            forward(m.N, m.Sr[i, :used])
             for c in range(nx):
-                m.S[i, c] = m.Sr[i, c]
+                m.S[i, c] = m.Sr[i, c] if c < used else 0.0
+        if m.counts[LINEARIZED] == 1 and part == 1.0:  # it is right near the minimum
+            for i in range(nx):
+                m.x[i] = m.xr[i] + m.Sr[i, 2 * used]
+                for c in range(used):
+                    m.S[i, c] = m.Sr[i, used + c]
         if m.counts[HELD] == 0:
             m.score[SANDWICH] = sandwich(sensors, m)
         else:
@@ -152,7 +182,8 @@ def sandwich(sensors: MeasurementModel, m: FilterState) -> float:
 
     The variance by batch means (sandwich of Huber and White): where the residuals are no white noise, the gradient is
     a sum of parts b of batches that are nearly independent, so the variance of xi by them is W B W, W = (I + N)^-1,
-    B = sum b b'. The fit says W N W instead. The factor is the mean over payload and arm parameters of the ratio.
+    B = sum b b'. The fit says W N W instead, and where the friction has process noise, m.S more by what that adds. The
+    factor is the mean over payload and arm parameters of the ratio.
     """
     nx, row = m.x.size, sensors.f
     length = BATCH * sensors.block
@@ -164,8 +195,9 @@ def sandwich(sensors: MeasurementModel, m: FilterState) -> float:
         for c in range(nx):
             row[c] = m.S0[i, c]
         forward(m.N, row)
+        more = dot(m.S[i], m.S[i]) - dot(row, row) if m.counts[LINEARIZED] == 1 else 0.0
         backward(m.N, row)
-        said = dot(row, m.S0[i]) - dot(row, row)
+        said = dot(row, m.S0[i]) - dot(row, row) + more
         found = 0.0
         for a in range(nx):
             for b in range(a):
@@ -183,7 +215,8 @@ def widen_by_empty_arm(sensors: MeasurementModel, m: FilterState) -> None:
     """Add to the covariance of a fit with an object what its prior lacks: the variances of the empty arm's fit.
 
     If these are too small by the factor g, the prior of xi has the covariance g I, and xi the variance W + (g - 1) W W,
-    W = (I + N)^-1. The estimate stays, as the fit weighs the prior by what the empty arm's fit said.
+    W = (I + N)^-1. The estimate stays, as the fit weighs the prior by what the empty arm's fit said. m.N: factor L of
+    I + N; m.Sr: the derivative of the present state by xi, times the inverse of L'.
     """
     nx = m.x.size
     root = np.sqrt(max(m.score[SANDWICH] - 1.0, 0.0))
@@ -193,7 +226,7 @@ def widen_by_empty_arm(sensors: MeasurementModel, m: FilterState) -> None:
         for c in range(sensors.noise.shape[1]):
             sensors.noise[i, c] = 0.0
         for c in range(nx):
-            sensors.f[c] = m.S[i, c]
+            sensors.f[c] = m.Sr[i, c] if c < m.counts[USED] else 0.0
         backward(m.N, sensors.f)
         for c in range(nx):
             sensors.noise[i, c] = root * sensors.f[c]
@@ -344,5 +377,5 @@ def reject_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
         m.score[COST_BEFORE] = 1e300
     if not damped_step(motion, sensors, m):
         return False
-    begin_iteration(m)
+    begin_iteration(motion, m)
     return True

@@ -111,7 +111,7 @@ def is_behind(m: mem.FilterState) -> bool:
     """
     if m.counts[STORED] < FEW:
         return False
-    costs = m.score[mem.COST_BEFORE] > FITS * (m.xi.size + len(m.noise) * m.counts[mem.BEFORE])
+    costs = m.score[mem.MISFIT] > FITS * (m.xi.size + len(m.noise) * m.counts[mem.BEFORE])
     return bool((costs and m.counts[mem.AGAIN] == 1) or 2 * m.counts[mem.BEFORE] <= m.counts[STORED])
 
 

@@ -92,6 +92,8 @@ class MeasurementModel(NamedTuple):
     """(nx, nx + L) scratch for the process noise: of each state, and of the friction of each joint."""
     f: Array
     """(nx,) scratch."""
+    wide: Array
+    """(2 nx + 1,) scratch."""
     L: Array
     """(nx, nx) scratch."""
     W: Array

@@ -137,6 +137,8 @@ class ProcessModel(NamedTuple):
     share: Array
     """(L,) part of it that acts over the present sample, -1 to 1, by the measured rate of the joint; NaN: that of the
     model is used."""
+    rate: Array
+    """(L,) measured mean rate of each joint over that sample [rad/s]; NaN: it was not measured."""
     opened: NDArray[np.int64]
     """(1 + np,) number of the entries of p that are uncertain, then their indices."""
     bounds: Bounds
@@ -232,10 +234,11 @@ def set_torques(motion: ProcessModel, rows: Array, period: float) -> None:
         motion.driven[i] = motion.gain[i] * late_torque(rows, 1 + i, late[0], late[1], period, slope)
         slope[0] *= motion.gain[i]
         slope[1] *= motion.gain[i]
-        share = np.nan
+        share, motion.rate[i] = np.nan, np.nan
         if rows.shape[1] > 1 + links:
-            share = mean_share(rows[newest, 1 + links + i] / STICTION_RATE,
-                               rows[newest, 1 + 2 * links + i] / STICTION_RATE)
+            begin, end = rows[newest, 1 + links + i], rows[newest, 1 + 2 * links + i]
+            share = mean_share(begin / STICTION_RATE, end / STICTION_RATE)
+            motion.rate[i] = 0.5 * (begin + end)
         motion.share[i] = share
         motion.effort[i] = motion.driven[i]
         motion.arm.coulomb[i] = motion.coulomb[i]

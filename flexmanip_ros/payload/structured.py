@@ -248,7 +248,8 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     assert model is not None
     Y = measurements(model, rows)
     dt = float(np.median(np.diff(rows.stamp_ns) * 1e-9))
-    m = mem.memory(2 * model.motion.arm.stiffness.size + model.motion.kind.size, len(model.roles))
+    m = mem.memory(2 * model.motion.arm.stiffness.size + model.motion.kind.size, len(model.roles),
+                   model.motion.effort.size)
     m.noise[:] = structured_model.noise(model, Y)
     structured_model.first(config, model, m, Y[0])
     structured_model.freeze(config, model, np.mean(rows.angles, axis=0))

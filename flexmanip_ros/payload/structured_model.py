@@ -223,10 +223,11 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         least_rotor=_least_rotor(nominal), substeps=STEP_ANGLE / fastest_mode(config.arm), payload=np.zeros(4),
         effort=np.zeros(links), gain=np.ones(links), late=np.zeros((links, 2)), slope=np.zeros((links, 2)),
         driven=np.zeros(links), coulomb=nominal.coulomb.copy(), share=np.full(links, np.nan),
+        rate=np.full(links, np.nan),
         opened=np.array([size, *range(size)]), bounds=allocate_bounds(size, nx), p=np.zeros(size), a=np.zeros(n),
         k=np.zeros((20, n)), dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)),
         G=np.zeros((n, 2 * size)), F=np.zeros((n, 2 * n)), X=np.zeros((2 * n, 2 * n)), Y=np.zeros((n, n)),
-        scratch=spread_scratch(n, size, nx))
+        scratch=spread_scratch(n, size, 2 * nx + 1))
     return made._replace(prior=priors(config, made), given=_given(config.arm, made))
 
 
@@ -251,8 +252,8 @@ def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Ar
     return MeasurementModel(H=H, period=dt, rate=rate, gain=gain, offset=offset, delay=delay,
                             reach=torque_reach(model, dt), block=block,
                             noise_every=max(1, round(0.01 * config.payload.memory_time / dt)), diffusion=diffusion,
-                            noise=np.zeros((nx, nx + links)), f=np.zeros(nx), L=np.zeros((nx, nx)),
-                            W=np.zeros((nx, 2 * nx + links)))
+                            noise=np.zeros((nx, nx + links)), f=np.zeros(nx), wide=np.zeros(2 * nx + 1),
+                            L=np.zeros((nx, nx)), W=np.zeros((nx, 2 * nx + links)))
 
 
 def torque_reach(model: Model, dt: float) -> int:
