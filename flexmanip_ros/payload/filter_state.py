@@ -25,7 +25,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
  IN_SPECTRUM, SPECTRA, LINEARIZED) = range(23)
 # Elements of ``score``.
 (SHIFT, DOUBT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES, SANDWICH,
- WHITENED, MISFIT) = range(12)
+ WHITENED, MISFIT, EMPTY_MISFIT) = range(13)
 
 
 class FilterState(NamedTuple):
@@ -56,7 +56,7 @@ class FilterState(NamedTuple):
     again since the event; LINEARIZED: the iteration
     carries a linearized Kalman filter."""
     score: Array
-    """(12,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
+    """(13,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
     squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
     EMPTY_ARM_BIAS: payload that the arm seemed to hold before the event, when it was empty, in the filter's standard
     deviations; EXCESS_BIAS: the same over the deviation that its moves give, with the error of the inertia; COST: of
@@ -64,7 +64,8 @@ class FilterState(NamedTuple):
     Marquardt; MOVES: mean of the squared moves of payload and arm parameters, over the variance that the filter says,
     see ``judge_moves``; SANDWICH: factor, at least 1, by which the variances of the last fit of the empty arm are too
     small, see ``sandwich``; WHITENED: sum of the squared normalised innovations of the linearized filter in
-    this iteration; MISFIT: that of the last accepted iteration, without a linearized filter its COST."""
+    this iteration; MISFIT: that of the last accepted iteration, without a linearized filter its COST;
+    EMPTY_MISFIT: innovation power over white noise before the last capture."""
     moved: Array
     """(nx, 2) mean and variance of payload and arm parameters when their moves were last judged, with the process noise
     since then in the variance; see ``judge_moves``."""
@@ -106,7 +107,7 @@ def memory(nx: int, m: int, links: int) -> FilterState:
     """Allocate for nx states, m sensors and the joints of ``links`` links."""
     return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)),
-        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(23, dtype=np.int64), score=np.zeros(12),
+        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(23, dtype=np.int64), score=np.zeros(13),
         moved=np.zeros((nx, 2)), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
         normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, 2 * nx + 1)),
         N=np.zeros((nx, nx)), g=np.zeros(nx), batch=np.zeros(nx), B=np.zeros((nx, nx)),

@@ -61,9 +61,7 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         return Payload(0.0, math.inf, 0.0, math.inf, 1.0, begun)
     state = model.payload
     held = bool(m.counts[mem.HELD])
-    consistency, reckoned = figures(m.noise, sensors.rate, m.counts, sensors.block)
-    if math.isnan(consistency):
-        consistency = plain_misfit(sensors, m)
+    consistency, reckoned = innovation_power(sensors, m)
     fitting = held and m.counts[STORED] < HORIZON
     g = moves(m)
     if fitting:  # the next step may be as long as the last one
@@ -73,7 +71,9 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     status = Status.TRACKING
     if consistency > POWER_LIMIT or restless > WIDENING_LIMIT or abs(m.score[mem.EXCESS_BIAS]) > MOST_BIAS:
         status = Status.INCONSISTENT
-    if m.counts[mem.SINCE_EVENT] < FEW or (fitting and status is Status.TRACKING and is_behind(m)):
+    failed = bool(m.counts[REFITS]) and status is Status.INCONSISTENT  # a fit before it fitted no better
+    if (m.counts[mem.SINCE_EVENT] < FEW and not failed) or (
+            fitting and status is Status.TRACKING and is_behind(m)):
         status = Status.WARMING_UP
     if restarts and m.counts[mem.SEEN] < SETTLED:
         status = Status.DIVERGED
@@ -187,9 +187,16 @@ def inertia_error(config: IdentifierParameters, model: Model, mass: float) -> fl
     return config.payload.model_error * (mass + model.motion.scale)
 
 
-def plain_misfit(sensors: MeasurementModel, m: mem.FilterState) -> float:
-    """Innovation power over white noise of the displacements, their median, before a sensor tells of the payload."""
-    return float(np.median([sensor[mem.POWER] / white_variance(sensor, LEVEL) for sensor in m.noise[~sensors.rate]]))
+def innovation_power(sensors: MeasurementModel, m: mem.FilterState) -> tuple[float, float]:
+    """Return the innovation power over white noise, and ``misjudged``.
+
+    Of the displacements it is the median before a sensor tells of the payload.
+    """
+    power, reckoned = figures(m.noise, sensors.rate, m.counts, sensors.block)
+    if math.isnan(power):
+        power = float(np.median([sensor[mem.POWER] / white_variance(sensor, LEVEL)
+                                 for sensor in m.noise[~sensors.rate]]))
+    return power, reckoned
 
 
 Integers = NDArray[np.int64]

@@ -21,6 +21,7 @@ from flexmanip_ros.payload.filter_state import (
     COST,
     COST_BEFORE,
     EFFECTIVE,
+    EMPTY_MISFIT,
     ENOUGH,
     FIT,
     HELD,
@@ -99,7 +100,8 @@ UNFIT = 2.0
 BY_CHANCE, UNTOLD = 5.0, 0.05
 """The first fit after a capture is of a point mass. A body is fitted next where the point costs more than white noise
 by so many standard deviations (of chi square with n degrees of freedom: the root of 2 n), and by the share to which the
-white noise is known. Up to 30 dB a point in place of a body costs less than ``UNFIT``, and its mass is wrong."""
+white noise is known. Up to 30 dB a point in place of a body costs less than ``UNFIT``, and its mass is wrong. Where the
+empty arm itself showed more than noise, so will any object, and ``UNFIT`` decides: a body would fit what rings."""
 TRIALS = 10
 """Iterations over the same samples after which a fit is given up: those that converge take three to nine."""
 STARTS = 2
@@ -320,8 +322,9 @@ def misfits(motion: ProcessModel, m: FilterState) -> bool:
         return False
     expected = m.xi.size + m.noise.shape[0] * m.counts[MEASURED]
     largest = UNFIT
-    if m.counts[HELD] == 1 and m.counts[REFITS] == 0:
-        largest = min(UNFIT, 1.0 + UNTOLD + BY_CHANCE * np.sqrt(2.0 / expected))
+    chance = 1.0 + UNTOLD + BY_CHANCE * np.sqrt(2.0 / expected)
+    if m.counts[HELD] == 1 and m.counts[REFITS] == 0 and m.score[EMPTY_MISFIT] < chance:
+        largest = min(UNFIT, chance)
     failed = bool(m.counts[AGAIN] == 1 or m.score[MISFIT] > largest * expected)
     m.counts[REFITS] += failed
     return failed

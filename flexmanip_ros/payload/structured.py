@@ -16,7 +16,7 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured_model
 from flexmanip_ros.payload.capture_detection_kernel import filtered
-from flexmanip_ros.payload.interval import inertia_error, judge, moves
+from flexmanip_ros.payload.interval import inertia_error, innovation_power, judge, moves
 from flexmanip_ros.payload.measurement_update import MeasurementModel
 from flexmanip_ros.payload.moving_horizon import STARTS, keep_possible
 from flexmanip_ros.payload.process_model import Kind, predict
@@ -127,7 +127,7 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     ahead = max(event.stamp_ns - state.last_ns, 0)
     rows, rates = np.pad(state.efforts, ((0, 0), (1, 0))), np.full(state.rates.size, np.nan)
     predict(state.model.motion, m.x, m.S, m.x.size, rows, state.sensors.period, min(ahead * 1e-9, LONGEST_S))
-    _change(config, state.model, m, event)
+    _change(config, state.model, state.sensors, m, event)
     last_ns = state.last_ns + ahead
     return state._replace(memory=m, last_ns=last_ns, rates=rates,
                           horizon=Horizon(state.cursor, last_ns, state.efforts, rates))
@@ -138,7 +138,8 @@ def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
     return judge(config, state.model, state.sensors, state.memory, state.restarts)
 
 
-def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, event: CaptureEvent) -> None:
+def _change(config: IdentifierParameters, model: Model, sensors: MeasurementModel, m: mem.FilterState,
+            event: CaptureEvent) -> None:
     """Make uncertain what an event changes: the rates, and what is held."""
     payload, kind = model.payload, event.kind
     held = bool(m.counts[mem.HELD])
@@ -148,6 +149,7 @@ def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, even
     columns = structured_model.jump(config, model, m, math.hypot(event.std_s, config.payload.event_time_std))
     opened = np.zeros((m.x.size, model.body))
     if kind is EventKind.CAPTURE:
+        m.score[mem.EMPTY_MISFIT], _ = innovation_power(sensors, m)
         if not held:
             _forget_payload(config, model, m)  # the arm was empty: its payload was the bias of the model
         opened[payload, 0] = structured_model.body_std(config, model)[0]  # a point first

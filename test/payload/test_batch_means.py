@@ -91,7 +91,8 @@ def test_with_an_object_the_variance_is_that_of_a_prior_that_is_too_small_by_the
     half, now = rng.normal(size=(2, nx, nx))
     W = np.linalg.inv(np.eye(nx) + half @ half.T)
     m.N[:] = np.linalg.cholesky(np.eye(nx) + half @ half.T)
-    m.S[:] = np.linalg.solve(m.N, now.T).T
+    m.Sr[:, :nx] = np.linalg.solve(m.N, now.T).T
+    m.S[:], m.counts[mem.USED] = m.Sr[:, :nx], nx
     m.score[mem.SANDWICH] = factor
     widen_by_empty_arm(sensors, m)
     expected = now @ W @ (factor * np.eye(nx) + half @ half.T) @ W @ now.T

@@ -103,7 +103,7 @@ def test_bounds_of_arm_body_and_spin_are_those_of_differences_of_the_simulated_a
     settings = config(ARM, payload=PayloadParameters(learn=LEARN))
     found = cramer_rao.everything(settings, PLANT, torque, CAPTURE, NOISE, (COUNT,))
     model = structured_model.build(settings)
-    first = memory(2 * model.motion.arm.stiffness.size + model.motion.kind.size, len(model.roles))
+    first = memory(2 * model.motion.arm.stiffness.size + model.motion.kind.size, len(model.roles), 2)
     structured_model.first(settings, model, first, np.zeros(len(model.roles)))
     std = np.diag(first.S)[:model.payload]
     rest = simulator.init(PLANT).x
