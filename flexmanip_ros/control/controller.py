@@ -150,6 +150,8 @@ BRAKING = 4.0
 """Peak acceleration of a path that starts at a rate of 1 and comes to rest at its starting point after 1 s."""
 SHORTEST = 1e-3
 """Duration of the shortest move [s]."""
+NO_TORQUE = 1e-9
+"""Limit [N m] below which a joint counts as passive; waiting for so small a torque would take a move for ever."""
 
 
 class Path(NamedTuple):
@@ -209,8 +211,10 @@ def duration(distance: Array, rate: Array, fastest: float, loads: Array, limits:
     """Return the duration [s] of a move by ``distance`` (L,) that begins with ``rate`` (L,).
 
     fastest: the largest rate; loads (r, L): torques and bends per acceleration of each chord; limits (r,): largest
-    torques and bends. From rest it is the shortest duration within all limits.
+    torques and bends. From rest it is the shortest duration within all limits. A passive joint (a limit of zero) does
+    not limit a move.
     """
+    loads, limits = loads[limits > NO_TORQUE], limits[limits > NO_TORQUE]
     by_rate = PEAK_RATE * float(np.abs(distance).max()) / fastest
     by_load = PEAK_ACCELERATION * float((np.abs(loads @ distance) / limits).max())
     braking = BRAKING * float((np.abs(loads @ rate) / limits).max())

@@ -1,11 +1,15 @@
 """Parameters of the nodes around the identifier: controller, payload adapter, capture trigger and live page."""
 
+import math
 from dataclasses import dataclass, field
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.arm import ArmParameters
 from flexmanip_ros.parameters.field import check_all, fit_links, parameter
 from flexmanip_ros.parameters.identifier import PayloadParameters, check_signals, fit_signals
+
+LARGEST_SETPOINT = round(4.0 * math.pi, 2)
+"""Largest setpoint [rad]: two turns, which joints seldom exceed, but angles in degrees and encoder counts do."""
 
 
 @dataclass(frozen=True)
@@ -18,8 +22,8 @@ class ControllerParameters:
     hold_present: bool = parameter(
         True, 'true: hold the angles of the first sample after activation; false: move to setpoint')
     setpoint: tuple[float, ...] = parameter(
-        (0.0, 0.0), 'encoder angles to hold; setting them ends hold_present', unit='rad', size=2, per_link=True,
-        live=True)
+        (0.0, 0.0), 'encoder angles to hold; setting them ends hold_present', unit='rad', low=-LARGEST_SETPOINT,
+        high=LARGEST_SETPOINT, size=2, per_link=True, live=True)
     setpoint_rate: float = parameter(
         0.2, 'largest rate of the held angles while they move to a new setpoint', unit='rad/s', low=1e-3, high=100.0,
         live=True)
@@ -36,8 +40,8 @@ class ControllerParameters:
     effort_scale: tuple[float, ...] = parameter(
         (100.0, 50.0), 'torque that costs one unit in the regulator', unit='N m', low=1e-6, size=2, per_link=True)
     effort_limit: tuple[float, ...] = parameter(
-        (300.0, 150.0), 'largest torque of each joint; a larger command is cut to it', unit='N m', low=0.0, size=2,
-        per_link=True, live=True)
+        (300.0, 150.0), 'largest torque of each joint; a larger command is cut to it; 0: a passive joint', unit='N m',
+        low=0.0, size=2, per_link=True, live=True)
     noise_std: tuple[float, ...] = parameter(
         (3e-3, 3e-3, 3e-4, 3e-4, 0.2, 0.2, 0.02, 0.02),
         'measurement noise that the filter assumes for the angles, the bends, then their rates (larger: slower filter, '

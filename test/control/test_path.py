@@ -57,3 +57,10 @@ def test_stopping_where_one_is_takes_the_time_that_braking_takes() -> None:
     seconds = controller.duration(np.zeros(2), rate, 1.0, LOADS, LIMITS)
     rows = along(controller.plan(moving, position, seconds))
     assert (np.abs(rows[:, 2] @ LOADS.T) / LIMITS).max() < 1.8
+
+
+def test_a_joint_without_torque_of_its_own_does_not_limit_a_move() -> None:
+    distance, rest = np.array([0.4, -0.1]), np.zeros(2)
+    for limit in (0.0, 5e-324):
+        assert controller.duration(distance, rest, 1.0, LOADS, np.array([limit, 75.0, 0.01])) \
+            == controller.duration(distance, rest, 1.0, LOADS[1:], LIMITS[1:])
