@@ -10,6 +10,9 @@ from typing import NamedTuple
 from flexmanip_ros.parameters import AdapterParameters, ControllerParameters
 from flexmanip_ros.types import Payload
 
+LONGEST_AGE = 5.0
+"""Time without an estimate [s] after which a consumer warns: by default 250 estimates are missing then."""
+
 
 class PayloadEstimate(NamedTuple):
     """Estimate of ``~/payload_estimate``: mass, standard deviation, 95 % interval [kg], residual power, body."""

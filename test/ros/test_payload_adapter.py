@@ -13,6 +13,7 @@ from rclpy.node import Node
 from ros_harness import Ros, overrides
 from std_msgs.msg import Float64MultiArray
 
+from flexmanip_ros.control import handover
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.messages import payload_status
@@ -69,6 +70,33 @@ def test_a_refusal_is_reported_with_its_reason_and_asked_again(ros: Ros) -> None
     assert adapter.sent == 0
 
 
+def test_a_parameter_that_the_node_does_not_have_is_named_with_what_to_do(ros: Ros) -> None:
+    ros.managed(PlantSimulator(context=ros.context, overrides=overrides(rate=50.0, arm__modes=1)))
+    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
+        target_node='plant_simulator', mass_parameter='pay_load', settle_time=0.0)))
+    say(ros, 31.5, 0.1)
+    ros.wait(lambda: "node 'plant_simulator' did not set its parameter 'pay_load' to 31.500 kg" in adapter.problem)
+    assert 'let target_node and mass_parameter name a double that the node declares' in adapter.problem
+
+
+def test_estimates_that_cease_are_a_warning_and_are_no_longer_trusted(
+        ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    ros.managed(PlantSimulator(context=ros.context, overrides=overrides(rate=50.0, arm__modes=1)))
+    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
+        target_node='plant_simulator', settle_time=0.0)))
+    heard = ros.listen(DiagnosticArray, '/diagnostics')
+    say(ros, 31.5, 0.1)
+    ros.wait(lambda: adapter.sent == 1)
+    timer = next(iter(ros.helper.timers))
+    ros.run(ros.helper, timer.cancel)
+    monkeypatch.setattr(handover, 'LONGEST_AGE', 0.2)
+    found = ros.wait(lambda: [status for message in heard for status in message.status
+                              if 'no payload estimate for' in status.message], what='the warning')[0]
+    values = {item.key: item.value for item in found.values}
+    assert (found.name, found.level) == ('/payload_adapter: status', b'\x01')
+    assert (values['trusted'], float(values['estimate_age_s']) > 0.2) == ('False', True)
+
+
 def test_a_driver_that_is_not_there_is_named(ros: Ros) -> None:
     adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
         target_node='nobody', settle_time=0.0)))
@@ -114,6 +142,9 @@ def test_a_driver_that_does_not_answer_is_said_and_its_requests_are_not_kept(
         first = adapter._asked
         ros.wait(lambda first=first: adapter._asked is not first, what='another request')
     assert len(adapter._client._pending_requests) <= 1
+    ros.wait(lambda: adapter._asked is not None)
+    ros.run(ros.helper, next(iter(ros.helper.timers)).cancel)
+    ros.wait(lambda: adapter._asked is None, what='the end of the wait without another estimate')
     node.destroy_node()
 
 

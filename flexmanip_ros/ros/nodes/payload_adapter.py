@@ -46,6 +46,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         self.sent = 0
         self.problem = ''
         self._inertia: Inertia | None = None
+        self._estimated = math.nan
         self.doubtful = 0
         self._asked: tuple[Any, float] | None = None
         """Future of the request that waits for its answer, and when it was sent [s]; None without such a request."""
@@ -71,21 +72,21 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         """Begin in the state in which no payload has been sent."""
         self._forget_request()
         self.state, self.problem = handover.HandoverState(), ''
+        self._estimated = math.nan
 
     def _on_payload(self, message: InertiaStamped) -> None:
         self._inertia = message.inertia
 
     def _on_estimate(self, message: Float64MultiArray) -> None:
-        if not self.active or len(message.data) != 5 or self._inertia is None:
+        if not self.active or len(message.data) != 5:
             return
-        now = time.monotonic()
+        now = self._estimated = time.monotonic()
+        if self._inertia is None:
+            return
         body = self._inertia
         found = PayloadEstimate(*message.data)._replace(com=(body.com.x, body.com.y), inertia=body.izz)
         self.state, due = handover.step(self.config, self.state, found, now)
-        if self._asked is not None and now - self._asked[1] >= ANSWER_S:
-            self.problem = f"service '{self._client.srv_name}' has not answered within {ANSWER_S:g} s"
-            self.log_throttled('silence', f'{self.problem}; it is asked again')
-            self._forget_request()
+        self._give_up(now)
         if not due or self._asked is not None:
             return
         if not fits(self._inertia, found):
@@ -104,6 +105,13 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         future = self._client.call_async(self._request(inertia))
         self._asked = future, now
         future.add_done_callback(lambda future: self._answered(future, found))
+
+    def _give_up(self, now: float) -> None:
+        """Stop waiting for an answer that has not come within ``ANSWER_S``."""
+        if self._asked is not None and now - self._asked[1] >= ANSWER_S:
+            self.problem = f"service '{self._client.srv_name}' has not answered within {ANSWER_S:g} s"
+            self.log_throttled('silence', f'{self.problem}; it is asked again with the next estimate')
+            self._forget_request()
 
     def _forget_request(self) -> None:
         """Stop waiting for the answer and remove the request, which the client would keep without end."""
@@ -124,6 +132,10 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         reason = rejection(future.result())
         if reason:
             self.problem = f'{sent.mass:.3f} kg was rejected: {reason}'
+            if self.config.target_node:
+                self.problem = (f"node '{self.config.target_node}' did not set its parameter "
+                                f"'{self.config.mass_parameter}' to {sent.mass:.3f} kg ({reason}); let target_node and "
+                                'mass_parameter name a double that the node declares and lets others set')
             self.log_throttled('rejected', self.problem)
             self.state = handover.rejected(self.state, time.monotonic())
             return
@@ -133,13 +145,20 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         self.get_logger().info(f'the driver accepted a payload of {sent.mass:.3f} kg')
 
     def report(self, report: Report) -> None:
-        """Report what was sent, and what went wrong."""
+        """Report what was sent, how old the latest estimate is, and what went wrong."""
+        now = time.monotonic()
+        age = now - self._estimated
+        self._give_up(now)
+        if age > handover.LONGEST_AGE:  # false for NaN, before the first estimate
+            self.state = self.state._replace(trusted_since=None)  # settle_time begins again
         report.values.update(
             sent=self.sent, sent_mass_kg='none' if self.state.sent is None else self.state.sent.mass,
-            trusted=self.state.trusted_since is not None, doubtful=self.doubtful)
+            trusted=self.state.trusted_since is not None, estimate_age_s=age, doubtful=self.doubtful)
         if self.problem:
             report.worse(ERROR, self.problem)
-        elif self.active and self.state.trusted_since is None:
+        if self.active and age > handover.LONGEST_AGE:
+            report.worse(WARN, f'no payload estimate for {age:.0f} s')
+        elif self.active and not self.problem and self.state.trusted_since is None:
             report.worse(WARN, 'no payload that can be trusted')
 
 
