@@ -105,6 +105,12 @@ def hold(config: ControllerParameters, theta: Array, payload: Array) -> tuple[Ar
     return torque / np.array(config.arm.torque_gain), observation(config)[:, links:] @ eta
 
 
+def hold_goal(config: ControllerParameters, state: ControllerState) -> Array:
+    """Return the torques (L,) [N m] that hold the arm at the end of its path."""
+    assert state.way is not None, 'there is no path before the first sample'
+    return hold(config, reference(config, state.way.goal), state.payload)[0]
+
+
 class Design(NamedTuple):
     """Model, regulator, filter and feedforward for one configuration and payload.
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flexmanip_ros.arm.manipulator import payload_array
 from flexmanip_ros.control import controller
 from flexmanip_ros.control.handover import PayloadEstimate, Verdict, judge
 from flexmanip_ros.errors import ParameterError
@@ -72,6 +73,26 @@ def test_torques_stay_within_the_limits_whatever_is_measured() -> None:
         state, torque = controller.step(CONFIG, state, controller.Measured(
             np.full(4, value), np.full(4, value), np.array([1e9, -1e9])))
         assert (np.abs(torque) <= CONFIG.effort_limit).all()
+
+
+@pytest.mark.parametrize('limits', [(300.0, 0.0), (0.0, 150.0), (0.0, 0.0), (1e-300, 5e-324)])
+def test_an_arm_with_passive_joints_moves_with_finite_torques_and_none_there(limits: tuple[float, float]) -> None:
+    config = replace(CONFIG, effort_limit=limits)
+    positions, torques, state = run(config, 4.0)
+    assert np.isfinite(torques).all()
+    assert (np.abs(torques) <= limits).all()
+    if limits[0] == 300.0:
+        assert positions[-1, 0] - positions[0, 0] == pytest.approx(0.1, abs=0.05)
+    assert state.way is not None
+    assert state.way.ended
+
+
+def test_holding_the_goal_takes_the_weight_of_the_arm_and_its_payload() -> None:
+    config = replace(CONFIG, arm=replace(CONFIG.arm, gravity=(0.0, -9.81)), hold_present=False, initial_payload=2.0)
+    state, _ = controller.step(config, controller.init(config), controller.Measured(*np.zeros((2, 4)), np.zeros(2)))
+    assert state.way is not None
+    assert controller.hold_goal(config, state) == pytest.approx(
+        controller.hold(config, np.zeros(2), payload_array(2.0))[0], rel=1e-9)
 
 
 @pytest.mark.parametrize(('changed', 'verdict'), [

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from joint_states import joint_state
 from rclpy.parameter import Parameter
 from ros_harness import Ros, overrides
@@ -11,8 +12,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros.arm.manipulator import payload_array
-from flexmanip_ros.control import controller
-from flexmanip_ros.errors import ModelError
+from flexmanip_ros.control import controller, handover
+from flexmanip_ros.errors import ModelError, ParameterError
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import joint_record
 from flexmanip_ros.ros.nodes.payload_controller import PayloadController
@@ -104,6 +105,7 @@ def test_where_there_is_no_regulator_the_gains_stay(ros: Ros, monkeypatch: pytes
         raise ModelError('there is no regulator', 'none')
 
     heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
+    diagnostics = ros.listen(DiagnosticArray, '/diagnostics')
     node = start(ros, payload_rate=1e6)
     monkeypatch.setattr(controller, 'design', none)
     node._on_estimate(Float64MultiArray(data=[20.0, 0.1, 19.8, 20.2, 1.0]))
@@ -112,6 +114,7 @@ def test_where_there_is_no_regulator_the_gains_stay(ros: Ros, monkeypatch: pytes
         states.publish(joint_state(k))
     ros.wait(lambda: len(heard) == 20)
     assert (node.state.failed_designs, node.state.designs) == (1, 0)
+    ros.wait(lambda: diagnosed(diagnostics, 'no stable regulator was found'), what='the warning')
 
 
 def test_silence_means_zero_torque_once(ros: Ros) -> None:
@@ -182,3 +185,95 @@ def test_a_parameter_that_is_no_setpoint_moves_nothing(ros: Ros) -> None:
         ros.wait(lambda k=k: len(heard) == k + 1)
         assert node.state is not None
         assert node.state.setpoint.tolist() == ([0.1, 0.0] if k == 2 else [0.5, 0.3])
+
+
+def diagnosed(heard: list[DiagnosticArray], words: str) -> list[tuple[bytes, dict[str, str]]]:
+    """Return level and values of the entries of payload_controller whose message contains the words."""
+    return [(status.level, {item.key: item.value for item in status.values})
+            for message in heard for status in message.status
+            if status.name == '/payload_controller: status' and words in status.message]
+
+
+@pytest.mark.parametrize('angle', [90.0, -90.0, 1e6, 1e300, math.nan])
+def test_a_setpoint_beyond_two_turns_is_rejected_live_and_at_start(ros: Ros, angle: float) -> None:
+    node = start(ros, readers=0)
+    (result,) = node.set_parameters([Parameter('setpoint', value=[0.1, angle])])
+    assert not result.successful
+    assert "parameter 'setpoint' is" in result.reason
+    assert 'from -12.57 to 12.57 rad' in result.reason
+    assert node.config.setpoint == (0.0, 0.0)
+    with pytest.raises(ParameterError, match=r'from -12\.57 to 12\.57 rad'):
+        PayloadController(context=ros.context, overrides=overrides(setpoint=[angle, 0.0]))
+
+
+def test_a_setpoint_with_a_passive_joint_gives_finite_torques(ros: Ros) -> None:
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
+    start(ros, effort_limit=[300.0, 0.0], hold_present=False, setpoint=[0.5, 0.2])
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    for k in range(200):
+        states.publish(joint_state(k))
+    ros.wait(lambda: len(heard) == 200)
+    torques = np.array([message.data for message in heard])
+    assert np.isfinite(torques).all()
+    assert torques[:, 0].any()
+    assert not torques[:, 1].any()
+
+
+def test_a_torque_that_is_not_finite_is_never_sent_and_the_control_begins_again(
+        ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
+    diagnostics = ros.listen(DiagnosticArray, '/diagnostics')
+    node = start(ros)
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    for k, bad in enumerate((False, True, False, False)):
+        with monkeypatch.context() as patch:
+            if bad:
+                patch.setattr(controller, 'duration', lambda *given: math.nan)
+                (result,) = node.set_parameters([Parameter('setpoint', value=[0.5, 0.2])])
+                assert result.successful
+            states.publish(joint_state(k))
+            ros.wait(lambda k=k: len(heard) == k + 1)
+    assert heard[1].data.tolist() == [0.0, 0.0]
+    assert np.isfinite([message.data for message in heard]).all()
+    assert heard[3].data.tolist() != [0.0, 0.0]
+    assert ros.wait(lambda: diagnosed(diagnostics, 'was not finite'), what='the error')[0][0] == b'\x02'
+
+
+def test_an_arm_too_heavy_for_its_joints_is_said_once_with_the_torques_that_it_needs(
+        ros: Ros, capfd: pytest.CaptureFixture[str]) -> None:
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
+    diagnostics = ros.listen(DiagnosticArray, '/diagnostics')
+    node = start(ros, arm__gravity=[0.0, -9.81], rate=250.0, hold_present=False)
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    words = 'holding the arm at 0 and 0 rad needs 1742 and 514.6 N m; effort_limit is 300 and 150 N m'
+    for k in range(200):  # 0.8 s at the limits
+        states.publish(joint_state(4 * k))
+    ros.wait(lambda: len(heard) == 200)
+    assert ros.wait(lambda: diagnosed(diagnostics, words), what='the error')[0][0] == b'\x02'
+    ros.wait(lambda: len(diagnosed(diagnostics, words)) > 1, what='another entry')
+    said = capfd.readouterr().err
+    assert said.count(words) == 1
+    assert 'Check rate' not in said
+    (result,) = node.set_parameters([Parameter('effort_limit', value=[3000.0, 1500.0])])
+    assert result.successful
+    before = len(diagnosed(diagnostics, ''))
+    ros.wait(lambda: len(diagnosed(diagnostics, '')) > before + 1)
+    assert words not in diagnostics[-1].status[0].message
+
+
+def test_estimates_that_cease_are_a_warning_with_the_payload_that_stays(
+        ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    diagnostics = ros.listen(DiagnosticArray, '/diagnostics')
+    node = start(ros, readers=0)
+    _, before = ros.wait(lambda: diagnosed(diagnostics, ''))[0]
+    assert (before['estimate'], before['estimate_age_s']) == ('none', 'unknown')
+    estimates = ros.publisher(Float64MultiArray, 'rpbsid_identifier/payload_estimate', qos.latched())
+    estimates.publish(Float64MultiArray(data=[20.0, 0.1, 19.8, 20.2, 1.0]))
+    ros.wait(lambda: node.state.trusted[0] == 20.0)
+    monkeypatch.setattr(handover, 'LONGEST_AGE', 0.2)
+    level, values = ros.wait(lambda: diagnosed(diagnostics, 'no payload estimate for'), what='the warning')[0]
+    assert diagnosed(diagnostics, 'the gains stay those of 20.00 kg')
+    assert values['estimate'] == 'trusted'
+    assert float(values['estimate_age_s']) > 0.2
+    assert level == b'\x03'  # STALE, as no joint states come either; it outranks the warning
+    assert node.state.trusted[0] == 20.0

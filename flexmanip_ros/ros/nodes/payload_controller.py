@@ -8,21 +8,22 @@ publishes   effort_controller/commands          std_msgs/Float64MultiArray  one 
             /diagnostics                        diagnostic_msgs/DiagnosticArray  1 Hz
 
 An estimate changes the gains only when it is trusted: in range, confident, consistent; the gains follow it no
-faster than `payload_rate` and take over within `blend_time`. Without joint states for `stale_after`, and when
-the node is deactivated or stopped, it sends zero torque once. An example of a consumer, not a safety
-controller.
+faster than `payload_rate` and take over within `blend_time`. Without estimates the gains stay, and /diagnostics warns.
+Without joint states for `stale_after`, and when the node is deactivated or stopped, it sends zero torque once. An
+example of a consumer, not a safety controller.
 """
 
+import math
 import sys
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import numpy as np
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from flexmanip_ros.control import controller
+from flexmanip_ros.control import controller, handover
 from flexmanip_ros.control.handover import PayloadEstimate, Verdict
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.parameters import ControllerParameters
@@ -41,6 +42,9 @@ AT_LIMIT_S = 0.5
 """Time at the limits of the torque, less the time within them, after which the log warns [s]: no move takes that."""
 LARGEST = 1e6
 """Bound on an angle, bend or rate, in SI units, that no arm exceeds; joint states beyond it are dropped."""
+NOT_FINITE = ('a computed torque was not finite: zero torque was sent, and the control begins again at the present '
+              'angles; check the parameters arm.*, setpoint and effort_limit')
+"""What the log and /diagnostics say of such a torque."""
 
 
 class PayloadController(FlexmanipNode[ControllerParameters]):
@@ -50,8 +54,10 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         super().__init__(NAME, ControllerParameters, **options)
         self.state: controller.ControllerState | None = None
         self._estimate: PayloadEstimate | None = None
+        self._estimated = math.nan
         self._body: tuple[float, ...] | None = None
         self.dropped = 0
+        self.not_finite = 0
         self.sent = 0
         self._added, self._added_at = np.zeros(len(self.config.joints)), -np.inf
         self._last_ns: int | None = None
@@ -62,6 +68,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._names: tuple[str, ...] = ()
         self._places: list[int] = []
         self._at_limit = 0
+        self._too_heavy = False
 
     def make_entities(self) -> None:
         """Create the publisher, the subscriptions, and the timer that notices when joint states cease."""
@@ -86,7 +93,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
     def activated(self) -> None:
         """Hold the joints from the next sample on, or go to the setpoint that was set while it was inactive."""
         self.state = controller.init(self.config)
-        self._last_ns, self._arrived = None, np.inf
+        self._last_ns, self._arrived, self._too_heavy = None, np.inf, False
         if self._estimate is not None:
             self._judge(self._estimate)
 
@@ -126,17 +133,40 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
             if goal is not None:
                 self.state = controller.goto(self.state, goal)
             self.state, torque = controller.step(self.config, self.state, measured)
+            if not np.isfinite(torque).all():
+                self.not_finite += 1
+                self.log_throttled('not_finite', NOT_FINITE)
+                self.state = self.state._replace(x=None, way=None)
+                torque = np.zeros(len(torque))
             self._send(torque)
             self._watch_limits(torque)
 
     def _watch_limits(self, torque: Array) -> None:
         """Warn when the torques are at their limits more often than not, counted over ``AT_LIMIT_S``."""
-        at_limit = bool(np.any(np.abs(torque) >= np.asarray(self.config.effort_limit)))
+        limit = np.asarray(self.config.effort_limit)
+        at_limit = bool(np.any((np.abs(torque) >= limit) & (limit > controller.NO_TORQUE)))
         self._at_limit = max(0, self._at_limit + (1 if at_limit else -1))
-        if self._at_limit == round(AT_LIMIT_S * self.config.rate):
+        if self._at_limit == round(AT_LIMIT_S * self.config.rate) and not self._shortage():
             self.get_logger().warning(
                 'the torques stay at effort_limit: the arm is not held. Check rate and the parameters arm.*; an arm '
                 'without damping (arm.damping_ratio 0) becomes unstable in its fastest modes')
+
+    def _shortage(self) -> str:
+        """Return what holding the arm needs where that is more than effort_limit, and log it once; else empty."""
+        if self.state is None or self.state.way is None:
+            return ''
+        needed, limit = controller.hold_goal(self.config, self.state), np.asarray(self.config.effort_limit)
+        before, self._too_heavy = self._too_heavy, bool(
+            np.any((np.abs(needed) > limit) & (limit > controller.NO_TORQUE)))
+        if not self._too_heavy:
+            return ''
+        goal = np.round(self.state.way.goal, 3) + 0.0  # no -0
+        words = (f'holding the arm at {listed(goal)} rad needs {listed(np.abs(needed))} N m; '
+                 f'effort_limit is {listed(limit)} N m')
+        if not before:
+            self.get_logger().error(f'{words}. There the arm falls: raise effort_limit as far as the joints allow, '
+                                    'change setpoint, or correct arm.gravity and the masses arm.*')
+        return words
 
     def _is_late(self, stamp_ns: int) -> bool:
         """Return whether a sample is not newer than the last, and drop it; a long step back counts as a new clock."""
@@ -172,6 +202,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         if len(message.data) != 5:
             self._drop('payload_estimate', f'a payload estimate was dropped: it has {len(message.data)} values, not 5')
             return
+        self._estimated = time.monotonic()
         self._estimate = PayloadEstimate(*message.data)  # kept: a latched estimate may come before activation
         if self._judge(self._estimate) is None:
             self._body = None  # it is that of the object held before
@@ -228,14 +259,29 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
                          f'{self.config.rate:.0f}; set rate')
         if self.state is None:
             return
+        if self.not_finite:
+            report.worse(ERROR, f'{NOT_FINITE} ({self.not_finite} times)')
+        if self.active and (words := self._shortage()):
+            report.worse(ERROR, words)
         if self.state.failed_designs:
-            report.worse(WARN, f'{self.state.failed_designs} times no regulator was found; the gains before stay')
+            report.worse(WARN, f'for {self.state.failed_designs} configurations or payloads no stable regulator was '
+                         'found, and the gains designed before them stayed in use; change angle_scale, bend_scale or '
+                         'effort_scale')
         verdict = self.state.verdict
+        age = time.monotonic() - self._estimated
         report.values.update(
             scheduled_payload_kg=float(self.state.payload[0]), trusted_payload_kg=float(self.state.trusted[0]),
-            designs=self.state.designs, estimate='none' if verdict is None else verdict.value)
+            designs=self.state.designs, estimate='none' if verdict is None else verdict.value, estimate_age_s=age)
         if verdict not in (None, Verdict.TRUSTED):
             report.worse(WARN, f'payload estimate not trusted: {verdict.value}')
+        if self.active and self.config.use_estimate and age > handover.LONGEST_AGE:  # false for NaN, before the first
+            report.worse(WARN, f'no payload estimate for {age:.0f} s: the gains stay those of '
+                         f'{self.state.trusted[0]:.2f} kg')
+
+
+def listed(values: Iterable[float]) -> str:
+    """Return numbers as words, such as '970 and 362'."""
+    return ' and '.join(f'{value:.4g}' for value in values)
 
 
 def main(argv: list[str] | None = None) -> int:
