@@ -129,6 +129,11 @@ def _sqlite(path: Path) -> Iterator[Raw]:
             yield Raw(*topics[number], data)
 
 
+STORAGE = ('.mcap', '.db3')
+COMPRESSED = tuple(f'{ending}.zstd' for ending in STORAGE)
+"""Ends of the names of a recording's files; the second ones are of `ros2 bag record --compression-mode file`."""
+METADATA_FAULTS = ('Could not load YAML', 'Invalid bag metadata', 'A metadata key is missing')
+"""How the library begins what it says of a metadata.yaml whose content is unusable."""
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 HEADER = 'std_msgs/msg/Header'
 BLOCK = 2048
@@ -217,8 +222,16 @@ class _Recording:
         """Number of messages on the chosen topics that were read so far."""
         self.total: int | None = None
         self._kinds: dict[str, str] = {}
+        self._found: set[str] = set()
+        """Wanted event topics that are there."""
+        self._there: dict[str, str] = {}
+        """Types of the topics of the messages that were read without the library."""
+        self._metadata = ''
+        """What is wrong with metadata.yaml."""
         self._damage = ''
-        self._faults: list[str] = []
+        """What is wrong with the data."""
+        self._faults: list[tuple[str, str]] = []
+        """What is wrong with single messages, and what to do."""
         self._joint_states = 0
         self._layout: cdr.Layout | None = None
         self._run = BLOCK
@@ -235,7 +248,9 @@ class _Recording:
             raise BagError(f"bag '{path}' does not exist", 'check the path')
         if path.suffix == '.bag':
             raise BagError(f"'{path}' is a ROS 1 bag", 'convert it: rosbags-convert --src FILE --dst FOLDER')
-        if path.is_file() and path.suffix not in ('.mcap', '.db3'):
+        if path.is_file() and path.name.endswith(COMPRESSED):
+            raise BagError(f"'{path}' is compressed", f'give its directory with metadata.yaml, or {_unpacking(path)}')
+        if path.is_file() and path.suffix not in STORAGE:
             raise BagError(f"'{path}' is not a bag", 'give a rosbag2 directory, an .mcap or a .db3 file')
         if path.is_dir() and not (path / 'metadata.yaml').is_file() and not self._files():
             raise BagError(f"directory '{path}' is not a bag: metadata.yaml and recording are missing",
@@ -246,7 +261,8 @@ class _Recording:
     def _files(self) -> list[Path]:
         if self.path.is_file():
             return [self.path]
-        found = (file for file in self.path.iterdir() if file.suffix in ('.mcap', '.db3'))
+        found = (file for file in self.path.iterdir() if file.suffix in STORAGE or (
+            file.name.endswith(COMPRESSED) and not file.with_suffix('').exists()))  # one that was decompressed is read
         return sorted(found, key=lambda file: [  # file 10 of a split recording comes after file 9
             (part.isdigit(), int(part) if part.isdigit() else 0, part) for part in re.split(r'(\d+)', file.name)])
 
@@ -265,9 +281,13 @@ class _Recording:
         except BagError:
             raise
         except Exception as err:  # broken bytes lead the library to errors of many kinds
-            self._damage = ' '.join(str(err).split()).rstrip('.') or type(err).__name__
+            words = ' '.join(str(err).split()).rstrip('.') or type(err).__name__
             if self.path.is_dir() and not (self.path / 'metadata.yaml').is_file():
-                self._damage = 'metadata.yaml is missing'
+                self._metadata = 'metadata.yaml is missing'
+            elif words.startswith(METADATA_FAULTS):
+                self._metadata = 'metadata.yaml is not what ros2 bag record writes'
+            else:
+                self._damage = words
             yield from self._salvaged()
 
     def _salvaged(self) -> Iterator[tuple[str, bytes]]:
@@ -276,7 +296,11 @@ class _Recording:
         self.total = None
         try:
             for file in self._files():
+                if file.name.endswith(COMPRESSED):
+                    raise BagError(f"bag '{self.path}' cannot be read: {self._metadata or self._damage}, and its files "
+                                   'are compressed', f'{_unpacking(file)}; then give that file or the directory')
                 for raw in salvaged(file):
+                    self._there[raw.topic] = raw.msgtype
                     if not self._choose({raw.topic: raw.msgtype}, complete=False):
                         continue
                     if skip:
@@ -292,7 +316,7 @@ class _Recording:
     @property
     def is_damaged(self) -> bool:
         """Whether the library failed to read the bag."""
-        return bool(self._damage)
+        return bool(self._metadata or self._damage)
 
     @property
     def event_topics(self) -> tuple[str, ...]:
@@ -307,7 +331,7 @@ class _Recording:
             try:
                 block, self._layout = cdr.joint_block(tried, self._layout)
             except (cdr.CdrError, UnicodeDecodeError) as err:
-                self._faults.append(f"message {first + done} (on '{self.joint_topic}') is garbled: {err}")
+                self._garbled(first + done, self.joint_topic, err)
                 done += 1
                 continue
             count = len(block.stamp_ns)
@@ -321,23 +345,37 @@ class _Recording:
         try:
             yield cdr.capture_event(raw).heard_on(topic)
         except (cdr.CdrError, UnicodeDecodeError) as err:
-            self._faults.append(f"message {self.taken} (on '{topic}') is garbled: {err}")
+            self._garbled(self.taken, topic, err)
         except ValueError as err:
-            self._faults.append(f"an event on '{topic}' is neither capture nor release: {err}")
+            self._faults.append((f"an event on '{topic}' is left out: {err}", (
+                "publish 'capture' or 'release' as its frame_id; of this recording give --capture-time or "
+                '--release-time, or let --detect look for it in the signals')))
+
+    def _garbled(self, number: int, topic: str, err: Exception) -> None:
+        self._faults.append((f"message {number} (on '{topic}') is garbled: {err}",
+                             'correct the publisher and record again'))
 
     def check(self) -> None:
         """Raise BagError if a fault was found, or no joint state."""
         count = f"{self._joint_states} messages on '{self.joint_topic}' were read"
-        if self._damage and self._joint_states == 0:
-            raise BagError(f"bag '{self.path}' cannot be read: {self._damage}",
+        missing = [name for name in self.topics.events if name not in self._found]
+        if self.is_damaged and self.topics.events_required and missing:
+            count += f", and none on '{missing[0]}' ({_event_topics(self._there)})"
+        if self._metadata and not self._damage and not self.joint_topic:
+            self._choose(self._there)  # raises what it says of a whole recording without the topic
+        if self.is_damaged and self._joint_states == 0:
+            raise BagError(f"bag '{self.path}' cannot be read: {self._damage or self._metadata}",
                            'check that it is a rosbag2 recording and copied whole')
         if self._damage:
             raise BagError(f"bag '{self.path}' is damaged: {self._damage}; {count}",
                            "repair it with 'ros2 bag reindex' or 'mcap recover', or record again")
         if self._faults:
-            more = f' (and {len(self._faults) - 1} more)' if len(self._faults) > 1 else ''
-            raise BagError(f"bag '{self.path}': {self._faults[0]}{more}; {count}",
-                           'correct the publisher and record again')
+            (fault, remedy), *others = self._faults
+            more = f' (and {len(others)} more)' if others else ''
+            raise BagError(f"bag '{self.path}': {fault}{more}; {count}", remedy)
+        if self._metadata:
+            raise BagError(f"bag '{self.path}': {self._metadata}; its data are whole: {count}",
+                           "make it with 'ros2 bag reindex'")
         if self._joint_states == 0:
             raise BagError(f"bag '{self.path}' has no message on '{self.joint_topic}'",
                            'record while the joint states are published')
@@ -349,7 +387,7 @@ class _Recording:
             if found is None and complete:
                 listed = ', '.join(f'{name} ({kind})' for name, kind in sorted(there.items())) or 'none'
                 raise BagError(f"bag '{self.path}' has no topic '{self.topics.joint_states}'",
-                               f'the topics there are: {listed}')
+                               f'name one with --joint-states NAME; the topics there are: {listed}')
             if found is not None:
                 self.joint_topic = found
                 self._kinds[found] = JOINT_STATE
@@ -360,10 +398,20 @@ class _Recording:
             event = _resolve(name, near, HEADER, self.path, '--capture-event')
             if event is not None:
                 self._kinds[event] = HEADER
+                self._found.add(name)
             elif complete and self.topics.events_required:
-                listed = ', '.join(sorted(topic for topic, kind in there.items() if kind == HEADER)) or 'none'
-                raise BagError(f"bag '{self.path}' has no topic '{name}'", f'the event topics there are: {listed}')
+                raise BagError(f"bag '{self.path}' has no topic '{name}'", _event_topics(there))
         return any(topic in self._kinds for topic in there)
+
+
+def _event_topics(there: dict[str, str]) -> str:
+    listed = ', '.join(sorted(topic for topic, kind in there.items() if kind == HEADER)) or 'none'
+    return f'the event topics there are: {listed}'
+
+
+def _unpacking(file: Path) -> str:
+    """Return what to do with a compressed file. zstd takes the name's end .zstd only where it writes to stdout."""
+    return f"decompress it with 'zstd -dc {file.name} > {file.stem}'"
 
 
 def _resolve(wanted: str, there: dict[str, str], kind: str, path: Path, option: str) -> str | None:

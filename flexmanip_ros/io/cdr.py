@@ -58,6 +58,8 @@ def capture_event(raw: bytes) -> CaptureEvent:
     """Return the event in a Header. Raises ValueError when its frame_id is neither capture nor release."""
     stamp = stamp_ns(raw)
     frame, _ = _string(raw, HEAD)
+    if frame not in (kind.value for kind in EventKind):
+        raise ValueError(f"its frame_id is '{frame}', not 'capture' or 'release'")
     return CaptureEvent(stamp, EventKind(frame))
 
 

@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from flexmanip_ros.cli import console
 from flexmanip_ros.errors import BagError
 from flexmanip_ros.io import bag
+from flexmanip_ros.io.bag import zstd
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.types import CaptureEvent, JointRecord
 
@@ -34,16 +35,6 @@ def test_missing_things_are_named(tmp_path):
         assert 'is empty' in good_part(tmp_path / name)[1]
         (tmp_path / name).write_bytes(b'something else entirely' * 100)
         assert 'cannot be read' in good_part(tmp_path / name)[1]
-
-
-def test_a_recording_without_its_metadata_is_read_and_says_so(tmp_path):
-    path = write(tmp_path / 'bag')
-    whole = len(list(bag.read(path)))
-    (path / 'metadata.yaml').unlink()
-    read, line = good_part(path)
-    assert len(read) == whole
-    assert 'metadata.yaml is missing' in line
-    assert 'ros2 bag reindex' in line
 
 
 @pytest.mark.parametrize('moment', ['open', 'add_connection', 'write', 'close'])
@@ -127,14 +118,91 @@ def test_a_recording_without_metadata_is_read_and_reported(tmp_path):
     (path / 'metadata.yaml').unlink()
     items, line = good_part(path)
     assert len(items) == 51
-    assert 'metadata' in line
+    assert 'metadata.yaml is missing; its data are whole' in line
+    assert 'ros2 bag reindex' in line
+    assert 'damaged' not in line
 
 
 @pytest.mark.parametrize('text', ['', 'words', 'rosbag2_bagfile_information: {version: 5}', ': : :', '\x00'])
-def test_broken_metadata_is_reported_in_one_line(tmp_path, text):
+def test_broken_metadata_is_reported_in_plain_words(tmp_path, text):
     path = write(tmp_path / 'bag')
     (path / 'metadata.yaml').write_text(text)
-    assert len(good_part(path)[0]) == 51
+    items, line = good_part(path)
+    assert len(items) == 51
+    assert 'metadata.yaml is not what ros2 bag record writes; its data are whole' in line
+    assert 'Error' not in line
+    assert 'NoneType' not in line
+
+
+def test_a_recording_without_metadata_and_without_the_topic_names_the_topics_that_are_there(tmp_path):
+    path = write(tmp_path / 'bag', topic='/other')
+    (path / 'metadata.yaml').unlink()
+    line = good_part(path)[1]
+    assert "has no topic 'joint_states'; name one with --joint-states NAME" in line
+    assert '/other (sensor_msgs/msg/JointState)' in line
+
+
+@pytest.mark.parametrize('is_cut', [False, True])
+def test_an_event_topic_asked_for_is_missed_in_a_recording_that_the_library_cannot_read(tmp_path, is_cut):
+    path = write(tmp_path / 'bag', 2000)
+    file = storage_file(path)
+    (path / 'metadata.yaml').unlink()
+    if is_cut:
+        file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
+    with pytest.raises(BagError, match=r"and none on '/capture_evnt' \(the event topics there are: /capture_event\)"):
+        list(bag.read(path, bag.Topics(events=('/capture_evnt',), events_required=True)))
+
+
+def test_an_unknown_event_is_answered_with_the_two_texts_and_other_ways_to_tell_the_capture(tmp_path):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    kinds = store.types
+    header = kinds['std_msgs/msg/Header'](kinds['builtin_interfaces/msg/Time'](1, 0), 'grasp')
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.write('/joint_states', START, joint_state_record(0))
+        writer.write_raw('/capture_event', START, bytes(store.serialize_cdr(header, 'std_msgs/msg/Header')),
+                         'std_msgs/msg/Header')
+    items, line = good_part(tmp_path / 'bag')
+    assert len(items) == 1
+    assert "its frame_id is 'grasp', not 'capture' or 'release'" in line
+    assert '--capture-time' in line
+    assert '--detect' in line
+
+
+def _compressed(path, storage):
+    """Write a recording as ``ros2 bag record --compression-mode file`` does."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    writer = Writer(path, version=9, storage_plugin=storage)
+    writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    with Reader(write(path.with_name('plain'))) as reader, writer:
+        made = {item.topic: writer.add_connection(item.topic, item.msgtype, typestore=store)
+                for item in reader.connections}
+        for connection, stamp, raw in reader.messages():
+            writer.write(made[connection.topic], stamp, raw)
+    return path
+
+
+@pytest.mark.parametrize('storage', list(StoragePlugin))
+def test_a_recording_whose_files_are_compressed_is_read(tmp_path, storage):
+    path = _compressed(tmp_path / 'packed', storage)
+    assert [file.suffix for file in path.glob('packed*')] == ['.zstd']
+    assert list(map(str, bag.read(path))) == list(map(str, bag.read(tmp_path / 'plain')))
+
+
+@pytest.mark.parametrize('storage', list(StoragePlugin))
+def test_a_compressed_file_without_its_metadata_is_answered_with_the_command_that_makes_it_readable(tmp_path, storage):
+    path = _compressed(tmp_path / 'packed', storage)
+    file = next(path.glob('*.zstd'))
+    (path / 'metadata.yaml').unlink()
+    command = f'zstd -dc {file.name} > {file.stem}'
+    for place in (file, path):
+        items, line = good_part(place)
+        assert items == []
+        assert command in line
+    file.with_suffix('').write_bytes(zstd.decompress(file.read_bytes()))
+    assert len(list(bag.read(file.with_suffix('')))) == 51
+    items, line = good_part(path)
+    assert len(items) == 51
+    assert 'metadata.yaml is missing' in line
 
 
 def test_compressed_recordings_are_read_and_salvaged(tmp_path):
