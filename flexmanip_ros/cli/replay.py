@@ -83,8 +83,6 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     """
     started = time.perf_counter()
     if request.report is not None:
-        if request.output is not None and Path(request.output).resolve() == Path(request.report).resolve():
-            raise ParameterError(f"--output and --report are both '{request.report}'", 'give two names')
         check_place(request.report, '.html', '.htm')
         require_matplotlib()
     for place, endings in ((request.save_arm, ('.yaml', '.yml')), (request.configurations, ('.csv',))):

@@ -47,8 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(given: argparse.Namespace) -> int:
-    from flexmanip_ros.io.outputs import write_text
+    from flexmanip_ros.io.outputs import check_apart, write_text
 
+    check_apart({'--output': given.output}, given.params)
     text = urdf(load_arm(given.params, given.set), given.segments)
     if given.output:
         write_text(given.output, text)

@@ -79,6 +79,29 @@ def check_place(path: str | Path, *endings: str) -> None:
         raise OutputError(f"'{path}' does not end in {' or '.join(endings)}", 'give such a name')
 
 
+def check_apart(outputs: Mapping[str, str | None], params: str | None, bag: str | None = None) -> None:
+    """Raise OutputError where a run would write over what it reads, or write two outputs to one place.
+
+    outputs: path of each option, None where it is not given; params: the parameter file that is read; bag: the recording
+    that is read. No output may be in the folder of a recording.
+    """
+    taken: dict[Path, str] = {}
+    folder = None if bag is None else Path(bag).resolve()
+    if folder is not None and (folder.parent / 'metadata.yaml').is_file():  # one file of a recording
+        folder = folder.parent
+    for option, given in outputs.items():
+        if not given:
+            continue
+        path = Path(given).resolve()
+        if params is not None and path == Path(params).resolve():
+            raise OutputError(f"{option} would overwrite '{given}', which --params reads", 'give another name')
+        if folder is not None and path.is_relative_to(folder):
+            raise OutputError(f"{option} '{given}' is in the recording '{bag}'", 'give a place outside of it')
+        if path in taken:
+            raise OutputError(f"{taken[path]} and {option} are both '{given}'", 'give two names')
+        taken[path] = option
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file as UTF-8, whole or not at all."""
     write_file(path, lambda file: file.write(text.encode('utf-8')))

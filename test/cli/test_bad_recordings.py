@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexmanip_ros.cli import monte_carlo, reproduce_paper, simulate_bag
+from flexmanip_ros.cli import monte_carlo, reproduce_paper, simulate_bag, write_urdf
 from flexmanip_ros.cli.identify_bag import main
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
@@ -152,11 +152,50 @@ def test_a_name_too_long_is_said_before_the_work(capsys, tmp_path, option):
         assert 'too long' in err
 
 
-def test_output_and_report_cannot_be_one_file(capsys, tmp_path):
+@pytest.mark.parametrize(('first', 'second', 'name'), [
+    ('--output', '--report', 'a.csv'), ('--output', '--configurations', 'a.csv'),
+    ('--suggest', '--save-arm', 'a.yaml')])
+def test_two_outputs_cannot_be_one_file(capsys, tmp_path, first, second, name):
     path = _bag(tmp_path / 'bag', _records())
-    status, _, err = _run(capsys, path, PLAIN, '--output', tmp_path / 'a.csv', '--report', tmp_path / 'a.csv')
+    status, _, err = _run(capsys, path, PLAIN, first, tmp_path / name, second, tmp_path / 'bag' / '..' / name)
     assert status == 2
+    assert f'{first} and {second} are both' in err
     assert 'give two names' in err
+
+
+@pytest.mark.parametrize('option', ['--output', '--report', '--save-arm', '--suggest', '--configurations'])
+@pytest.mark.parametrize('reads_one_file', [False, True])
+def test_nothing_is_written_into_the_recording_that_is_read(capsys, tmp_path, option, reads_one_file):
+    path = _bag(tmp_path / 'bag', _records())
+    before = {file: file.read_bytes() for file in path.iterdir()}
+    for name in ('metadata.yaml', 'bag.mcap', 'new.yaml', 'new.csv', 'new'):
+        source = path / 'bag.mcap' if reads_one_file else path
+        status, _, err = _run(capsys, source, PLAIN, option, path / name)
+        assert status == 2
+        assert f'{option} ' in err
+        assert 'is in the recording' in err
+    assert {file: file.read_bytes() for file in path.iterdir()} == before
+
+
+@pytest.mark.parametrize('option', ['--save-arm', '--suggest'])
+def test_the_parameter_file_that_is_read_is_not_overwritten(capsys, tmp_path, option):
+    path = _bag(tmp_path / 'bag', _records())
+    params = tmp_path / 'mine.yaml'
+    params.write_text('/**: {ros__parameters: {order: 4}}\n', encoding='utf-8')
+    status, _, err = _run(capsys, path, '--params', params, option, tmp_path / 'bag' / '..' / 'mine.yaml')
+    assert status == 2
+    assert 'which --params reads' in err
+    assert write_urdf.main(['--params', str(params), '--output', str(params)]) == 2
+    assert 'which --params reads' in capsys.readouterr().err
+    assert params.read_text(encoding='utf-8') == '/**: {ros__parameters: {order: 4}}\n'
+
+
+def test_an_earlier_output_is_written_anew(capsys, tmp_path):
+    path = _bag(tmp_path / 'bag', _records())
+    table = tmp_path / 'estimates.csv'
+    table.write_text('the last results\n', encoding='utf-8')
+    assert _run(capsys, path, PLAIN, '--output', table)[0] == 0
+    assert table.read_text(encoding='utf-8').startswith('stamp_ns,')
 
 
 def test_detection_needs_angles_but_no_payload_method(capsys, tmp_path):
