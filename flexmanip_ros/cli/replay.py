@@ -301,9 +301,13 @@ def _dropped(state: pipeline.State) -> FlexmanipError | None:
     faulty = counters.not_finite + counters.unequal_sizes
     if not faulty or rejection is None:
         return None
-    what = 'NaN or infinity in a configured signal' if counters.not_finite else 'arrays of unequal sizes'
-    return BagError(f'{faulty} of {counters.received} messages hold {what} and were left out',
-                    'look at the publisher of the joint states')
+    what = ' or '.join(words for count, words in (
+        (counters.not_finite, 'NaN or infinity in a configured signal'),
+        (counters.unequal_sizes, 'arrays of unequal sizes')) if count)
+    words = f'{faulty} of {counters.received} messages hold {what} and were left out'
+    if rejection.reason not in ('not_finite', 'unequal_sizes'):  # the latest one was left out for another reason
+        return BagError(words, 'look at the publisher of the joint states')
+    return BagError(f'{words}; the last of them: {rejection.problem}', rejection.remedy)
 
 
 def _remark(state: pipeline.State, foreign: int) -> str:

@@ -82,8 +82,8 @@ def check_place(path: str | Path, *endings: str) -> None:
 def check_apart(outputs: Mapping[str, str | None], params: str | None, bag: str | None = None) -> None:
     """Raise OutputError where a run would write over what it reads, or write two outputs to one place.
 
-    outputs: path of each option, None where it is not given; params: the parameter file that is read; bag: the recording
-    that is read. No output may be in the folder of a recording.
+    outputs: path of each option, None where it is not given; params: the parameter file that is read; bag: the
+    recording that is read, in whose folder no output may be.
     """
     taken: dict[Path, str] = {}
     folder = None if bag is None else Path(bag).resolve()

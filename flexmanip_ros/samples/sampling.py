@@ -21,6 +21,7 @@ from flexmanip_ros.samples.signals import (
     columns,
     extract,
     joint_rates,
+    not_finite,
     resolve,
     wrong_size,
 )
@@ -120,7 +121,7 @@ def push(config: IdentifierParameters, clock: Clock, log: SampleLog, record: Joi
         return Sampled(_reject(clock, fault), log)
     raw = extract(channels, record)
     if raw is None:
-        return Sampled(_reject(clock, _NOT_FINITE), log)
+        return Sampled(_reject(clock, not_finite(channels, record)), log)
     if log.width == EMPTY.width:  # also in a state that was saved before the first usable message
         log = SampleLog(Width(len(channels.u), len(channels.y), len(channels.angles), len(channels.rates)))
     return _on_clock(config, clock, log, raw)
@@ -228,8 +229,6 @@ def collect(config: IdentifierParameters, items: Iterable[JointRecord | JointBlo
     return signals(config, clock, log)
 
 
-_NOT_FINITE = Rejection('not_finite', 'a configured signal is NaN or infinite',
-                        'check the publisher of the joint states')
 _REPEATED = Rejection('repeated_stamp', 'header stamps do not advance',
                       'use a publisher that fills header.stamp with the time of each sample')
 _LATE = Rejection('late_stamp', 'a header stamp is older than the one before',

@@ -123,6 +123,15 @@ def extract(channels: Channels, record: JointRecord) -> Sample | None:
     return Sample(record.stamp_ns, row[:r], row[r:r + m], row[r + m:], np.array(rates, dtype=np.float64))
 
 
+def not_finite(channels: Channels, record: JointRecord) -> Rejection:
+    """Return why ``extract`` rejects a record: the first configured signal that is NaN or infinite."""
+    field, index = next(place for place in channels.places if not math.isfinite(getattr(record, place[0])[place[1]]))
+    what = 'NaN' if math.isnan(getattr(record, field)[index]) else 'infinite'
+    is_spare = field == 'velocity' and (field, index) in channels.y  # positions suffice as outputs
+    return Rejection('not_finite', f"'{channels.names[index]}/{field}' is {what}",
+                     ('leave it out of outputs, or ' if is_spare else '') + 'check the publisher of the joint states')
+
+
 def joint_rates(channels: Channels, block: JointBlock, taken: slice) -> Array:
     """Return measured rates of the joints, as in ``extract``, of the messages ``taken``, (N, a) [rad/s]; NaN: unknown.
 

@@ -311,6 +311,7 @@ def test_faulty_messages_are_left_out_counted_and_reported(capsys, tmp_path):
     status, out, err = _run(capsys, _bag(tmp_path / 'bag', records), *SETTINGS, '--json')
     assert status == 2
     assert '2 of 600 messages' in err
+    assert "names but 2 values in 'position'" in err
     assert json.loads(out)['samples'] == 598
 
 

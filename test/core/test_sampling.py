@@ -139,6 +139,28 @@ def test_nan_matters_only_in_configured_fields() -> None:
     assert drive(fine)[0].counters.dropped == 0
 
 
+@pytest.mark.parametrize(('bad', 'problem', 'remedy'), [
+    ({'velocity': [1.0, 1.0, np.nan, 1.0]}, "'link1_bend/velocity' is NaN",
+     'leave it out of outputs, or check the publisher of the joint states'),
+    ({'position': [1.0, 1.0, 1.0, -np.inf]}, "'link2_bend/position' is infinite",
+     'check the publisher of the joint states'),
+    ({'position': [np.nan, 1.0, 1.0, 1.0]}, "'joint1/position' is NaN", 'check the publisher of the joint states'),
+    ({'effort': [1.0, np.inf, 1.0, 1.0]}, "'joint2/effort' is infinite", 'check the publisher of the joint states'),
+])
+def test_a_signal_that_is_not_finite_is_named_alone_and_in_a_block(
+        bad: dict[str, object], problem: str, remedy: str) -> None:
+    records = [record(k) for k in range(60)]
+    records[40] = record(40, **bad)
+    alone = drive(records)[0]
+    block = JointBlock(NAMES, np.array([one.stamp_ns for one in records]),
+                       *(np.stack([getattr(one, name) for one in records])
+                         for name in ('position', 'velocity', 'effort')))
+    together = sampling.push_whole(IdentifierParameters(), sampling.Clock(), sampling.EMPTY, block).clock
+    for clock in (alone, together):
+        assert clock.rejection is not None
+        assert (clock.rejection.problem, clock.rejection.remedy) == (problem, remedy)
+
+
 @pytest.mark.parametrize('missing', [5, 45])
 def test_beyond_max_gap_a_missing_message_marks_a_gap_before_and_after_the_sample_time_is_known(missing: int) -> None:
     none = configure(IdentifierParameters, {'max_gap': 0.0})
