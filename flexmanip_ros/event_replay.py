@@ -19,6 +19,8 @@ BEFORE_ALL = -(1 << 63)
 """Stamp that stands for the row before the first one [ns]."""
 SNAPSHOTS = 2
 """Number of snapshots within ``rewind_time``. One older snapshot is kept, so a rewind can go back all this time."""
+FAR_EVENT_NS = 10_000_000_000
+"""Time between an event and the samples beyond which its stamp is probably of another clock, or zero [ns]."""
 MOST_EVENTS = 100
 """Largest number of events that wait for their stamps; beyond it the latest ones are dropped."""
 MOST_ROWS = 20_000

@@ -12,6 +12,7 @@ import numpy as np
 from flexmanip_ros import estimator, pipeline
 from flexmanip_ros.cli.console import Report, require_matplotlib
 from flexmanip_ros.errors import BagError, FlexmanipError, MissingSignalError, ModelError, ParameterError, SignalError
+from flexmanip_ros.event_replay import FAR_EVENT_NS
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.outputs import TableOutput, check_place, open_output, write_rows, write_text
 from flexmanip_ros.numerics.background import REPLAY_THREADS, Threads, read_ahead
@@ -144,14 +145,16 @@ def identify(request: Request, progress: Report | None = None) -> Result:
                              'name two angles and, as outputs, half as many positions as the order; see '
                              'docs/moving_arm.md')
         write_rows(request.configurations, found.rows())
+    remark = '; '.join((*messages.far_events(), *_remarks(state, messages.foreign)))
     if request.report is not None and signals is not None:
         progress.phase('drawing the report')
-        _report(request, summary, messages, kept, signals, last, scores, state, fault, found)
+        _report(request, summary, messages, kept, signals, last, scores, state,
+                '; '.join(str(words) for words in (fault, remark) if words), found)
     return Result(
         summary, () if last is None else last.modes, state.config or request.config,
         tuple(str(place) for place in (request.output, request.report, request.save_arm, request.configurations)
               if place is not None), fault,
-        interrupted, messages.search(summary.status), _remark(state, messages.foreign))
+        interrupted, messages.search(summary.status), remark)
 
 
 class _Messages:
@@ -163,6 +166,8 @@ class _Messages:
         """Messages that hold none of the configured joints."""
         self.first_ns: int | None = None
         self.events: list[CaptureEvent] = []
+        self._recorded: list[CaptureEvent] = []
+        """The events that are neither given nor found in the signals."""
         self.is_kept = (request.smooth or request.validate_from is not None or request.report is not None
                         or request.configurations is not None)
         self._clock, self._log = sampling.Clock(), sampling.EMPTY
@@ -181,13 +186,27 @@ class _Messages:
         topics = bag.Topics(request.joint_states, request.events, request.events_required)
         watch = self._watch(topics)
         try:
-            items: Iterable[pipeline.Item] = bag.read_blocks(request.bag, topics, self._progress)
+            items: Iterable[pipeline.Item] = self._noted(bag.read_blocks(request.bag, topics, self._progress))
             if watch is not None:
                 items = capture_detection.with_detected(watch, items, self._findings)
             for item in items:
                 yield from self._event(item) if isinstance(item, CaptureEvent) else self._joint_states(item)
         except BagError as error:
             self.fault = error
+
+    def _noted(self, items: Iterable[pipeline.Item]) -> Iterator[pipeline.Item]:
+        for item in items:
+            if isinstance(item, CaptureEvent):
+                self._recorded.append(item)
+            yield item
+
+    def far_events(self) -> list[str]:
+        """Return what is wrong with each recorded event whose stamp is long before the first sample, and what to do."""
+        first_ns = self.first_ns or 0
+        return [f'the stamp of a {event.kind.value} is {event.stamp_ns * 1e-9:.6f}, '
+                f'{(first_ns - event.stamp_ns) * 1e-9:.0f} s before the first sample: stamp an event with the time of '
+                f'its samples, or give --{event.kind.value}-time'
+                for event in self._recorded if first_ns - event.stamp_ns > FAR_EVENT_NS]
 
     def _watch(self, topics: bag.Topics) -> capture_detection.Watch | None:
         """Return the detector where events are to be looked for in the signals; say why where they are not.
@@ -310,8 +329,8 @@ def _dropped(state: pipeline.State) -> FlexmanipError | None:
     return BagError(f'{words}; the last of them: {rejection.problem}', rejection.remedy)
 
 
-def _remark(state: pipeline.State, foreign: int) -> str:
-    """Return one line about messages left out and events not applied at their stamp; empty if there are none.
+def _remarks(state: pipeline.State, foreign: int) -> list[str]:
+    """Return what is to be said of messages left out and of events not applied at their stamp.
 
     foreign: number of messages of other publishers on the same topic, which are left out of this line.
     """
@@ -330,12 +349,12 @@ def _remark(state: pipeline.State, foreign: int) -> str:
         if events.late_events:
             parts.append(f'{events.late_events} events arrived more than rewind_time after their stamp; '
                         'they were applied on arrival')
-    return '; '.join(parts)
+    return parts
 
 
 def _report(request: Request, summary: Summary, messages: _Messages, kept: list[Estimate], signals: Signals,
             last: Estimate | None, scores: whole_recording.Scores | None, state: pipeline.State,
-            fault: FlexmanipError | None, found: whole_recording.Sweep | None) -> None:
+            fault: str, found: whole_recording.Sweep | None) -> None:
     from flexmanip_ros.io import plots, report
 
     assert request.report is not None
@@ -349,6 +368,6 @@ def _report(request: Request, summary: Summary, messages: _Messages, kept: list[
     counts: dict[str, Any] = {**state.counters._asdict(), 'dropped': state.counters.dropped}
     report.identification_report(
         request.report, Path(request.bag).name, config, summary, made,
-        None if last is None else last.model, scores, counts, bound, '' if fault is None else str(fault),
+        None if last is None else last.model, scores, counts, bound, fault,
         modes=() if last is None else last.modes, events=messages.search(summary.status),
         player=embedded(messages.screen, messages.events, kept), configurations=found)

@@ -85,13 +85,14 @@ def legend(ax: Any) -> None:
 
 
 def events(axes: Iterable[Any], found: Sequence[Event]) -> None:
-    """Mark captures and releases in every plot, named in the first."""
+    """Mark captures and releases in every plot, named in the first; those outside of its times are not named."""
     for index, ax in enumerate(axes):
         for time, kind in found:
             ax.axvline(time, color=EVENT_COLOUR, linestyle='--', linewidth=1.2)
             if index == 0:
                 ax.annotate(f'{kind.value} {time:.2f} s', (time, 1.0), xycoords=('data', 'axes fraction'),
-                            xytext=(3, 3), textcoords='offset points', color=EVENT_COLOUR, fontsize=9)
+                            xytext=(3, 3), textcoords='offset points', color=EVENT_COLOUR, fontsize=9,
+                            annotation_clip=True)
 
 
 def times(estimates: Sequence[Estimate], start_ns: int) -> Array:

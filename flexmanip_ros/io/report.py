@@ -159,7 +159,7 @@ def _answer(config: IdentifierParameters, summary: Summary, modes: Sequence[Mode
     parts = [f'<p class="changed">{escape(fault)}</p>'] if fault else []
     if summary.payload_ci95_kg is not None:
         since = summary.held_since_s
-        held = '' if since is None else f', since {since:.3f} s'
+        held = '' if since is None else f', since {since:.3f} s' if since >= 0.0 else ', since before the first sample'
         if summary.release_time_s is not None and since is None:
             held = f', since the release at {summary.release_time_s:.3f} s'
         parts.append(f'<p class="answer">Payload: {escape(summary.payload_text())}{held}.</p>')

@@ -112,7 +112,7 @@ def result_rows(summary: Summary, config: IdentifierParameters, modes: Sequence[
     """
     found = [('samples', f'{summary.samples}, {summary.gaps} gaps, sample time {_text(summary.sample_time_s)} s, '
               f'identified in {summary.wall_s:.2f} s'), *([('events', events)] if events else ())]
-    found += [(name, f'at {time:.3f} s') for name, time in (
+    found += [(name, f'at {time:.3f} s{", before the first sample" if time < 0.0 else ""}') for name, time in (
         ('capture', summary.capture_time_s), ('release', summary.release_time_s)) if time is not None]
     found.append(('status', f'{summary.status}: {status_text(Status[summary.status], config)}'))
     if summary.model_status not in (summary.status, Status.TRACKING.name):

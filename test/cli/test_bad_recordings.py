@@ -105,6 +105,29 @@ def test_an_event_without_a_stamp_is_applied_on_arrival_and_reported(capsys, tmp
     assert '1 events arrived more than rewind_time after their stamp' in err
 
 
+@pytest.mark.parametrize('kind', list(EventKind))
+@pytest.mark.parametrize('at', [0, 600], ids=['latched', 'in the middle'])
+def test_an_event_stamped_long_before_the_recording_is_reported_with_what_to_do(capsys, tmp_path, kind, at):
+    path = _bag(tmp_path / 'bag', _records(700), CaptureEvent(0, kind), at=at)
+    page = tmp_path / 'report.html'
+    status, found, err = _run(capsys, path, PLAIN, '--report', page)
+    assert status == 0
+    assert found[f'{kind.value}_time_s'] == -START / 1e9
+    words = (f'the stamp of a {kind.value} is 0.000000, 1700000000 s before the first sample: stamp an event with the '
+             f'time of its samples, or give --{kind.value}-time')
+    assert words in err
+    assert words in page.read_text(encoding='utf-8')
+    assert main([str(path), PLAIN]) == 0
+    assert 'at -1700000000.000 s, before the first sample' in capsys.readouterr().out
+
+
+def test_a_capture_before_the_recording_is_no_mistake_where_it_is_given_or_seconds_old(capsys, tmp_path):
+    path = _bag(tmp_path / 'bag', _records(700), CaptureEvent(START - 5000 * MS, EventKind.CAPTURE))
+    assert _run(capsys, path, PLAIN)[2] == ''
+    status, found, err = _run(capsys, _bag(tmp_path / 'other', _records(700)), PLAIN, '--capture-time=-3600')
+    assert (status, found['capture_time_s'], err) == (0, -3600.0, '')
+
+
 @pytest.mark.parametrize('option', ['--validate-from', '--capture-time', '--release-time'])
 @pytest.mark.parametrize('value', ['nan', 'inf', '-inf', '1e300', 'soon', ''])
 def test_a_time_that_is_none_is_one_line_and_exit_2(capsys, tmp_path, option, value):
