@@ -17,6 +17,7 @@ from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores, get_typestore
 
 from flexmanip_ros.errors import BagError
+from flexmanip_ros.io.bag import STORAGE, DamagedError, salvaged
 from flexmanip_ros.messages import Diagnostics, Inertia, LabelledArray
 from flexmanip_ros.types import CaptureEvent, JointRecord
 
@@ -85,7 +86,7 @@ class BagWriter:
                     self._flush()
             except OSError as err:
                 raise BagError(f"bag '{self.path}' cannot be written: {err.strerror}",
-                               'free some space; what was written before is kept') from err
+                               'free some space and write it again') from err
 
     def flush(self) -> None:
         """Flush now. A recorder calls this on a timer, as ``write`` flushes only when a message comes."""
@@ -123,8 +124,18 @@ class BagWriter:
             except OSError as err:
                 with contextlib.suppress(OSError):  # the rest of the buffer cannot be written either
                     self._writer.abort()
-                raise BagError(f"bag '{self.path}' cannot be finished: {err.strerror}",
-                               "free some space, then run 'ros2 bag reindex'; the messages are kept") from err
+                problem = f"bag '{self.path}' cannot be finished: {err.strerror}"
+                if self._holds_messages():
+                    raise BagError(f'{problem}; its end is missing, earlier messages are on the disk',
+                                   "free some space, then run 'ros2 bag reindex'") from err
+                raise BagError(f'{problem}; no message is on the disk', 'free some space, remove it, run again'
+                               ) from err
+
+    def _holds_messages(self) -> bool:
+        """Return whether a message can be read of a recording that was not finished."""
+        with contextlib.suppress(DamagedError, OSError):
+            return any(True for file in self.path.iterdir() if file.suffix in STORAGE for _ in salvaged(file))
+        return False
 
     def __enter__(self) -> BagWriter:
         return self

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import resource
 import shutil
 import threading
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -104,6 +106,29 @@ def test_an_exception_while_recording_leaves_a_whole_bag(tmp_path):
     with pytest.raises(TypeError), BagWriter(tmp_path / 'bag') as writer:
         writer.write('/joint_states', START, joint_state_record(0)) or writer.write('/x', START, 'a text')
     assert len(list(bag.read(tmp_path / 'bag'))) == 1
+
+
+@contextmanager
+def _file_size(limit):
+    """Limit the size of a file [bytes], as a full disk does."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize(('limit', 'words', 'least'), [
+    (100_000, "earlier messages are on the disk; free some space, then run 'ros2 bag reindex'", 100),
+    (100, 'no message is on the disk; free some space, remove it, run again', 0),
+])
+def test_a_recording_that_cannot_be_finished_says_whether_messages_are_kept(tmp_path, limit, words, least):
+    with pytest.raises(BagError, match=words), _file_size(limit):
+        write(tmp_path / 'bag', 2000)
+    kept = good_part(storage_file(tmp_path / 'bag'))[0]
+    assert len(kept) >= least
+    assert bool(kept) == bool(least)
 
 
 def test_a_killed_recorder_loses_only_what_was_not_flushed(tmp_path):
