@@ -153,7 +153,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
             self.state = self.state._replace(trusted_since=None)  # settle_time begins again
         report.values.update(
             sent=self.sent, sent_mass_kg='none' if self.state.sent is None else self.state.sent.mass,
-            trusted=self.state.trusted_since is not None, estimate_age_s='none' if math.isnan(age) else age,
+            trusted=self.state.trusted_since is not None, estimate_age_s=age,
             doubtful=self.doubtful)
         if self.problem:
             report.worse(ERROR, self.problem)

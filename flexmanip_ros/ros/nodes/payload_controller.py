@@ -272,7 +272,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         report.values.update(
             scheduled_payload_kg=float(self.state.payload[0]), trusted_payload_kg=float(self.state.trusted[0]),
             designs=self.state.designs, estimate='none' if verdict is None else verdict.value,
-            estimate_age_s='none' if math.isnan(age) else age)
+            estimate_age_s=age)
         if verdict not in (None, Verdict.TRUSTED):
             report.worse(WARN, f'payload estimate not trusted: {verdict.value}')
         if self.active and self.config.use_estimate and age > handover.LONGEST_AGE:  # false for NaN, before the first
