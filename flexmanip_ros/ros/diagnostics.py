@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import textwrap
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any
@@ -17,6 +18,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from flexmanip_ros.identification.realization import suggested_order
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload.structured_model import unobservable_reason
+from flexmanip_ros.samples.sampling import Clock
+from flexmanip_ros.samples.signals import Rejection
 from flexmanip_ros.types import Estimate, Status
 
 OK = 0
@@ -27,6 +30,12 @@ _SEVERITY = (OK, WARN, STALE, ERROR)
 """Levels from the least to the most severe: STALE (no messages) outranks a warning, an error outranks STALE."""
 RECENT_S = 60.0
 """Time for which a loss is a warning [s], so that an occasional reader of /diagnostics sees it."""
+LONGEST_LINE = 600
+"""Largest number of characters of an error in the log or in /diagnostics, which may quote a message of any length."""
+BUSY = 0.9
+"""Share of the time that a callback may take; beyond it messages wait, and are lost once the queue is full."""
+TOO_SLOW = 'samples come faster than they can be computed, or the computer is busy with other work, and wait'
+CLOCK = '/clock'
 
 
 @dataclass
@@ -38,6 +47,8 @@ class Report:
     words: list[str] = field(default_factory=list)
     waits_for: str = ''
     """Topic that the node needs and on which no message comes; empty when there is none."""
+    silence_s: float | None = None
+    """Time since the topics that the node needs ceased [s]; None where they never came since its activation."""
 
     def worse(self, level: int, words: str) -> None:
         """Note a problem."""
@@ -47,7 +58,17 @@ class Report:
     def silent(self, topic: str) -> None:
         """Note that no message comes on a topic that the node needs."""
         self.waits_for = topic
-        self.worse(STALE, f'no {topic}')
+        self.worse(STALE, self.silence(topic))
+
+    def silence(self, topic: str, none: str = 'no') -> str:
+        """Return 'no <topic>', with the time since it ceased, and for /clock why it is needed. none: replaces 'no'."""
+        since = '' if self.silence_s is None else f' for {self.silence_s:.0f} s'
+        return f'{none} {topic}{since}{" (use_sim_time is true)" if topic == CLOCK else ""}'
+
+    def busy(self, remedy: str) -> None:
+        """Warn where the callback takes more than ``BUSY`` of the time; the values of a ``Meter`` must be there."""
+        if self.values['callback_share'] > BUSY:
+            self.worse(WARN, f'{TOO_SLOW}: {remedy}')
 
     def message(self, node: str, namespace: str, stamp: Time) -> DiagnosticArray:
         """Return the entry as the message for /diagnostics; node: the fully qualified name of the node.
@@ -61,6 +82,16 @@ class Report:
         array = DiagnosticArray(status=[status])
         array.header.stamp = stamp
         return array
+
+
+def shortened(words: str) -> str:
+    """Return words with at most ``LONGEST_LINE`` characters."""
+    return textwrap.shorten(words, LONGEST_LINE, placeholder=' ...')
+
+
+def number(count: int, what: str) -> str:
+    """Return a count with its noun, such as '1 message' or '2 messages'."""
+    return f'{count} {what}' if count == 1 else f'{count} {what}s'
 
 
 def text(value: Any) -> str:
@@ -112,6 +143,28 @@ class Meter:
         }
 
 
+class Recent:
+    """Counts what happened in the last ``RECENT_S`` seconds, to a second."""
+
+    def __init__(self) -> None:
+        self._counts: deque[tuple[float, int]] = deque(maxlen=round(RECENT_S) + 1)
+        """Time [s] and count, in steps of a second at least."""
+
+    def add(self, count: int) -> None:
+        """Add what happens now; a count of zero changes nothing."""
+        now = time.monotonic()
+        if count and self._counts and now - self._counts[-1][0] < 1.0:
+            at, before = self._counts.pop()
+            self._counts.append((at, before + count))
+        elif count:
+            self._counts.append((now, count))
+
+    def count(self) -> int:
+        """Return the count of the last ``RECENT_S`` seconds."""
+        now = time.monotonic()
+        return sum(count for at, count in self._counts if now - at <= RECENT_S)
+
+
 class LossCounter:
     """Counts messages that were sent and never arrived, from the publishers' sequence numbers.
 
@@ -123,15 +176,15 @@ class LossCounter:
     def __init__(self) -> None:
         self.lost = 0
         """Number of messages lost since the node started."""
-        self._publishers = 1
+        self.publishers = 1
+        """Number of publishers on the topic, at least 1."""
         self._expected: list[int] = []
         """Next sequence number of each publisher from which a message arrived."""
-        self._losses: deque[tuple[float, int]] = deque()
-        """Time [s] and number of messages of each loss within ``RECENT_S``."""
+        self._losses = Recent()
 
     def matched(self, event: Any) -> None:
         """Process the matched event of the subscription: a publisher came or went."""
-        self._publishers = max(int(event.current_count), 1)
+        self.publishers = max(int(event.current_count), 1)
         if event.current_count_change < 0:
             self._expected = []
 
@@ -141,7 +194,7 @@ class LossCounter:
             return
         if number in self._expected:
             self._expected.remove(number)
-        elif len(self._expected) >= self._publishers:
+        elif len(self._expected) >= self.publishers:
             before = max((expected for expected in self._expected if expected < number), default=None)
             if before is None:  # a publisher started again without a matched event
                 self._expected.pop()
@@ -152,20 +205,100 @@ class LossCounter:
 
     def _add(self, count: int) -> None:
         self.lost += count
-        self._losses.append((time.monotonic(), count))
+        self._losses.add(count)
 
     def recent(self) -> int:
         """Return how many messages were lost in the last ``RECENT_S`` seconds."""
-        while self._losses and time.monotonic() - self._losses[0][0] > RECENT_S:
-            self._losses.popleft()
-        return sum(count for _, count in self._losses)
+        return self._losses.count()
 
     def report(self, report: Report, name: str, what: str) -> None:
-        """Add the total under a name, and a warning for losses in ``RECENT_S``. what: 'messages' or 'commands'."""
+        """Add the total under a name, and a warning for losses in ``RECENT_S``. what: 'message' or 'command'."""
         report.values[name] = self.lost
         recent = self.recent()
         if recent:
-            report.worse(WARN, f'{recent} {what} lost in the last {RECENT_S:.0f} s')
+            report.worse(WARN, f'{number(recent, what)} lost in the last {RECENT_S:.0f} s')
+
+
+class JointStateFaults:
+    """Counts the joint states that became no sample, and the jumps and gaps of their stamps.
+
+    Messages with none of the configured joints, such as those of a gripper on the same topic, are an error only while
+    no other message can be used.
+    """
+
+    def __init__(self, joints: Collection[str]) -> None:
+        self.losses = LossCounter()
+        self.foreign = 0
+        """Number of messages with none of the configured joints."""
+        self._joints = frozenset(joints)
+        self._dropped, self._resets, self._gaps, self._unordered = Recent(), Recent(), Recent(), Recent()
+        self._why = ''
+        """Why the latest message of the configured joints was dropped."""
+        self._is_used = False
+        """Whether a message became a sample since the last report."""
+        self._unused: Rejection | None = None
+        """Why the latest message that was dropped since the last report could not be used."""
+
+    def note(self, before: Clock, clock: Clock, names: Collection[str]) -> Rejection | None:
+        """Process the clock before and after messages with these names; return why some were dropped.
+
+        None is returned where none was dropped, and for messages with none of the configured joints.
+        """
+        then, now = before.counters, clock.counters
+        self._is_used |= now.accepted > then.accepted
+        self._resets.add(now.resets - then.resets)
+        self._gaps.add(now.gaps - then.gaps)
+        self._unordered.add(now.late_stamp + now.repeated_stamp - then.late_stamp - then.repeated_stamp)
+        dropped, rejection = now.dropped - then.dropped, clock.rejection
+        if not dropped or rejection is None:
+            return None
+        if self._joints.isdisjoint(names):
+            self.foreign += dropped
+            self._unused = self._unused or rejection
+            return None
+        self._dropped.add(dropped)
+        self._unused, self._why = rejection, shortened(f'{rejection.problem}; {rejection.remedy}')
+        return rejection
+
+    def likely_cause(self, topic: str) -> str:
+        """Return that the topic has several publishers where that explains the faults, otherwise ''.
+
+        Publishers of different joints on one topic are no fault. So the stamps must have jumped or come out of order,
+        or more than one gap a second was not caused by a loss; and where messages of other joints came, one publisher
+        is theirs.
+        """
+        gaps = self._gaps.count() - self.losses.recent()
+        is_likely = self._resets.count() or self._unordered.count() or gaps > RECENT_S
+        if self.losses.publishers - bool(self.foreign) < 2 or not is_likely:
+            return ''
+        return (f'{self.losses.publishers} publishers are on {topic}: only one may publish these joints, '
+                'with the stamps of one clock')
+
+    def jumped(self, topic: str) -> str:
+        """Return the words for stamps that jumped: how often they did lately, and the likely cause."""
+        count, cause = self._resets.count(), self.likely_cause(topic)
+        often = f' ({count} times in the last {RECENT_S:.0f} s)' if count > 1 else ''
+        return f'the stamps jumped or their rate changed{often}{": " if cause else ""}{cause}'
+
+    def report(self, report: Report, topic: str) -> Rejection | None:
+        """Report losses and faults; return why no message since the last report could be used, None where one was.
+
+        topic: the full name of the topic.
+        """
+        self.losses.report(report, 'lost', 'message')
+        report.values['foreign'] = self.foreign
+        unused, self._unused = None if self._is_used else self._unused, None
+        self._is_used = False
+        dropped, cause = self._dropped.count(), self.likely_cause(topic)
+        if unused is not None:
+            report.worse(ERROR, shortened(f'no message can be used: {unused.problem}; {unused.remedy}'))
+        elif dropped:
+            report.worse(WARN, f'{number(dropped, "message")} dropped in the last {RECENT_S:.0f} s: {self._why}')
+        if self._resets.count() > 1:
+            report.worse(WARN, self.jumped(topic))
+        elif cause:
+            report.worse(WARN, cause)
+        return unused
 
 
 ADVICE = {

@@ -3,7 +3,6 @@
 import argparse
 import math
 import sys
-import textwrap
 import time
 import traceback
 import warnings
@@ -32,16 +31,17 @@ from flexmanip_ros.errors import FlexmanipError, ParameterError
 from flexmanip_ros.io import cdr
 from flexmanip_ros.parameters.document import help_text
 from flexmanip_ros.ros import qos, rclpy_workarounds
-from flexmanip_ros.ros.diagnostics import ERROR, WARN, Report
+from flexmanip_ros.ros.diagnostics import CLOCK, ERROR, WARN, JointStateFaults, Report, shortened
 from flexmanip_ros.ros.parameters import NodeParameters, arm_line
+from flexmanip_ros.samples.signals import Rejection
 
 Config = TypeVar('Config')
 BAD_INPUT = 2
 """Exit code of a program whose arguments or parameters are wrong."""
 THROTTLE_S = 2.0
 """Shortest time between two log lines of a repeated error [s]: the log stays readable and does not fill the disk."""
-LONGEST_LINE = 600
-"""Largest number of characters of a logged error, which may quote a message of any length."""
+OTHERS = {'durability': ('volatile', 'transient_local'), 'reliability': ('best_effort', 'reliable')}
+"""What a publisher offers, and the subscription wants, where the two do not match: the only such pair of a policy."""
 
 
 class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
@@ -65,7 +65,9 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         self._unknown_to_rclpy = ExitStack()
         """Clean-up of the alarms and batches, which ``destroy_node`` of rclpy does not know."""
         self._logged_at: dict[str, float] = {}
-        self._waits_for = ''
+        self._waits_for = self._cause = ''  # the topic, and the cause of faults, in the last report
+        self._heard_at: float | None = None
+        """Time of the last report in which the node waited for nothing [s]; None while there was none."""
         try:
             self.autostarts = bool(self.declare_parameter(
                 'autostart', True, ParameterDescriptor(
@@ -162,7 +164,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
 
     def _activate(self) -> None:
         self.activated()
-        self.active, self._waits_for = True, ''
+        self.active, self._waits_for, self._heard_at = True, '', None
         self.get_logger().info(f'ready: {self.summary()}' if self.summary() else 'ready')
 
     def _deactivate(self) -> None:
@@ -230,10 +232,12 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
 
     def _incompatible(self, topic: str, event: Any) -> None:
         self._count(topic, 'incompatible_publishers', event.total_count)
-        policy = QoSPolicyKind(event.last_policy_kind).name.lower()
+        policy, full = QoSPolicyKind(event.last_policy_kind).name.lower(), self.resolve_topic_name(topic)
+        offered, wanted = OTHERS.get(policy, ('that this node cannot take', 'of another value'))
+        value = f':={offered}' if policy in OTHERS else ''
         self.get_logger().error(
-            f"a publisher of '{topic}' offers a {policy} that this node cannot take; publish with another one, or set "
-            f'qos_overrides.{self.resolve_topic_name(topic)}.subscription.{policy}')
+            f'a publisher of {full} offers {policy} {offered}, so none of its messages is received; publish with '
+            f'{policy} {wanted}, or start this node with -p qos_overrides.{full}.subscription.{policy}{value}')
 
     def stamp_of(self, raw: bytes) -> int | None:
         """Return the header stamp [ns] of a serialized JointState; log an error and return None if it is not CDR."""
@@ -245,16 +249,34 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
 
     # Log lines and diagnostics.
 
-    def log_throttled(self, reason: str, words: str) -> None:
-        """Log an error; errors of the same reason are logged at most once in ``THROTTLE_S``."""
+    def log_throttled(self, reason: str, words: str, *, is_error: bool = True) -> None:
+        """Log an error or a warning; those of the same reason are logged at most once in ``THROTTLE_S``."""
         now = time.monotonic()
-        if now - self._logged_at.get(reason, -math.inf) >= THROTTLE_S:
-            self._logged_at[reason] = now
-            self.get_logger().error(textwrap.shorten(words, LONGEST_LINE, placeholder=' ...'))
+        if now - self._logged_at.get(reason, -math.inf) < THROTTLE_S:
+            return
+        self._logged_at[reason] = now
+        if is_error:
+            self.get_logger().error(shortened(words))
+        else:  # rclpy raises where one line of code logs with two severities
+            self.get_logger().warning(shortened(words))
+
+    def log_dropped(self, why: Rejection | None) -> None:
+        """Log why a joint state was dropped, where there is a reason."""
+        if why is not None:
+            self.log_throttled(why.reason, f'message dropped: {why.problem}; {why.remedy}')
+
+    def report_faults(self, report: Report, faults: JointStateFaults) -> None:
+        """Report the faults of the joint states; log why none can be used, and once what the likely cause is."""
+        topic = self.resolve_topic_name('joint_states')
+        self.log_dropped(faults.report(report, topic))
+        before, self._cause = self._cause, faults.likely_cause(topic)
+        if self._cause and not before:
+            self.get_logger().warning(f'the stamps of the joint states are irregular: {self._cause}')
 
     def diagnose(self) -> None:
         """Publish the node's diagnostic entry; log when the messages that it needs stop or come."""
-        report = Report()
+        now = time.monotonic()
+        report = Report(silence_s=None if self._heard_at is None else now - self._heard_at)
         if self._entities_made:
             self.report(report)
         report.values['active'] = self.active
@@ -267,13 +289,26 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
             report.worse(ERROR, 'another node has the same name; stop one, or rename it with __node')
         if not self.active:
             report.words.insert(0, 'not active')
-        elif report.waits_for != self._waits_for:
-            self._waits_for = report.waits_for
-            self.get_logger().info(
-                f'waiting for {self.resolve_topic_name(report.waits_for)}' if report.waits_for
-                else f'messages arrive: {report.values["rate_hz"]:.0f} a second')
+        else:
+            self._log_silence(report)
+            self._heard_at = self._heard_at if report.waits_for else now
         self._diagnostics.publish(report.message(
             self.get_fully_qualified_name(), self.get_namespace(), self.get_clock().now().to_msg()))
+
+    def _log_silence(self, report: Report) -> None:
+        """Log when the messages that the node needs cease or come."""
+        before, self._waits_for = self._waits_for, report.waits_for
+        if report.waits_for == before:
+            return
+        topic = self.resolve_topic_name(report.waits_for or before)
+        if report.waits_for and report.silence_s is not None:
+            self.get_logger().warning(report.silence(topic))
+        elif report.waits_for:
+            self.get_logger().info(report.silence(topic, none='waiting for'))
+        elif before == CLOCK:
+            self.get_logger().info(f'{CLOCK} is there')
+        else:
+            self.get_logger().info(f'messages arrive: {report.values["rate_hz"]:.0f} a second')
 
 
 def _unused(message: Any) -> None:
@@ -299,8 +334,9 @@ class SampleGrid:
 
     def __init__(self, node: rclpy.node.Node, rate: float) -> None:
         self._ros = node.get_clock()
-        self.clock: Clock = self._ros if node.get_parameter('use_sim_time').value \
-            else Clock(clock_type=ClockType.STEADY_TIME)
+        self.is_simulated = bool(node.get_parameter('use_sim_time').value)
+        """Whether elapsed time is that of /clock."""
+        self.clock: Clock = self._ros if self.is_simulated else Clock(clock_type=ClockType.STEADY_TIME)
         self.rate = rate
         self.start_ns = 0
         self._origin_ns: int | None = None

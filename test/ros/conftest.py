@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -37,3 +38,29 @@ def ros(surroundings: None) -> Iterator[Ros]:
         yield made
     finally:
         made.close()
+
+
+@pytest.fixture
+def log(ros: Ros, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> Iterator[Callable[[str], str]]:
+    """Return a function that waits until a text was logged, and returns the log so far.
+
+    What is written while pytest reads what it captured is lost, so the standard error goes to a file from the first
+    call on. /rosout ends where an earlier node of the same name is collected.
+    """
+    path, before = tmp_path / 'stderr', ['']
+
+    def so_far() -> str:
+        return before[0] + path.read_text(encoding='utf-8')
+
+    with path.open('ab') as file:
+        def wait(text: str) -> str:
+            if not os.path.sameopenfile(file.fileno(), 2):
+                os.dup2(file.fileno(), 2)  # pytest puts its own back after the test
+                before[0] = capfd.readouterr().err
+            try:
+                ros.wait(lambda: text in so_far())
+            except AssertionError:
+                pytest.fail(f'{text!r} was not logged but\n{so_far()}')
+            return so_far()
+
+        yield wait

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -9,10 +10,13 @@ from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
 
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.diagnostics import LossCounter, Meter
+from flexmanip_ros.ros.diagnostics import JointStateFaults, LossCounter, Meter
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
+from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
+from flexmanip_ros.samples.sampling import Clock, Counters
 
 
 def entries(heard: list[DiagnosticArray], name: str) -> list[Any]:
@@ -45,6 +49,27 @@ def test_a_publisher_of_another_quality_of_service_is_an_error(ros: Ros) -> None
     ros.wait(lambda: any(status.level == b'\x02' and 'incompatible' in status.message
                          for status in entries(heard, 'capture_trigger')), what='the error')
     assert node.events['joint_states incompatible_publishers'] == 1
+
+
+def test_a_publisher_of_events_that_are_not_latched_is_told_the_policy_and_the_parameter(
+        ros: Ros, log: Callable[[str], str]) -> None:
+    ros.managed(PlantSimulator(context=ros.context, overrides=overrides(rate=100.0, arm__modes=1)))
+    ros.helper.create_publisher(Header, 'capture_event', 10)
+    log('a publisher of /capture_event offers durability volatile, so none of its messages is received; publish with '
+        'durability transient_local, or start this node with '
+        '-p qos_overrides./capture_event.subscription.durability:=volatile')
+
+
+def test_joint_states_that_cease_are_said_to_have_ceased_and_for_how_long(
+        ros: Ros, log: Callable[[str], str]) -> None:
+    heard = ros.listen(DiagnosticArray, '/diagnostics', 10)
+    ros.managed(CaptureTrigger(context=ros.context))
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    assert 'waiting for /joint_states' in log('waiting for /joint_states')
+    states.publish(joint_state(0))
+    log('messages arrive: ')
+    log('no /joint_states for ')
+    ros.wait(lambda: entries(heard, 'capture_trigger')[-1].message.startswith('no joint_states for '))
 
 
 def test_diagnostics_come_once_a_second_active_or_not(ros: Ros) -> None:
@@ -82,6 +107,17 @@ def test_losses_are_counted_from_numbers_and_a_new_publisher_is_none() -> None:
     for number in (1, 2, 5, 6, 1, 2, 4, None):
         losses.note(number)
     assert losses.lost == 2 + 1
+
+
+def test_several_publishers_are_a_likely_cause_of_gaps_that_no_loss_explains() -> None:
+    faults, clock = JointStateFaults(('joint1',)), Clock(counters=Counters(gaps=100))
+    faults.losses.publishers = 2
+    faults.note(Clock(), clock, ('joint1',))
+    assert faults.likely_cause('/joint_states').startswith('2 publishers are on /joint_states: ')
+    for number in (1, 1001, 2, 1102):  # those of two publishers; 100 of the second are missing
+        faults.losses.note(number)
+    assert faults.losses.recent() == 100
+    assert faults.likely_cause('/joint_states') == ''
 
 
 def test_a_meter_counts_times_and_begins_again() -> None:

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from joint_states import joint_state
 from rclpy.parameter import Parameter
 from ros_harness import Ros, overrides
@@ -36,6 +39,16 @@ def test_amplitude_and_offset_change_while_it_runs(ros: Ros) -> None:
     (result,) = node.set_parameters([Parameter('amplitude', value=[1.0, 2.0])])
     assert result.successful
     ros.wait(lambda: set(np.abs(heard[-1].data)) == {1.0, 2.0})
+
+
+def test_without_simulated_time_it_says_that_it_waits_for_the_clock(ros: Ros, log: Callable[[str], str]) -> None:
+    heard = ros.listen(DiagnosticArray, '/diagnostics', 10)
+    log('')
+    ros.managed(Excitation(context=ros.context, overrides=overrides(use_sim_time=True)))
+    log('clock /clock (use_sim_time is true)')
+    log('waiting for /clock (use_sim_time is true)')
+    status = ros.wait(lambda: next((item.status[0] for item in heard if '/clock' in item.status[0].message), 0))
+    assert (status.level, status.message) == (b'\x03', 'no /clock (use_sim_time is true)')
 
 
 def test_nothing_is_sent_before_it_is_active(ros: Ros) -> None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -40,32 +39,6 @@ NODES = (PlantSimulator, Excitation, CaptureTrigger, PayloadController, PayloadA
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = [path for path in sorted((ROOT / 'config').rglob('*.yaml'))
           if 'ros__parameters' in path.read_text(encoding='utf-8') and path.stem != 'ros2_control']  # other nodes' too
-
-
-@pytest.fixture
-def log(ros: Ros, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> Iterator[Callable[[str], str]]:
-    """Return a function that waits until a text was logged, and returns the log so far.
-
-    What is written while pytest reads what it captured is lost, so the standard error goes to a file from the first
-    call on. /rosout ends where an earlier node of the same name is collected.
-    """
-    path, before = tmp_path / 'stderr', ['']
-
-    def so_far() -> str:
-        return before[0] + path.read_text(encoding='utf-8')
-
-    with path.open('ab') as file:
-        def wait(text: str) -> str:
-            if not os.path.sameopenfile(file.fileno(), 2):
-                os.dup2(file.fileno(), 2)  # pytest puts its own back after the test
-                before[0] = capfd.readouterr().err
-            try:
-                ros.wait(lambda: text in so_far())
-            except AssertionError:
-                pytest.fail(f'{text!r} was not logged but\n{so_far()}')
-            return so_far()
-
-        yield wait
 
 
 @pytest.mark.parametrize('cls', NODES)

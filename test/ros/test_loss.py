@@ -26,7 +26,7 @@ def test_live_over_a_lossy_network_the_payload_is_trusted_and_a_replay_gives_the
     live = Live(ros)
     relay = ros.add(lossy.Relay(case, 1, context=ros.context))
     sent = ros.publisher(JointState, 'sent/joint_states', qos.sensor_output())
-    ros.wait(lambda: live.node.losses._publishers == 2, what='the relay at the identifier')
+    ros.wait(lambda: live.node.losses.publishers == 2, what='the relay at the identifier')
     live.events.publish(conversions.header(CAPTURE))
     samples = recording(2000)
     for first in range(0, len(samples), PORTION):

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -95,14 +96,14 @@ def test_two_publishers_with_numbers_of_their_own_are_no_loss(ros: Ros) -> None:
     node, _ = start(ros)
     node.trigger_activate()
     first, second = (ros.publisher(Float64MultiArray, 'effort_controller/commands') for _ in range(2))
-    ros.wait(lambda: node.lost_commands._publishers == 2)
+    ros.wait(lambda: node.lost_commands.publishers == 2)
     torque = 0.0
     for publisher in (*[first] * 50, second, first, second):
         torque += 1.0
         publisher.publish(Float64MultiArray(data=[torque, 1.0]))
         ros.wait(lambda torque=torque: node.efforts[0] == torque)
     ros.helper.destroy_publisher(second)
-    ros.wait(lambda: node.lost_commands._publishers == 1)
+    ros.wait(lambda: node.lost_commands.publishers == 1)
     first.publish(Float64MultiArray(data=[-1.0, 1.0]))
     ros.wait(lambda: node.efforts[0] == -1.0)
     assert node.lost_commands.lost == 0
@@ -175,6 +176,24 @@ def test_both_kinds_of_reader_match(ros: Ros) -> None:
     ros.wait(lambda: node.joint_states.get_subscription_count() == 2)
     node.trigger_activate()
     ros.wait(lambda: len(reliable) > 20 and len(best_effort) > 20)
+
+
+def test_without_simulated_time_it_says_that_it_waits_for_the_clock_until_it_comes(
+        ros: Ros, log: Callable[[str], str]) -> None:
+    heard = ros.listen(DiagnosticArray, '/diagnostics', 10)
+    node, samples = start(ros, use_sim_time=True)
+    node.trigger_activate()
+    log('waiting for /clock (use_sim_time is true)')
+    status = ros.wait(lambda: next((item.status[0] for item in heard if '/clock' in item.status[0].message), 0))
+    assert (status.level, status.message) == (b'\x03', 'no /clock (use_sim_time is true)')
+    clock, ticks = ros.publisher(Clock, '/clock', 10), iter(range(10**9, 10**12, STEP_NS))
+
+    def is_heard() -> bool:
+        clock.publish(Clock(clock=time_message(next(ticks))))
+        return bool(samples)
+
+    ros.wait(is_heard)
+    log('/clock is there')
 
 
 def test_simulated_time_drives_the_samples_and_a_jump_back_begins_anew(ros: Ros) -> None:

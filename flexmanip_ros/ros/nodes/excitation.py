@@ -19,7 +19,7 @@ from std_msgs.msg import Float64MultiArray
 from flexmanip_ros.parameters import ExcitationParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import NumbersWriter
-from flexmanip_ros.ros.diagnostics import WARN, Meter, Report
+from flexmanip_ros.ros.diagnostics import CLOCK, WARN, Meter, Report
 from flexmanip_ros.ros.node import FlexmanipNode, SampleGrid, run
 from flexmanip_ros.simulation import excitation
 from flexmanip_ros.types import Array
@@ -59,7 +59,9 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
         """Say which torque it is."""
         config = self.config
         peaks = ' and '.join(f'{peak:g}' for peak in config.amplitude)
-        return f'{config.shape} of {peaks} N m at {config.rate:g} Hz, clock {config.clock}'
+        is_simulated = self._timer is not None and self._grid.is_simulated
+        clock = f'{CLOCK} (use_sim_time is true)' if is_simulated else config.clock
+        return f'{config.shape} of {peaks} N m at {config.rate:g} Hz, clock {clock}'
 
     def activated(self) -> None:
         """Begin the sequence: sample 0 is now, or with ``clock: joint_states`` at the first joint state."""
@@ -112,6 +114,8 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
         report.values.update(self._meter.window(), skipped_instants=self.skipped, shape=self.config.shape)
         if self.active and self.config.clock == 'joint_states' and report.values['rate_hz'] == 0.0:
             report.silent('joint_states')
+        elif self.active and self._timer is not None and not self._grid.begun:
+            report.silent(CLOCK)
         elif self.active and report.values['rate_hz'] < 0.9 * self.config.rate:
             report.worse(WARN, f'{report.values["rate_hz"]:.0f} of {self.config.rate:.0f} commands a second')
 

@@ -140,7 +140,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
         now, samples = time.monotonic(), self._screen.samples
         report.values.update(self._meter.window())
         report.values['updates_hz'] = report.values['rate_hz']
-        self.losses.report(report, 'lost', 'messages')
+        self.losses.report(report, 'lost', 'message')
         if self.server is None:
             return
         report.values['rate_hz'] = (samples - self._reported) / max(now - self._asked, 1e-3)

@@ -23,7 +23,7 @@ from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateWriter, capture_event
-from flexmanip_ros.ros.diagnostics import ERROR, WARN, LossCounter, Meter, Report
+from flexmanip_ros.ros.diagnostics import CLOCK, ERROR, WARN, LossCounter, Meter, Report
 from flexmanip_ros.ros.node import FlexmanipNode, SampleGrid, run
 from flexmanip_ros.ros.rclpy_workarounds import sequence_number, with_info
 from flexmanip_ros.simulation import simulator
@@ -200,11 +200,13 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
                       rejected_events=self.rejected_events)
         if self._fault:
             report.worse(ERROR, self._fault)
+        elif self.active and not self._grid.begun:
+            report.silent(CLOCK)
         elif self.active and values['rate_hz'] < 0.9 * self.config.rate:
             report.worse(WARN, f'{values["rate_hz"]:.0f} of {self.config.rate:.0f} samples a second')
         if self.dropped_commands:
             report.worse(WARN, f'{self.dropped_commands} commands dropped')
-        self.lost_commands.report(report, 'lost_commands', 'commands')
+        self.lost_commands.report(report, 'lost_commands', 'command')
         if self.rejected_events:
             report.worse(WARN, f'{self.rejected_events} events rejected')
 
