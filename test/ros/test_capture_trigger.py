@@ -1,5 +1,10 @@
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from joint_states import START_NS, joint_state
 from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
@@ -7,7 +12,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters
-from flexmanip_ros.ros import qos
+from flexmanip_ros.ros import diagnostics, qos
 from flexmanip_ros.ros.conversions import joint_state as joint_state_message
 from flexmanip_ros.ros.conversions import stamp_ns
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
@@ -105,3 +110,63 @@ def test_mode_auto_finds_a_capture_and_tells_it_where_the_plant_does_not_listen(
     assert abs(stamp_ns(detected[0].stamp) - capture.stamp_ns) < 30_000_000
     assert node.detected == 1
     assert commanded == []
+
+
+class Auto:
+    """The trigger in mode auto, with the diagnostics that it published."""
+
+    def __init__(self, ros: Ros) -> None:
+        self.ros = ros
+        self.heard = ros.listen(DiagnosticArray, '/diagnostics', 10)
+        self.node = ros.managed(CaptureTrigger(context=ros.context, overrides=overrides(mode='auto')))
+        self.states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+
+    def send(self, *samples: int, start_ns: int = START_NS) -> None:
+        """Publish these samples and wait until they are taken, in portions that no queue overflows at."""
+        for first in range(0, len(samples), 200):
+            part = samples[first:first + 200]
+            until = self.node._watch.clock.counters.received + len(part)
+            for k in part:
+                self.states.publish(joint_state(k, start_ns=start_ns))
+            self.ros.wait(lambda until=until: self.node._watch.clock.counters.received >= until)
+
+    def wait(self, words: str) -> DiagnosticStatus:
+        """Return the first diagnostic entry that has these words."""
+        return self.ros.wait(lambda: next((m.status[0] for m in self.heard if words in m.status[0].message), None),
+                             what=words)
+
+
+def test_mode_auto_counts_what_it_lost_while_it_was_held_up_and_warns(
+        ros: Ros, log: Callable[[str], str]) -> None:
+    auto, release = Auto(ros), threading.Event()
+    auto.send(*range(600))
+    spun = auto.ros._of(auto.node)
+    spun.jobs.append(release.wait)
+    for k in range(600, 3000):
+        auto.states.publish(joint_state(k))
+    release.set()
+    ros.wait(lambda: auto.node._watch.clock.counters.received + auto.node.faults.losses.lost == 3000)
+    assert auto.node.faults.losses.lost > 0
+    log('the detection begins again after a gap in the joint states: a capture or release in the gap, or within 0.5 s '
+        'after it, is not found')
+    status = auto.wait('messages lost in the last 60 s')
+    assert status.level == b'\x01'
+    assert 'restart of the detection in the last 60 s' in auto.wait('restart').message
+
+
+def test_mode_auto_says_that_a_jump_of_the_stamps_began_the_detection_again(
+        ros: Ros, log: Callable[[str], str]) -> None:
+    auto = Auto(ros)
+    auto.send(*range(600))
+    log('')
+    auto.send(*range(100), start_ns=START_NS - 10**10)
+    log('the detection begins again with an empty arm: the stamps jumped or their rate changed')
+    auto.wait('1 restart of the detection')
+
+
+def test_mode_auto_warns_where_samples_come_faster_than_they_are_computed(
+        ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(diagnostics, 'BUSY', 1e-6)  # this machine may be fast
+    auto = Auto(ros)
+    auto.send(*range(200))
+    auto.wait(f'{diagnostics.TOO_SLOW}: publish joint states less often')

@@ -28,8 +28,9 @@ from flexmanip_ros.parameters import TriggerParameters
 from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, header
-from flexmanip_ros.ros.diagnostics import Meter, Report
+from flexmanip_ros.ros.diagnostics import RECENT_S, WARN, JointStateFaults, Meter, Recent, Report, number
 from flexmanip_ros.ros.node import FlexmanipNode, run
+from flexmanip_ros.ros.rclpy_workarounds import sequence_number, with_info
 from flexmanip_ros.samples.signals import joints
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, events_at
 
@@ -46,6 +47,11 @@ def warm_up(config: TriggerParameters) -> None:
     for k in range(WARM_UP_SAMPLES):
         wave = np.array([math.sin(0.05 * k * (i + 1)) for i in range(len(names))]) * 1e-3
         watch, _ = capture_detection.look(watch, JointRecord(k * 1_000_000, names, wave, wave * 0.0, wave * 1e3))
+
+
+def _began(watch: capture_detection.Watch) -> int | None:
+    """Return the row at which the detection began, or began again after a gap; None before it does."""
+    return None if watch.state is None else watch.state.since
 
 
 class CaptureTrigger(FlexmanipNode[TriggerParameters]):
@@ -65,12 +71,16 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         self.detected = self.announced = 0
         """Number of events published on capture_detected, and on capture_event."""
         self.latest: CaptureEvent | None = None
+        self.faults = JointStateFaults(joints(self.config))
+        self._restarts = Recent()
+        """How often the detection began again, after a gap or a jump of the stamps."""
 
     def make_entities(self) -> None:
         """Create the publishers, the subscription and the services."""
         self.events_publisher = self.publisher(Header, 'capture_event', qos.latched())
         self.detected_publisher = self.publisher(Header, 'capture_detected', qos.latched())
-        self.subscription(JointState, 'joint_states', self._on_joint_states, qos.sensor_input(), raw=True)
+        self.subscription(JointState, 'joint_states', with_info(self._on_joint_states), qos.sensor_input(), raw=True,
+                          matched=self.faults.losses.matched)
         self.create_service(Trigger, '~/capture', lambda _, response: self._requested(EventKind.CAPTURE, response))
         self.create_service(Trigger, '~/release', lambda _, response: self._requested(EventKind.RELEASE, response))
 
@@ -93,7 +103,8 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         self._first_ns = self._last_ns = self._before_ns = self.latest = None
         self._pending = ()
 
-    def _on_joint_states(self, raw: bytes) -> None:
+    def _on_joint_states(self, raw: bytes, info: object) -> None:
+        self.faults.losses.note(sequence_number(info))
         if not self.active:
             return
         with self._meter:
@@ -127,10 +138,19 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         for event in events:
             self._publish(self.detected_publisher, event, 'detected ')
             self.detected += 1
-        rejection = watch.clock.rejection
-        if watch.clock.counters.dropped > before.clock.counters.dropped and rejection is not None:
-            self.log_throttled(rejection.reason, f'message dropped: {rejection.problem}; {rejection.remedy}')
+        self.log_dropped(self.faults.note(before.clock, watch.clock, record.names))
+        began = _began(before)
+        if began is not None and _began(watch) != began:
+            self._log_restart(watch.clock.counters.resets > before.clock.counters.resets)
         return watch
+
+    def _log_restart(self, jumped: bool) -> None:
+        """Warn that the detection began again. jumped: after a jump of the stamps, otherwise after a gap."""
+        self._restarts.add(1)
+        words = (f'with an empty arm: {self.faults.jumped(self.resolve_topic_name("joint_states"))}' if jumped else
+                 'after a gap in the joint states: a capture or release in the gap, or within '
+                 f'{capture_detection.SETTLE:g} s after it, is not found')
+        self.log_throttled('restart', f'the detection begins again {words}', is_error=False)
 
     def _begin(self, stamp: int) -> None:
         """Plan the events of mode time from the first stamp."""
@@ -176,13 +196,19 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         return response
 
     def report(self, report: Report) -> None:
-        """Report the rate of the joint states and the number of announced events."""
+        """Report the rate of the joint states, losses, faults and restarts of the detection, and the events."""
         report.values.update(self._meter.window(), mode=self.config.mode, announced=self.announced,
                              pending=len(self._pending))
+        self.report_faults(report, self.faults)
+        report.busy('publish joint states less often, or end other programs')
         if self._watch is not None:
             statistic, threshold = self._watch.statistic
-            report.values.update(detected=self.detected, dropped=self._watch.clock.counters.dropped,
+            counters, restarts = self._watch.clock.counters, self._restarts.count()
+            report.values.update(counters._asdict(), dropped=counters.dropped, detected=self.detected,
                                  statistic=statistic, threshold=threshold)
+            if restarts:
+                report.worse(WARN, f'{number(restarts, "restart")} of the detection in the last {RECENT_S:.0f} s: '
+                             'a capture or release may have been missed')
         if self.active and report.values['rate_hz'] == 0.0:
             report.silent('joint_states')
 
