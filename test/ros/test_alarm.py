@@ -12,8 +12,7 @@ from identifier_harness import Live, recording
 from rclpy.node import Node
 from ros_harness import Ros
 
-from flexmanip_ros.ros import conversions
-from flexmanip_ros.ros.nodes import rpbsid_identifier
+from flexmanip_ros.ros import conversions, diagnostics
 from flexmanip_ros.ros.rclpy_workarounds import Alarm
 
 
@@ -63,10 +62,10 @@ def test_diagnostics_come_once_a_second_while_samples_are_taken(ros: Ros) -> Non
 def test_samples_that_come_faster_than_they_are_computed_are_a_warning(
     ros: Ros, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(rpbsid_identifier, 'BUSY', 1e-6)  # this machine may be fast
+    monkeypatch.setattr(diagnostics, 'BUSY', 1e-6)  # this machine may be fast
     live = Live(ros, payload_method='none')
     live.send(*recording()[:200])
-    ros.wait(lambda: any(rpbsid_identifier.TOO_SLOW in message.status[0].message for message in _own(live.diagnostics)))
+    ros.wait(lambda: any(diagnostics.TOO_SLOW in message.status[0].message for message in _own(live.diagnostics)))
 
 
 def _own(heard: list[DiagnosticArray]) -> list[DiagnosticArray]:

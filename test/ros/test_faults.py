@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 
 import numpy as np
 from identifier_harness import CAPTURE, START_NS, Live, recording, replayed
@@ -175,3 +176,72 @@ def test_a_release_without_a_capture_and_two_captures_claim_nothing_wrong(ros: R
     ros.wait(lambda: live.node.state.payload.repeated_events == 1)
     live.send(*samples[200:])
     assert honest(believed(live), TRUTH)
+
+
+def renamed(record: JointRecord, *names: str) -> JointRecord:
+    """Return a record whose joints have other names."""
+    return record._replace(names=names)
+
+
+def message_with(live: Live, words: str) -> str:
+    """Return the first diagnostic message that has these words."""
+    return str(live.ros.wait(lambda: next(
+        (status.message for message in live.diagnostics for status in message.status if words in status.message), ''),
+        what=words))
+
+
+def test_two_publishers_on_two_clocks_are_named_and_the_resets_logged_once_in_two_seconds(
+        ros: Ros, log: Callable[[str], str]) -> None:
+    live = Live(ros, payload_method='none')
+    other = ros.helper.create_publisher(JointState, 'joint_states', qos.sensor_output())
+    ros.wait(lambda: live.node.losses.publishers == 2)
+    log('')
+    began = time.monotonic()
+    samples = recording(700)
+    for k in range(0, 700, 50):
+        for sample in samples[k:k + 50]:
+            live.joint_states.publish(conversions.joint_state(sample))
+        other.publish(conversions.joint_state(samples[k]._replace(stamp_ns=k * 10**6)))
+        ros.wait(lambda k=k: live.node.state.counters.received >= (k // 50 + 1) * 51)
+    assert live.node.state.counters.resets > 5
+    cause = '2 publishers are on /joint_states: only one may publish these joints, with the stamps of one clock'
+    assert cause in message_with(live, 'the stamps jumped or their rate changed (')
+    log(f'the stamps of the joint states are irregular: {cause}')
+    lines = log(cause).count('everything identified is forgotten: the stamps jumped')
+    assert 1 <= lines <= 1 + (time.monotonic() - began) / 2.0
+
+
+def test_two_publishers_of_different_joints_are_no_fault(ros: Ros, log: Callable[[str], str]) -> None:
+    live = Live(ros, payload_method='none')
+    gripper = ros.helper.create_publisher(JointState, 'joint_states', qos.sensor_output())
+    ros.wait(lambda: live.node.losses.publishers == 2)
+    log('')
+    for k, sample in enumerate(recording(600)):
+        live.joint_states.publish(conversions.joint_state(sample))
+        if k % 10 == 0:
+            gripper.publish(conversions.joint_state(renamed(sample, 'f1', 'f2', 'f3', 'f4')))
+        if k % 100 == 99:
+            ros.wait(lambda k=k: live.node.state.counters.accepted == k + 1)
+    ros.wait(lambda: live.node.faults.foreign == 60)
+    reports = len(live.diagnostics)
+    ros.wait(lambda: len(live.diagnostics) > reports + 1)
+    said = ' '.join(status.message for message in live.diagnostics for status in message.status)
+    assert 'publishers' not in said
+    assert 'dropped' not in said
+    assert 'message dropped' not in log('')
+
+
+def test_where_no_message_can_be_used_the_diagnostics_and_the_log_say_why(
+        ros: Ros, log: Callable[[str], str]) -> None:
+    live = Live(ros, payload_method='none')
+    log('')
+    live.send(*(renamed(sample, 'f1', 'f2', 'f3', 'f4') for sample in recording(50)))
+    words = "'joint1/effort' of parameter 'inputs' is not in the messages; the joints there are: f1, f2, f3, f4"
+    assert message_with(live, 'no message can be used: ').startswith(f'no message can be used: {words}')
+    log(f'message dropped: {words}')
+
+
+def test_a_drop_is_a_warning_with_its_reason(ros: Ros) -> None:
+    live = Live(ros, payload_method='none')
+    live.send(*recording(100), recording(100)[-1])
+    assert '1 message dropped in the last 60 s: header stamps do not advance; ' in message_with(live, 'dropped')

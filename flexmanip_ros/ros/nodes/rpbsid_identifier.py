@@ -46,11 +46,12 @@ from flexmanip_ros.ros.conversions import JointStateReader, capture_event, to_me
 from flexmanip_ros.ros.diagnostics import (
     ERROR,
     UNANNOUNCED,
-    WARN,
-    LossCounter,
+    JointStateFaults,
     Meter,
     Report,
+    number,
     report_estimate,
+    shortened,
     status_line,
 )
 from flexmanip_ros.ros.node import FlexmanipNode, run
@@ -86,10 +87,9 @@ SHORTEST_WAIT_S = 0.00025
 MOST_DOUBLED = 7
 """Number of times that ``SHORTEST_WAIT_S`` doubles, until it is more than ``LONGEST_WAIT_S``."""
 
-BUSY = 0.9
-"""Share of the time that the callback may take; beyond it samples wait, and are lost once 1000 do."""
-TOO_SLOW = ('samples come faster than they can be computed, and wait: publish joint states less often, or name fewer '
-            'parameters in payload.learn (small arms with Coulomb friction need many steps a sample)')
+FASTER = ('publish joint states less often, end other programs, or name fewer parameters in payload.learn (small arms '
+          'with Coulomb friction need many steps a sample)')
+"""What a user can do where the callback is busy."""
 
 WARM_UP_EVENT = 40
 """Number of samples before the event of the warm-up, more than are needed to learn the sample time."""
@@ -145,7 +145,10 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self.estimate: Estimate | None = None
         """The latest estimate: the last one published, or that of a saved state."""
         self.rejected = self.published = 0
-        self.losses = LossCounter()
+        self.problem = ''
+        """Why the latest message was rejected."""
+        self.faults = JointStateFaults(joints(self.config))
+        self.losses = self.faults.losses
         self.meter = Meter()
         self._reader = JointStateReader()
         self._background = Deferred()
@@ -310,21 +313,18 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def _step(self, item: JointBlock | CaptureEvent) -> None:
         """Take one step of the pipeline and publish; a message that cannot be used is counted and logged."""
-        before = self.state.clock.counters
+        before = self.state.clock
         try:
             self.state, estimates = pipeline.step(self.config, self.state, item, self._background)
         except FlexmanipError as error:
             self._reject('configuration', str(error), len(item.stamp_ns) if isinstance(item, JointBlock) else 1)
             return
         self._publish(estimates)
-        clock = self.state.clock
-        if clock.counters is before:
-            return
-        if clock.counters.dropped > before.dropped and clock.rejection is not None:
-            self.log_throttled(
-                clock.rejection.reason, f'message dropped: {clock.rejection.problem}; {clock.rejection.remedy}')
-        if clock.counters.resets > before.resets:
-            self.get_logger().warning('the stamps jumped or their rate changed: everything identified is forgotten')
+        if isinstance(item, JointBlock):
+            self.log_dropped(self.faults.note(before, self.state.clock, item.names))
+        if self.state.counters.resets > before.counters.resets:
+            self.log_throttled('reset', 'everything identified is forgotten: '
+                               + self.faults.jumped(self.resolve_topic_name('joint_states')), is_error=False)
 
     def _publish(self, estimates: tuple[Estimate, ...]) -> None:
         """Publish what is new in each estimate."""
@@ -359,6 +359,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def _reject(self, reason: str, words: str, count: int = 1) -> None:
         self.rejected += count
+        self.problem = shortened(words)
         self.log_throttled(reason, words)
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -372,7 +373,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         """Report the rate, losses, drops by reason, and the quality of the latest estimate."""
         values, counters = report.values, self.state.counters
         values.update(self.meter.window())
-        self.losses.report(report, 'lost', 'messages')
+        self.report_faults(report, self.faults)
         values.update(counters._asdict(), dropped=counters.dropped, rejected=self.rejected)
         if self._checkpoints is not None:
             values['checkpoints'] = self._checkpoints.saves
@@ -384,12 +385,9 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
                           rewinds=events.rewinds, outliers=identifier.estimator.outliers)
         if self.active and values['rate_hz'] == 0.0:
             report.silent('joint_states')
-        if values['callback_share'] > BUSY:
-            report.worse(WARN, TOO_SLOW)
+        report.busy(FASTER)
         if self.rejected:
-            report.worse(ERROR, f'{self.rejected} messages rejected')
-        if counters.dropped:
-            report.worse(WARN, f'{counters.dropped} messages dropped')
+            report.worse(ERROR, f'{number(self.rejected, "message")} rejected: {self.problem}')
         report_estimate(report, self.estimate, self.config.order)
         if self.active and self.estimate is not None:
             self._log_estimate(self.estimate)
