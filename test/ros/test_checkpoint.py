@@ -1,14 +1,17 @@
 from __future__ import annotations
 
+import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from identifier_harness import CAPTURE, Live, recording, replayed
-from ros_harness import Ros
+from ros_harness import Ros, overrides
 
 from flexmanip_ros import messages
 from flexmanip_ros.ros import conversions
 from flexmanip_ros.ros.demo import compare
+from flexmanip_ros.ros.nodes.rpbsid_identifier import RpbsidIdentifier
 from flexmanip_ros.types import CaptureEvent, EventKind
 
 
@@ -46,6 +49,32 @@ def test_states_are_saved_while_it_runs(ros: Ros, tmp_path: Path) -> None:
     ros.wait(lambda: live.node._checkpoints.saves >= 1, what='a saved state')
     assert (tmp_path / 'state').stat().st_size > 1000
     live.node._checkpoints.join()
+
+
+def test_a_state_that_cannot_be_saved_is_logged_once_while_it_runs_and_at_the_end(
+        ros: Ros, tmp_path: Path, log: Callable[[str], str]) -> None:
+    folder = tmp_path / 'folder'
+    folder.mkdir()
+    live = Live(ros, checkpoint_file=str(folder / 'state'), checkpoint_period=0.1, payload_method='none')
+    shutil.rmtree(folder)
+    samples = iter(recording())
+    ros.wait(lambda: live.send(next(samples)) or live.node._checkpoints.problem, what='a save that fails')
+    problem = f"checkpoint '{folder / 'state'}' cannot be written: No such file or directory"
+    log(problem)
+    reports = len(live.diagnostics)
+    ros.wait(lambda: len(live.diagnostics) >= reports + 2, what='two more reports')
+    assert log(problem).count(problem) == 1
+    live.finish()
+    log(f'the last state was not saved: {problem}')
+
+
+def test_a_checkpoint_file_in_no_folder_is_refused_when_the_node_is_configured(
+        ros: Ros, tmp_path: Path, log: Callable[[str], str]) -> None:
+    node = ros.add(RpbsidIdentifier(context=ros.context, overrides=overrides(
+        checkpoint_file=str(tmp_path / 'none' / 'state'))))
+    log('')
+    ros.run(node, lambda: node.autostart() and ros.helper.get_logger().error('it started'))
+    assert 'it started' not in log(f"checkpoint_file cannot be written: '{tmp_path / 'none'}' is no folder")
 
 
 def test_a_state_of_other_parameters_or_damaged_or_old_is_not_used_and_the_node_starts_anew(

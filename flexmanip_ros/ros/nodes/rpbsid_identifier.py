@@ -23,6 +23,7 @@ import time
 from collections.abc import Collection, Iterator
 from functools import partial
 from itertools import chain, islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from flexmanip_ros import messages, pipeline
-from flexmanip_ros.errors import CheckpointError, FlexmanipError, SignalError
+from flexmanip_ros.errors import CheckpointError, FlexmanipError, ParameterError, SignalError
 from flexmanip_ros.identification import batch_fit, recursive_fit
 from flexmanip_ros.io.checkpoint import CheckpointWriter, too_old
 from flexmanip_ros.numerics.background import Deferred
@@ -158,7 +159,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self._heard: list[CaptureEvent] = []
         """The events since then; they count whatever the age of the saved state is."""
         self._logged: dict[str, object] = {}
-        """What was last logged, by kind: status, trusted payload and missing announcement."""
+        """What was last logged, by kind: status, trusted payload, missing announcement and failed checkpoint."""
         self._latest: JointRecord | None = None
         """The latest joint state that is not drawn yet."""
         self._lag_ns: int | None = None
@@ -181,7 +182,14 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self.create_timer(1.0 / ARM_RATE, self._draw, clock=self._steady)
 
     def start(self) -> None:
-        """Compile or load every kernel before the first sample; begin with nothing known, or from a checkpoint."""
+        """Compile or load every kernel before the first sample; begin with nothing known, or from a checkpoint.
+
+        Raises ParameterError when the folder of ``checkpoint_file`` does not exist.
+        """
+        folder = Path(self.config.checkpoint_file).parent
+        if self.config.checkpoint_file and not folder.is_dir():
+            raise ParameterError(f"checkpoint_file cannot be written: '{folder}' is no folder",
+                                 'make it, or give another checkpoint_file')
         warm_up(self.config)
         self._forget()
         self._checkpoints = CheckpointWriter(self.config) if self.config.checkpoint_file else None
@@ -215,6 +223,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         if self._checkpoints is not None:
             self._checkpoints.join()
             self._checkpoints.save(self.config, self.state)
+            if self._checkpoints.problem:
+                self.get_logger().error(f'the last state was not saved: {self._checkpoints.problem}')
 
     def configuration_changed(self, config: IdentifierParameters, names: Collection[str]) -> None:
         """Continue with the changed parameters; the samples before the change are taken with the former ones."""
@@ -377,8 +387,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         values.update(counters._asdict(), dropped=counters.dropped, rejected=self.rejected)
         if self._checkpoints is not None:
             values['checkpoints'] = self._checkpoints.saves
-            if self._checkpoints.problem:
-                report.worse(ERROR, self._checkpoints.problem)
+            self._report_checkpoint(report, self._checkpoints.problem)
         events, identifier = self.state.payload, self.state.identifier
         if events is not None and identifier is not None:
             values.update(late_events=events.late_events, repeated_events=events.repeated_events,
@@ -391,6 +400,14 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         report_estimate(report, self.estimate, self.config.order)
         if self.active and self.estimate is not None:
             self._log_estimate(self.estimate)
+
+    def _report_checkpoint(self, report: Report, problem: str) -> None:
+        """Report why the last state could not be saved, and log it once."""
+        if problem:
+            report.worse(ERROR, problem)
+            if self._logged.get('checkpoint') != problem:
+                self.get_logger().error(problem)
+        self._logged['checkpoint'] = problem
 
     def _log_estimate(self, estimate: Estimate) -> None:
         """Log each change of the status, a payload when it is first trusted, and that a capture seems unannounced."""
