@@ -347,8 +347,11 @@ def _remarks(state: pipeline.State, foreign: int) -> list[str]:
         parts += [f'a {event.kind.value} has a stamp after the last sample and was not applied'
                  for event in events.pending]
         if events.late_events:
-            parts.append(f'{events.late_events} events arrived more than rewind_time after their stamp; '
-                        'they were applied on arrival')
+            one = events.late_events == 1
+            parts.append(f'{events.late_events} {"event" if one else "events"} arrived more than rewind_time after '
+                         f'{"its stamp and was" if one else "their stamps and were"} applied on arrival: the samples '
+                         'between were estimated as if nothing had been caught or released; raise rewind_time, or '
+                         'announce events earlier')
     return parts
 
 

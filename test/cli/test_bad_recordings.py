@@ -102,7 +102,7 @@ def test_an_event_without_a_stamp_is_applied_on_arrival_and_reported(capsys, tmp
     status, _, err = _run(capsys, _bag(tmp_path / 'bag', _records(700), CaptureEvent(0, EventKind.CAPTURE),
                                        at=600), PLAIN)
     assert status == 0
-    assert '1 events arrived more than rewind_time after their stamp' in err
+    assert '1 event arrived more than rewind_time after its stamp' in err
 
 
 @pytest.mark.parametrize('kind', list(EventKind))

@@ -37,6 +37,7 @@ from visualization_msgs.msg import MarkerArray
 
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.errors import CheckpointError, FlexmanipError, ParameterError, SignalError
+from flexmanip_ros.event_replay import FAR_EVENT_NS
 from flexmanip_ros.identification import batch_fit, recursive_fit
 from flexmanip_ros.io.checkpoint import CheckpointWriter, too_old
 from flexmanip_ros.numerics.background import Deferred
@@ -69,8 +70,6 @@ TOPICS = {
     messages.STATUS: (DiagnosticArray, qos.latched), messages.ARM_PARAMETERS: (Float64MultiArray, qos.latched),
 }
 """Message type and quality of service of each output topic."""
-FAR_EVENT_NS = 10_000_000_000
-"""Time between an event and the last sample beyond which the stamp is probably of another clock, or zero [ns]."""
 ARM = 'arm'
 ARM_RATE = 25.0
 """Rate at which the markers of the arm are published [Hz]."""
