@@ -42,9 +42,12 @@ class Leaf:
     @property
     def range_words(self) -> str:
         """The inclusive range with its unit, as an error message asks for it."""
-        low = '-inf' if self.low is None else f'{self.low:g}'
-        high = 'inf' if self.high is None else f'{self.high:g}'
-        return f'a value from {low} to {high} {self.unit}'.rstrip()
+        if self.low is None and self.high is None:
+            return 'a finite number'
+        if self.high is None:
+            return f'a value of at least {self.low:g} {self.unit}'.rstrip()
+        low = 'up' if self.low is None else f'from {self.low:g}'
+        return f'a value {low} to {self.high:g} {self.unit}'.rstrip()
 
 
 def parameter(default: Any, words: str, *, unit: str = '', low: float | None = None, high: float | None = None,
@@ -150,7 +153,7 @@ def fit_links(config: Any, links: int) -> None:
         if value == leaf.default:
             value = of_links(value, links)
         if len(value) != wanted:
-            raise ParameterError(f"parameter '{leaf.name}' has {len(value)} elements, but the arm has {links} links",
+            raise ParameterError(f"parameter '{leaf.name}' has {len(value)} elements, but arm.link_length has {links}",
                                  f'give {wanted} {WANTED[leaf.kind][1]}')
         object.__setattr__(config, leaf.name, value)
 
@@ -182,7 +185,7 @@ def _check_one(leaf: Leaf, value: Any) -> Any:
         raise ParameterError(f"parameter '{leaf.name}' is {value!r}", f'give {WANTED[leaf.kind][leaf.is_array]}')
     if isinstance(converted, float) and not math.isfinite(converted):
         what = 'not a number' if math.isnan(converted) else 'infinite'
-        raise ParameterError(f"parameter '{leaf.name}' is {what}", f'give {leaf.range_words}, finite')
+        raise ParameterError(f"parameter '{leaf.name}' is {what}", f'give {leaf.range_words}')
     if leaf.choices and converted not in leaf.choices:
         raise ParameterError(f"parameter '{leaf.name}' is {converted!r}", f'choose one of {", ".join(leaf.choices)}')
     below = leaf.low is not None and converted < leaf.low
