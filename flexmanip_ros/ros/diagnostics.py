@@ -34,7 +34,7 @@ LONGEST_LINE = 600
 """Largest number of characters of an error in the log or in /diagnostics, which may quote a message of any length."""
 BUSY = 0.9
 """Share of the time that a callback may take; beyond it messages wait, and are lost once the queue is full."""
-TOO_SLOW = 'samples come faster than they can be computed, or the computer is busy with other work, and wait'
+TOO_SLOW = 'samples wait: they come faster than they can be computed, or the computer is busy with other work'
 CLOCK = '/clock'
 
 

@@ -40,7 +40,7 @@ BAD_INPUT = 2
 """Exit code of a program whose arguments or parameters are wrong."""
 THROTTLE_S = 2.0
 """Shortest time between two log lines of a repeated error [s]: the log stays readable and does not fill the disk."""
-OTHERS = {'durability': ('volatile', 'transient_local'), 'reliability': ('best_effort', 'reliable')}
+MISMATCHED = {'durability': ('volatile', 'transient_local'), 'reliability': ('best_effort', 'reliable')}
 """What a publisher offers, and the subscription wants, where the two do not match: the only such pair of a policy."""
 
 
@@ -233,8 +233,8 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
     def _incompatible(self, topic: str, event: Any) -> None:
         self._count(topic, 'incompatible_publishers', event.total_count)
         policy, full = QoSPolicyKind(event.last_policy_kind).name.lower(), self.resolve_topic_name(topic)
-        offered, wanted = OTHERS.get(policy, ('that this node cannot take', 'of another value'))
-        value = f':={offered}' if policy in OTHERS else ''
+        offered, wanted = MISMATCHED.get(policy, ('that this node cannot take', 'of another value'))
+        value = f':={offered}' if policy in MISMATCHED else ''
         self.get_logger().error(
             f'a publisher of {full} offers {policy} {offered}, so none of its messages is received; publish with '
             f'{policy} {wanted}, or start this node with -p qos_overrides.{full}.subscription.{policy}{value}')
