@@ -10,7 +10,7 @@ import yaml
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import ArmParameters, PlantParameters, configure
-from flexmanip_ros.parameters.document import NODES, package_names
+from flexmanip_ros.parameters.document import NODES, package_names, scalar
 from flexmanip_ros.parameters.field import leaves
 
 Config = TypeVar('Config')
@@ -63,7 +63,8 @@ def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, An
 
     Sections named ``/**``, ``node``, ``/ns/node`` or with wildcards apply; later ones win. Sections of other nodes are
     ignored, and so are parameters of other nodes in a section for every node. An empty file gives no values. A file
-    without any section for ``node`` is an error unless ``optional``. Raises ParameterError naming the file.
+    without any section for ``node`` is an error unless ``optional``. So is a list such as [1, 2.0] in any section, with
+    which no node starts. Raises ParameterError naming the file.
     """
     where = f"parameter file '{path}'"
     try:
@@ -81,6 +82,8 @@ def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, An
     sections = dict(_sections(document, '', where))
     if not sections:
         raise ParameterError(f"{where} has no 'ros__parameters'", f"write '{node}: {{ros__parameters: {{...}}}}'")
+    for section in sections.values():
+        _reject_mixed(section, '', where)
     chosen = [name for name in sections if _applies(name, node)]
     if not chosen and not optional:
         near = difflib.get_close_matches(node, [name.rpartition('/')[2] for name in sections], n=1)
@@ -123,6 +126,17 @@ def _flatten(tree: Any, prefix: str, where: str) -> dict[str, Any]:
                 raise ParameterError(f"{where} gives '{known}' twice", 'keep one of them')
             flat[known] = item
     return flat
+
+
+def _reject_mixed(tree: Any, name: str, where: str) -> None:
+    """Raise ParameterError for a list with integers and doubles: rcl refuses the whole file for it."""
+    if isinstance(tree, Mapping):
+        for key, value in tree.items():
+            _reject_mixed(value, f'{name}.{key}' if name else str(key), where)
+    elif isinstance(tree, list) and {int, float} <= set(map(type, tree)):
+        items = ', '.join(scalar(float(item) if type(item) is int else item) for item in tree)
+        raise ParameterError(f"{where}: the list '{name}' has numbers with and without a point, which ROS cannot read",
+                             f'write [{items}]')
 
 
 def parse_overrides(items: Iterable[str]) -> dict[str, Any]:

@@ -22,7 +22,7 @@ Config = TypeVar('Config')
 
 _TYPES = {bool: 'BOOL', int: 'INTEGER', float: 'DOUBLE', str: 'STRING'}
 _EXAMPLE = {bool: 'true or false', int: 'a whole number such as 100',
-            float: 'a number with a decimal point such as 100.0', str: 'a text'}
+            float: 'a number such as 100.0', str: 'a text'}
 _LARGEST = sys.float_info.max
 _LARGEST_INT = 2**63 - 1
 
@@ -101,6 +101,7 @@ def _type(leaf: Leaf) -> Parameter.Type:
 
 def _declare(node: Node, leaf: Leaf) -> Any:
     """Declare one parameter and return its value, from an override or the default."""
+    _widen(parameter_overrides(node), leaf)
     try:
         value = declare(node, leaf.name, ros_value(leaf, leaf.default), _type(leaf), descriptor(leaf))
     except InvalidParameterTypeException as error:
@@ -112,6 +113,17 @@ def _declare(node: Node, leaf: Leaf) -> Any:
         check(leaf, given)  # raises the message of this package
         raise ParameterError(f"parameter '{leaf.name}' is {given!r}", str(error)) from error
     return check(leaf, value)
+
+
+def _widen(overrides: dict[str, Parameter], leaf: Leaf) -> None:
+    """Turn the integers that are given for a parameter of type double into doubles, as programs read them."""
+    given = overrides.get(leaf.name)
+    if leaf.kind is not float or given is None:
+        return
+    if given.type_ is Parameter.Type.INTEGER and not leaf.is_array:
+        overrides[leaf.name] = Parameter(leaf.name, value=float(given.value))
+    elif given.type_ is Parameter.Type.INTEGER_ARRAY and leaf.is_array:
+        overrides[leaf.name] = Parameter(leaf.name, value=[float(item) for item in given.value])
 
 
 def _given_type(node: Node, leaf: Leaf) -> str:

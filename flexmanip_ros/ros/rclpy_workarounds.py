@@ -237,10 +237,14 @@ def _raise(error: BaseException) -> None:
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of an error without source locations: rcl puts paths of its build machine there."""
+    """Return the first line of an error without source locations: rcl puts paths of its build machine there.
+
+    rcl refuses a list such as [1, 2.0] without saying what to do, which is added.
+    """
     text = str(error).strip().splitlines()
-    line = text[0] if text else type(error).__name__
-    return line.split(', at ./')[0].split(', at /')[0]
+    line = (text[0] if text else type(error).__name__).split(', at ./')[0].split(', at /')[0]
+    is_mixed = 'Sequence should be of same type' in str(error)
+    return f'{line}; give a list of one type, each number with a point such as 1.0' if is_mixed else line
 
 
 class ManagedNode(LifecycleNode):

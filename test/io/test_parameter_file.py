@@ -94,6 +94,21 @@ def test_missing_and_unreadable_files_are_named(tmp_path):
         read(tmp_path, NODE)
 
 
+@pytest.mark.parametrize('section', [NODE, 'plant_simulator'])
+def test_a_list_that_ends_every_node_is_rejected_with_what_to_write(tmp_path, section):
+    path = _file(tmp_path, f'{{/**: {{ros__parameters: {{order: 4}}}},\n'
+                           f'{section}: {{ros__parameters: {{arm: {{link_length: [1, 2.0]}}}}}}}}')
+    with pytest.raises(ParameterError, match=r"the list 'arm\.link_length' has numbers .* write \[1\.0, 2\.0\]"):
+        load(IdentifierParameters, NODE, path)
+
+
+@pytest.mark.parametrize('written', ['[1, 2]', '[1.0, 2.0]'])
+def test_numbers_of_a_list_are_read_with_a_point_and_without(tmp_path, written):
+    path = _file(tmp_path, f'{NODE}: {{ros__parameters: {{arm: {{link_length: {written}, joint_mass: 3}}}}}}')
+    arm = load(IdentifierParameters, NODE, path).arm
+    assert (arm.link_length, arm.joint_mass) == ((1.0, 2.0), 3.0)
+
+
 @pytest.mark.parametrize('item', ['order', '=4', ''])
 def test_an_override_without_a_name_or_value_is_rejected(item):
     with pytest.raises(ParameterError, match='name=value'):

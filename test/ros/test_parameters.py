@@ -76,7 +76,9 @@ def test_what_is_no_list_is_not_taken_for_an_empty_one(ros: Ros, given: object) 
     ('ordr', 4, "unknown parameter 'ordr'; did you mean 'order'?"),
     ('zzz', 4, 'known are angles, arm.*, base_frame'),
     ('payload.zzzzzzzzzzzz', 4, 'known are payload.'),
-    ('publish_rate', 100, "'publish_rate' is of type integer; give a number with a decimal point"),
+    ('publish_rate', '100', "'publish_rate' is of type string; give a number such as 100.0"),
+    ('arm.link_length', 3, "'arm.link_length' is of type integer; give a list, each a number such as 100.0"),
+    ('publish_rate', -100, "'publish_rate' is -100.0 Hz"),
     ('future_window', 11, 'cannot exceed past_window (10)'),
     ('inputs', ['joint1'], 'write NAME/FIELD'),
 ])
@@ -85,6 +87,15 @@ def test_a_wrong_parameter_is_named_with_the_way_out(ros: Ros, name: str, value:
     with pytest.raises(ParameterError) as caught:
         NodeParameters(node, IdentifierParameters)
     assert said in str(caught.value)
+
+
+def test_a_whole_number_is_taken_for_a_double_as_the_programs_take_it(ros: Ros) -> None:
+    node = ros.add(Node('declaring', context=ros.context, parameter_overrides=overrides(
+        publish_rate=100, arm__link_length=[1, 2], payload__working_point=[0, 1])))
+    config = NodeParameters(node, IdentifierParameters).config
+    assert (config.publish_rate, config.arm.link_length) == (100.0, (1.0, 2.0))
+    assert config.payload.working_point == (0.0, 1.0)
+    assert node.get_parameter('publish_rate').type_ is Parameter.Type.DOUBLE
 
 
 def test_a_parameter_of_another_node_of_the_package_is_let_pass(ros: Ros) -> None:

@@ -75,6 +75,7 @@ def test_help_says_what_it_is_with_its_parameters(
     ('capture_trigger', ['--ros-args', '-p', 'mode:=magic'], 'choose one of service, time, auto'),
     ('excitation', ['--ros-args', '-p', 'amplitud:=[1.0, 1.0]'], "did you mean 'amplitude'?"),
     ('plant_simulator', ['--ros-args', '--params-file', 'nowhere.yaml'], 'nowhere.yaml'),
+    ('plant_simulator', ['--ros-args', '-p', 'arm.link_length:=[1, 2.0]'], 'each number with a point such as 1.0'),
     ('rpbsid_identifier', ['--ros-args', '-p', 'future_window:=30'], 'cannot exceed past_window (10)'),
     ('rpbsid_identifier', ['--nonsense'], 'unrecognized arguments: --nonsense'),
     ('capture_trigger', ['--ros-args', '-p', 'qos_overrides./joint_states.subscription.reliability:=magic'],
