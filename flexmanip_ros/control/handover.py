@@ -58,6 +58,7 @@ def judge(config: ControllerParameters, estimate: PayloadEstimate) -> Verdict:
     """Say whether an estimate may change the gains.
 
     A mass near zero whose interval reaches below zero is in range: the interval, not the sign of the mass, decides.
+    A body is in range where its centre of mass and its radius of gyration together are within the reach of the arm.
     """
     if not all(map(math.isfinite, (*estimate[:4], *estimate.com, estimate.inertia))):
         return Verdict.NOT_FINITE
@@ -82,7 +83,8 @@ class HandoverState(NamedTuple):
 
 def trusted(config: AdapterParameters, found: PayloadEstimate) -> bool:
     """Whether this payload may be sent to a driver."""
-    if not all(map(math.isfinite, (found.mass, found.std))) or not 0.0 <= found.mass <= config.max_payload:
+    is_finite = all(map(math.isfinite, (found.mass, found.std, gyration(found))))
+    if not is_finite or not 0.0 <= found.mass <= config.max_payload:
         return False
     sure = found.std <= max(config.max_std, config.max_relative_std * found.mass)
     return sure and found.consistency <= config.max_consistency
@@ -108,8 +110,10 @@ def changed(config: AdapterParameters, sent: PayloadEstimate, found: PayloadEsti
 
 
 def gyration(body: PayloadEstimate) -> float:
-    """Radius of gyration [m] about the centre of mass."""
-    return math.sqrt(max(body.inertia, 0.0) / body.mass) if body.mass > 0.0 else 0.0
+    """Radius of gyration sqrt(inertia / mass) [m] about the centre of mass; infinite for an inertia without a mass."""
+    if body.inertia <= 0.0:
+        return 0.0
+    return math.sqrt(body.inertia / body.mass) if body.mass > 0.0 else math.inf
 
 
 def accepted(state: HandoverState, sent: PayloadEstimate, now: float) -> HandoverState:

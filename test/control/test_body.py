@@ -157,6 +157,13 @@ def test_a_body_that_is_not_that_of_the_estimate_is_not_taken() -> None:
     assert judge(CONTROL, taken._replace(com=(9.0, 0.0))) is Verdict.OUT_OF_RANGE
 
 
+@pytest.mark.parametrize(('mass', 'inertia', 'verdict'), [
+    (0.0, 1e6, Verdict.OUT_OF_RANGE), (-0.01, 1e6, Verdict.OUT_OF_RANGE), (0.02, 1e6, Verdict.OUT_OF_RANGE),
+    (0.0, 0.0, Verdict.TRUSTED), (-0.01, 0.0, Verdict.TRUSTED), (0.02, 1e-4, Verdict.TRUSTED)])
+def test_an_inertia_needs_a_mass_within_the_reach_of_the_arm(mass: float, inertia: float, verdict: Verdict) -> None:
+    assert judge(CONTROL, PayloadEstimate(mass, 0.02, mass - 0.04, mass + 0.04, 1.0, inertia=inertia)) is verdict
+
+
 def test_the_torques_that_hold_a_stiff_arm_are_the_moments_of_all_weights_about_its_joints() -> None:
     arm = replace(ARM, base_mass=0.0, base_joint_offset=(0.0, 0.0), bending_stiffness=(1e9, 1e9), gravity=(0.0, -9.81))
     elbow, tip = 3.0 * np.cos(THETA[0]), 3.0 * np.cos(THETA[0]) + 3.0 * np.cos(THETA[1])

@@ -47,6 +47,7 @@ def test_another_place_of_its_centre_of_mass_or_another_inertia_is_told_again() 
 @pytest.mark.parametrize('bad', [
     {'mass': math.nan}, {'std': math.inf}, {'mass': -1.0}, {'mass': 1000.0}, {'consistency': 50.0},
     {'consistency': math.nan}, {'std': 3.0},
+    {'mass': 0.0, 'inertia': 1e6},
 ])
 def test_what_cannot_be_trusted_is_never_told(bad: dict[str, float]) -> None:
     assert told_times([(0.1 * k, GOOD._replace(**bad)) for k in range(50)]) == []
