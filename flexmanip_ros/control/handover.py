@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from enum import Enum
+from itertools import pairwise
 from typing import NamedTuple
 
 from flexmanip_ros.parameters import AdapterParameters, ControllerParameters
@@ -12,6 +13,8 @@ from flexmanip_ros.types import Payload
 
 LONGEST_AGE = 5.0
 """Time without an estimate [s] after which a consumer warns: by default 250 estimates are missing then."""
+LONGEST_PERIODS = 2.0
+"""The same in periods of the estimates, where that is longer: ``publish_rate`` may be as low as 0.01 Hz."""
 
 
 class PayloadEstimate(NamedTuple):
@@ -42,6 +45,29 @@ class PayloadEstimate(NamedTuple):
         if not near or not all(map(math.isfinite, body)):
             return None
         return self._replace(com=(body[1], body[2]), inertia=max(body[3], 0.0))
+
+
+class Arrivals(NamedTuple):
+    """When the latest three estimates came [s], oldest first; NaN where fewer came."""
+
+    times: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+
+    def with_latest(self, now: float) -> Arrivals:
+        """Return the arrivals after an estimate that comes now [s]."""
+        return Arrivals((*self.times[1:], now))
+
+    def age(self, now: float) -> float:
+        """Return the age of the latest estimate [s]; NaN before the first."""
+        return now - self.times[-1]
+
+    def have_ceased(self, now: float) -> bool:
+        """Whether an estimate is overdue; False before the first.
+
+        The period is the longer of the last two, as an event brings an estimate between two others.
+        """
+        periods = (after - before for before, after in pairwise(self.times))
+        period = max((period for period in periods if not math.isnan(period)), default=0.0)
+        return self.age(now) > max(LONGEST_AGE, LONGEST_PERIODS * period)
 
 
 class Verdict(Enum):

@@ -53,6 +53,24 @@ def test_what_cannot_be_trusted_is_never_told(bad: dict[str, float]) -> None:
     assert told_times([(0.1 * k, GOOD._replace(**bad)) for k in range(50)]) == []
 
 
+def arrived(times: list[float]) -> handover.Arrivals:
+    arrivals = handover.Arrivals()
+    for time in times:
+        arrivals = arrivals.with_latest(time)
+    return arrivals
+
+
+def test_estimates_have_ceased_after_five_seconds_and_two_of_their_periods() -> None:
+    assert not arrived([]).have_ceased(1e9)
+    assert math.isnan(arrived([]).age(1e9))
+    for times, limit in (([0.0], 5.0), ([0.0, 0.02, 0.04], 5.0), ([0.0, 4.0, 8.0], 8.0), ([0.0, 10.0], 20.0),
+                         ([0.0, 10.0, 20.0], 20.0), ([0.0, 10.0, 11.0], 20.0), ([0.0, 60.0, 60.1, 60.2], 5.0)):
+        arrivals = arrived(times)
+        assert not arrivals.have_ceased(times[-1] + 0.99 * limit)
+        assert arrivals.have_ceased(times[-1] + 1.01 * limit)
+        assert arrivals.age(times[-1] + 3.0) == pytest.approx(3.0)
+
+
 def test_somebody_must_be_told() -> None:
     with pytest.raises(ParameterError, match="'service' and 'target_node' are both empty"):
         AdapterParameters(service='')

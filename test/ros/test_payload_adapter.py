@@ -28,15 +28,15 @@ from flexmanip_ros.types import Payload, Status
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def say(ros: Ros, mass: float, std: float) -> tuple[Any, Any]:
-    """Return publishers of a payload and its estimate, latched."""
+def say(ros: Ros, mass: float, std: float, period: float = 0.02) -> tuple[Any, Any]:
+    """Return publishers of a payload and its estimate, latched; the estimate is published every ``period`` [s]."""
     payload = ros.helper.create_publisher(InertiaStamped, 'rpbsid_identifier/payload', qos.latched())
     estimate = ros.helper.create_publisher(
         Float64MultiArray, 'rpbsid_identifier/payload_estimate', qos.latched())
     message = InertiaStamped()
     message.inertia.m = mass
     payload.publish(message)
-    ros.helper.create_timer(0.02, lambda: estimate.publish(
+    ros.helper.create_timer(period, lambda: estimate.publish(
         Float64MultiArray(data=[mass, std, mass - 2 * std, mass + 2 * std, 1.0])))
     return payload, estimate
 
@@ -95,6 +95,20 @@ def test_estimates_that_cease_are_a_warning_and_are_no_longer_trusted(
     values = {item.key: item.value for item in found.values}
     assert (found.name, found.level) == ('/payload_adapter: status', b'\x01')
     assert (values['trusted'], float(values['estimate_age_s']) > 0.2) == ('False', True)
+
+
+def test_estimates_every_half_a_second_are_trusted_and_no_warning_where_a_fifth_of_a_second_counts_as_long(
+        ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(handover, 'LONGEST_AGE', 0.2)
+    plant = ros.managed(PlantSimulator(context=ros.context, overrides=overrides(rate=50.0, arm__modes=1)))
+    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
+        target_node='plant_simulator', settle_time=3.0)))
+    heard = ros.listen(DiagnosticArray, '/diagnostics')
+    say(ros, 31.5, 0.1, period=0.5)
+    ros.wait(lambda: adapter.sent == 1)
+    assert plant.config.payload_mass == 31.5
+    said = [status.message for message in heard for status in message.status if 'payload_adapter' in status.name]
+    assert 'no payload estimate' not in ''.join(said[2:])  # the period is known from the second estimate on
 
 
 def test_a_driver_that_is_not_there_is_named(ros: Ros) -> None:

@@ -46,7 +46,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         self.sent = 0
         self.problem = ''
         self._inertia: Inertia | None = None
-        self._estimated = math.nan
+        self._arrivals = handover.Arrivals()
         self.doubtful = 0
         self._asked: tuple[Any, float] | None = None
         """Future of the request that waits for its answer, and when it was sent [s]; None without such a request."""
@@ -72,7 +72,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         """Begin in the state in which no payload has been sent."""
         self._forget_request()
         self.state, self.problem = handover.HandoverState(), ''
-        self._estimated = math.nan
+        self._arrivals = handover.Arrivals()
 
     def _on_payload(self, message: InertiaStamped) -> None:
         self._inertia = message.inertia
@@ -80,7 +80,8 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
     def _on_estimate(self, message: Float64MultiArray) -> None:
         if not self.active or len(message.data) != 5:
             return
-        now = self._estimated = time.monotonic()
+        now = time.monotonic()
+        self._arrivals = self._arrivals.with_latest(now)
         if self._inertia is None:
             return
         body = self._inertia
@@ -147,9 +148,9 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
     def report(self, report: Report) -> None:
         """Report what was sent, how old the latest estimate is, and what went wrong."""
         now = time.monotonic()
-        age = now - self._estimated
+        age, have_ceased = self._arrivals.age(now), self._arrivals.have_ceased(now)
         self._give_up(now)
-        if age > handover.LONGEST_AGE:  # false for NaN, before the first estimate
+        if have_ceased:
             self.state = self.state._replace(trusted_since=None)  # settle_time begins again
         report.values.update(
             sent=self.sent, sent_mass_kg='none' if self.state.sent is None else self.state.sent.mass,
@@ -157,7 +158,7 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
             doubtful=self.doubtful)
         if self.problem:
             report.worse(ERROR, self.problem)
-        if self.active and age > handover.LONGEST_AGE:
+        if self.active and have_ceased:
             report.worse(WARN, f'no payload estimate for {age:.0f} s')
         elif self.active and not self.problem and self.state.trusted_since is None:
             report.worse(WARN, 'no payload that can be trusted')

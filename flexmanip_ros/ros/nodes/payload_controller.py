@@ -13,7 +13,6 @@ Without joint states for `stale_after`, and when the node is deactivated or stop
 example of a consumer, not a safety controller.
 """
 
-import math
 import sys
 import time
 from collections.abc import Collection, Iterable
@@ -54,7 +53,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         super().__init__(NAME, ControllerParameters, **options)
         self.state: controller.ControllerState | None = None
         self._estimate: PayloadEstimate | None = None
-        self._estimated = math.nan
+        self._arrivals = handover.Arrivals()
         self._body: tuple[float, ...] | None = None
         self.dropped = 0
         self.not_finite = 0
@@ -202,7 +201,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         if len(message.data) != 5:
             self._drop('payload_estimate', f'a payload estimate was dropped: it has {len(message.data)} values, not 5')
             return
-        self._estimated = time.monotonic()
+        self._arrivals = self._arrivals.with_latest(time.monotonic())
         self._estimate = PayloadEstimate(*message.data)  # kept: a latched estimate may come before activation
         if self._judge(self._estimate) is None:
             self._body = None  # it is that of the object held before
@@ -268,14 +267,15 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
                          'found, and the gains designed before them stayed in use; change angle_scale, bend_scale or '
                          'effort_scale')
         verdict = self.state.verdict
-        age = time.monotonic() - self._estimated
+        now = time.monotonic()
+        age = self._arrivals.age(now)
         report.values.update(
             scheduled_payload_kg=float(self.state.payload[0]), trusted_payload_kg=float(self.state.trusted[0]),
             designs=self.state.designs, estimate='none' if verdict is None else verdict.value,
             estimate_age_s=age)
         if verdict not in (None, Verdict.TRUSTED):
             report.worse(WARN, f'payload estimate not trusted: {verdict.value}')
-        if self.active and self.config.use_estimate and age > handover.LONGEST_AGE:  # false for NaN, before the first
+        if self.active and self.config.use_estimate and self._arrivals.have_ceased(now):
             report.worse(WARN, f'no payload estimate for {age:.0f} s: the gains stay those of '
                          f'{self.state.trusted[0]:.2f} kg')
 
