@@ -87,11 +87,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.cli import first_use
-    from flexmanip_ros.cli.replay import Request, identify
+    from flexmanip_ros.cli.replay import Request, identify, places
     from flexmanip_ros.io.outputs import check_apart
 
-    check_apart({'--suggest': given.suggest, '--output': given.output, '--report': given.report,
-                 '--save-arm': given.save_arm, '--configurations': given.configurations}, given.params, given.bag)
+    check_apart({'--suggest': given.suggest, **places(given)}, given.params, given.bag)
     if given.suggest is not None:
         from flexmanip_ros.cli.suggest import suggest_for
 

@@ -14,7 +14,7 @@ from flexmanip_ros.cli.console import Report, require_matplotlib
 from flexmanip_ros.errors import BagError, FlexmanipError, MissingSignalError, ModelError, ParameterError, SignalError
 from flexmanip_ros.event_replay import FAR_EVENT_NS
 from flexmanip_ros.io import bag
-from flexmanip_ros.io.outputs import TableOutput, check_place, open_output, write_rows, write_text
+from flexmanip_ros.io.outputs import TableOutput, check_apart, check_place, open_output, write_rows, write_text
 from flexmanip_ros.numerics.background import REPLAY_THREADS, Threads, read_ahead
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import yaml_text
@@ -60,6 +60,12 @@ class Request:
     """Path of the table of the frequencies of every configuration; None: none is written."""
 
 
+def places(given: Any) -> dict[str, str | None]:
+    """Return option and path of each file that a run writes, None where it does not. given: Request or arguments."""
+    names = ('output', 'report', 'save_arm', 'configurations')
+    return {f'--{name.replace("_", "-")}': getattr(given, name) for name in names}
+
+
 @dataclass(frozen=True, eq=False)
 class Result:
     """The result of a run. fault: what was wrong with the recording; its sound messages were used all the same."""
@@ -80,9 +86,11 @@ class Result:
 def identify(request: Request, progress: Report | None = None) -> Result:
     """Replay a recording through the identifier; write the output and the report that are asked for.
 
-    Raises FlexmanipError when no message can be used and when a file cannot be written.
+    Raises FlexmanipError when no message can be used, and when a file cannot be written, is to be written twice, or is
+    in the recording.
     """
     started = time.perf_counter()
+    check_apart(places(request), None, str(request.bag))
     if request.report is not None:
         check_place(request.report, '.html', '.htm')
         require_matplotlib()

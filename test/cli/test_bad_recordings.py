@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexmanip_ros.cli import monte_carlo, reproduce_paper, simulate_bag, write_urdf
+from flexmanip_ros.cli import monte_carlo, replay, reproduce_paper, simulate_bag, write_urdf
 from flexmanip_ros.cli.identify_bag import main
 from flexmanip_ros.io.bag_writer import BagWriter
+from flexmanip_ros.io.outputs import OutputError
+from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
 START = 1_700_000_000_000_000_000
@@ -211,6 +213,18 @@ def test_the_parameter_file_that_is_read_is_not_overwritten(capsys, tmp_path, op
     assert write_urdf.main(['--params', str(params), '--output', str(params)]) == 2
     assert 'which --params reads' in capsys.readouterr().err
     assert params.read_text(encoding='utf-8') == '/**: {ros__parameters: {order: 4}}\n'
+
+
+@pytest.mark.parametrize(('places', 'words'), [
+    ({'output': 'both.csv', 'configurations': 'both.csv'}, '--output and --configurations are both'),
+    ({'save_arm': 'bag/arm.yaml'}, 'is in the recording')])
+def test_the_function_behind_the_program_writes_no_two_outputs_to_one_file(tmp_path, places, words):
+    path = _bag(tmp_path / 'bag', _records())
+    request = replay.Request(path, IdentifierParameters(payload_method='none'), **{
+        name: str(tmp_path / place) for name, place in places.items()})
+    with pytest.raises(OutputError, match=words):
+        replay.identify(request)
+    assert not (tmp_path / 'both.csv').exists()
 
 
 def test_an_earlier_output_is_written_anew(capsys, tmp_path):
