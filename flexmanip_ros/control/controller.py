@@ -261,6 +261,8 @@ class ControllerState(NamedTuple):
     setpoint: Array | None = None
     blend: float = 1.0
     """0: the old gains, 1: the new ones."""
+    limit: Array | None = None
+    """Limits (L,) of the torques in use [N m], which follow ``effort_limit``; None before the first sample."""
     verdict: Verdict | None = None
     """Verdict on the latest payload estimate."""
     designs: int = 0
@@ -317,9 +319,19 @@ def step(config: ControllerParameters, state: ControllerState, measured: Measure
     wanted, acceleration = _wanted(config, state, way)
     wanted[:links] -= reference(config, sag[:links])
     feedforward = state.between(state.old.F, state.now.F) @ acceleration + holding
-    limit = np.asarray(config.effort_limit)
+    limit = _limit(config, state)
     torque: Array = np.clip(measured.added + feedforward - state.gain @ (x - wanted), -limit, limit)
-    return state._replace(x=state.now.A @ x + state.now.B @ (torque - holding)), torque
+    return state._replace(x=state.now.A @ x + state.now.B @ (torque - holding), limit=limit), torque
+
+
+def _limit(config: ControllerParameters, state: ControllerState) -> Array:
+    """Return the limits (L,) of the torques [N m]: a lower one holds at once, a higher one is reached gradually.
+
+    A limit rises from zero within ``blend_time``: a joint that was passive is far from its path, and the regulator asks
+    for all that the limit allows.
+    """
+    wanted = np.asarray(config.effort_limit)
+    return wanted if state.limit is None else np.minimum(wanted, state.limit + _share(config) * wanted)
 
 
 def _filtered(config: ControllerParameters, state: ControllerState, measured: Measured, sag: Array) -> Array:
@@ -374,8 +386,7 @@ def _scheduled(config: ControllerParameters, state: ControllerState, theta: Arra
         change, reach = state.trusted - payload, config.payload_rate / config.rate
         distance = _weight(config, state.trusted, change)
         payload = state.trusted if distance <= reach else payload + change * (reach / distance)
-    share = 1.0 / (config.blend_time * config.rate) if config.blend_time > 0.0 else 1.0
-    state = state._replace(payload=payload, blend=min(state.blend + share, 1.0))
+    state = state._replace(payload=payload, blend=min(state.blend + _share(config), 1.0))
     if state.blend < 1.0:
         return state  # one change after the other keeps the torque continuous and designs rare
     held_mass = config.arm.tip_mass + state.designed_payload[0]
@@ -389,6 +400,11 @@ def _scheduled(config: ControllerParameters, state: ControllerState, theta: Arra
     except ModelError:  # the gains in use stay
         return state._replace(failed_designs=state.failed_designs + 1)
     return state._replace(old=state.now, now=wanted, blend=0.0, designs=state.designs + 1)
+
+
+def _share(config: ControllerParameters) -> float:
+    """Return the share of a change that takes over within ``blend_time`` that one sample makes."""
+    return 1.0 / (config.blend_time * config.rate) if config.blend_time > 0.0 else 1.0
 
 
 def _weight(config: ControllerParameters, body: Array, change: Array) -> float:

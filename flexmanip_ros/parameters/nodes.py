@@ -40,8 +40,8 @@ class ControllerParameters:
     effort_scale: tuple[float, ...] = parameter(
         (100.0, 50.0), 'torque that costs one unit in the regulator', unit='N m', low=1e-6, size=2, per_link=True)
     effort_limit: tuple[float, ...] = parameter(
-        (300.0, 150.0), 'largest torque of each joint; a larger command is cut to it; 0: a passive joint', unit='N m',
-        low=0.0, size=2, per_link=True, live=True)
+        (300.0, 150.0), 'largest torque of each joint; a larger command is cut to it; 0: a passive joint; a raised '
+        'limit is reached within blend_time', unit='N m', low=0.0, size=2, per_link=True, live=True)
     noise_std: tuple[float, ...] = parameter(
         (3e-3, 3e-3, 3e-4, 3e-4, 0.2, 0.2, 0.02, 0.02),
         'measurement noise that the filter assumes for the angles, the bends, then their rates (larger: slower filter, '
@@ -68,7 +68,9 @@ class ControllerParameters:
     reschedule_angle: float = parameter(
         0.05, 'change of a chord angle that the arm depends on (that between the links) that asks for new gains',
         unit='rad', low=1e-3, high=3.0)
-    blend_time: float = parameter(0.1, 'time over which new gains replace the old ones', unit='s', low=0.0, high=10.0)
+    blend_time: float = parameter(
+        0.1, 'time over which new gains replace the old ones, and a raised effort_limit is reached', unit='s', low=0.0,
+        high=10.0)
     stale_after: float = parameter(
         0.1, 'time without joint states (or added efforts) after which the torque (or the added torque) is zero',
         unit='s', low=0.005, high=10.0)

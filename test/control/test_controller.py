@@ -75,6 +75,21 @@ def test_torques_stay_within_the_limits_whatever_is_measured() -> None:
         assert (np.abs(torque) <= CONFIG.effort_limit).all()
 
 
+def test_a_raised_limit_moves_the_torque_without_a_step_and_a_lowered_one_holds_at_once() -> None:
+    state, torques = controller.init(CONFIG), []
+    passive, lower = (replace(CONFIG, effort_limit=(300.0, limit)) for limit in (0.0, 20.0))
+    for k, config in enumerate([passive] * 50 + [CONFIG] * 150 + [lower] * 10 + [CONFIG] * 100):
+        angle = 0.3 if k else 0.0  # the first sample is held, so joint 2 is as far off as a passive joint may be
+        state, torque = controller.step(config, state, controller.Measured(
+            np.array([0.0, angle, 0.0, 0.0]), np.zeros(4), np.zeros(2)))
+        torques.append(abs(torque[1]))
+    assert torques[:50] == [0.0] * 50
+    assert np.diff(torques[49:200]).max() <= 1.5 + 1e-9  # 150 N m over 100 samples
+    assert torques[149:200] == pytest.approx([150.0] * 51)
+    assert torques[200:210] == pytest.approx([20.0] * 10)
+    assert torques[210:] == pytest.approx([min(20.0 + 1.5 * (k + 1), 150.0) for k in range(100)])
+
+
 @pytest.mark.parametrize('limits', [(300.0, 0.0), (0.0, 150.0), (0.0, 0.0), (1e-300, 5e-324)])
 def test_an_arm_with_passive_joints_moves_with_finite_torques_and_none_there(limits: tuple[float, float]) -> None:
     config = replace(CONFIG, effort_limit=limits)
