@@ -143,6 +143,34 @@ class Meter:
         }
 
 
+class Stamps:
+    """Collects the steps between stamps since the last report; steps back, of a clock that was set, are left out.
+
+    Their median is the sample time also where less than a third of the messages is lost, or simulated time runs slowly.
+    """
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
+        self._steps_ns: list[int] = []
+
+    def note(self, stamp_ns: int) -> None:
+        """Process the stamp of a message [ns]."""
+        if self._last_ns is not None and stamp_ns > self._last_ns:
+            self._steps_ns.append(stamp_ns - self._last_ns)
+        self._last_ns = stamp_ns
+
+    def window(self) -> tuple[float, float]:
+        """Return the rate of the samples [Hz] and the share of them that did not come, since the last call.
+
+        Both are NaN where fewer than two messages came.
+        """
+        steps_ns, self._steps_ns = self._steps_ns, []
+        if not steps_ns:
+            return math.nan, math.nan
+        step_ns = float(np.median(steps_ns))
+        return 1e9 / step_ns, max(0.0, 1.0 - len(steps_ns) * step_ns / sum(steps_ns))
+
+
 class Recent:
     """Counts what happened in the last ``RECENT_S`` seconds, to a second."""
 

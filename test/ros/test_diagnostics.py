@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
+import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from joint_states import joint_state
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -13,7 +15,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.diagnostics import JointStateFaults, LossCounter, Meter
+from flexmanip_ros.ros.diagnostics import JointStateFaults, LossCounter, Meter, Stamps
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
 from flexmanip_ros.samples.sampling import Clock, Counters
@@ -130,3 +132,17 @@ def test_a_meter_counts_times_and_begins_again() -> None:
     assert 0.0 <= window['callback_p50_us'] <= window['callback_p99_us'] <= window['callback_max_us']
     assert 0.0 <= window['callback_share'] <= 1.0
     assert meter.window()['rate_hz'] == 0.0
+
+
+def test_the_rate_is_that_of_the_stamps_whatever_is_lost_and_whoever_set_the_clock() -> None:
+    stamps = Stamps()
+    assert all(map(math.isnan, stamps.window()))
+    for k in (0, 1, 2, 5, 6, 7, 9, 10):  # 3 of 11 are lost
+        stamps.note(5_000_000 * k)
+    rate, missing = stamps.window()
+    assert (rate, missing) == (pytest.approx(200.0), pytest.approx(0.3))
+    for k in range(5):
+        stamps.note(10_000_000 * k)
+    rate, missing = stamps.window()
+    assert (rate, missing) == (pytest.approx(100.0), pytest.approx(0.0))
+    assert all(map(math.isnan, stamps.window()))

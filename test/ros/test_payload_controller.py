@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -192,6 +194,27 @@ def diagnosed(heard: list[DiagnosticArray], words: str) -> list[tuple[bytes, dic
     return [(status.level, {item.key: item.value for item in status.values})
             for message in heard for status in message.status
             if status.name == '/payload_controller: status' and words in status.message]
+
+
+@pytest.mark.parametrize(('rate', 'kept', 'said', 'not_said'), [
+    (1000.0, lambda k: k % 4, '% of the joint states did not come', 'set rate'),  # every fourth is lost
+    (500.0, lambda k: True, '1000 joint states a second by their stamps, designed for 500; set rate', 'did not come')])
+def test_the_advice_to_set_the_rate_comes_where_the_stamps_have_another_one_and_not_where_messages_are_lost(
+        ros: Ros, rate: float, kept: Callable[[int], object], said: str, not_said: str) -> None:
+    diagnostics = ros.listen(DiagnosticArray, '/diagnostics')
+    start(ros, readers=0, rate=rate)
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    count = itertools.count()
+
+    def some() -> None:  # the wall clock runs slowly against the stamps
+        for k in itertools.islice(count, 6):
+            if kept(k):
+                states.publish(joint_state(k))
+
+    ros.helper.create_timer(0.02, some)
+    level, _ = ros.wait(lambda: diagnosed(diagnostics, said), what='the words')[0]
+    assert level == b'\x02'
+    assert not diagnosed(diagnostics, not_said)
 
 
 @pytest.mark.parametrize('angle', [90.0, -90.0, 1e6, 1e300, math.nan])

@@ -28,7 +28,7 @@ from flexmanip_ros.errors import SignalError
 from flexmanip_ros.parameters import ControllerParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, doubles
-from flexmanip_ros.ros.diagnostics import ERROR, WARN, Meter, Report
+from flexmanip_ros.ros.diagnostics import ERROR, WARN, Meter, Report, Stamps
 from flexmanip_ros.ros.node import FlexmanipNode, run
 from flexmanip_ros.types import Array, JointRecord
 
@@ -41,6 +41,8 @@ AT_LIMIT_S = 0.5
 """Time at the limits of the torque, less the time within them, after which the log warns [s]: no move takes that."""
 LARGEST = 1e6
 """Bound on an angle, bend or rate, in SI units, that no arm exceeds; joint states beyond it are dropped."""
+RATE_TOLERANCE = 0.2
+"""Share by which the rate of the stamps may differ from ``rate``, and share of the joint states that may be missing."""
 NOT_FINITE = ('a computed torque was not finite: zero torque was sent, and the control begins again at the present '
               'angles; check the parameters arm.*, setpoint and effort_limit')
 """What the log and /diagnostics say of such a torque."""
@@ -61,7 +63,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._added, self._added_at = np.zeros(len(self.config.joints)), -np.inf
         self._last_ns: int | None = None
         self._arrived = np.inf
-        self._meter = Meter()
+        self._meter, self._stamps = Meter(), Stamps()
         self._reader = JointStateReader()
         self._goal: Array | None = None
         self._names: tuple[str, ...] = ()
@@ -128,6 +130,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
             if self._last_ns is not None and record.stamp_ns - self._last_ns > longest_ns:
                 self.state = self.state._replace(x=None)
             self._last_ns = record.stamp_ns
+            self._stamps.note(record.stamp_ns)
             goal, self._goal = self._goal, None
             if goal is not None:
                 self.state = controller.goto(self.state, goal)
@@ -245,6 +248,16 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._commands.publish(self._message)
         self.sent += 1
 
+    def _report_rate(self, report: Report) -> None:
+        """Report a rate of the stamps that is not the parameter, and joint states that did not come."""
+        rate, missing = self._stamps.window()
+        if abs(rate / self.config.rate - 1.0) > RATE_TOLERANCE:  # false for NaN
+            report.worse(ERROR, f'{rate:.0f} joint states a second by their stamps, designed for '
+                         f'{self.config.rate:.0f}; set rate')
+        elif missing > RATE_TOLERANCE:
+            report.worse(ERROR, f'{100.0 * missing:.0f} % of the joint states did not come: look for the load of this '
+                         'computer and its network')
+
     def report(self, report: Report) -> None:
         """Report the rate, the payload that the gains follow, and the verdict on the latest estimate."""
         report.values.update(self._meter.window())
@@ -253,9 +266,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
             report.worse(WARN, f'{self.dropped} messages dropped')
         if self.active and report.values['rate_hz'] == 0.0:
             report.silent('joint_states')
-        elif self.active and abs(report.values['rate_hz'] / self.config.rate - 1.0) > 0.2:
-            report.worse(ERROR, f'{report.values["rate_hz"]:.0f} joint states a second, designed for '
-                         f'{self.config.rate:.0f}; set rate')
+        self._report_rate(report)
         if self.state is None:
             return
         if self.not_finite:
