@@ -165,19 +165,21 @@ class ModelRequest:
     stamp_ns: int
     dt: float
     rows: Rows
-    """The latest samples, on which the model is judged."""
+    """The latest samples, on which the model is judged; with decimation the identifier has filtered ones instead."""
 
     def solve(self) -> Estimate:
         """Return the estimate with model and modes, and with the payload where it is read from them."""
         config, identifier = self.config, self.identifier
         payload: Payload | None = None
         found, without = _identified(config, identifier.rpbsid, self.dt, self.rows)
-        if found is not None and config.decimation == 1:
+        if found is not None:
             role = parameter_varying.roles(config)
+            filtered = rpbsid.latest(config, identifier.rpbsid, identifier.since_ns, self.dt)
             found = prediction_check.judged(
-                found, self.rows, config.outputs, 0 if role is None else len(role.displacements),
+                found, self.rows if filtered is None else filtered, config.outputs,
+                0 if role is None else len(role.displacements),
                 float(np.ptp(identifier.turned)) if identifier.turned.size else 0.0,
-                float(identifier.rpbsid.counts[USED]))
+                float(identifier.rpbsid.counts[USED]), filtered=filtered is not None)
         if config.payload_method == 'block' and found is not None:
             payload = block_extraction.estimate(config, found, identifier.angles, identifier.configuration_range)
         if found is None:

@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.identification import decimation, factor, model_output, paper_recursion, recursive_fit
+from flexmanip_ros.identification import (
+    decimation,
+    factor,
+    model_output,
+    paper_recursion,
+    prediction_check,
+    recursive_fit,
+)
 from flexmanip_ros.identification.factor import FILLED, POWER, PRIOR, USED, WEIGHT, WEIGHT2, Outcomes
 from flexmanip_ros.identification.moments import solve_regressor
 from flexmanip_ros.identification.uncertainty import Identified
@@ -157,14 +164,19 @@ def _advance(config: IdentifierParameters, state: RpbsidState, rows: Rows, backg
 def _decimate(config: IdentifierParameters, state: RpbsidState, decimator: decimation.Decimator,
               log: SampleLog, rows: Rows) -> tuple[RpbsidState, Rows]:
     """Filter rows; return the new state and the rows that they add to the decimated log."""
+    was_empty = decimator.seen < len(decimator.taps)  # the filter has given no sample since the gap
     decimator, kept, at = decimation.decimate(decimator, rows.u_y, config.decimation)
     r = log.width.inputs
     first = log.end
+    needed = first - prediction_check.MOST_ROWS
     if state.refined is not None:
-        log = log.from_row(recursive_fit.first_needed(state.refined))
+        needed = min(needed, recursive_fit.first_needed(state.refined))
     absent = rows.missing[at]
-    log = log.append(rows.stamp_ns[at], kept[:, :r], kept[:, r:], np.zeros((len(at), 0)),
-                     np.zeros(len(at), dtype=np.bool_), missing=np.where(absent > config.decimation // 2, absent, 0))
+    gap = np.zeros(len(at), dtype=np.bool_)
+    gap[:1] = was_empty and first > 0
+    log = log.from_row(needed).append(
+        rows.stamp_ns[at], kept[:, :r], kept[:, r:], np.zeros((len(at), 0)), gap,
+        missing=np.where(absent > config.decimation // 2, absent, 0))
     return state._replace(decimator=decimator, decimated=log), log.rows(first, log.end)
 
 
@@ -191,6 +203,19 @@ def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array, m
         state.counts, config.past_window, int(config.direct_feedthrough), config.regularization[0],
         config.forgetting_factor[0], mode, missing, outcome)
     return outcome
+
+
+def latest(config: IdentifierParameters, state: RpbsidState, since_ns: int, dt: float) -> Rows | None:
+    """Return the filtered samples on which a model is judged; None without decimation.
+
+    They are the last 1.5 s, or as many as the order needs, but none before ``since_ns`` [ns]. dt: sample time [s].
+    """
+    log = state.decimated
+    if log is None:
+        return None
+    count = max(prediction_check.length(dt * config.decimation), prediction_check.STRETCHES * config.order)
+    first = max(log.start, log.end - count)
+    return log.rows(min(log.row_at(since_ns, first), log.end), log.end)
 
 
 def finish(config: IdentifierParameters, state: RpbsidState, background: Background = INLINE) -> RpbsidState:

@@ -119,6 +119,17 @@ def test_the_suggested_file_predicts_better_than_the_defaults_and_finds_the_mode
     assert at_once['vaf_horizon_percent'] == found['vaf_horizon_percent']
 
 
+@pytest.mark.parametrize('decimation', [1, 2, 3])
+def test_a_model_with_modes_that_nothing_determines_is_not_tracking_whatever_its_rate(recording, capsys, decimation):
+    for order, tracking in ((4, True), (10, False)):
+        found = _json(capsys, recording, '--set=inputs=[hub/effort]', '--set=outputs=[hub/position, gauge/position]',
+                      '--set=payload_method=none', '--set=angles=[]', '--set=refinement=none',
+                      '--set=forgetting_factor=[1.0, 1.0, 1.0]', '--set=direct_feedthrough=true',
+                      '--set=past_window=20', '--set=future_window=10', f'--set=order={order}',
+                      f'--set=decimation={decimation}')
+        assert (found['status'] == 'TRACKING') is tracking
+
+
 def test_what_is_set_stays_as_it_is(recording, tmp_path, capsys):
     place = tmp_path / 'set.yaml'
     _json(capsys, recording, '--suggest', place, '--set=order=4', '--set=decimation=5', '--set=model_rate=2.0',

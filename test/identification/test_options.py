@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from linear_arm import benchmark, configuration, random_system, record, run, shared_data, sorted_poles, start
 
 from flexmanip_ros.identification import rpbsid, validation
+from flexmanip_ros.identification.prediction_check import MOST_ROWS
 from flexmanip_ros.identification.realization import stabilized, suggested_order, to_continuous, to_discrete
 
 
@@ -57,6 +60,26 @@ def test_decimated_identification_finds_the_slow_poles():
     for k in range(400):
         stepped = stepped.feed(u[k:k + 1], y[k:k + 1])
     assert np.array_equal(stepped.state.memory[0], run(config, u[:400], y[:400]).state.memory[0])
+
+
+def test_a_decimated_log_is_bounded_and_marks_where_the_filter_began_anew():
+    rng = np.random.default_rng(6)
+    config = configuration(1, 1, order=2, past_window=4, future_window=3, decimation=2, refinement='none')
+    stepped = start(config)
+    for _ in range(12):
+        stepped = stepped.feed(rng.standard_normal((1000, 1)), rng.standard_normal((1000, 1)))
+    log = stepped.state.decimated
+    assert log is not None
+    assert log.end - log.start <= MOST_ROWS + 500
+    restarted = stepped._replace(state=rpbsid.window_restart(config, stepped.state))
+    after = restarted.feed(rng.standard_normal((5, 1)), rng.standard_normal((5, 1))).feed(
+        rng.standard_normal((200, 1)), rng.standard_normal((200, 1))).state.decimated
+    assert after is not None
+    assert np.flatnonzero(after.rows(after.start, after.end).gap).tolist() == [log.end - after.start]
+    judged = rpbsid.latest(config, stepped.state, 0, 0.001)
+    assert judged is not None
+    assert len(judged) == 750  # 1.5 s
+    assert rpbsid.latest(replace(config, decimation=1), start(replace(config, decimation=1)).state, 0, 0.001) is None
 
 
 def test_continuous_and_discrete_are_inverse():
