@@ -72,8 +72,8 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     if consistency > POWER_LIMIT or restless > WIDENING_LIMIT or abs(m.score[mem.EXCESS_BIAS]) > MOST_BIAS:
         status = Status.INCONSISTENT
     failed = bool(m.counts[REFITS]) and status is Status.INCONSISTENT  # a fit before it fitted no better
-    if (m.counts[mem.SINCE_EVENT] < FEW and not failed) or (
-            fitting and status is Status.TRACKING and is_behind(m)):
+    too_few = m.counts[mem.SINCE_EVENT] < FEW or (status is Status.INCONSISTENT and is_fitted_to_few(m))
+    if (too_few and not failed) or (fitting and status is Status.TRACKING and is_behind(m)):
         status = Status.WARMING_UP
     if restarts and m.counts[mem.SEEN] < SETTLED:
         status = Status.DIVERGED
@@ -113,6 +113,16 @@ def is_behind(m: mem.FilterState) -> bool:
         return False
     costs = m.score[mem.MISFIT] > FITS * (m.xi.size + len(m.noise) * m.counts[mem.BEFORE])
     return bool((costs and m.counts[mem.AGAIN] == 1) or 2 * m.counts[mem.BEFORE] <= m.counts[STORED])
+
+
+def is_fitted_to_few(m: mem.FilterState) -> bool:
+    """Whether the fit has read fewer than ``FEW`` of the samples since the event, and more will be read soon.
+
+    The iterations end with 36, 51 and 71 samples, so at ``FEW`` samples the variances are those of a fit to 36. A fit
+    that twice ``FEW`` samples have not brought further is judged as it is.
+    """
+    is_first = m.counts[mem.SINCE_EVENT] <= m.counts[STORED] < 2 * FEW  # no loss has begun the horizon again
+    return bool(is_first and m.counts[mem.BEFORE] < FEW)
 
 
 def moves(m: mem.FilterState) -> float:

@@ -258,6 +258,19 @@ def test_signals_that_cannot_give_a_payload_are_unobservable(parameters):
     assert found.upper == np.inf
 
 
+@pytest.mark.parametrize('seed', [7, 15, 24, 26])
+def test_a_fit_to_fewer_than_fifty_samples_is_not_called_inconsistent(seed):
+    arm = ArmParameters()
+    settings, samples = IdentifierParameters(arm=arm), record(0.06, arm=arm, seed=seed)
+    found = []
+    for count in range(45, 56):
+        found.append(structured.estimate(settings, structured.advance(
+            settings, structured.init(settings), samples.between(0, count))))
+    assert Status.INCONSISTENT not in [payload.status for payload in found]
+    assert [payload.status for payload in found[:5]] == [Status.WARMING_UP] * 5
+    assert all(np.isfinite(payload.upper) for payload in found)
+
+
 @pytest.mark.parametrize('events', [
     (event(-0.5),), (event(0.0, EventKind.RELEASE),), (event(-1.0), event(-0.5)),
     (event(0.3), event(0.3005, EventKind.RELEASE)),
