@@ -1,7 +1,7 @@
 """Arms as they are and what they catch: friction, rotors, gains and offsets of the signals, bodies, floating bases.
 
-The simulated arm has five sines a link beside the static shapes, the estimator's three; 40 dB, square waves of 10 and 5 N m,
-capture after 3 s, random object and start.
+The simulated arm has five sines a link beside the static shapes, the estimator's three; 40 dB, square waves of 10 and 5
+N m, capture after 3 s, random object and start.
 """
 
 from __future__ import annotations
