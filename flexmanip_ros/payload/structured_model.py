@@ -417,6 +417,17 @@ def first(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Arr
     m.S[:] = np.diag(std)
 
 
+def expect_losses(model: Model, m: mem.FilterState) -> None:
+    """Begin with rotors and friction that are a prior deviation above those given: another start of a fit that failed.
+
+    From a rotor of zero the effect of one is steep and soon saturates, so a fit may end in a minimum without it.
+    """
+    n = model.motion.arm.stiffness.size
+    for c, kind in enumerate(model.motion.kind):
+        if kind in (Kind.VISCOUS, Kind.COULOMB, Kind.ROTOR):
+            m.x[2 * n + c] += model.motion.prior[c]
+
+
 def take_as_known(model: Model, m: mem.FilterState, beyond: Kind = Kind.DAMPING) -> None:
     """Take the entries of p beyond a kind as given, where an unknown object hides them; modes stay uncertain."""
     n = model.motion.arm.stiffness.size

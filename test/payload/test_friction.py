@@ -15,7 +15,7 @@ from flexmanip_ros.payload import structured
 from flexmanip_ros.payload.gauss_newton import TRUSTED
 from flexmanip_ros.payload.measurement_update import observe
 from flexmanip_ros.payload.moving_horizon import MODELLED_SHARE, WAVES
-from flexmanip_ros.payload.process_model import predict
+from flexmanip_ros.payload.process_model import Kind, predict
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import Status
 
@@ -91,3 +91,14 @@ def test_with_a_friction_of_a_tenth_of_the_torque_the_mass_is_inside_its_interva
     assert found.status is Status.TRACKING
     assert found.lower < 20.0 < found.upper
     assert found.mass == pytest.approx(20.0, rel=0.01)
+
+
+@pytest.mark.parametrize(('failed', 'deviations'), [(1, 0.0), (2, 1.0), (3, 1.0)])
+def test_a_fit_that_failed_twice_begins_again_with_other_rotors_and_friction(failed, deviations):
+    samples = record(0.024, arm=RUBBING)
+    state = structured.advance(CONFIG, structured.init(CONFIG)._replace(refits=failed), samples)
+    motion, begun = state.model.motion, state.memory.x0[-state.model.motion.kind.size:]
+    for kind in (Kind.VISCOUS, Kind.COULOMB, Kind.ROTOR):
+        some = motion.kind == kind
+        assert np.all(motion.prior[some] > 0.0)
+        assert begun[some] == pytest.approx(motion.given[some] + deviations * motion.prior[some], rel=1e-9, abs=1e-15)
