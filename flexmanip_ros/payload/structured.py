@@ -260,7 +260,7 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
         structured_model.guess_noise(model, m.noise)
     # the simplest arm first; then all that may be learned, with late signals and without in turn, from another start
     if state.refits > 1:
-        structured_model.expect_losses(model, m)
+        structured_model.expect_rotors_and_friction(model, m)
     if state.refits % 2 == 0:
         structured_model.take_as_known(model, m, Kind.MODE if state.refits else Kind.DAMPING)
     m.S[:] = structured_model.triangular(m.S)
