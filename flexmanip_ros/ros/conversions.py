@@ -11,7 +11,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import InertiaStamped
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header, MultiArrayDimension
 
@@ -71,43 +71,6 @@ class JointStateReader:
             yield block
             count = len(block.stamp_ns)
             first, most = first + count, 2 * count  # where layouts alternate, a block does not scan all the rest
-
-
-class JointStateWriter:
-    """Serializer of JointStates, whose bytes a publisher sends as they are: it takes a third of the time of rclpy's.
-
-    While names and array lengths stay the same, it overwrites only the stamp and the numbers of the last message.
-    """
-
-    def __init__(self) -> None:
-        self._message = bytearray()
-        self._layout: cdr.Layout | None = None
-
-    def __call__(self, record: JointRecord) -> bytes:
-        """Return a record as a serialized JointState."""
-        layout, counts = self._layout, tuple(map(len, record[2:]))
-        is_alike = layout is not None and layout.names == record.names and layout.counts == counts
-        if layout is not None and is_alike and FIRST_NS <= record.stamp_ns <= LAST_NS:
-            return cdr.refilled(self._message, layout, record)
-        raw: bytes = serialize_message(joint_state(record))
-        self._message, self._layout = bytearray(raw), cdr.joint_record(raw, None)[1]
-        return raw
-
-
-class NumbersWriter:
-    """Serializer of Float64MultiArrays without labels: only the numbers, the last bytes, are written anew."""
-
-    def __init__(self) -> None:
-        self._head = b''
-        self._size = -1
-
-    def __call__(self, values: Array) -> bytes:
-        """Return values (N,) as a serialized Float64MultiArray."""
-        data = np.ascontiguousarray(values, dtype=np.float64).tobytes()
-        if len(data) != self._size:
-            raw: bytes = serialize_message(Float64MultiArray(data=doubles(values)))
-            self._head, self._size = raw[:len(raw) - len(data)], len(data)
-        return self._head + data
 
 
 def _decoded(raw: bytes) -> JointRecord:

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, Header
+from std_msgs.msg import Header
 
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.messages import Dimension, Inertia, LabelledArray
@@ -29,27 +29,6 @@ def same(a: JointRecord, b: JointRecord) -> bool:
     fields = ('position', 'velocity', 'effort')
     return (a.stamp_ns, a.names) == (b.stamp_ns, b.names) and all(
         getattr(a, field).tobytes() == getattr(b, field).tobytes() for field in fields)
-
-
-@given(st.lists(records(), min_size=1, max_size=3), st.lists(VALUES, min_size=3, max_size=3), STAMPS)
-def test_bytes_written_over_the_last_message_are_the_message(
-        some: list[JointRecord], numbers: list[np.ndarray], later_ns: int) -> None:
-    write, read = conversions.JointStateWriter(), conversions.JointStateReader()
-    for record in some:
-        others = (np.resize(new, len(old)) for new, old in zip(numbers, record[2:], strict=True))
-        again = JointRecord(later_ns, record.names, *others)
-        assert same(read(write(record)), record)
-        assert same(conversions.joint_record(deserialize_message(write(again), JointState)), again)
-
-
-@given(st.lists(VALUES, min_size=1, max_size=4))
-def test_numbers_written_over_the_last_message_are_the_message(some: list[np.ndarray]) -> None:
-    write = conversions.NumbersWriter()
-    for values in some:
-        for again in (values, -values):
-            message = deserialize_message(write(again), Float64MultiArray)
-            assert np.array(message.data).tobytes() == again.tobytes()
-            assert not message.layout.dim
 
 
 @given(records())

@@ -18,7 +18,7 @@ from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros.parameters import ExcitationParameters
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.conversions import NumbersWriter
+from flexmanip_ros.ros.conversions import doubles
 from flexmanip_ros.ros.diagnostics import CLOCK, WARN, Meter, Report
 from flexmanip_ros.ros.node import FlexmanipNode, SampleGrid, run
 from flexmanip_ros.simulation import excitation
@@ -33,7 +33,6 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
     def __init__(self, **options: Any) -> None:
         super().__init__(NAME, ExcitationParameters, **options)
         self._meter = Meter()
-        self._written = NumbersWriter()
         self._last = -1
         self._first_ns: int | None = None
         self.skipped = 0
@@ -107,7 +106,7 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
         self._send(excitation.torque(self.config, latest))
 
     def _send(self, torque: Array) -> None:
-        self.commands.publish(self._written(torque))
+        self.commands.publish(Float64MultiArray(data=doubles(torque)))
 
     def report(self, report: Report) -> None:
         """Report the rate and the number of instants that passed without a command."""

@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.conversions import JointStateWriter, capture_event
+from flexmanip_ros.ros.conversions import capture_event, joint_state
 from flexmanip_ros.ros.diagnostics import CLOCK, ERROR, WARN, LossCounter, Meter, Report
 from flexmanip_ros.ros.node import FlexmanipNode, SampleGrid, run
 from flexmanip_ros.ros.rclpy_workarounds import sequence_number, with_info
@@ -52,7 +52,6 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         self._restarted_ns = 0
         self._pending: tuple[CaptureEvent, ...] = ()
         self._meter = Meter()
-        self._written = JointStateWriter()
         self._fault = ''
 
     def make_entities(self) -> None:
@@ -131,7 +130,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             return
         self.samples += 1
         if record is not None:  # None: lost on its way (sensors.drop_probability)
-            self.joint_states.publish(self._written(record))
+            self.joint_states.publish(joint_state(record))
 
     def _apply_events(self, stamp: int) -> None:
         """Take or let go of the object before the first sample that is not older than the event."""
