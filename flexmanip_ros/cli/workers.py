@@ -6,18 +6,17 @@ import ctypes
 import gc
 import importlib
 import json
-import math
 import multiprocessing
 import multiprocessing.connection
 import os
 import signal
 import threading
-import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from itertools import islice
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,10 +41,6 @@ ANSWER_TIME = 10.0
 """Time after which a scheduler that does not answer counts as missing [s]."""
 GARBAGE = 20_000
 """Number of new objects between two garbage collections, each of which visits the many small objects of a run."""
-RECOUNT = 5.0
-"""Time after which the workers of a cluster are counted again [s]."""
-ATTEMPTS = 2
-"""Number of times that a run is tried when its worker dies; the last time it runs alone."""
 
 Task = Any
 Work = Callable[[Task], Any]
@@ -151,41 +146,58 @@ def serial(work: Work, tasks: Iterable[Task]) -> Iterator[Outcome]:
 def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome]:
     """Compute in ``count`` processes of this machine. Outcomes come as they are ready.
 
-    A worker that dies (killed, out of memory) costs at most the run it was doing.
+    A worker that dies (killed, out of memory) costs at most the run it was doing: the runs under way are done again,
+    each alone, so that it is known which one kills its worker.
     """
     for name in THREADS:
         os.environ.setdefault(name, '1')  # one run per core leaves no core for more threads
     waiting = iter(tasks)
-    again: list[tuple[Task, int]] = []
     spawn = multiprocessing.get_context('spawn')
     told = spawn.Value(ctypes.c_bool, False)
+
+    def tried(some: Iterator[Task]) -> Iterator[Outcome]:
+        with ProcessPoolExecutor(count, spawn, _serve, (told,)) as pool:
+            yield from _outcomes(pool, work, some, lambda: count)
+
     while True:
-        pool = ProcessPoolExecutor(count, spawn, _serve, (told,))
-        running: dict[Future[Any], tuple[Task, int]] = {}
-        try:
-            if again:  # alone, so that it is known which run kills its worker
-                task, attempt = again.pop()
-                running[pool.submit(work, task)] = (task, attempt)
+        again: list[Task] = []
+        for outcome in tried(waiting):
+            if isinstance(outcome.error, BrokenProcessPool):
+                again.append(outcome.task)
             else:
-                _fill(pool, work, waiting, running, count * AHEAD)
+                yield outcome
+        if not again:
+            return
+        for task in again:
+            for outcome in tried(iter([task])):
+                is_dead = isinstance(outcome.error, BrokenProcessPool)
+                yield outcome._replace(error=FlexmanipError(
+                    'the worker died in this run', 'run it alone with --workers 0 to see why')) if is_dead else outcome
+
+
+def _outcomes(pool: Executor, work: Work, waiting: Iterator[Task], workers: Callable[[], int]) -> Iterator[Outcome]:
+    """Compute until no task waits or the pool is broken, with ``AHEAD`` tasks a worker under way."""
+    running: dict[Future[Any], Task] = {}
+    is_broken = False
+    try:
+        while True:
+            for task in islice(waiting, 0 if is_broken else max(AHEAD * workers() - len(running), 0)):
+                try:
+                    running[pool.submit(work, task)] = task
+                except BrokenProcessPool as broken:
+                    is_broken = True
+                    yield Outcome(task, None, broken)
+                    break
             if not running:
                 return
-            alone = len(running) == 1 and next(iter(running.values()))[1] > 0
-            while running:
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    task, attempt = running.pop(future)
-                    error = future.exception()
-                    if not isinstance(error, BrokenProcessPool):
-                        yield Outcome(task, None if error else future.result(), error)
-                    elif attempt + 1 < ATTEMPTS:
-                        again.append((task, attempt + 1))
-                    else:
-                        yield Outcome(task, None, FlexmanipError(
-                            'the worker died in this run', 'run it alone with --workers 0 to see why'))
-                if not alone and not again:
-                    _fill(pool, work, waiting, running, count * AHEAD)
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                task = running.pop(future)
+                error = CancelledError('the run was cancelled') if future.cancelled() else future.exception()
+                is_broken |= isinstance(error, BrokenProcessPool)
+                yield Outcome(task, None if error else future.result(), error)
+    finally:
+        for future in running:
+            future.cancel()
 
 
 def _serve(told: Synchronized[bool]) -> None:
@@ -203,20 +215,6 @@ def _end_with(sentinel: int) -> None:
     """End this process when the process of the sentinel has ended."""
     multiprocessing.connection.wait([sentinel])
     os._exit(1)
-
-
-def _fill(pool: ProcessPoolExecutor, work: Work, waiting: Iterator[Task],
-          running: dict[Future[Any], tuple[Task, int]], most: int) -> None:
-    try:
-        while len(running) < most:
-            task = next(waiting)
-            running[pool.submit(work, task)] = (task, 0)
-    except StopIteration:
-        return
-    except BrokenProcessPool:  # the task that could not be submitted is tried with the others
-        broken: Future[Any] = Future()
-        broken.set_exception(BrokenProcessPool())
-        running[broken] = (task, 0)
 
 
 def cluster(work: Work, tasks: Iterable[Task], address: str) -> Iterator[Outcome]:
@@ -237,28 +235,5 @@ def cluster(work: Work, tasks: Iterable[Task], address: str) -> Iterator[Outcome
         except TimeoutError as err:
             raise FlexmanipError(f"the cluster at '{address}' has no workers",
                                  'start some with: dask worker ADDRESS') from err
-        waiting = iter(tasks)
-        running: dict[Any, Task] = {}
-        ready = dask.as_completed()
-        most, counted = 0, -math.inf
-
-        def submit() -> None:
-            nonlocal most, counted
-            if time.monotonic() - counted > RECOUNT:  # workers may join and leave
-                most, counted = AHEAD * max(sum(client.nthreads().values()), 1), time.monotonic()
-            while len(running) < most:
-                try:
-                    task = next(waiting)
-                except StopIteration:
-                    return
-                future = client.submit(work, task, pure=False)
-                running[future] = task
-                ready.add(future)
-
-        submit()
-        for future in ready:
-            task = running.pop(future)
-            error = future.exception()
-            yield Outcome(task, None if error else future.result(), error)
-            future.release()
-            submit()
+        yield from _outcomes(client.get_executor(pure=False), work, iter(tasks),
+                             lambda: max(sum(client.nthreads().values()), 1))  # workers may join and leave
