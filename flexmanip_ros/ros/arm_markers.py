@@ -1,9 +1,7 @@
-"""Markers of the arm and of the object that it holds, for RViz, Lichtblick and Foxglove.
-
-The marker messages are created once and refilled for each publication: filling takes 0.1 ms, publishing 0.2 ms.
-"""
+"""Markers of the arm and of the object that it holds, for RViz, Lichtblick and Foxglove."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -61,75 +59,61 @@ THICKNESS = 1.0 / 60.0
 
 
 class ArmMarkers:
-    """Fills the markers of one arm: links, joints, the object, its mass as text."""
+    """Makes the markers of one arm: links, joints, the object, its mass as text."""
 
     def __init__(self, config: IdentifierParameters) -> None:
-        """Create the messages; ``drawn`` is False where the configured signals lack the angles of the arm."""
         self._config = config
         known = signals(config)
         self.drawn = known is not None and known.angles
-        links = len(config.arm.link_length)
-        self._bends: list[str | None] = [None] * links
+        """Whether the configured signals have the angles of the arm."""
+        self._bends: list[str | None] = [None] * len(config.arm.link_length)
         if known is not None:
             for role, name in zip(known.outputs, config.outputs, strict=True):
                 if role.quantity is Quantity.BEND:
                     self._bends[role.link] = name.rpartition('/')[0]
         self._joints = [name.rpartition('/')[0] for name in config.angles]
-        reach = sum(config.arm.link_length)
-        width = THICKNESS * reach
-        self._links = [_marker('link', k, Marker.LINE_STRIP, (width, 0.0, 0.0), LINK_COLOURS[k])
-                       for k in range(links)]
-        for link in self._links:
-            link.points = [Point() for _ in range(POINTS)]
-        self._ends = _marker('joint', 0, Marker.SPHERE_LIST, (2.0 * width,) * 3, JOINT)
-        self._ends.points = [Point() for _ in range(links + 1)]
-        self._object = _marker('object', 0, Marker.SPHERE, (width,) * 3, TRUSTED)
-        # scale.z: height of the letters; RViz makes a space as wide as half of scale.x, or that of letters of 1 m
-        self._text = _marker('payload', 0, Marker.TEXT_VIEW_FACING, (width, 0.0, 2.0 * width), JOINT)
-        self._above = 4.0 * width
-        self.message = MarkerArray(markers=[*self._links, self._ends, self._object, self._text])
+        self._width = THICKNESS * sum(config.arm.link_length)
 
-    def update(self, record: JointRecord, payload: Payload | None) -> bool:
-        """Fill ``message``; return False where the record lacks an angle or has a value that is not finite."""
+    def message(self, record: JointRecord, payload: Payload | None) -> MarkerArray | None:
+        """Return the markers; None where the record lacks an angle or has a value that is not finite."""
         found = {name: k for k, name in enumerate(record.names) if k < record.position.size}
         if any(name not in found for name in self._joints):
-            return False
+            return None
         angles = record.position[[found[name] for name in self._joints]]
         bends = np.array([record.position[found[name]] if name in found else 0.0 for name in self._bends])
         if not (np.isfinite(angles).all() and np.isfinite(bends).all()):
-            return False
+            return None
         drawing = draw(self._config.arm, angles, bends)
-        stamp = time_message(record.stamp_ns)
-        for marker in self.message.markers:
-            marker.header.stamp = stamp
+        width, tips = self._width, drawing.links[:, -1].tolist()
+        links = [_marker('link', k, Marker.LINE_STRIP, (width, 0.0, 0.0), LINK_COLOURS[k], points=line)
+                 for k, line in enumerate(drawing.links.tolist())]
+        ends = _marker('joint', 0, Marker.SPHERE_LIST, (2.0 * width,) * 3, JOINT, points=[[0.0, 0.0], *tips])
+        held = self._held(payload, tips[-1], drawing.tip_angle)
+        made = MarkerArray(markers=[*links, ends, *held])
+        for marker in made.markers:
+            marker.header.stamp = time_message(record.stamp_ns)
             marker.header.frame_id = self._config.base_frame
-        for marker, line in zip(self._links, drawing.links.tolist(), strict=True):
-            _place(marker.points, line)
-        _place(self._ends.points, [[0.0, 0.0], *drawing.links[:, -1].tolist()])
-        self._held(payload, drawing.links[-1, -1], drawing.tip_angle)
-        return True
+        return made
 
-    def _held(self, payload: Payload | None, tip: np.ndarray, angle: float) -> None:
-        """Draw the object where its mass is known, and write what is known of the payload as text."""
+    def _held(self, payload: Payload | None, tip: Sequence[float], angle: float) -> tuple[Marker, Marker]:
+        """Return the object, where its mass is known, and what is known of the payload as text. angle: of the tip."""
+        x, y = tip
         known = payload is not None and math.isfinite(payload.std)
-        shown = payload is not None and known and payload.mass > 0.0
-        self._object.action = Marker.ADD if shown else Marker.DELETE
         trusted = payload is not None and known and payload.status is Status.TRACKING
         colour = TRUSTED if trusted else DOUBTFUL
-        x, y = float(tip[0]), float(tip[1])
-        if payload is not None and shown:
-            size = (6.0 * payload.mass / (math.pi * DENSITY)) ** (1.0 / 3.0)
-            c, s = math.cos(angle), math.sin(angle)
-            centre, scale = self._object.pose.position, self._object.scale
-            centre.x = x + c * payload.com[0] - s * payload.com[1]
-            centre.y = y + s * payload.com[0] + c * payload.com[1]
-            scale.x = scale.y = scale.z = size
-            _paint(self._object, colour)
-        _paint(self._text, colour)
-        self._text.pose.position.x, self._text.pose.position.y = x, y + self._above
-        self._text.text = words(payload)
+        mass, (com_x, com_y, _) = (payload.mass, payload.com) if payload is not None and known else (0.0, (0.0,) * 3)
+        size = (6.0 * max(mass, 0.0) / (math.pi * DENSITY)) ** (1.0 / 3.0)
+        ball = _marker('object', 0, Marker.SPHERE, (size,) * 3, colour)
+        ball.action = Marker.ADD if mass > 0.0 else Marker.DELETE
+        ball.pose.position.x = x + math.cos(angle) * com_x - math.sin(angle) * com_y
+        ball.pose.position.y = y + math.sin(angle) * com_x + math.cos(angle) * com_y
+        # scale.z: height of the letters; RViz makes a space as wide as half of scale.x, or that of letters of 1 m
+        text = _marker('payload', 0, Marker.TEXT_VIEW_FACING, (self._width, 0.0, 2.0 * self._width), colour)
+        text.pose.position.x, text.pose.position.y = x, y + 4.0 * self._width
+        text.text = words(payload)
         # RViz never draws a text marker that was empty at first, and keeps the old text of one that becomes empty
-        self._text.action = Marker.ADD if self._text.text else Marker.DELETE
+        text.action = Marker.ADD if text.text else Marker.DELETE
+        return ball, text
 
 
 def words(payload: Payload | None) -> str:
@@ -142,21 +126,11 @@ def words(payload: Payload | None) -> str:
     return text if payload.status is Status.TRACKING else f'not reliable: {text}'
 
 
-def _marker(space: str, number: int, kind: int, size: tuple[float, float, float], colour: tuple[float, float, float]
-            ) -> Marker:
-    made = Marker(ns=space, id=number, type=kind, action=Marker.ADD)
+def _marker(space: str, number: int, kind: int, size: tuple[float, ...], colour: tuple[float, ...],
+            points: Sequence[Sequence[float]] = ()) -> Marker:
+    made = Marker(ns=space, id=number, type=kind, action=Marker.ADD, points=[Point(x=x, y=y) for x, y in points])
     made.pose.orientation.w = 1.0
     made.scale.x, made.scale.y, made.scale.z = size
-    _paint(made, colour)
+    made.color.r, made.color.g, made.color.b = colour
+    made.color.a = 1.0
     return made
-
-
-def _paint(marker: Marker, colour: tuple[float, float, float]) -> None:
-    rgba = marker.color
-    rgba.r, rgba.g, rgba.b = colour
-    rgba.a = 1.0
-
-
-def _place(points: list[Point], line: list[list[float]]) -> None:
-    for point, (x, y) in zip(points, line, strict=True):
-        point.x, point.y = x, y

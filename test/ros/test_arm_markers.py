@@ -27,16 +27,15 @@ RECORD = JointRecord(1_500_000_000, ('link2_bend', 'joint2', 'joint1', 'link1_be
 HELD = Payload(20.0, 0.1, 19.8, 20.2, 1.0, Status.TRACKING, com=(0.1, 0.0, 0.0))
 
 
-def by_name(markers: ArmMarkers) -> dict[str, Any]:
-    return {f'{item.ns}{item.id}': item for item in markers.message.markers}
+def by_name(drawn: MarkerArray | None) -> dict[str, Any]:
+    assert drawn is not None
+    return {f'{item.ns}{item.id}': item for item in drawn.markers}
 
 
 def test_the_links_are_drawn_from_the_signals_by_name_and_the_object_at_its_centre_of_mass() -> None:
     config = IdentifierParameters(base_frame='world')
-    markers = ArmMarkers(config)
-    assert markers.update(RECORD, HELD)
+    found = by_name(ArmMarkers(config).message(RECORD, HELD))
     drawn = draw(config.arm, np.array([0.3, 0.5]), np.array([0.02, 0.01]))
-    found = by_name(markers)
     for link in range(2):
         points = np.array([(point.x, point.y) for point in found[f'link{link}'].points])
         np.testing.assert_array_equal(points, drawn.links[link])
@@ -46,16 +45,14 @@ def test_the_links_are_drawn_from_the_signals_by_name_and_the_object_at_its_cent
         (tip[0] + 0.1 * math.cos(angle), tip[1] + 0.1 * math.sin(angle)))
     assert 1000.0 * math.pi / 6.0 * ball.scale.x ** 3 == pytest.approx(20.0)  # as heavy as water
     assert found['payload0'].text == '20.00 kg (95 %: 19.80 to 20.20)'
-    for item in markers.message.markers:
+    for item in found.values():
         assert item.header.frame_id == 'world'
         assert conversions.stamp_ns(item.header.stamp) == RECORD.stamp_ns
 
 
 def test_a_payload_that_is_not_known_is_no_ball_and_no_number() -> None:
-    markers = ArmMarkers(IdentifierParameters())
-    assert markers.update(RECORD, HELD)
-    assert markers.update(RECORD, Payload(0.0, math.inf, 0.0, math.inf, 1.0, Status.INCONSISTENT))
-    found = by_name(markers)
+    unknown = Payload(0.0, math.inf, 0.0, math.inf, 1.0, Status.INCONSISTENT)
+    found = by_name(ArmMarkers(IdentifierParameters()).message(RECORD, unknown))
     assert found['object0'].action == Marker.DELETE
     assert found['payload0'].text.startswith('payload not known: ')
     assert words(HELD._replace(status=Status.INCONSISTENT)).startswith('not reliable: 20.00 kg')
@@ -64,10 +61,9 @@ def test_a_payload_that_is_not_known_is_no_ball_and_no_number() -> None:
 
 def test_a_record_without_an_angle_or_with_nan_is_not_drawn_and_one_without_bends_is_straight() -> None:
     markers = ArmMarkers(IdentifierParameters())
-    assert not markers.update(RECORD._replace(names=('a', 'b', 'c', 'd')), None)
-    assert not markers.update(RECORD._replace(position=np.array([0.01, math.nan, 0.3, 0.02])), None)
-    assert markers.update(RECORD._replace(names=('x', 'joint2', 'joint1', 'y')), None)
-    first = by_name(markers)['link0'].points
+    assert markers.message(RECORD._replace(names=('a', 'b', 'c', 'd')), None) is None
+    assert markers.message(RECORD._replace(position=np.array([0.01, math.nan, 0.3, 0.02])), None) is None
+    first = by_name(markers.message(RECORD._replace(names=('x', 'joint2', 'joint1', 'y')), None))['link0'].points
     assert math.atan2(first[5].y, first[5].x) == pytest.approx(0.3)
 
 
@@ -89,11 +85,13 @@ def test_the_identifier_shows_the_latest_sample_and_what_it_holds_when_somebody_
     assert len(heard) < 100  # 25 a second, not one a sample
 
 
-def test_nothing_is_drawn_for_nobody(ros: Ros) -> None:
+def test_nothing_is_drawn_for_nobody(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[JointRecord] = []
+    monkeypatch.setattr(ArmMarkers, 'message', lambda self, record, payload: drawn.append(record))
     live = Live(ros)
     live.send(*recording(100))
     ros.wait(lambda: live.node._latest is None, what='the timer')
-    assert not any(marker.header.frame_id for marker in live.node._markers.message.markers)
+    assert drawn == []
 
 
 def topics(value: Any) -> set[str]:

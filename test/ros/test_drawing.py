@@ -56,10 +56,10 @@ def test_no_text_is_shown_before_the_first_estimate() -> None:
     config = IdentifierParameters()
     names = tuple(name.rpartition('/')[0] for name in (*config.angles, *config.outputs[:2]))
     record = JointRecord(0, names, np.zeros(4), np.zeros(4), np.zeros(4))
-    markers = ArmMarkers(config)
-    text = next(marker for marker in markers.message.markers if marker.ns == 'payload')
     known = Payload(20.0, 0.1, 19.8, 20.2, 1.0, Status.TRACKING)
     for payload, action in ((None, Marker.DELETE), (known, Marker.ADD), (None, Marker.DELETE)):
-        assert markers.update(record, payload)
+        drawn = ArmMarkers(config).message(record, payload)
+        assert drawn is not None
+        text = next(marker for marker in drawn.markers if marker.ns == 'payload')
         assert text.action == action
-    assert text.scale.x > 0.0  # else its spaces are those of letters of 1 m
+        assert text.scale.x > 0.0  # else its spaces are those of letters of 1 m

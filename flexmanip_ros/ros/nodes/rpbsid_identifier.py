@@ -353,8 +353,9 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         if not self.active or record is None or self.arm.get_subscription_count() == 0:
             return
         payload = None if self.estimate is None else self.estimate.payload
-        if self._markers.update(record, payload):
-            self.arm.publish(self._markers.message)
+        markers = self._markers.message(record, payload)
+        if markers is not None:
+            self.arm.publish(markers)
 
     def _check_age(self, stamp_ns: int) -> None:
         """Drop a saved state that is too old for these samples: the arm may hold something else by now."""
