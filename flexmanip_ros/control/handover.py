@@ -38,13 +38,19 @@ class PayloadEstimate(NamedTuple):
     def having(self, body: Sequence[float]) -> PayloadEstimate | None:
         """Return the estimate with the body (20,) of ``~/payload_body``; None where that is of another time.
 
-        body: mass, centre of mass x, y, inertia about it, then their covariance. Messages that belong together are at
-        most a few samples apart, so their masses are close.
+        body: mass, centre of mass x, y, inertia about it, then their covariance.
         """
-        near = abs(body[0] - self.mass) <= max(3.0 * self.std, 1e-3 * abs(self.mass))
-        if not near or not all(map(math.isfinite, body)):
+        if not self.fits(body):
             return None
         return self._replace(com=(body[1], body[2]), inertia=max(body[3], 0.0))
+
+    def fits(self, body: Sequence[float]) -> bool:
+        """Whether a body, with its mass first, is finite and belongs to the estimate.
+
+        Messages that belong together are at most a few samples apart, so their masses are close.
+        """
+        near = abs(body[0] - self.mass) <= max(3.0 * self.std, 1e-3 * abs(self.mass))
+        return near and all(map(math.isfinite, body))
 
 
 class Arrivals(NamedTuple):
@@ -100,7 +106,7 @@ def judge(config: ControllerParameters, estimate: PayloadEstimate) -> Verdict:
 
 
 class HandoverState(NamedTuple):
-    """Since when the estimate is trusted [s], which one the driver accepted, and when it was last asked [s]."""
+    """Since when the estimate is trusted [s], which one the driver accepted, and when it last answered [s]."""
 
     trusted_since: float | None = None
     sent: PayloadEstimate | None = None
@@ -140,13 +146,3 @@ def gyration(body: PayloadEstimate) -> float:
     if body.inertia <= 0.0:
         return 0.0
     return math.sqrt(body.inertia / body.mass) if body.mass > 0.0 else math.inf
-
-
-def accepted(state: HandoverState, sent: PayloadEstimate, now: float) -> HandoverState:
-    """Note that the driver accepted a payload."""
-    return state._replace(sent=sent, sent_at=now)
-
-
-def rejected(state: HandoverState, now: float) -> HandoverState:
-    """Note that the driver did not accept the payload: it is sent again after ``min_period``."""
-    return state._replace(sent_at=now)

@@ -6,16 +6,15 @@ import math
 import textwrap
 import time
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from flexmanip_ros.identification.realization import suggested_order
+from flexmanip_ros.messages import DiagnosticStatus
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload.structured_model import unobservable_reason
 from flexmanip_ros.samples.sampling import Clock
@@ -66,22 +65,18 @@ class Report:
         return f'{none} {topic}{since}{" (use_sim_time is true)" if topic == CLOCK else ""}'
 
     def busy(self, remedy: str) -> None:
-        """Warn where the callback takes more than ``BUSY`` of the time; the values of a ``Meter`` must be there."""
+        """Warn where the callback takes more than ``BUSY`` of the time."""
         if self.values['callback_share'] > BUSY:
             self.worse(WARN, f'{TOO_SLOW}: {remedy}')
 
-    def message(self, node: str, namespace: str, stamp: Time) -> DiagnosticArray:
-        """Return the entry as the message for /diagnostics; node: the fully qualified name of the node.
+    def entry(self, node: str, namespace: str) -> DiagnosticStatus:
+        """Return the entry for /diagnostics; node: the fully qualified name of the node.
 
         The hardware_id contains the namespace, because the nodes in one namespace belong to one arm.
         """
-        status = DiagnosticStatus(
-            level=bytes([self.level]), name=f'{node}: status', message='; '.join(self.words) or 'ok',
-            hardware_id=f'flexmanip_ros {namespace}',
-            values=[KeyValue(key=key, value=text(value)) for key, value in self.values.items()])
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = stamp
-        return array
+        return DiagnosticStatus(
+            self.level, f'{node}: status', '; '.join(self.words) or 'ok', f'flexmanip_ros {namespace}',
+            tuple((key, text(value)) for key, value in self.values.items()))
 
 
 def shortened(words: str) -> str:
@@ -102,29 +97,20 @@ def text(value: Any) -> str:
 
 
 class Meter:
-    """Measures the run times of a callback and counts its messages; the callback's body runs in ``with meter:``."""
+    """Measures the run times of a callback and counts its messages."""
 
     def __init__(self) -> None:
         self._times_ns: list[int] = []
         self._messages = 0
-        self._taken = 1
-        self._entered_ns = 0
         self._window_ns = time.monotonic_ns()
 
-    def of(self, messages: int) -> Meter:
-        """Return the meter, set for a run of the callback that takes this number of messages."""
-        self._taken = messages
-        return self
-
-    def __enter__(self) -> Meter:
-        self._entered_ns = time.perf_counter_ns()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
-        self._times_ns.append(time.perf_counter_ns() - self._entered_ns)
-        self._messages += self._taken
-        self._taken = 1
+    @contextmanager
+    def timed(self, messages: int = 1) -> Iterator[None]:
+        """Measure the body, which takes this number of messages."""
+        entered_ns = time.perf_counter_ns()
+        yield
+        self._times_ns.append(time.perf_counter_ns() - entered_ns)
+        self._messages += messages
 
     def window(self) -> Mapping[str, float]:
         """Return rate of the messages [Hz] and times of the callback since the last call, and start a new window."""

@@ -25,13 +25,26 @@ from rclpy.qos import QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
+from sensor_msgs.msg import JointState
 
 from flexmanip_ros.errors import FlexmanipError, ParameterError
 from flexmanip_ros.io import cdr
+from flexmanip_ros.messages import Diagnostics
 from flexmanip_ros.parameters.document import help_text
 from flexmanip_ros.ros import qos, rclpy_workarounds
-from flexmanip_ros.ros.diagnostics import CLOCK, ERROR, WARN, JointStateFaults, Report, shortened
+from flexmanip_ros.ros.conversions import diagnostic_array
+from flexmanip_ros.ros.diagnostics import (
+    CLOCK,
+    ERROR,
+    WARN,
+    JointStateFaults,
+    LossCounter,
+    Meter,
+    Report,
+    shortened,
+)
 from flexmanip_ros.ros.parameters import NodeParameters, arm_line
 from flexmanip_ros.samples.signals import Rejection
 
@@ -59,6 +72,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         """
         super().__init__(name, parameter_overrides=overrides, **options)
         self.active = False
+        self.meter = Meter()
         self.events: dict[str, int] = {}
         """Counts of QoS events, by topic and kind: missed deadlines, incompatible publishers, ..."""
         self._entities_made = False
@@ -193,26 +207,40 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         with _qos_errors(topic):
             return self.create_publisher(kind, topic, profile, qos_overriding_options=qos.overridable())
 
-    def subscription(self, kind: type[Any], topic: str, callback: Callable[..., None], profile: QoSProfile, *,
-                     raw: bool = False, matched: Callable[[Any], None] | None = None) -> Subscription:
+    def subscription(self, kind: type[Any], topic: str, callback: Callable[[Any], None], profile: QoSProfile, *,
+                     raw: bool = False, losses: LossCounter | None = None) -> Subscription:
         """Create a subscription whose quality of service the user may override; its QoS events are counted.
 
-        matched: called when a publisher comes or goes.
+        losses: counts the messages that do not arrive.
         """
+        def counted(message: Any, info: Any) -> None:
+            assert losses is not None
+            losses.note(rclpy_workarounds.sequence_number(info))
+            callback(message)
+
         watch = SubscriptionEventCallbacks(
-            matched=matched,
+            matched=None if losses is None else losses.matched,
             deadline=lambda event: self._count(topic, 'deadline_missed', event.total_count),
             liveliness=lambda event: self._count(topic, 'publishers_not_alive', event.not_alive_count),
             incompatible_qos=lambda event: self._incompatible(topic, event))
         with _qos_errors(topic):
-            return self.create_subscription(kind, topic, callback, profile, raw=raw, event_callbacks=watch,
-                                            qos_overriding_options=qos.overridable())
+            return self.create_subscription(
+                kind, topic, callback if losses is None else rclpy_workarounds.with_info(counted), profile, raw=raw,
+                event_callbacks=watch, qos_overriding_options=qos.overridable())
 
-    def batches(self, kind: type[Any], topic: str, profile: QoSProfile, *,
-                matched: Callable[[Any], None] | None = None) -> rclpy_workarounds.Batches:
-        """Create a subscription whose serialized messages wait in its queue until they are taken, see ``Batches``."""
-        made = rclpy_workarounds.Batches(
-            self, self.subscription(kind, topic, _unused, profile, raw=True, matched=matched))
+    def each_joint_state(self, take: Callable[[bytes], None], losses: LossCounter | None = None) -> None:
+        """Subscribe to the joint states, serialized; ``take`` gets each while the node is active, and is timed."""
+        def timed(raw: bytes) -> None:
+            if self.active:
+                with self.meter.timed():
+                    take(raw)
+
+        self.subscription(JointState, 'joint_states', timed, qos.sensor_input(), raw=True, losses=losses)
+
+    def waiting_joint_states(self, losses: LossCounter) -> rclpy_workarounds.Batches:
+        """Subscribe to the joint states, which wait, serialized, until they are taken. Note their numbers."""
+        made = rclpy_workarounds.Batches(self, self.subscription(
+            JointState, 'joint_states', lambda raw: None, qos.sensor_input(), raw=True, losses=losses))
         self._unknown_to_rclpy.callback(made.give_back, self)
         return made
 
@@ -278,6 +306,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         now = time.monotonic()
         report = Report(silence_s=None if self._heard_at is None else now - self._heard_at)
         if self._entities_made:
+            report.values.update(self.meter.window())
             self.report(report)
         report.values['active'] = self.active
         for name, count in self.events.items():
@@ -292,8 +321,8 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         else:
             self._log_silence(report)
             self._heard_at = self._heard_at if report.waits_for else now
-        self._diagnostics.publish(report.message(
-            self.get_fully_qualified_name(), self.get_namespace(), self.get_clock().now().to_msg()))
+        entry = report.entry(self.get_fully_qualified_name(), self.get_namespace())
+        self._diagnostics.publish(diagnostic_array(Diagnostics(self.get_clock().now().nanoseconds, (entry,))))
 
     def _log_silence(self, report: Report) -> None:
         """Log when the messages that the node needs cease or come."""
@@ -311,10 +340,6 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
             self.get_logger().info(f'messages arrive: {report.values["rate_hz"]:.0f} a second')
 
 
-def _unused(message: Any) -> None:
-    """Do nothing; rclpy requires a callback for every subscription."""
-
-
 @contextmanager
 def _qos_errors(topic: str) -> Iterator[None]:
     """Raise ParameterError for a quality of service that is not possible, naming the parameters that set it."""
@@ -326,41 +351,60 @@ def _qos_errors(topic: str) -> Iterator[None]:
 
 
 class SampleGrid:
-    """A uniform grid of instants: instant k is k / rate seconds after the call of ``begin``.
+    """A uniform grid of instants, and a timer on it: instant k is k / rate seconds after instant 0.
 
-    Elapsed time is that of a steady clock, so a correction of the system clock moves no stamp. With ``use_sim_time``
-    it is that of /clock.
+    ``begun`` is called when instant 0 is set: at ``start``, or with the first simulated time, and again when simulated
+    time goes back before instant 0. ``reached`` is called with the index of the latest instant. Elapsed time is that of
+    a steady clock, so a correction of the system clock moves no stamp. With ``use_sim_time`` it is that of /clock.
     """
 
-    def __init__(self, node: rclpy.node.Node, rate: float) -> None:
-        self._ros = node.get_clock()
+    def __init__(self, node: FlexmanipNode[Any], rate: float, begun: Callable[[], None], reached: Callable[[int], None]
+                 ) -> None:
+        self._node, self._rate, self._begun, self._reached = node, rate, begun, reached
         self.is_simulated = bool(node.get_parameter('use_sim_time').value)
         """Whether elapsed time is that of /clock."""
-        self.clock: Clock = self._ros if self.is_simulated else Clock(clock_type=ClockType.STEADY_TIME)
-        self.rate = rate
+        self._clock = node.get_clock() if self.is_simulated else Clock(clock_type=ClockType.STEADY_TIME)
         self.start_ns = 0
+        """Stamp of instant 0."""
         self._origin_ns: int | None = None
-
-    def begin(self) -> bool:
-        """Set instant 0 to now; return False while no simulated time has been received."""
-        self.start_ns = int(self._ros.now().nanoseconds)
-        self._origin_ns = int(self.clock.now().nanoseconds) if self.start_ns > 0 else None
-        return self._origin_ns is not None
+        self._timer: Timer = node.create_timer(1.0 / rate, self.tick, clock=self._clock)
+        self._timer.cancel()
 
     @property
-    def begun(self) -> bool:
-        """Whether instant 0 is set."""
+    def is_running(self) -> bool:
+        """Whether instant 0 is set; not before the first simulated time."""
         return self._origin_ns is not None
 
+    def start(self) -> None:
+        """Set instant 0 to now, and start the timer."""
+        self._begin()
+        self._timer.reset()
+
     def stop(self) -> None:
-        """Forget instant 0."""
+        """Stop the timer and forget instant 0."""
+        self._timer.cancel()
         self._origin_ns = None
+
+    def _begin(self) -> None:
+        self.start_ns = int(self._node.get_clock().now().nanoseconds)
+        self._origin_ns = int(self._clock.now().nanoseconds) if self.start_ns > 0 else None
+        if self.is_running:
+            self._begun()
 
     def latest(self) -> int:
         """Return the index of the latest instant reached; negative when the clock went back before instant 0."""
         assert self._origin_ns is not None
-        elapsed_ns = int(self.clock.now().nanoseconds) - self._origin_ns
-        return int(elapsed_ns * self.rate / 1e9 + 1e-6) if elapsed_ns >= 0 else -1
+        elapsed_ns = int(self._clock.now().nanoseconds) - self._origin_ns
+        return int(elapsed_ns * self._rate / 1e9 + 1e-6) if elapsed_ns >= 0 else -1
+
+    def tick(self) -> None:
+        """Run the callback of the timer."""
+        if not self._node.active:
+            return
+        if not self.is_running or self.latest() < 0:
+            self._begin()
+        if self.is_running:
+            self._reached(self.latest())
 
 
 def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cls: type,

@@ -19,7 +19,7 @@ def told_times(estimates: list[tuple[float, PayloadEstimate]]) -> list[float]:
         state, due = handover.step(CONFIG, state, found, now)
         if due:
             times.append(now)
-            state = handover.accepted(state, found, now)
+            state = state._replace(sent=found, sent_at=now)  # the driver took it
     return times
 
 

@@ -56,7 +56,7 @@ def test_nothing_is_sent_before_it_is_active(ros: Ros) -> None:
     node = ros.add(Excitation(context=ros.context, overrides=overrides(rate=500.0)))
     node.trigger_configure()
     ros.wait(lambda: node.commands.get_subscription_count() == 1)
-    node._tick()
+    node._grid.tick()
     assert heard == []
 
 

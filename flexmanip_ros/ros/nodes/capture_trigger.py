@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 from rclpy.publisher import Publisher
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
@@ -28,9 +27,8 @@ from flexmanip_ros.parameters import TriggerParameters
 from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, header
-from flexmanip_ros.ros.diagnostics import RECENT_S, WARN, JointStateFaults, Meter, Recent, Report, number
+from flexmanip_ros.ros.diagnostics import RECENT_S, WARN, JointStateFaults, Recent, Report, number
 from flexmanip_ros.ros.node import FlexmanipNode, run
-from flexmanip_ros.ros.rclpy_workarounds import sequence_number, with_info
 from flexmanip_ros.samples.signals import joints
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, events_at
 
@@ -59,7 +57,6 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NAME, TriggerParameters, **options)
-        self._meter = Meter()
         self._first_ns: int | None = None
         self._last_ns: int | None = None
         self._before_ns: int | None = None
@@ -79,8 +76,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         """Create the publishers, the subscription and the services."""
         self.events_publisher = self.publisher(Header, 'capture_event', qos.latched())
         self.detected_publisher = self.publisher(Header, 'capture_detected', qos.latched())
-        self.subscription(JointState, 'joint_states', with_info(self._on_joint_states), qos.sensor_input(), raw=True,
-                          matched=self.faults.losses.matched)
+        self.each_joint_state(self._on_joint_state, self.faults.losses)
         self.create_service(Trigger, '~/capture', lambda _, response: self._requested(EventKind.CAPTURE, response))
         self.create_service(Trigger, '~/release', lambda _, response: self._requested(EventKind.RELEASE, response))
 
@@ -103,23 +99,19 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         self._first_ns = self._last_ns = self._before_ns = self.latest = None
         self._pending = ()
 
-    def _on_joint_states(self, raw: bytes, info: object) -> None:
-        self.faults.losses.note(sequence_number(info))
-        if not self.active:
+    def _on_joint_state(self, raw: bytes) -> None:
+        stamp = self.stamp_of(raw)
+        if stamp is None:
             return
-        with self._meter:
-            stamp = self.stamp_of(raw)
-            if stamp is None:
-                return
-            self._arrived = time.monotonic()
-            if self._first_ns is None or self._is_new_recording(stamp):
-                self._begin(stamp)
-            self._before_ns, self._last_ns = self._last_ns, stamp
-            while self._pending and stamp >= self._pending[0].stamp_ns - int(self.config.lead_time * 1e9):
-                self._announce(self._pending[0])
-                self._pending = self._pending[1:]
-            if self._watch is not None:
-                self._watch = self._detect(self._watch, raw)
+        self._arrived = time.monotonic()
+        if self._first_ns is None or self._is_new_recording(stamp):
+            self._begin(stamp)
+        self._before_ns, self._last_ns = self._last_ns, stamp
+        while self._pending and stamp >= self._pending[0].stamp_ns - int(self.config.lead_time * 1e9):
+            self._announce(self._pending[0])
+            self._pending = self._pending[1:]
+        if self._watch is not None:
+            self._watch = self._detect(self._watch, raw)
 
     def _is_new_recording(self, stamp: int) -> bool:
         """Return whether the stamp went back to a new recording, not from a single wrong stamp to the right ones."""
@@ -197,8 +189,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
 
     def report(self, report: Report) -> None:
         """Report the rate of the joint states, losses, faults and restarts of the detection, and the events."""
-        report.values.update(self._meter.window(), mode=self.config.mode, announced=self.announced,
-                             pending=len(self._pending))
+        report.values.update(mode=self.config.mode, announced=self.announced, pending=len(self._pending))
         self.report_faults(report, self.faults)
         report.busy('publish joint states less often, or end other programs')
         if self._watch is not None:

@@ -12,14 +12,12 @@ import sys
 from typing import Any
 
 import numpy as np
-from rclpy.timer import Timer
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros.parameters import ExcitationParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import doubles
-from flexmanip_ros.ros.diagnostics import CLOCK, WARN, Meter, Report
+from flexmanip_ros.ros.diagnostics import CLOCK, WARN, Report
 from flexmanip_ros.ros.node import FlexmanipNode, SampleGrid, run
 from flexmanip_ros.simulation import excitation
 from flexmanip_ros.types import Array
@@ -32,7 +30,6 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NAME, ExcitationParameters, **options)
-        self._meter = Meter()
         self._last = -1
         self._first_ns: int | None = None
         self.skipped = 0
@@ -40,13 +37,11 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
     def make_entities(self) -> None:
         """Create the publisher, and the timer or the subscription whose callback sends each torque."""
         self.commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.command())
-        self._grid = SampleGrid(self, self.config.rate)
-        self._timer: Timer | None = None
+        self._grid: SampleGrid | None = None
         if self.config.clock == 'joint_states':
-            self.subscription(JointState, 'joint_states', self._on_joint_states, qos.sensor_input(), raw=True)
+            self.each_joint_state(self._on_joint_state)
         else:
-            self._timer = self.create_timer(1.0 / self.config.rate, self._tick, clock=self._grid.clock)
-            self._timer.cancel()
+            self._grid = SampleGrid(self, self.config.rate, self._begin, self._tick)
 
     def start(self) -> None:
         """Compute one sample, so that the first one is not late; log the payload accuracy that a design will reach."""
@@ -58,45 +53,37 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
         """Say which torque it is."""
         config = self.config
         peaks = ' and '.join(f'{peak:g}' for peak in config.amplitude)
-        is_simulated = self._timer is not None and self._grid.is_simulated
+        is_simulated = self._grid is not None and self._grid.is_simulated
         clock = f'{CLOCK} (use_sim_time is true)' if is_simulated else config.clock
         return f'{config.shape} of {peaks} N m at {config.rate:g} Hz, clock {clock}'
 
     def activated(self) -> None:
         """Begin the sequence: sample 0 is now, or with ``clock: joint_states`` at the first joint state."""
-        self._last, self._first_ns = -1, None
-        if self._timer is not None:
-            self._grid.begin()
-            self._timer.reset()
+        self._first_ns = None
+        if self._grid is not None:
+            self._grid.start()
 
     def deactivated(self) -> None:
         """Stop the timer and send zero torque once."""
-        if self._timer is not None:
-            self._timer.cancel()
-        self._grid.stop()
+        if self._grid is not None:
+            self._grid.stop()
         self._send(np.zeros(len(self.config.amplitude)))
 
-    def _tick(self) -> None:
-        if not self.active or not (self._grid.begun or self._grid.begin()):
-            return
-        with self._meter:
-            latest = self._grid.latest()
-            if latest < 0:  # simulated time went back
-                self._grid.begin()
-                self._last, latest = -1, 0
+    def _begin(self) -> None:
+        self._last = -1
+
+    def _tick(self, latest: int) -> None:
+        with self.meter.timed():
             self._instant(latest)
 
-    def _on_joint_states(self, raw: bytes) -> None:
+    def _on_joint_state(self, raw: bytes) -> None:
         """Send the torque that the arm needs at the sample after this one."""
-        if not self.active:
+        stamp = self.stamp_of(raw)
+        if stamp is None:
             return
-        with self._meter:
-            stamp = self.stamp_of(raw)
-            if stamp is None:
-                return
-            if self._first_ns is None or stamp < self._first_ns:
-                self._first_ns, self._last = stamp, 0
-            self._instant(round((stamp - self._first_ns) * 1e-9 * self.config.rate) + 1)
+        if self._first_ns is None or stamp < self._first_ns:
+            self._first_ns, self._last = stamp, 0
+        self._instant(round((stamp - self._first_ns) * 1e-9 * self.config.rate) + 1)
 
     def _instant(self, latest: int) -> None:
         if latest == self._last:
@@ -110,10 +97,10 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
 
     def report(self, report: Report) -> None:
         """Report the rate and the number of instants that passed without a command."""
-        report.values.update(self._meter.window(), skipped_instants=self.skipped, shape=self.config.shape)
+        report.values.update(skipped_instants=self.skipped, shape=self.config.shape)
         if self.active and self.config.clock == 'joint_states' and report.values['rate_hz'] == 0.0:
             report.silent('joint_states')
-        elif self.active and self._timer is not None and not self._grid.begun:
+        elif self.active and self._grid is not None and not self._grid.is_running:
             report.silent(CLOCK)
         elif self.active and report.values['rate_hz'] < 0.9 * self.config.rate:
             report.worse(WARN, f'{report.values["rate_hz"]:.0f} of {self.config.rate:.0f} commands a second')

@@ -16,15 +16,13 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.parameters import ViewParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, capture_event, diagnostics
-from flexmanip_ros.ros.diagnostics import LossCounter, Meter, Report
+from flexmanip_ros.ros.diagnostics import LossCounter, Report
 from flexmanip_ros.ros.node import FlexmanipNode, run
 from flexmanip_ros.ros.rclpy_workarounds import sequence_number
 from flexmanip_ros.view.screen import Screen, Source, encoded, page
@@ -41,14 +39,13 @@ class LiveView(FlexmanipNode[ViewParameters]):
         self.server: Server | None = None
         """The web server of the page, which exists while the node is active."""
         self.losses = LossCounter()
-        self._meter = Meter()
         self._reader = JointStateReader()
 
     def make_entities(self) -> None:
         """Create the subscriptions, and the timer whose callback takes their messages."""
         self._screen = self._new_screen()
-        self._joint_states = self.batches(JointState, 'joint_states', qos.sensor_input(), matched=self.losses.matched)
-        self._statuses = self.batches(DiagnosticArray, f'{self.config.identifier}/status', qos.sensor_input())
+        self._joint_states = self.waiting_joint_states(self.losses)
+        self.subscription(DiagnosticArray, f'{self.config.identifier}/status', self._on_status, qos.sensor_input())
         for topic in ('capture_event', 'capture_detected'):
             self.subscription(Header, topic, self._on_event, qos.latched_input())
         self._timer = self.create_timer(1.0 / self.config.rate, self._update, clock=self._steady)
@@ -85,7 +82,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
 
     def _update(self) -> None:
         """Take every waiting message; send what is new to the pages."""
-        with self._meter:
+        with self.meter.timed():
             self._take()
             if not self.active or self.server is None:
                 return
@@ -113,7 +110,6 @@ class LiveView(FlexmanipNode[ViewParameters]):
         for raw, info in self._joint_states.take():
             self.losses.note(sequence_number(info))
             raws.append(raw)
-        statuses = [raw for raw, _ in self._statuses.take()]
         if not self.active:
             return
         for block in self._reader.blocks(raws):
@@ -121,11 +117,10 @@ class LiveView(FlexmanipNode[ViewParameters]):
                 self.log_throttled('encoding', f'message dropped: {block}')
             else:
                 self._screen.joint_states(block)
-        for raw in statuses:
-            try:
-                self._screen.status(diagnostics(deserialize_message(raw, DiagnosticArray)))
-            except (RuntimeError, MemoryError):  # the errors of the middleware
-                self.log_throttled('status', 'a status that is no DiagnosticArray was dropped')
+
+    def _on_status(self, message: DiagnosticArray) -> None:
+        if self.active:
+            self._screen.status(diagnostics(message))
 
     def _on_event(self, message: Header) -> None:
         if not self.active:
@@ -138,7 +133,6 @@ class LiveView(FlexmanipNode[ViewParameters]):
     def report(self, report: Report) -> None:
         """Report the rate of the joint states, losses, and the number of open pages."""
         now, samples = time.monotonic(), self._screen.samples
-        report.values.update(self._meter.window())
         report.values['updates_hz'] = report.values['rate_hz']
         self.losses.report(report, 'lost', 'message')
         if self.server is None:

@@ -12,7 +12,6 @@ A payload is sent once it has been trusted for `settle_time`, and again when its
 """
 
 import importlib
-import math
 import sys
 import time
 from typing import Any
@@ -35,6 +34,7 @@ from flexmanip_ros.ros.node import FlexmanipNode, run
 NAME = 'payload_adapter'
 ANSWER_S = 5.0
 """Longest wait for the answer of a driver [s], after which it is asked again."""
+INERTIA = ('ixx', 'iyy', 'izz', 'ixy', 'ixz', 'iyz')
 
 
 class PayloadAdapter(FlexmanipNode[AdapterParameters]):
@@ -78,30 +78,35 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         self._inertia = message.inertia
 
     def _on_estimate(self, message: Float64MultiArray) -> None:
-        if not self.active or len(message.data) != 5:
-            return
+        if self.active and len(message.data) == 5:
+            with self.meter.timed():
+                self._take(PayloadEstimate(*message.data))
+
+    def _take(self, found: PayloadEstimate) -> None:
+        """Send the payload where that is due."""
         now = time.monotonic()
         self._arrivals = self._arrivals.with_latest(now)
         if self._inertia is None:
             return
         body = self._inertia
-        found = PayloadEstimate(*message.data)._replace(com=(body.com.x, body.com.y), inertia=body.izz)
+        found = found._replace(com=(body.com.x, body.com.y), inertia=body.izz)
         self.state, due = handover.step(self.config, self.state, found, now)
         self._give_up(now)
         if not due or self._asked is not None:
             return
-        if not fits(self._inertia, found):
+        numbers = [getattr(body, name) for name in ('m', *INERTIA)] + [body.com.x, body.com.y, body.com.z]
+        if body.m < 0.0 or not found.fits(numbers):
             self.doubtful += 1
             self.log_throttled('payload', 'a payload was not sent: its mass is not that of the estimate, or it '
                           'has a value that is not finite')
             return
-        self._send(self._inertia, found._replace(mass=self._inertia.m), now)
+        self._send(body, found._replace(mass=body.m), now)
 
     def _send(self, inertia: Inertia, found: PayloadEstimate, now: float) -> None:
         if not self._client.service_is_ready():
             self.problem = f"service '{self._client.srv_name}' is not available"
             self.log_throttled('service', f'{self.problem}; start the driver, or correct the parameters')
-            self.state = handover.rejected(self.state, now)
+            self.state = self.state._replace(sent_at=now)
             return
         future = self._client.call_async(self._request(inertia))
         self._asked = future, now
@@ -138,11 +143,11 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
                                 f"'{self.config.mass_parameter}' to {sent.mass:.3f} kg ({reason}); let target_node and "
                                 'mass_parameter name a double that the node declares and lets others set')
             self.log_throttled('rejected', self.problem)
-            self.state = handover.rejected(self.state, time.monotonic())
+            self.state = self.state._replace(sent_at=time.monotonic())
             return
         self.problem = ''
         self.sent += 1
-        self.state = handover.accepted(self.state, sent, time.monotonic())
+        self.state = self.state._replace(sent=sent, sent_at=time.monotonic())
         self.get_logger().info(f'the driver accepted a payload of {sent.mass:.3f} kg')
 
     def report(self, report: Report) -> None:
@@ -164,14 +169,6 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
             report.worse(WARN, 'no payload that can be trusted')
 
 
-def fits(inertia: Inertia, found: PayloadEstimate) -> bool:
-    """Return whether a body may be sent: finite values, a mass not below zero and close to the trusted estimate."""
-    com, body = inertia.com, inertia
-    numbers = (com.x, com.y, com.z, body.ixx, body.ixy, body.ixz, body.iyy, body.iyz, body.izz)
-    near = abs(inertia.m - found.mass) <= max(3.0 * found.std, 1e-3 * abs(found.mass))  # they may be one sample apart
-    return near and inertia.m >= 0.0 and all(map(math.isfinite, numbers))
-
-
 def service_class(name: str) -> Any:
     """Return the class of a service type PACKAGE/srv/TYPE. Raises ParameterError when it is not installed."""
     package, _, kind = name.split('/')
@@ -180,9 +177,6 @@ def service_class(name: str) -> Any:
     except (ImportError, AttributeError) as error:
         raise ParameterError(f"service type '{name}' is not installed",
                              f'install and source the package {package}') from error
-
-
-INERTIA = ('ixx', 'iyy', 'izz', 'ixy', 'ixz', 'iyz')
 
 
 def fill(request: Any, inertia: Inertia, transition_time: float = 0.0) -> Any:

@@ -19,7 +19,6 @@ from collections.abc import Collection, Iterable
 from typing import Any
 
 import numpy as np
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros.control import controller, handover
@@ -28,7 +27,7 @@ from flexmanip_ros.errors import SignalError
 from flexmanip_ros.parameters import ControllerParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, doubles
-from flexmanip_ros.ros.diagnostics import ERROR, WARN, Meter, Report, Stamps
+from flexmanip_ros.ros.diagnostics import ERROR, WARN, Report, Stamps
 from flexmanip_ros.ros.node import FlexmanipNode, run
 from flexmanip_ros.types import Array, JointRecord
 
@@ -53,7 +52,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NAME, ControllerParameters, **options)
-        self.state: controller.ControllerState | None = None
+        self.state: controller.ControllerState
         self._estimate: PayloadEstimate | None = None
         self._arrivals = handover.Arrivals()
         self._body: tuple[float, ...] | None = None
@@ -63,19 +62,16 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._added, self._added_at = np.zeros(len(self.config.joints)), -np.inf
         self._last_ns: int | None = None
         self._arrived = np.inf
-        self._meter, self._stamps = Meter(), Stamps()
+        self._stamps = Stamps()
         self._reader = JointStateReader()
         self._goal: Array | None = None
-        self._names: tuple[str, ...] = ()
-        self._places: list[int] = []
         self._at_limit = 0
         self._too_heavy = False
 
     def make_entities(self) -> None:
         """Create the publisher, the subscriptions, and the timer that notices when joint states cease."""
         self._commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.command())
-        self._message = Float64MultiArray()
-        self.subscription(JointState, 'joint_states', self._on_joint_states, qos.sensor_input(), raw=True)
+        self.each_joint_state(self._on_joint_state)
         self.subscription(Float64MultiArray, 'rpbsid_identifier/payload_estimate', self._on_estimate,
                           qos.latched_input())
         self.subscription(Float64MultiArray, 'rpbsid_identifier/payload_body', self._on_body, qos.latched_input())
@@ -108,40 +104,37 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         if 'setpoint' in names:
             self._goal = np.asarray(config.setpoint)
 
-    def _on_joint_states(self, raw: bytes) -> None:
-        if not self.active or self.state is None:
+    def _on_joint_state(self, raw: bytes) -> None:
+        try:
+            record = self._reader(raw)
+        except SignalError as error:
+            self._drop('encoding', f'a joint state was dropped: {error}')
             return
-        with self._meter:
-            try:
-                record = self._reader(raw)
-            except SignalError as error:
-                self._drop('encoding', f'a joint state was dropped: {error}')
-                return
-            measured = self._measured(record)
-            if measured is None:
-                wanted = ', '.join((*self.config.joints, *self.config.bends))
-                self._drop('joint_states', 'a joint state was dropped: it lacks position and velocity '
-                           f'(finite, below {LARGEST:g}) of {wanted}')
-                return
-            if self._is_late(record.stamp_ns):
-                return
-            self._arrived = time.monotonic()
-            longest_ns = LONG_GAP * 1e9 / self.config.rate
-            if self._last_ns is not None and record.stamp_ns - self._last_ns > longest_ns:
-                self.state = self.state._replace(x=None)
-            self._last_ns = record.stamp_ns
-            self._stamps.note(record.stamp_ns)
-            goal, self._goal = self._goal, None
-            if goal is not None:
-                self.state = controller.goto(self.state, goal)
-            self.state, torque = controller.step(self.config, self.state, measured)
-            if not np.isfinite(torque).all():
-                self.not_finite += 1
-                self.log_throttled('not_finite', NOT_FINITE)
-                self.state = self.state._replace(x=None, way=None)
-                torque = np.zeros(len(torque))
-            self._send(torque)
-            self._watch_limits(torque)
+        measured = self._measured(record)
+        if measured is None:
+            wanted = ', '.join((*self.config.joints, *self.config.bends))
+            self._drop('joint_states', 'a joint state was dropped: it lacks position and velocity '
+                       f'(finite, below {LARGEST:g}) of {wanted}')
+            return
+        if self._is_late(record.stamp_ns):
+            return
+        self._arrived = time.monotonic()
+        longest_ns = LONG_GAP * 1e9 / self.config.rate
+        if self._last_ns is not None and record.stamp_ns - self._last_ns > longest_ns:
+            self.state = self.state._replace(x=None)
+        self._last_ns = record.stamp_ns
+        self._stamps.note(record.stamp_ns)
+        goal, self._goal = self._goal, None
+        if goal is not None:
+            self.state = controller.goto(self.state, goal)
+        self.state, torque = controller.step(self.config, self.state, measured)
+        if not np.isfinite(torque).all():
+            self.not_finite += 1
+            self.log_throttled('not_finite', NOT_FINITE)
+            self.state = self.state._replace(x=None, way=None)
+            torque = np.zeros(len(torque))
+        self._send(torque)
+        self._watch_limits(torque)
 
     def _watch_limits(self, torque: Array) -> None:
         """Warn when the torques are at their limits more often than not, counted over ``AT_LIMIT_S``."""
@@ -155,7 +148,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
 
     def _shortage(self) -> str:
         """Return what holding the arm needs where that is more than effort_limit, and log it once; else empty."""
-        if self.state is None or self.state.way is None:
+        if self.state.way is None:
             return ''
         needed, limit = controller.hold_goal(self.config, self.state), np.asarray(self.config.effort_limit)
         before, self._too_heavy = self._too_heavy, bool(
@@ -174,7 +167,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         """Return whether a sample is not newer than the last, and drop it; a long step back counts as a new clock."""
         if self._last_ns is None or stamp_ns > self._last_ns:
             return False
-        if stamp_ns < self._last_ns - CLOCK_SET_BACK_NS and self.state is not None:
+        if stamp_ns < self._last_ns - CLOCK_SET_BACK_NS:
             self.state = self.state._replace(x=None)
             return False
         self._drop('stamps', 'a joint state whose stamp does not advance was dropped')
@@ -186,15 +179,11 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
 
     def _measured(self, record: JointRecord) -> controller.Measured | None:
         """Pick the angles and bends by name; None when one is missing, not finite, or far too large."""
-        count = len(record.names)
-        if record.names != self._names:
-            wanted = (*self.config.joints, *self.config.bends)
-            if not set(wanted) <= set(record.names):
-                return None
-            self._names, self._places = record.names, [record.names.index(name) for name in wanted]
-        if record.position.size != count or record.velocity.size != count:
+        count, wanted = len(record.names), (*self.config.joints, *self.config.bends)
+        if not set(wanted) <= set(record.names) or record.position.size != count or record.velocity.size != count:
             return None
-        position, velocity = record.position[self._places], record.velocity[self._places]
+        places = [record.names.index(name) for name in wanted]
+        position, velocity = record.position[places], record.velocity[places]
         if not np.abs([position, velocity]).max() < LARGEST:  # false for NaN too
             return None
         fresh = time.monotonic() - self._added_at <= self.config.stale_after
@@ -220,11 +209,10 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
     def _judge(self, estimate: PayloadEstimate) -> PayloadEstimate | None:
         """Let the controller judge an estimate; return it with the body that belongs to it, None without a body."""
         body = None if self._body is None else estimate.having(self._body)
-        if self.state is not None:
-            before = self.state.verdict
-            self.state = controller.estimate(self.config, self.state, body or estimate)
-            if self.state.verdict is not before and self.state.verdict is not None:
-                self.get_logger().info(f'payload {estimate.mass:.2f} kg: {self.state.verdict.value}')
+        before = self.state.verdict
+        self.state = controller.estimate(self.config, self.state, body or estimate)
+        if self.state.verdict is not before and self.state.verdict is not None:
+            self.get_logger().info(f'payload {estimate.mass:.2f} kg: {self.state.verdict.value}')
         return body
 
     def _on_added(self, message: Float64MultiArray) -> None:
@@ -238,14 +226,12 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         if not self.active or time.monotonic() - self._arrived <= self.config.stale_after:
             return
         self._arrived = np.inf
-        if self.state is not None:
-            self.state = self.state._replace(x=None)
+        self.state = self.state._replace(x=None)
         self._send(np.zeros(len(self.config.joints)))
         self.log_throttled('silence', f'no joint_states for {self.config.stale_after:g} s: zero torque was sent')
 
     def _send(self, torque: Array) -> None:
-        self._message.data = doubles(torque)
-        self._commands.publish(self._message)
+        self._commands.publish(Float64MultiArray(data=doubles(torque)))
         self.sent += 1
 
     def _report_rate(self, report: Report) -> None:
@@ -260,15 +246,12 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
 
     def report(self, report: Report) -> None:
         """Report the rate, the payload that the gains follow, and the verdict on the latest estimate."""
-        report.values.update(self._meter.window())
         report.values['dropped'] = self.dropped
         if self.dropped:
             report.worse(WARN, f'{self.dropped} messages dropped')
         if self.active and report.values['rate_hz'] == 0.0:
             report.silent('joint_states')
         self._report_rate(report)
-        if self.state is None:
-            return
         if self.not_finite:
             report.worse(ERROR, f'{NOT_FINITE} ({self.not_finite} times)')
         if self.active and (words := self._shortage()):

@@ -23,9 +23,8 @@ from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import capture_event, joint_state
-from flexmanip_ros.ros.diagnostics import CLOCK, ERROR, WARN, LossCounter, Meter, Report
+from flexmanip_ros.ros.diagnostics import CLOCK, ERROR, WARN, LossCounter, Report
 from flexmanip_ros.ros.node import FlexmanipNode, SampleGrid, run
-from flexmanip_ros.ros.rclpy_workarounds import sequence_number, with_info
 from flexmanip_ros.simulation import simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
@@ -41,7 +40,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NAME, PlantParameters, **options)
-        self.state: simulator.PlantState | None = None
+        self.state: simulator.PlantState
         self.efforts = np.zeros(len(self.config.arm.link_length))
         self.dropped_commands = 0
         self.lost_commands = LossCounter()
@@ -51,26 +50,22 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         self.backlog = 0
         self._restarted_ns = 0
         self._pending: tuple[CaptureEvent, ...] = ()
-        self._meter = Meter()
         self._fault = ''
 
     def make_entities(self) -> None:
         """Create the publisher, the subscriptions, the service and the timer."""
         self.joint_states = self.publisher(JointState, 'joint_states', qos.sensor_output())
-        self.subscription(
-            Float64MultiArray, 'effort_controller/commands', with_info(self._on_command), qos.command(),
-            matched=self.lost_commands.matched)
+        self.subscription(Float64MultiArray, 'effort_controller/commands', self._on_command, qos.command(),
+                          losses=self.lost_commands)
         self.subscription(Header, 'capture_event', self._on_event, qos.latched_input())
         self.create_service(Trigger, '~/reset', self._on_reset)
-        self._grid = SampleGrid(self, self.config.rate)
-        self._timer = self.create_timer(1.0 / self.config.rate, self._tick, clock=self._grid.clock)
-        self._timer.cancel()
+        self._grid = SampleGrid(self, self.config.rate, self._begin, self._advance)
 
     def start(self) -> None:
         """Simulate a step, a capture and a release, so that nothing is compiled while the clock runs."""
-        state = simulator.init(self.config)
-        self._noise_std = state.noise_std
-        state = simulator.attach(self.config, state)
+        self.state = simulator.init(self.config)
+        self._noise_std = self.state.noise_std
+        state = simulator.attach(self.config, self.state)
         state, _ = simulator.step(self.config, state, np.zeros(len(self.config.arm.link_length)))
         simulator.release(self.config, state)
 
@@ -79,22 +74,16 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         return f'{self.config.rate:g} samples a second, object of {self.config.payload_mass:g} kg'
 
     def activated(self) -> None:
-        """Begin the grid of stamps at sample 0, and start the timer."""
-        self._begin()
-        self._timer.reset()
+        """Begin the grid of stamps at sample 0."""
+        self._grid.start()
 
     def deactivated(self) -> None:
-        """Stop the timer and the grid of stamps, so that the arm stands still."""
-        self._timer.cancel()
+        """Stop the grid of stamps, so that the arm stands still."""
         self._grid.stop()
 
-    def _begin(self) -> bool:
-        """Set the stamp of sample 0 to now; return False while the clock has no time yet."""
+    def _begin(self) -> None:
         self.samples = 0
-        if not self._grid.begin():
-            return False
         self._restart()
-        return True
 
     def _restart(self) -> None:
         """Put the arm at its initial state from the next stamp on."""
@@ -105,22 +94,16 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
     def _stamp(self, index: int) -> int:
         return self._grid.start_ns + round(index * 1e9 / self.config.rate)
 
-    def _tick(self) -> None:
-        if not self.active or not (self._grid.begun or self._begin()):
-            return
-        latest = self._grid.latest()
-        if latest < 0:  # simulated time went back
-            self._begin()
-            latest = 0
+    def _advance(self, latest: int) -> None:
+        """Make the samples up to the latest instant, at most ``CATCH_UP``."""
         self.backlog = latest + 1 - self.samples
         for _ in range(min(self.backlog, CATCH_UP)):
             if self._fault:
                 return
-            with self._meter:
+            with self.meter.timed():
                 self._step()
 
     def _step(self) -> None:
-        assert self.state is not None
         try:
             self._apply_events(simulator.stamp(self.config, self.state))
             self.state, record = simulator.step(self.config, self.state, self.efforts)
@@ -134,14 +117,12 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
 
     def _apply_events(self, stamp: int) -> None:
         """Take or let go of the object before the first sample that is not older than the event."""
-        assert self.state is not None
         while self._pending and self._pending[0].stamp_ns <= stamp:
             event, self._pending = self._pending[0], self._pending[1:]
             change = simulator.attach if event.kind is EventKind.CAPTURE else simulator.release
             self.state = change(self.config, self.state)
 
-    def _on_command(self, message: Float64MultiArray, info: object) -> None:
-        self.lost_commands.note(sequence_number(info))
+    def _on_command(self, message: Float64MultiArray) -> None:
         efforts = np.array(message.data)
         links = len(self.config.arm.link_length)
         if efforts.size != links:
@@ -183,7 +164,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         if not self.active:
             response.success, response.message = False, f'{NAME} is not active'
             return response
-        if self._grid.begun:
+        if self._grid.is_running:
             if self._fault:  # the samples since the fault are not made up for
                 self.samples = max(self.samples, self._grid.latest() + 1)
             self._restart()
@@ -194,12 +175,11 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
     def report(self, report: Report) -> None:
         """Report the rate, the backlog, dropped commands and events that came late."""
         values = report.values
-        values.update(self._meter.window(), samples=self.samples, backlog=self.backlog,
-                      dropped_commands=self.dropped_commands, late_events=self.late_events,
-                      rejected_events=self.rejected_events)
+        values.update(samples=self.samples, backlog=self.backlog, dropped_commands=self.dropped_commands,
+                      late_events=self.late_events, rejected_events=self.rejected_events)
         if self._fault:
             report.worse(ERROR, self._fault)
-        elif self.active and not self._grid.begun:
+        elif self.active and not self._grid.is_running:
             report.silent(CLOCK)
         elif self.active and values['rate_hz'] < 0.9 * self.config.rate:
             report.worse(WARN, f'{values["rate_hz"]:.0f} of {self.config.rate:.0f} samples a second')

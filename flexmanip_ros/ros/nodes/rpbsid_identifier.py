@@ -30,7 +30,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import InertiaStamped
 from numpy.typing import NDArray
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -49,7 +48,6 @@ from flexmanip_ros.ros.diagnostics import (
     ERROR,
     UNANNOUNCED,
     JointStateFaults,
-    Meter,
     Report,
     number,
     report_estimate,
@@ -149,7 +147,6 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         """Why the latest message was rejected."""
         self.faults = JointStateFaults(joints(self.config))
         self.losses = self.faults.losses
-        self.meter = Meter()
         self._reader = JointStateReader()
         self._background = Deferred()
         self._checkpoints: CheckpointWriter | None = None
@@ -169,7 +166,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
     def make_entities(self) -> None:
         """Create the publishers, the subscriptions and the reset service."""
         self.outputs = {name: self.publisher(kind, f'~/{name}', profile()) for name, (kind, profile) in TOPICS.items()}
-        self._joint_states = self.batches(JointState, 'joint_states', qos.sensor_input(), matched=self.losses.matched)
+        self._joint_states = self.waiting_joint_states(self.losses)
         self._alarm = self.alarm(self._take)
         self._alarm.after(LONGEST_WAIT_S)
         for topic in ('capture_event', 'capture_detected'):
@@ -250,7 +247,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         raws, arrived_ns = self._waiting()
         if not self.active or not raws:
             return len(raws)
-        with self.meter.of(len(raws)):
+        with self.meter.timed(len(raws)):
             first = 0
             for block in self._reader.blocks(raws):
                 count = 1 if isinstance(block, SignalError) else len(block.stamp_ns)
@@ -382,7 +379,6 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
     def report(self, report: Report) -> None:
         """Report the rate, losses, drops by reason, and the quality of the latest estimate."""
         values, counters = report.values, self.state.counters
-        values.update(self.meter.window())
         self.report_faults(report, self.faults)
         values.update(counters._asdict(), dropped=counters.dropped, rejected=self.rejected)
         if self._checkpoints is not None:
