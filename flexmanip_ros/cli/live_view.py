@@ -137,7 +137,7 @@ def read(config: IdentifierParameters, items: Iterable[pipeline.Item], source: S
     for _, estimate in pipeline.replay(config, tapped()):
         if estimate is not None:
             screen.estimate(estimate)
-    return screen.frame(MOST_ROWS) or {}, fault
+    return screen.frame(MOST_ROWS), fault
 
 
 if __name__ == '__main__':

@@ -67,13 +67,8 @@ class Source(NamedTuple):
     config: ViewParameters
 
     @property
-    def torques(self) -> tuple[str, ...]:
-        """The signals of the first plot."""
-        return self.config.inputs
-
-    @property
     def bends(self) -> tuple[str, ...]:
-        """The signals of the second plot: outputs that are positions but no joint angles; without any, all outputs."""
+        """The signals below the inputs: outputs that are positions but no joint angles; without any, all outputs."""
         positions = tuple(name for name in self.config.outputs
                           if name.endswith('/position') and name not in self.config.angles)
         return positions or self.config.outputs
@@ -81,7 +76,7 @@ class Source(NamedTuple):
     @property
     def columns(self) -> tuple[str, ...]:
         """The signals of a row, in which they follow the time."""
-        return (*self.torques, *self.bends, *self.config.angles)
+        return (*self.config.inputs, *self.bends, *self.config.angles)
 
     @property
     def is_arm(self) -> bool:
@@ -90,13 +85,13 @@ class Source(NamedTuple):
 
     def layout(self) -> dict[str, Any]:
         """Return what a page has to know before the first sample."""
-        config, arm, r, m = self.config, self.config.arm, len(self.torques), len(self.bends)
-        torques = all(name.endswith('/effort') for name in self.torques)
+        config, arm, r, m = self.config, self.config.arm, len(self.config.inputs), len(self.bends)
+        torques = all(name.endswith('/effort') for name in config.inputs)
         positions = all(name.endswith('/position') for name in self.bends)
         return {
             'title': self.title, 'words': self.words, 'columns': len(self.columns),
             'torques': {'title': 'torque' if torques else 'input', 'unit': 'N m' if torques else '', 'scale': 1,
-                        'lines': [[_short(name, torques), k] for k, name in enumerate(self.torques)]},
+                        'lines': [[_short(name, torques), k] for k, name in enumerate(config.inputs)]},
             'bends': {'title': 'bend' if self.is_arm else 'position' if positions else 'output',
                       'unit': 'mm' if self.is_arm else '', 'scale': 1000 if self.is_arm else 1,
                       'lines': [[_short(name, positions), r + k] for k, name in enumerate(self.bends)]},
@@ -220,11 +215,11 @@ class Screen:
             if name == messages.STATUS and isinstance(value, Diagnostics):
                 self.status(value)
 
-    def frame(self, most_rows: int | None = None) -> dict[str, Any] | None:
-        """Return what came since the frame before; None if nothing came. most_rows: samples are thinned to so many."""
+    def frame(self, most_rows: int | None = None) -> dict[str, Any]:
+        """Return what came since the frame before. most_rows: samples are thinned to so many."""
         if self.first_ns is None:  # without a first sample there is no time 0
             del self._payloads[:-1], self._models[:-1]
-            return None
+            return {}
         first_ns, frame = self.first_ns, dict[str, Any]()
         if self._rows:
             rows = np.concatenate(self._rows)
@@ -242,7 +237,7 @@ class Screen:
                                for event in self._events]
         self._rows, self._payloads, self._models = [], [], []
         self._events.clear()
-        return frame or None
+        return frame
 
 
 def thinned(rows: Array, most: int) -> Array:
@@ -283,7 +278,7 @@ def embedded(screen: Screen, events: Iterable[CaptureEvent], estimates: Iterable
         screen.event(event)
     for estimate in estimates:
         screen.estimate(estimate)
-    return page(screen.source, screen.frame(EMBEDDED_ROWS) or {}, playing=False)
+    return page(screen.source, screen.frame(EMBEDDED_ROWS), playing=False)
 
 
 def encoded(value: Any) -> str:

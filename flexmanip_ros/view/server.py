@@ -106,32 +106,35 @@ class Feed:
             self._changed.notify_all()
 
 
-class Server:
+class Server(socketserver.ThreadingTCPServer):
     """Serves a page until it is closed. Raises ViewError when the port cannot be opened.
 
-    page: the HTML; state: returns numbers for ``/state``, called on a thread of the server.
+    page: the HTML; state: returns numbers for ``/state``, called on a thread of the server. The base is not HTTPServer,
+    which looks up the name of the machine when it starts.
     """
 
+    allow_reuse_address = True
+    daemon_threads = True  # a process that ends in a hurry waits for no page
+    block_on_close = False
+
     def __init__(self, page: str, port: int, state: Callable[[], Mapping[str, Any]] = dict) -> None:
-        self._page = page.encode()
-        self.feed = Feed(self._page)
-        self._state = state
-        self._lock = threading.Lock()
-        self._closed = threading.Condition(self._lock)
-        """Notified when a page has been closed."""
-        self._connections: set[socket.socket] = set()
+        self.page = page.encode()
+        self.feed = Feed(self.page)
+        self.state = state
         self.pages = 0
         """Number of pages that are open."""
+        self.pages_changed = threading.Condition()
+        self._connections: set[Any] = set()
         try:
-            self._http = _Http(self, port)
+            super().__init__((HOST, port), _Handler)
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
                 raise ViewError(f'port {port} of this machine is in use',
                                 'end the program that has it, or give another port (0: any that is free)') from error
             raise ViewError(f'port {port} cannot be opened: {error.strerror}',
                             'give a port from 1024 up (0: any that is free)') from error
-        self.port = int(self._http.server_address[1])
-        self._thread = threading.Thread(target=self._http.serve_forever, args=(0.2,), name='http', daemon=True)
+        self.port = int(self.server_address[1])
+        self._thread = threading.Thread(target=self.serve_forever, args=(0.2,), name='http', daemon=True)
         self._thread.start()
 
     @property
@@ -144,101 +147,77 @@ class Server:
         """Text that tells a user how to open the page."""
         return f'open {self.url} in a browser on this machine'
 
-    def respond(self, handler: _Handler) -> None:
-        """Answer one GET."""
-        host = handler.headers.get('Host', '').rpartition(':')[0]
-        if host not in (HOST, 'localhost'):  # another site whose name resolves to this address could read the data
-            handler.send_error(HTTPStatus.FORBIDDEN, f'open {self.url}')
-            return
-        path = handler.path.partition('?')[0]
-        if path == '/':
-            handler.answer('text/html; charset=utf-8', self._page)
-        elif path == '/state':
-            handler.answer('application/json', json.dumps({'pages': self.pages, **self._state()}).encode())
-        elif path == '/events':
-            self._stream(handler)
-        else:
-            handler.send_error(HTTPStatus.NOT_FOUND)
-
-    def _stream(self, handler: _Handler) -> None:
-        with self._lock:
-            if self.pages >= MOST_PAGES:
-                handler.send_error(HTTPStatus.SERVICE_UNAVAILABLE, f'{MOST_PAGES} pages are open already')
-                return
-            self.pages += 1
+    def finish_request(self, request: Any, client_address: Any) -> None:
+        """Answer a request, on a thread of its own; its connection is noted, so that it can be ended."""
+        self._connections.add(request)
         try:
-            handler.answer('text/event-stream')
-            number, data = self.feed.greeting()
-            handler.wfile.write(data)
-            while (found := self.feed.after(number)) is not None:
-                number, data = found
-                handler.wfile.write(data)
+            super().finish_request(request, client_address)
         finally:
-            with self._closed:
-                self.pages -= 1
-                self._closed.notify_all()
+            self._connections.discard(request)
 
-    def connected(self, connection: socket.socket, is_open: bool) -> None:
-        """Note a connection that came or went."""
-        with self._lock:
-            (self._connections.add if is_open else self._connections.discard)(connection)
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Ignore the error: it means that a page has gone."""
 
     def close(self) -> None:
         """Disconnect every page and release the port. Calling it again does nothing."""
         if self.feed.closed:
             return
         self.feed.close()
-        self._http.shutdown()
-        with self._lock:
-            for connection in self._connections:
-                with contextlib.suppress(OSError):
-                    connection.shutdown(socket.SHUT_RDWR)  # ends a write to a page that reads nothing
-        self._http.server_close()
+        self.shutdown()
+        for connection in list(self._connections):
+            with contextlib.suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)  # ends a write to a page that reads nothing
+        self.server_close()
         self._thread.join()
-        with self._closed:
-            self._closed.wait_for(lambda: self.pages == 0, STUCK_S)
-
-
-class _Http(socketserver.ThreadingTCPServer):
-    """HTTP server without HTTPServer, which looks up the name of the machine when it starts."""
-
-    allow_reuse_address = True
-    daemon_threads = True  # a process that ends in a hurry waits for no page
-    block_on_close = False
-
-    def __init__(self, owner: Server, port: int) -> None:
-        self.owner = owner
-        super().__init__((HOST, port), _Handler)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore the error: it means that a page has gone."""
+        with self.pages_changed:
+            self.pages_changed.wait_for(lambda: self.pages == 0, STUCK_S)
 
 
 class _Handler(BaseHTTPRequestHandler):
     """One connection, one answer."""
 
-    server: _Http
+    server: Server
     timeout = STUCK_S
     server_version, sys_version = 'flexmanip_ros', ''
 
-    def setup(self) -> None:
-        """Note the connection, so that it can be ended."""
-        super().setup()
-        self.server.owner.connected(self.connection, True)
-
-    def finish(self) -> None:
-        """Forget the connection."""
-        self.server.owner.connected(self.connection, False)
-        super().finish()
-
     def do_GET(self) -> None:
         """Answer a GET; the base class answers every other method with 501."""
+        server, path = self.server, self.path.partition('?')[0]
         try:
-            self.server.owner.respond(self)
+            # Another site whose name resolves to this address could read the data.
+            if self.headers.get('Host', '').rpartition(':')[0] not in (HOST, 'localhost'):
+                self.send_error(HTTPStatus.FORBIDDEN, f'open {server.url}')
+            elif path == '/':
+                self._answer('text/html; charset=utf-8', server.page)
+            elif path == '/state':
+                self._answer('application/json', json.dumps({'pages': server.pages, **server.state()}).encode())
+            elif path == '/events':
+                self._stream()
+            else:
+                self.send_error(HTTPStatus.NOT_FOUND)
         except OSError:  # the page has gone, or took no byte for STUCK_S
             self.close_connection = True
 
-    def answer(self, kind: str, body: bytes | None = None) -> None:
+    def _stream(self) -> None:
+        server = self.server
+        with server.pages_changed:
+            if server.pages >= MOST_PAGES:
+                self.send_error(HTTPStatus.SERVICE_UNAVAILABLE, f'{MOST_PAGES} pages are open already')
+                return
+            server.pages += 1
+        try:
+            self._answer('text/event-stream')
+            number, data = server.feed.greeting()
+            self.wfile.write(data)
+            while (found := server.feed.after(number)) is not None:
+                number, data = found
+                self.wfile.write(data)
+        finally:
+            with server.pages_changed:
+                server.pages -= 1
+                server.pages_changed.notify_all()
+
+    def _answer(self, kind: str, body: bytes | None = None) -> None:
         """Send the head and, where there is one, the body."""
         self.send_response(HTTPStatus.OK)
         self.send_header('Content-Type', kind)

@@ -61,7 +61,7 @@ def test_frames_together_hold_every_sample_once() -> None:
     for first, count in ((0, 1), (1, 33), (34, 500), (534, 2)):
         shown.joint_states(block(first, count))
         found.append(rows(shown.frame()))
-    assert shown.frame() is None
+    assert shown.frame() == {}
     every = np.concatenate(found)
     assert every[:, 0] == pytest.approx(1e-3 * np.arange(536), abs=1e-6)
     assert shown.samples == 536
@@ -112,7 +112,7 @@ def test_an_event_counts_from_the_first_sample_and_is_shown_once() -> None:
     shown = screen()
     event = CaptureEvent(START_NS + 3_000_000_000, EventKind.CAPTURE)
     shown.event(event)
-    assert shown.frame() is None  # there is no time 0 yet
+    assert shown.frame() == {}  # there is no time 0 yet
     shown.joint_states(block(0, 2))
     shown.event(event._replace(stamp_ns=event.stamp_ns + 50_000_000))  # found in the signals too
     shown.event(CaptureEvent(START_NS + 4_000_000_000, EventKind.RELEASE))

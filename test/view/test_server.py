@@ -78,7 +78,7 @@ def test_the_page_is_there_and_may_load_nothing_from_elsewhere(server: Server) -
 
 def test_it_listens_on_this_machine_alone(server: Server) -> None:
     assert server.url == f'http://127.0.0.1:{server.port}/'
-    assert server._http.socket.getsockname()[0] == '127.0.0.1'
+    assert server.socket.getsockname()[0] == '127.0.0.1'
 
 
 @pytest.mark.parametrize('method', ['POST', 'PUT', 'DELETE', 'PATCH'])

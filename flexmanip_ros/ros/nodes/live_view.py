@@ -84,19 +84,17 @@ class LiveView(FlexmanipNode[ViewParameters]):
         """Take every waiting message; send what is new to the pages."""
         with self.meter.timed():
             self._take()
-            if not self.active or self.server is None:
+            if self.server is None:
                 return
             feed, now, screen = self.server.feed, time.monotonic(), self._screen
             if screen.runs != self._runs:
                 self._runs = screen.runs
                 feed.reset()
             frame = screen.frame()
-            if frame is not None:
-                events = {'events': frame.pop('events')} if 'events' in frame else None
-                if events is not None:
-                    feed.publish('frame', encoded(events), lasting=True)
-                if frame:
-                    feed.publish('frame', encoded(frame))
+            if 'events' in frame:
+                feed.publish('frame', encoded({'events': frame.pop('events')}), lasting=True)
+            if frame:
+                feed.publish('frame', encoded(frame))
             if screen.samples != self._counted:
                 self._counted, self._heard, self._beaten = screen.samples, now, now
             elif now - self._beaten >= BEAT_S / 2:
