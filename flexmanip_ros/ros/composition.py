@@ -1,7 +1,7 @@
 """All nodes of the demonstration, and a recorder, in one process on one executor, over DDS."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,6 @@ from flexmanip_ros.parameters import DemoParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, capture_event, from_message
 from flexmanip_ros.ros.diagnostics import LossCounter
-from flexmanip_ros.ros.node import FlexmanipNode
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.nodes.excitation import Excitation
 from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
@@ -136,7 +135,8 @@ class Composition:
         self.config = config
         self._nodes: list[Any] = []
         self._bag = bag
-        self._recorder: Recorder | None = None
+        self.recorder: Recorder
+        """It exists from the call of ``connect`` on."""
         self.executor: Executor = make_executor()
         try:
             self.plant: PlantSimulator = self._add(PlantSimulator())
@@ -146,17 +146,8 @@ class Composition:
         except BaseException:
             self.close()
             raise
-
-    @property
-    def managed(self) -> Sequence[FlexmanipNode[Any]]:
-        """The lifecycle nodes in the order in which they start: subscribers first, the plant and its clock last."""
-        return self.identifier, self.trigger, self.excitation, self.plant
-
-    @property
-    def recorder(self) -> Recorder:
-        """The recorder, which exists from the call of ``connect`` on."""
-        assert self._recorder is not None
-        return self._recorder
+        # Subscribers start first, the plant and its clock last.
+        self._managed = self.identifier, self.trigger, self.excitation, self.plant
 
     def _add(self, node: Any) -> Any:
         self._nodes.append(node)
@@ -165,7 +156,7 @@ class Composition:
 
     def configure(self) -> None:
         """Configure every node. It builds states and compiles kernels, which is slow, before any clock runs."""
-        for node in self.managed:
+        for node in self._managed:
             if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
                 raise CompositionError(f'{node.get_name()} could not be configured', 'see its log above')
 
@@ -174,7 +165,7 @@ class Composition:
 
         others: number of further subscriptions to the joint states, in other processes.
         """
-        self._recorder = self._add(Recorder(self._bag))
+        self.recorder = self._add(Recorder(self._bag))
         if not self.wait(lambda: self._matched(others), DISCOVERY_TIMEOUT_S):
             raise CompositionError(f'the nodes did not find each other within {DISCOVERY_TIMEOUT_S:.0f} s',
                                    'unset ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS')
@@ -190,7 +181,7 @@ class Composition:
 
     def start(self) -> None:
         """Activate every node."""
-        for node in self.managed:
+        for node in self._managed:
             node.trigger_activate()
 
     @property

@@ -17,7 +17,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 from urllib.request import urlopen
 
 import numpy as np
@@ -51,12 +51,11 @@ class ViewerError(FlexmanipError):
     """The live page could not be started."""
 
 
-class Viewer:
+class Viewer(NamedTuple):
     """The process of the node ``live_view`` and the address of its page."""
 
-    def __init__(self, process: subprocess.Popen[bytes], url: str) -> None:
-        self.url = url
-        self._process = process
+    process: subprocess.Popen[bytes]
+    url: str
 
     def pages(self) -> int:
         """Return how many pages are open."""
@@ -65,10 +64,6 @@ class Viewer:
                 return int(json.load(answer)['pages'])
         except OSError:
             return 0
-
-    def wait(self) -> None:
-        """Wait until the process ends."""
-        self._process.wait()
 
 
 @contextmanager
@@ -212,7 +207,7 @@ def _run(config: DemoParameters, folder: Path, console: Console, view: Viewer | 
     if view is not None and sys.stdout.isatty():
         console.print(f'\nthe live view stays open at {view.url} until Ctrl-C')
         with suppress(KeyboardInterrupt):
-            view.wait()
+            view.process.wait()
     return FAILED if different else 0
 
 
@@ -323,15 +318,10 @@ def _init(arguments: Sequence[str], console: Console) -> None:
 
 def _occupied() -> bool:
     """Return whether another process uses the topics of joint states or efforts on the domain."""
-    node: Any = Node('demo_lookout')
-    executor = rclpy_workarounds.make_executor()
-    executor.add_node(node)
+    node = Node('demo_lookout')
     limit = time.monotonic() + LOOK_AROUND_S
-    found = False
-    while time.monotonic() < limit and not found:
-        executor.spin_once(timeout_sec=0.05)
-        found = foreign_arm(node, own_writers=0, own_readers=0)
-    executor.shutdown()
+    while not (found := foreign_arm(node, own_writers=0, own_readers=0)) and time.monotonic() < limit:
+        time.sleep(0.05)
     node.destroy_node()
     return found
 
