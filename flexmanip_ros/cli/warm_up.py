@@ -12,12 +12,26 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from flexmanip_ros.samples.sample_log import Rows
+from flexmanip_ros import pipeline
+from flexmanip_ros.identification import validation
+from flexmanip_ros.numerics.compiled import compile_for
+from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, TriggerParameters
+from flexmanip_ros.payload import (
+    capture_detection,
+    capture_detection_kernel,
+    filter_state,
+    gauss_newton,
+    moving_horizon,
+    process_model,
+    structured,
+)
+from flexmanip_ros.payload.structured_model import build, diffusion, sensors
+from flexmanip_ros.samples.sample_log import log_of
+from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.types import CaptureEvent, EventKind, StateSpace
 
 SAMPLES = 1200
 """Number of samples, enough for the prediction-error fit to begin."""
@@ -30,12 +44,6 @@ PERIOD_NS = 1_000_000
 
 def simulator_and_identifier() -> None:
     """Simulate a capture and a release, identify a model from the samples, and simulate and predict with a model."""
-    from flexmanip_ros import pipeline
-    from flexmanip_ros.identification import validation
-    from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
-    from flexmanip_ros.simulation import excitation, simulator
-    from flexmanip_ros.types import CaptureEvent, EventKind, StateSpace
-
     plant = PlantParameters()
     efforts = excitation.sequence(ExcitationParameters(), SAMPLES)
     events = (CaptureEvent(SAMPLES // 3 * PERIOD_NS, EventKind.CAPTURE),
@@ -63,22 +71,8 @@ def simulator_and_identifier() -> None:
     validation.predict_ahead(model, u, y, 2)
 
 
-def small_signals() -> Rows:
-    """Return samples of the default arm that are small random numbers."""
-    from flexmanip_ros.samples.sample_log import log_of
-
-    signals = 1e-4 * np.random.default_rng(0).standard_normal((SAMPLES, 8))
-    stamps = np.arange(SAMPLES) * PERIOD_NS
-    return log_of(signals[:, :2], signals[:, 2:6], signals[:, 6:], stamps).rows(0, SAMPLES)
-
-
 def steps_of_the_fit() -> None:
     """Compile what the payload's filter calls now and then."""
-    from flexmanip_ros.numerics.compiled import compile_for
-    from flexmanip_ros.parameters import IdentifierParameters
-    from flexmanip_ros.payload import capture_detection_kernel, filter_state, gauss_newton, moving_horizon
-    from flexmanip_ros.payload.structured_model import build, diffusion, sensors
-
     config = IdentifierParameters()
     model = build(config)
     assert model is not None
@@ -94,13 +88,9 @@ def steps_of_the_fit() -> None:
 
 def payload() -> None:
     """Estimate a payload from small random signals, and look for captures in them."""
-    from flexmanip_ros.numerics.compiled import compile_for
-    from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
-    from flexmanip_ros.payload import capture_detection, process_model, structured
-    from flexmanip_ros.types import CaptureEvent, EventKind
-
-    rows = small_signals()
-    stamps = rows.stamp_ns
+    signals = 1e-4 * np.random.default_rng(0).standard_normal((SAMPLES, 8))
+    stamps = np.arange(SAMPLES) * PERIOD_NS
+    rows = log_of(signals[:, :2], signals[:, 2:6], signals[:, 6:], stamps).rows(0, SAMPLES)
     config = IdentifierParameters()
     state = structured.init(config)
     assert state.model is not None
