@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import textwrap
 import time
-from collections import deque
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -161,22 +160,19 @@ class Recent:
     """Counts what happened in the last ``RECENT_S`` seconds, to a second."""
 
     def __init__(self) -> None:
-        self._counts: deque[tuple[float, int]] = deque(maxlen=round(RECENT_S) + 1)
-        """Time [s] and count, in steps of a second at least."""
+        self._counts: dict[int, int] = {}
+        """Count of each second of the monotonic clock."""
 
     def add(self, count: int) -> None:
-        """Add what happens now; a count of zero changes nothing."""
-        now = time.monotonic()
-        if count and self._counts and now - self._counts[-1][0] < 1.0:
-            at, before = self._counts.pop()
-            self._counts.append((at, before + count))
-        elif count:
-            self._counts.append((now, count))
+        """Add what happens now."""
+        now = int(time.monotonic())
+        self._counts[now] = self._counts.get(now, 0) + count
 
     def count(self) -> int:
-        """Return the count of the last ``RECENT_S`` seconds."""
-        now = time.monotonic()
-        return sum(count for at, count in self._counts if now - at <= RECENT_S)
+        """Return the count of the last ``RECENT_S`` seconds, and forget older ones."""
+        oldest = time.monotonic() - RECENT_S
+        self._counts = {at: count for at, count in self._counts.items() if at >= oldest}
+        return sum(self._counts.values())
 
 
 class LossCounter:
@@ -214,12 +210,9 @@ class LossCounter:
                 self._expected.pop()
             else:
                 self._expected.remove(before)
-                self._add(number - before)
+                self.lost += number - before
+                self._losses.add(number - before)
         self._expected.append(number + 1)
-
-    def _add(self, count: int) -> None:
-        self.lost += count
-        self._losses.add(count)
 
     def recent(self) -> int:
         """Return how many messages were lost in the last ``RECENT_S`` seconds."""
