@@ -122,7 +122,6 @@ class Screen:
         """Number of joint states taken since the start, in all runs."""
         self.runs = 0
         """Number of runs begun; each run has its own time 0."""
-        self._places: tuple[tuple[str, ...], list[tuple[str, int] | None]] = ((), [])
         self._begin()
 
     def _begin(self) -> None:
@@ -169,12 +168,12 @@ class Screen:
 
     def _values(self, block: JointBlock) -> Array:
         """Return the signals (N, c), NaN for one that is not in the messages."""
-        if self._places[0] != block.names:
-            self._places = block.names, [_place(name, block) for name in self.source.columns]
         values = np.full((len(block.stamp_ns), len(self.source.columns)), np.nan)
-        for column, place in enumerate(self._places[1]):
-            if place is not None and place[1] < getattr(block, place[0]).shape[1]:
-                values[:, column] = getattr(block, place[0])[:, place[1]]
+        for column, name in enumerate(self.source.columns):
+            joint, _, field = name.rpartition('/')
+            given: Array = getattr(block, field)
+            if joint in block.names[:given.shape[1]]:
+                values[:, column] = given[:, block.names.index(joint)]
         values[~(np.abs(values) <= LARGEST)] = np.nan
         return values
 
@@ -289,11 +288,6 @@ def encoded(value: Any) -> str:
 def _short(name: str, by_joint: bool) -> str:
     """Return the label of a line: the joint's name where all lines show the same field, else the signal's name."""
     return name.rpartition('/')[0] if by_joint else name
-
-
-def _place(name: str, block: JointBlock) -> tuple[str, int] | None:
-    joint, _, field = name.rpartition('/')
-    return (field, block.names.index(joint)) if joint in block.names else None
 
 
 def _numbers(status: DiagnosticStatus) -> list[Any] | None:
