@@ -17,7 +17,7 @@ from visualization_msgs.msg import MarkerArray
 
 from flexmanip_ros import messages
 from flexmanip_ros.errors import BagError, FlexmanipError
-from flexmanip_ros.io.bag_writer import BagWriter, Value
+from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.parameters import DemoParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, capture_event, from_message
@@ -79,31 +79,28 @@ class Recorder(Node):
             self.first_ns = record.stamp_ns
         self.last_ns = record.stamp_ns
         self.joint_states += 1
-        self._write('/joint_states', record)
+        self._record(self.writer.write, '/joint_states', record)
 
     def _on_command(self, message: Float64MultiArray) -> None:
-        self._write('/effort_controller/commands', from_message(message))
+        self._record(self.writer.write, '/effort_controller/commands', from_message(message))
 
     def _on_event(self, topic: str, message: Header) -> None:
-        self._write(topic, capture_event(message), latched=True)
+        self._record(self.writer.write, topic, capture_event(message), latched=True)
 
     def _on_output(self, name: str, message: Any) -> None:
         value = from_message(message)
         self.published[name].append(value)
-        self._write(f'/rpbsid_identifier/{name}', value)
+        self._record(self.writer.write, f'/rpbsid_identifier/{name}', value)
 
     def _on_shown(self, topic: str, kind: str, raw: bytes) -> None:
-        self._record(partial(self.writer.write_raw, data=raw, kind=kind), topic)
+        self._record(self.writer.write_raw, topic, raw, kind)
 
-    def _write(self, topic: str, value: Value, *, latched: bool = False) -> None:
-        self._record(partial(self.writer.write, value=value, latched=latched), topic)
-
-    def _record(self, write: Callable[..., None], topic: str) -> None:
+    def _record(self, write: Callable[..., None], topic: str, *content: Any, latched: bool = False) -> None:
         if self.failure is not None:
             return
         self._log_ns = max(time.time_ns(), self._log_ns)
         try:
-            write(topic, self._log_ns)
+            write(topic, self._log_ns, *content, latched=latched)
         except BagError as error:
             self._fail(error)
 

@@ -8,7 +8,6 @@ bit.
 import argparse
 import json
 import os
-import select
 import shutil
 import signal
 import subprocess
@@ -43,7 +42,6 @@ from flexmanip_ros.ros.node import BAD_INPUT, reject
 from flexmanip_ros.studies.results import status_text
 from flexmanip_ros.types import QUANTILE, CaptureEvent, Estimate, JointRecord, Payload, Status
 
-START_TIMEOUT_S = 20.0
 END_TIMEOUT_S = 15.0
 
 
@@ -104,14 +102,10 @@ def ros_arguments(arguments: Sequence[str]) -> list[str]:
 def _url(process: subprocess.Popen[bytes]) -> str:
     """Return the address of the page, which the node prints on stdout."""
     assert process.stdout is not None
-    said, limit = b'', time.monotonic() + START_TIMEOUT_S
-    while b'\n' not in said:
-        ready, _, _ = select.select([process.stdout], [], [], max(limit - time.monotonic(), 0.0))
-        more = os.read(process.stdout.fileno(), 4096) if ready else b''
-        if not more:
-            raise ViewerError('the live view did not start', 'see its log above, or leave --view away')
-        said += more
-    return next(word for word in said.decode().split() if word.startswith('http://'))
+    for word in process.stdout.readline().decode().split():
+        if word.startswith('http://'):
+            return word
+    raise ViewerError('the live view did not start', 'see its log above, or leave --view away')
 
 
 NAME = 'demo'
