@@ -105,8 +105,9 @@ def _declare(node: Node, leaf: Leaf) -> Any:
     try:
         value = declare(node, leaf.name, ros_value(leaf, leaf.default), _type(leaf), descriptor(leaf))
     except InvalidParameterTypeException as error:
+        given = parameter_overrides(node)[leaf.name].type_.name.lower().replace('_', ' ')
         raise ParameterError(
-            f"parameter '{leaf.name}' is of type {_given_type(node, leaf)}",
+            f"parameter '{leaf.name}' is of type {given}",
             f'give {"a list, each " if leaf.is_array else ""}{_EXAMPLE[leaf.kind]}') from error
     except InvalidParameterValueException as error:
         given = parameter_overrides(node)[leaf.name].value
@@ -124,10 +125,6 @@ def _widen(overrides: dict[str, Parameter], leaf: Leaf) -> None:
         overrides[leaf.name] = Parameter(leaf.name, value=float(given.value))
     elif given.type_ is Parameter.Type.INTEGER_ARRAY and leaf.is_array:
         overrides[leaf.name] = Parameter(leaf.name, value=[float(item) for item in given.value])
-
-
-def _given_type(node: Node, leaf: Leaf) -> str:
-    return str(parameter_overrides(node)[leaf.name].type_.name).lower().replace('_', ' ')
 
 
 def _reject_unknown(node: Node, known: dict[str, Leaf]) -> None:

@@ -22,7 +22,7 @@ import sys
 import time
 from collections.abc import Collection, Iterator
 from functools import partial
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -337,9 +337,9 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         for estimate in estimates:
             if not self.context.ok():  # a context that has ended publishes nothing
                 return
-            values = messages.outgoing_payload(estimate.payload, estimate.stamp_ns, self.config.payload_frame)
-            new = chain(values, messages.outgoing_arm(estimate)) if estimate.payload_is_new else ()
-            for name, value in chain(new, messages.outgoing_model(estimate)):  # publishes each before the next is made
+            values = (messages.outgoing(estimate, self.config.payload_frame) if estimate.payload_is_new else
+                      messages.outgoing_model(estimate))
+            for name, value in values:  # publishes each before the next is made
                 self.outputs[name].publish(to_message(value))
                 self.published += 1
             self.estimate = estimate
