@@ -8,6 +8,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import wraps
 from typing import Any, Generic, TypeVar
 
 import rclpy
@@ -55,6 +56,23 @@ THROTTLE_S = 2.0
 """Shortest time between two log lines of a repeated error [s]: the log stays readable and does not fill the disk."""
 MISMATCHED = {'durability': ('volatile', 'transient_local'), 'reliability': ('best_effort', 'reliable')}
 """What a publisher offers, and the subscription wants, where the two do not match: the only such pair of a policy."""
+
+
+def _logged(work: Callable[[Any], None]) -> Callable[..., TransitionCallbackReturn]:
+    """Turn a method into a callback of a transition, and log its exception, which rclpy would drop."""
+    @wraps(work)
+    def transition(node: Any, state: LifecycleState | None = None) -> TransitionCallbackReturn:
+        try:
+            work(node)
+        except FlexmanipError as error:
+            node.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        except Exception:
+            node.get_logger().error(traceback.format_exc())
+            return TransitionCallbackReturn.ERROR
+        return TransitionCallbackReturn.SUCCESS
+
+    return transition
 
 
 class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
@@ -127,43 +145,9 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
 
     # Lifecycle transitions.
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+    @_logged
+    def on_configure(self) -> None:
         """Create what the node needs and build its state."""
-        return self._transition(self._configure)
-
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Begin to work."""
-        return self._transition(self._activate)
-
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Cease to work."""
-        return self._transition(self._deactivate)
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Keep topics, services and state; the next configure transition builds a new state."""
-        return TransitionCallbackReturn.SUCCESS
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Cease to work for good."""
-        return self._transition(self._deactivate)
-
-    def autostart(self) -> bool:
-        """Configure and activate at once, as a plain ``ros2 run`` expects, unless ``autostart`` is false.
-
-        Return False, with the reason logged, when a transition fails.
-        """
-        if not self.autostarts:
-            self.get_logger().info('not started, as autostart is false; to start it: '
-                                   f'ros2 lifecycle set {self.get_fully_qualified_name()} configure')
-            return True
-        return all(transition() == TransitionCallbackReturn.SUCCESS
-                   for transition in (self.trigger_configure, self.trigger_activate))
-
-    def close(self) -> None:
-        """Cease to work before the node is destroyed."""
-        self._transition(self._deactivate)
-
-    def _configure(self) -> None:
         arm, is_doubtful = arm_line(self)
         if is_doubtful:
             self.get_logger().warning(arm)
@@ -176,29 +160,39 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
             self.make_entities()
             self._entities_made = True
 
-    def _activate(self) -> None:
+    @_logged
+    def on_activate(self) -> None:
+        """Begin to work."""
         self.activated()
         self.active, self._waits_for, self._heard_at = True, '', None
         self.get_logger().info(f'ready: {self.summary()}' if self.summary() else 'ready')
 
-    def _deactivate(self) -> None:
+    @_logged
+    def on_deactivate(self) -> None:
+        """Cease to work."""
         if self.active:
             try:
                 self.deactivated()
             finally:
                 self.active = False
 
-    def _transition(self, work: Callable[[], None]) -> TransitionCallbackReturn:
-        """Run a part of a transition and log its exception, which rclpy would drop."""
-        try:
-            work()
-        except FlexmanipError as error:
-            self.get_logger().error(str(error))
-            return TransitionCallbackReturn.FAILURE
-        except Exception:
-            self.get_logger().error(traceback.format_exc())
-            return TransitionCallbackReturn.ERROR
+    on_shutdown = close = on_deactivate
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Keep topics, services and state; the next configure transition builds a new state."""
         return TransitionCallbackReturn.SUCCESS
+
+    def autostart(self) -> bool:
+        """Configure and activate at once, as a plain ``ros2 run`` expects, unless ``autostart`` is false.
+
+        Return False, with the reason logged, when a transition fails.
+        """
+        if not self.autostarts:
+            self.get_logger().info('not started, as autostart is false; to start it: '
+                                   f'ros2 lifecycle set {self.get_fully_qualified_name()} configure')
+            return True
+        return all(transition() == TransitionCallbackReturn.SUCCESS
+                   for transition in (self.trigger_configure, self.trigger_activate))
 
     # Topics.
 

@@ -43,15 +43,11 @@ class LiveView(FlexmanipNode[ViewParameters]):
 
     def make_entities(self) -> None:
         """Create the subscriptions, and the timer whose callback takes their messages."""
-        self._screen = self._new_screen()
         self._joint_states = self.waiting_joint_states(self.losses)
         self.subscription(DiagnosticArray, f'{self.config.identifier}/status', self._on_status, qos.sensor_input())
         for topic in ('capture_event', 'capture_detected'):
             self.subscription(Header, topic, self._on_event, qos.latched_input())
         self._timer = self.create_timer(1.0 / self.config.rate, self._update, clock=self._steady)
-
-    def _new_screen(self) -> Screen:
-        return Screen(Source('Live', self.resolve_topic_name('joint_states'), self.config))
 
     def summary(self) -> str:
         """Say where the page is."""
@@ -59,7 +55,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
 
     def activated(self) -> None:
         """Serve the page. Raises ViewError when the port is not available."""
-        self._screen = self._new_screen()
+        self._screen = Screen(Source('Live', self.resolve_topic_name('joint_states'), self.config))
         self._counted = self._runs = self._reported = 0
         self._heard: float | None = None
         self._beaten = self._asked = time.monotonic()
@@ -130,11 +126,11 @@ class LiveView(FlexmanipNode[ViewParameters]):
 
     def report(self, report: Report) -> None:
         """Report the rate of the joint states, losses, and the number of open pages."""
-        now, samples = time.monotonic(), self._screen.samples
         report.values['updates_hz'] = report.values['rate_hz']
         self.losses.report(report, 'lost', 'message')
         if self.server is None:
             return
+        now, samples = time.monotonic(), self._screen.samples
         report.values['rate_hz'] = (samples - self._reported) / max(now - self._asked, 1e-3)
         self._reported, self._asked = samples, now
         report.values.update(samples=samples, pages=self.server.pages)
