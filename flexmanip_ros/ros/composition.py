@@ -1,5 +1,6 @@
 """All nodes of the demonstration, and a recorder, in one process on one executor, over DDS."""
 
+import math
 import time
 from collections.abc import Callable
 from functools import partial
@@ -11,28 +12,34 @@ from rclpy.executors import Executor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
 from visualization_msgs.msg import MarkerArray
 
 from flexmanip_ros import messages
 from flexmanip_ros.errors import BagError, FlexmanipError
+from flexmanip_ros.io import cdr
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.parameters import DemoParameters
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.conversions import JointStateReader, capture_event, from_message
+from flexmanip_ros.ros.conversions import from_message
 from flexmanip_ros.ros.diagnostics import LossCounter
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.nodes.excitation import Excitation
 from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
 from flexmanip_ros.ros.nodes.rpbsid_identifier import TOPICS, RpbsidIdentifier
-from flexmanip_ros.ros.rclpy_workarounds import make_executor, sequence_number, with_info
+from flexmanip_ros.ros.rclpy_workarounds import make_executor, sequence_number, spin, with_info
+from flexmanip_ros.types import Payload, Status
 
 READERS = 4
 """Number of subscriptions to joint_states in this process: identifier, trigger, excitation, recorder."""
-SHOWN = {'/rpbsid_identifier/arm': (MarkerArray, 'visualization_msgs/msg/MarkerArray'),
-         '/diagnostics': (DiagnosticArray, 'diagnostic_msgs/msg/DiagnosticArray')}
-"""Topics recorded for viewers only, as serialized: message class and type name. A replay does not repeat them."""
+RECORDED: dict[str, type[Any]] = {
+    '/joint_states': JointState, '/effort_controller/commands': Float64MultiArray, '/capture_event': Header,
+    '/capture_detected': Header, **{f'/rpbsid_identifier/{name}': kind for name, (kind, _) in TOPICS.items()},
+    '/rpbsid_identifier/arm': MarkerArray, '/diagnostics': DiagnosticArray,
+}
+"""Recorded topics. The last two are for viewers alone: a replay does not repeat them."""
 DISCOVERY_TIMEOUT_S = 20.0
 DRAIN_TIMEOUT_S = 30.0
 """Longest wait for messages under way [s]: a busy machine has a backlog, an idle one needs milliseconds."""
@@ -44,7 +51,7 @@ class CompositionError(FlexmanipError):
 
 
 class Recorder(Node):
-    """Writes joint states, commands, events, outputs and diagnostics into a bag; counts the joint states it missed.
+    """Writes the messages of ``RECORDED`` into a bag; keeps what the identifier said, and counts lost joint states.
 
     Messages are written in the order of arrival, so that a replay processes events and samples in the order in which
     the identifier did. The bag is closed and readable whatever happens.
@@ -60,47 +67,27 @@ class Recorder(Node):
         self.published: dict[str, list[messages.Value]] = {name: [] for name in TOPICS}
         """Values that the identifier published, by topic, in the order of arrival."""
         self.losses = LossCounter()
-        self._reader = JointStateReader()
         deep = QoSProfile(depth=qos.SENSOR_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
-        self.create_subscription(JointState, 'joint_states', with_info(self._on_joint_states), deep, raw=True)
-        self.create_subscription(Float64MultiArray, 'effort_controller/commands', self._on_command, deep)
-        for topic in ('capture_event', 'capture_detected'):
-            self.create_subscription(Header, topic, partial(self._on_event, '/' + topic), qos.latched_input())
-        for name, (kind, _) in TOPICS.items():
-            self.create_subscription(kind, f'/rpbsid_identifier/{name}', partial(self._on_output, name), deep)
-        for topic, (shown, name) in SHOWN.items():
-            self.create_subscription(shown, topic, partial(self._on_shown, topic, name), deep, raw=True)
+        for topic, kind in RECORDED.items():
+            self.create_subscription(kind, topic, with_info(partial(self._on_message, topic, kind)),
+                                     qos.latched_input() if kind is Header else deep, raw=True)
         self.create_timer(FLUSH_PERIOD_S, self._flush)
 
-    def _on_joint_states(self, raw: bytes, info: object) -> None:
-        self.losses.note(sequence_number(info))
-        record = self._reader(raw)
-        if self.first_ns is None:
-            self.first_ns = record.stamp_ns
-        self.last_ns = record.stamp_ns
-        self.joint_states += 1
-        self._record(self.writer.write, '/joint_states', record)
-
-    def _on_command(self, message: Float64MultiArray) -> None:
-        self._record(self.writer.write, '/effort_controller/commands', from_message(message))
-
-    def _on_event(self, topic: str, message: Header) -> None:
-        self._record(self.writer.write, topic, capture_event(message), latched=True)
-
-    def _on_output(self, name: str, message: Any) -> None:
-        value = from_message(message)
-        self.published[name].append(value)
-        self._record(self.writer.write, f'/rpbsid_identifier/{name}', value)
-
-    def _on_shown(self, topic: str, kind: str, raw: bytes) -> None:
-        self._record(self.writer.write_raw, topic, raw, kind)
-
-    def _record(self, write: Callable[..., None], topic: str, *content: Any, latched: bool = False) -> None:
+    def _on_message(self, topic: str, kind: type[Any], raw: bytes, info: Any) -> None:
+        name = topic.rpartition('/')[2]
+        if kind is JointState:
+            self.losses.note(sequence_number(info))
+            self.last_ns = cdr.stamp_ns(raw)
+            self.first_ns = self.last_ns if self.first_ns is None else self.first_ns
+            self.joint_states += 1
+        elif name in self.published:
+            self.published[name].append(from_message(deserialize_message(raw, kind)))
         if self.failure is not None:
             return
         self._log_ns = max(time.time_ns(), self._log_ns)
         try:
-            write(topic, self._log_ns, *content, latched=latched)
+            self.writer.write_raw(topic, self._log_ns, raw, f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}',
+                                  latched=kind is Header)
         except BagError as error:
             self._fail(error)
 
@@ -176,21 +163,28 @@ class Composition:
                 and commands.get_subscription_count() >= 2 and events.get_subscription_count() >= 3 + others
                 and all(item.get_subscription_count() >= 1 for item in self.identifier.outputs.values()))
 
-    def start(self) -> None:
-        """Activate every node."""
+    def run(self, show: Callable[[str], None]) -> None:
+        """Activate every node, and run until the last sample is recorded; ``show`` gets a line once a second."""
         for node in self._managed:
             node.trigger_activate()
+        timer = self.recorder.create_timer(1.0, lambda: show(self._progress()))
+        count = round(self.config.duration * self.config.rate)
+        spin(self.executor, until=lambda: self.recorder.joint_states >= count)
+        timer.cancel()
 
-    @property
-    def elapsed(self) -> float:
-        """Time from the first to the last recorded joint state [s]."""
-        recorder = self.recorder
-        return 0.0 if recorder.first_ns is None else (recorder.last_ns - recorder.first_ns) * 1e-9
-
-    @property
-    def finished(self) -> bool:
-        """Whether the last sample of the run was recorded."""
-        return self.recorder.joint_states >= round(self.config.duration * self.config.rate)
+    def _progress(self) -> str:
+        """Return the recorded time of the run and the latest estimate."""
+        estimate, event, recorder = self.identifier.estimate, self.trigger.latest, self.recorder
+        elapsed_s = 0.0 if recorder.first_ns is None else (recorder.last_ns - recorder.first_ns) * 1e-9
+        time_s = f'{elapsed_s:5.1f} / {self.config.duration:.1f} s'
+        if estimate is None:
+            return f'{time_s}  warming up'
+        words = [' '.join(f'{mode.frequency_hz:.2f}' for mode in estimate.modes[:2]) + ' Hz'] if estimate.modes else []
+        if event is not None and event.stamp_ns <= estimate.stamp_ns:  # announced ahead
+            words.append(event.kind.value)
+        if estimate.payload is not None:
+            words.append(payload_words(estimate.payload))
+        return f'{time_s}  {", ".join(words)}'
 
     @property
     def lost(self) -> int:
@@ -222,6 +216,14 @@ class Composition:
         for node in self._nodes:
             node.destroy_node()
         self._nodes = []
+
+
+def payload_words(payload: Payload) -> str:
+    """Return a payload as text for the progress line; it has numbers only where the payload is known."""
+    if not math.isfinite(payload.std):
+        return 'payload not known'
+    doubt = '' if payload.status is Status.TRACKING else f' ({payload.status.name})'
+    return f'payload {payload.mass:.2f} +- {payload.std:.2g} kg{doubt}'
 
 
 def foreign_arm(node: Node, own_writers: int, own_readers: int) -> bool:

@@ -40,7 +40,7 @@ from flexmanip_ros.ros import rclpy_workarounds
 from flexmanip_ros.ros.composition import Composition, foreign_arm
 from flexmanip_ros.ros.node import BAD_INPUT, reject
 from flexmanip_ros.studies.results import status_text
-from flexmanip_ros.types import QUANTILE, CaptureEvent, Estimate, JointRecord, Payload, Status
+from flexmanip_ros.types import QUANTILE, CaptureEvent, Estimate, JointRecord
 
 END_TIMEOUT_S = 15.0
 
@@ -163,8 +163,7 @@ def _run(config: DemoParameters, folder: Path, console: Console, view: Viewer | 
             console.print(f'\nlive view: open {view.url} in a browser on this machine')
             _wait_for_a_page(view, composition, console)
         began = time.monotonic()
-        composition.start()
-        rclpy_workarounds.spin(composition.executor, until=Progress(console, composition).update)
+        composition.run(console.print)
         composition.drain()
         failure, live = composition.recorder.failure, composition.recorder.published
         identifier, plant = composition.identifier.config, composition.plant.config
@@ -216,42 +215,6 @@ def _wait_for_a_page(view: Viewer, composition: Composition, console: Console) -
     if sys.stdout.isatty():
         console.print(f'the run starts when the page is open, at the latest after {PAGE_TIMEOUT_S:.0f} s')
         composition.wait(lambda: view.pages() > 0, PAGE_TIMEOUT_S)
-
-
-class Progress:
-    """Prints the recorded time of the run and the latest estimate once a second."""
-
-    def __init__(self, console: Console, composition: Composition) -> None:
-        self._console, self._composition = console, composition
-        self._next = time.monotonic() + 1.0
-
-    def update(self) -> bool:
-        """Print if a second has passed; return True when the run is over."""
-        now = time.monotonic()
-        if now >= self._next:
-            self._next = now + 1.0
-            composition = self._composition
-            self._console.print(f'{composition.elapsed:5.1f} / {composition.config.duration:.1f} s  {self._words()}')
-        return self._composition.finished
-
-    def _words(self) -> str:
-        estimate, event = self._composition.identifier.estimate, self._composition.trigger.latest
-        if estimate is None:
-            return 'warming up'
-        words = [' '.join(f'{mode.frequency_hz:.2f}' for mode in estimate.modes[:2]) + ' Hz'] if estimate.modes else []
-        if event is not None and event.stamp_ns <= estimate.stamp_ns:  # announced ahead
-            words.append(event.kind.value)
-        if estimate.payload is not None:
-            words.append(payload_words(estimate.payload))
-        return ', '.join(words)
-
-
-def payload_words(payload: Payload) -> str:
-    """Return a payload as text for the progress line; it has numbers only where the payload is known."""
-    if not np.isfinite(payload.std):
-        return 'payload not known'
-    doubt = '' if payload.status is Status.TRACKING else f' ({payload.status.name})'
-    return f'payload {payload.mass:.2f} +- {payload.std:.2g} kg{doubt}'
 
 
 def parser() -> argparse.ArgumentParser:

@@ -9,24 +9,19 @@ SENSOR_DEPTH = 1000
 """Queue depth for joint states, a second at 1 kHz: a reader that stalls loses nothing (depths 5-10 lost 5-30 %)."""
 
 
-def _profile(depth: int, reliability: ReliabilityPolicy,
-             durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability, durability=durability)
-
-
 # Each of these is called for a new profile, because a QoS override changes the profile that it is given.
-sensor_output = partial(_profile, SENSOR_DEPTH, ReliabilityPolicy.RELIABLE)
+_reliable = partial(QoSProfile, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
+sensor_output = partial(_reliable, depth=SENSOR_DEPTH)
 """Profile for publishing joint states: reliable, so that reliable and best-effort subscriptions match."""
-sensor_input = partial(_profile, SENSOR_DEPTH, ReliabilityPolicy.BEST_EFFORT)
+sensor_input = partial(sensor_output, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Profile for subscribing to joint states: best effort, so that reliable and best-effort publishers match."""
-command = partial(_profile, 10, ReliabilityPolicy.RELIABLE)
+command = partial(_reliable, depth=10)
 """Profile for effort commands."""
-latched = partial(_profile, 1, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
+latched = partial(_reliable, depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Profile for publishing events, models and payloads: a late subscription still gets the last message."""
-latched_input = partial(_profile, 10, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
+latched_input = partial(latched, depth=10)
 """Profile for subscribing to latched topics, deeper than ``latched``: two events in quick succession both arrive."""
-output = partial(_profile, 10, ReliabilityPolicy.RELIABLE)
+output = partial(_reliable, depth=10)
 """Profile for everything else that the identifier publishes."""
 
 
