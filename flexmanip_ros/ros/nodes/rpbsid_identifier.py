@@ -81,9 +81,7 @@ Signals and services wait for the end of the callback.
 LEAD_S = 0.003
 """Time before an estimate is due at which the messages so far are taken [s]: few are left, so it comes soon."""
 SHORTEST_WAIT_S = 0.00025
-"""Time after which the queue is read again when an expected message has not come [s]."""
-MOST_DOUBLED = 7
-"""Number of times that ``SHORTEST_WAIT_S`` doubles, until it is more than ``LONGEST_WAIT_S``."""
+"""Shortest time after which the queue is read again when an expected message has not come [s]."""
 
 FASTER = ('publish joint states less often, end other programs, or name fewer parameters in payload.learn (small arms '
           'with Coulomb friction need many steps a sample)')
@@ -160,8 +158,6 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         """The latest joint state that is not drawn yet."""
         self._lag_ns: int | None = None
         """Median of arrival time minus stamp of the latest messages [ns]; the stamps may be those of any clock."""
-        self._missed = 0
-        """Number of times, since the latest messages, that an expected message had not come."""
 
     def make_entities(self) -> None:
         """Create the publishers, the subscriptions and the reset service."""
@@ -265,7 +261,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             self._check_age(int(block.stamp_ns[0]))
         self._step(block)
         if self.state.clock.last_ns == block.stamp_ns[-1]:  # false for messages of another arm
-            self._lag_ns, self._missed = int(np.median(arrived_ns - block.stamp_ns)), 0
+            self._lag_ns = int(np.median(arrived_ns - block.stamp_ns))
             self._latest = block.record(-1)
 
     def _waiting(self, most: int | None = MOST_AT_ONCE) -> tuple[list[bytes], NDArray[np.int64]]:
@@ -291,9 +287,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         wait_s = (due_ns + self._lag_ns - time.time_ns()) * 1e-9
         if wait_s > 2.0 * LEAD_S:
             wait_s -= LEAD_S
-        elif wait_s < SHORTEST_WAIT_S:  # the message is late: the wait doubles each time
-            wait_s = SHORTEST_WAIT_S * 2.0 ** min(self._missed, MOST_DOUBLED)
-            self._missed += 1
+        elif wait_s < SHORTEST_WAIT_S:  # the message is late: wait for as long as it is late already
+            wait_s = max(SHORTEST_WAIT_S, -wait_s)
         return min(wait_s, longest_s)
 
     def _on_event(self, topic: str, message: Header) -> None:
