@@ -170,9 +170,10 @@ def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome
             return
         for task in again:
             for outcome in tried(iter([task])):
-                is_dead = isinstance(outcome.error, BrokenProcessPool)
-                yield outcome._replace(error=FlexmanipError(
-                    'the worker died in this run', 'run it alone with --workers 0 to see why')) if is_dead else outcome
+                if isinstance(outcome.error, BrokenProcessPool):
+                    outcome = Outcome(task, None, FlexmanipError(
+                        'the worker died in this run', 'run it alone with --workers 0 to see why'))
+                yield outcome
 
 
 def _outcomes(pool: Executor, work: Work, waiting: Iterator[Task], workers: Callable[[], int]) -> Iterator[Outcome]:
