@@ -70,10 +70,12 @@ def urdf(arm: ArmParameters, segments: int = 12) -> str:
         raise ModelError(f'{segments} segments cannot bend', 'draw at least two segments a link')
     robot = ET.Element('robot', name='flexible_arm')
     _link(robot, 'base_link')
-    parent, offset = 'base_link', 0.0
+    parent = 'base_link'
     for link in range(len(arm.link_length)):
-        parent, offset = _flexible_link(robot, arm, link, segments, parent, offset)
-    _body(robot, f'link{len(arm.link_length)}_tip', parent, offset, arm.tip_mass, arm.tip_inertia, '0.3 0.3 0.3 1', arm)
+        parent = _flexible_link(robot, arm, link, segments, parent)
+    tip = f'link{len(arm.link_length)}_tip'
+    _link(robot, tip, arm.tip_mass, arm.tip_inertia, 'body', '0.3 0.3 0.3 1', radius=min(arm.link_length) / 30)
+    _joint(robot, f'{tip}_mount', 'fixed', parent, tip)
     ET.indent(robot)
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding='unicode') + '\n'
 
@@ -94,91 +96,68 @@ def segment_angles(arm: ArmParameters, link: int, segments: int) -> Array:
     return np.diff(np.concatenate([[end], secants, [-end]]))
 
 
-def _flexible_link(
-    robot: ET.Element, arm: ArmParameters, link: int, segments: int, parent: str, offset: float,
-) -> tuple[str, float]:
-    """Add joint, sensor and segments of a link; return its last frame and the offset of the next link in it [m]."""
-    number = link + 1
+def _flexible_link(robot: ET.Element, arm: ArmParameters, link: int, segments: int, parent: str) -> str:
+    """Add joint, sensor and segments of a link to its parent's frame; return its last frame."""
+    name = f'link{link + 1}'
     L, rho = arm.link_length[link], arm.linear_density[link]
-    bend, h = f'link{number}_bend', L / segments
-    root = f'link{number}_root'
-    _link(robot, root)
-    _joint(robot, f'joint{number}', 'continuous', parent, root, offset)
+    bend, h = f'{name}_bend', L / segments
     turns = segment_angles(arm, link, segments)
-    chord = f'link{number}_chord'
+    root, chord, sensor, end = (f'{name}_{part}' for part in ('root', 'chord', 'bend_sensor', 'end'))
+    _link(robot, root)
+    _joint(robot, f'joint{link + 1}', 'continuous', parent, root)
     _link(robot, chord)
-    _joint(robot, f'{chord}_turn', 'continuous', root, chord, 0.0,
+    _joint(robot, f'{chord}_turn', 'continuous', root, chord,
            mimic=(bend, -math.pi / L / math.sin(math.pi * arm.sensor_position[link])))
-    _link(robot, f'{bend}_sensor')
-    _joint(robot, bend, 'prismatic', chord, f'{bend}_sensor', arm.sensor_position[link] * L, limit=L / 2)
+    _link(robot, sensor)
+    _joint(robot, bend, 'prismatic', chord, sensor, arm.sensor_position[link] * L, limit=L / 2)
     parent, offset = root, 0.0
     for index in range(segments):
-        child = f'link{number}_segment{index + 1}'
-        element = _link(robot, child)
-        _inertial(element, rho * h, rho * h**3 / 12, h / 2)
-        _visual(element, h / 2, COLOURS[link], box=(h, L / 60, L / 40))
+        child = f'{name}_segment{index + 1}'
+        _link(robot, child, rho * h, rho * h**3 / 12, str(link), COLOURS[link], box=(h, L / 60, L / 40))
         _joint(robot, f'{child}_turn', 'continuous', parent, child, offset, mimic=(bend, turns[index]))
         parent, offset = child, h
-    end = f'link{number}_end'
-    mass, inertia = (arm.joint_mass, arm.joint_inertia) if link < len(arm.link_length) - 1 else (0.0, 0.0)
-    _body(robot, end, parent, offset, mass, inertia, COLOURS[link], arm, mimic=(bend, turns[-1]))
-    return end, 0.0
+    is_last = link == len(arm.link_length) - 1
+    _link(robot, end, 0.0 if is_last else arm.joint_mass, arm.joint_inertia, str(link), COLOURS[link],
+          radius=min(arm.link_length) / 30)
+    _joint(robot, f'{end}_turn', 'continuous', parent, end, offset, mimic=(bend, turns[-1]))
+    return end
 
 
-def _body(
-    robot: ET.Element, name: str, parent: str, offset: float, mass: float, inertia: float, colour: str,
-    arm: ArmParameters, mimic: tuple[str, float] | None = None,
-) -> None:
-    element = _link(robot, name)
-    if mass:
-        _inertial(element, mass, inertia, 0.0)
-        _visual(element, 0.0, colour, radius=min(arm.link_length) / 30)
-    kind = 'continuous' if mimic else 'fixed'
-    _joint(robot, f'{name}_turn' if mimic else f'{name}_mount', kind, parent, name, offset, mimic=mimic)
-
-
-def _link(robot: ET.Element, name: str) -> ET.Element:
-    return ET.SubElement(robot, 'link', name=name)
-
-
-def _inertial(link: ET.Element, mass: float, inertia: float, centre: float) -> None:
-    element = ET.SubElement(link, 'inertial')
-    ET.SubElement(element, 'origin', xyz=f'{centre:.9g} 0 0')
-    ET.SubElement(element, 'mass', value=f'{mass:.9g}')
+def _link(robot: ET.Element, name: str, mass: float = 0.0, inertia: float = 0.0, material: str = '', colour: str = '',
+          *, box: tuple[float, float, float] | None = None, radius: float = 0.0) -> None:
+    """Add a link; one with a mass is drawn as a box that begins at its frame, or else as a sphere around it."""
+    link = ET.SubElement(robot, 'link', name=name)
+    if not mass:
+        return
+    centre = f'{box[0] / 2 if box else 0.0:.9g} 0 0'
+    inertial = ET.SubElement(link, 'inertial')
+    ET.SubElement(inertial, 'origin', xyz=centre)
+    ET.SubElement(inertial, 'mass', value=f'{mass:.9g}')
     turning = f'{max(inertia, 1e-9):.9g}'
-    ET.SubElement(element, 'inertia', ixx=turning, ixy='0', ixz='0', iyy=turning, iyz='0', izz=turning)
-
-
-def _visual(
-    link: ET.Element, centre: float, colour: str, box: tuple[float, float, float] | None = None,
-    radius: float = 0.0,
-) -> None:
-    element = ET.SubElement(link, 'visual')
-    ET.SubElement(element, 'origin', xyz=f'{centre:.9g} 0 0')
-    geometry = ET.SubElement(element, 'geometry')
+    ET.SubElement(inertial, 'inertia', ixx=turning, ixy='0', ixz='0', iyy=turning, iyz='0', izz=turning)
+    visual = ET.SubElement(link, 'visual')
+    ET.SubElement(visual, 'origin', xyz=centre)
+    geometry = ET.SubElement(visual, 'geometry')
     if box:
         ET.SubElement(geometry, 'box', size=' '.join(f'{side:.6g}' for side in box))
     else:
         ET.SubElement(geometry, 'sphere', radius=f'{radius:.6g}')
-    material = ET.SubElement(element, 'material', name=f'colour_{COLOURS.index(colour)}'
-                             if colour in COLOURS else 'colour_body')
-    ET.SubElement(material, 'color', rgba=colour)
+    ET.SubElement(ET.SubElement(visual, 'material', name=f'colour_{material}'), 'color', rgba=colour)
 
 
-def _joint(
-    robot: ET.Element, name: str, kind: str, parent: str, child: str, offset: float,
-    mimic: tuple[str, float] | None = None, limit: float | None = None,
-) -> None:
-    element = ET.SubElement(robot, 'joint', name=name, type=kind)
-    ET.SubElement(element, 'parent', link=parent)
-    ET.SubElement(element, 'child', link=child)
-    ET.SubElement(element, 'origin', xyz=f'{offset:.9g} 0 0')
+def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str, offset: float = 0.0, *,
+           mimic: tuple[str, float] | None = None, limit: float = 0.0) -> None:
+    """Add a joint at an offset along the parent [m]. mimic: joint whose position it follows, and the factor."""
+    joint = ET.SubElement(robot, 'joint', name=name, type=kind)
+    ET.SubElement(joint, 'parent', link=parent)
+    ET.SubElement(joint, 'child', link=child)
+    ET.SubElement(joint, 'origin', xyz=f'{offset:.9g} 0 0')
     if kind != 'fixed':
-        ET.SubElement(element, 'axis', xyz='0 1 0' if kind == 'prismatic' else '0 0 1')
-    if limit is not None:
-        ET.SubElement(element, 'limit', lower=f'{-limit:.9g}', upper=f'{limit:.9g}', effort='0', velocity='0')
+        ET.SubElement(joint, 'axis', xyz='0 1 0' if kind == 'prismatic' else '0 0 1')
+    if limit:
+        ET.SubElement(joint, 'limit', lower=f'{-limit:.9g}', upper=f'{limit:.9g}', effort='0', velocity='0')
     if mimic:
-        ET.SubElement(element, 'mimic', joint=mimic[0], multiplier=f'{mimic[1]:.9g}', offset='0')
+        ET.SubElement(joint, 'mimic', joint=mimic[0], multiplier=f'{mimic[1]:.9g}', offset='0')
 
 
 if __name__ == '__main__':
