@@ -15,7 +15,6 @@ from flexmanip_ros.paper import experiments
 
 if TYPE_CHECKING:
     from flexmanip_ros.paper.case_run import Track
-    from flexmanip_ros.paper.report import Planned
     from flexmanip_ros.studies.trial import Row
 
 PROG = 'reproduce_paper'
@@ -28,8 +27,10 @@ same seeds give the same numbers.
 exit status: 0 on success, 2 on bad arguments, 130 when interrupted.
 """
 PAGE, ROWS, SUMMARY = 'report.html', 'runs.csv', 'summary.csv'
-SHOWN = ('mean error [%]', 'rms error at 6 s [%]', 'bound at 6 s [%]', '95 % interval holds [%]',
-         'time per sample [us]')
+SHOWN = {'mean error [%]': '4-6 s, %', 'rms error at 6 s [%]': 'rms 6 s %', 'bound at 6 s [%]': 'bound %',
+         '95 % interval holds [%]': 'covered %', 'time per sample [us]': 'us/sample'}
+"""Columns of the summary that are printed, and their headings."""
+WIDTHS = (9, 9, 9, 11, 10)
 
 
 def _parser() -> console.Parser:
@@ -50,21 +51,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; return its exit status."""
     given = _parser().parse_args(arguments)
     return console.run(PROG, lambda: _main(given))
-
-
-def work(task: tuple[experiments.Case, int | None]) -> Any:
-    """Compute the bounds of a case, or one run of it where a seed is given."""
-    from flexmanip_ros.paper import case_run
-
-    case, seed = task
-    return case_run.bounds(case) if seed is None else case_run.run(case, seed)
-
-
-def draw(task: tuple[int, Planned]) -> bytes:
-    """Draw a figure as PNG."""
-    from flexmanip_ros.paper import report
-
-    return report.drawing(task[1])
 
 
 def _main(given: argparse.Namespace) -> int:
@@ -91,14 +77,15 @@ def _main(given: argparse.Namespace) -> int:
     planned = list(enumerate(report.planned(tracks, rows)))
     drawn: dict[int, bytes] = {}
     with console.progress('drawing', 'figures') as progress:
-        for outcome in workers.compute(draw, planned, given.workers):
+        for outcome in workers.compute(report.drawing, planned, given.workers):
             drawn[outcome.task[0]] = outcome.result or b''
             progress(len(drawn), len(planned))
     wall = time.perf_counter() - started
     lines = report.summary(rows, bounds)
     write_rows(folder / ROWS, rows)
     write_rows(folder / SUMMARY, lines)
-    report.report(folder / PAGE, report.Study(rows, bounds, [(one, drawn[k]) for k, one in planned], given.runs, wall))
+    lead = f'{given.runs} runs per case, {len(rows)} rows, computed in {wall:.0f} s.'
+    report.report(folder / PAGE, rows, lines, [(one, drawn[k]) for k, one in planned], lead)
     print('\n'.join(describe(lines)))
     print(f"{len(cases) * len(seeds)} runs in {wall:.1f} s; wrote '{folder / PAGE}', {ROWS} and {SUMMARY}")
     return console.SUCCESS
@@ -111,42 +98,36 @@ def _results(cases: Sequence[experiments.Case], seeds: Sequence[int], processes:
     Rows and tracks are in the order of cases and seeds, whatever the order in which the runs end.
     """
     from flexmanip_ros.cli import workers
-    from flexmanip_ros.studies import trial
+    from flexmanip_ros.paper import case_run
 
     tasks: list[tuple[experiments.Case, int | None]] = [(case, None) for case in cases]
     tasks += [(case, seed) for seed in seeds for case in cases]
-    bounds: dict[tuple[str, str], float] = {}
-    found: dict[tuple[str, int], tuple[list[Row], dict[str, Track]]] = {}
+    found: dict[tuple[experiments.Case, int | None], Any] = {}
     with console.progress('simulating and estimating', 'steps') as progress:
-        for count, (task, result, error) in enumerate(workers.compute(work, tasks, processes), start=1):
+        for count, (task, result, error) in enumerate(workers.compute(case_run.work, tasks, processes), start=1):
             case, seed = task
-            if seed is None:
-                bounds |= {(case.name, method): value for method, value in (result or {}).items()}
-            elif error is None:
-                found[case.name, seed] = result
+            if error is None:
+                found[task] = result
             else:
-                found[case.name, seed] = ([{'case': case.name, 'method': method.name, 'seed': seed,
-                                            'error': trial.describe(error)} for method in experiments.METHODS], {})
+                found[task] = {} if seed is None else case_run.failed(case, seed, error)
             progress(count, len(tasks))
-    rows = [row for case in cases for seed in seeds for row in found[case.name, seed][0]]
+    bounds = {(case.name, method): value for case in cases for method, value in found[case, None].items()}
+    rows = [row for case in cases for seed in seeds for row in found[case, seed][0]]
     tracks: dict[str, dict[str, list[Track]]] = {
         case.name: {method.name: [] for method in experiments.METHODS} for case in experiments.CASES}
     for case in cases:
         for seed in seeds:
-            for method, track in found[case.name, seed][1].items():
+            for method, track in found[case, seed][1].items():
                 tracks[case.name][method].append(track)
     return bounds, rows, tracks
 
 
 def describe(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the summary as the lines to print."""
-    shown = [f'{"case":40s} {"method":12s} {"4-6 s, %":>9s} {"rms 6 s %":>9s} {"bound %":>9s} '
-            f'{"covered %":>11s} {"us/sample":>10s}']
-    for line in lines:
-        error, rms, least, coverage, cost = (console.number(line[name]) for name in SHOWN)
-        shown.append(f'{line["case"]:40s} {line["method"]:12s} {error:>9s} {rms:>9s} {least:>9s} {coverage:>11s} '
-                    f'{cost:>10s}')
-    return shown
+    rows = [('case', 'method', *SHOWN.values()),
+            *((line['case'], line['method'], *(console.number(line[name]) for name in SHOWN)) for line in lines)]
+    return [f'{case:40s} {method:12s} ' + ' '.join(f'{text:>{width}s}' for text, width in zip(
+        numbers, WIDTHS, strict=True)) for case, method, *numbers in rows]
 
 
 if __name__ == '__main__':

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,38 +38,38 @@ from flexmanip_ros.studies.scenario import Run, Scenario
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointRecord, StateSpace, Status
 
 RATE = 1000.0
+COUNT, CAPTURE = round(experiments.WINDOW[1] * RATE), round(experiments.CAPTURE_TIME * RATE)
+"""Number of samples of a run, and of those before the capture."""
 STIFFNESS, DAMPING = 20000.0, 4000.0
 """Proportional and derivative gain of the joint [N m/rad, N m s/rad]."""
 JOINT_NAMES = ('joint1', 'joint2')
+Item = JointRecord | CaptureEvent
 
 
-def single_link_messages(arm: ArmParameters, angle: float, payload: float, seed: int, *, duration: float,
-             capture_time: float, snr_db: float) -> list[JointRecord | CaptureEvent]:
-    """Return joint states of link 2 (joint 1 at rest at 0) with chord angle ``angle`` [rad] at the start."""
-    torques, clean = single_link_motion(arm, angle, payload, duration, capture_time)
-    noise = float(np.std(clean)) * 10.0 ** (-snr_db / 20.0)
+def single_link_messages(case: Case, seed: int) -> list[Item]:
+    """Return joint states of link 2 (joint 1 at rest at 0), whose chord angle at the start is that of the case."""
+    torques, clean = single_link_motion(case)
+    noise = float(np.std(clean)) * 10.0 ** (-PlantParameters().snr_db / 20.0)
     angles = clean + noise * np.random.default_rng(seed).normal(size=clean.size)
     empty = np.empty(0)
-    items: list[JointRecord | CaptureEvent] = [
+    items: list[Item] = [
         JointRecord(round(k * 1e9 / RATE), JOINT_NAMES, np.array([0.0, angles[k]]), empty,
                     np.array([0.0, torques[k]])) for k in range(clean.size)]
-    capture = round(capture_time * RATE)
-    items.insert(capture, CaptureEvent(round(capture * 1e9 / RATE), EventKind.CAPTURE))
+    items.insert(CAPTURE, CaptureEvent(round(CAPTURE * 1e9 / RATE), EventKind.CAPTURE))
     return items
 
 
 @cache
-def single_link_motion(arm: ArmParameters, angle: float, payload: float, duration: float, capture_time: float
-           ) -> tuple[Array, Array]:
+def single_link_motion(case: Case) -> tuple[Array, Array]:
     """Return the torque of the joint [N m] and its angle [rad], (N,) each; they are the same for all seeds."""
-    count, capture = round(duration * RATE), round(capture_time * RATE)
+    arm, angle = configure(ArmParameters, experiments.ARM), math.radians(case.angles_deg[1])
     L, rho = arm.link_length[1], arm.linear_density[1]
-    wave = excitation.sequence(ExcitationParameters(rate=RATE), count)[:, 1]
-    torques, angles = np.empty(count), np.empty(count)
+    wave = excitation.sequence(ExcitationParameters(rate=RATE), COUNT)[:, 1]
+    torques, angles = np.empty(COUNT), np.empty(COUNT)
     x = np.array([angle, 0.0])
-    for k in range(count):
-        mass = payload if k >= capture else 0.0
-        if k == capture:  # the object is at rest: momentum is shared
+    for k in range(COUNT):
+        mass = case.payload if k >= CAPTURE else 0.0
+        if k == CAPTURE:  # the object is at rest: momentum is shared
             x[1] *= inertia(arm, 0.0) / inertia(arm, mass)
         known = (rho * L / 2 + arm.tip_mass) * GRAVITY * L
         weight = known + mass * GRAVITY * L
@@ -98,9 +98,6 @@ def _integrated(x: Array, torque: float, weight: float, moment: float) -> Array:
     return np.asarray(x + h / 6 * (a + 2 * b + 2 * c + d), dtype=np.float64)
 
 
-Item = JointRecord | CaptureEvent
-
-
 class Track(NamedTuple):
     """One method over one run: time (T,) [s], mass, lower, upper (T,) [kg], frequencies (T, 2) [Hz]."""
 
@@ -112,11 +109,14 @@ class Track(NamedTuple):
     model: StateSpace | None
 
 
-class MethodResult(NamedTuple):
-    """The result of a method: its estimates, the last one at the last sample, and the time they took [s]."""
+MethodResult = tuple[list[Estimate], float]
+"""The estimates of a method, the last one at the last sample, and the time they took [s]."""
 
-    estimates: list[Estimate]
-    wall: float
+
+def work(task: tuple[Case, int | None]) -> Any:
+    """Compute the bounds of a case, or one run of it where a seed is given."""
+    case, seed = task
+    return bounds(case) if seed is None else run(case, seed)
 
 
 def run(case: Case, seed: int) -> tuple[list[trial.Row], dict[str, Track]]:
@@ -125,45 +125,51 @@ def run(case: Case, seed: int) -> tuple[list[trial.Row], dict[str, Track]]:
     An exception of one method becomes the ``error`` of its row; the others are run all the same.
     """
     found: dict[str, MethodResult] = {}
-    failed: dict[str, str] = {}
+    failures: dict[str, str] = {}
     alone = [method for method in experiments.METHODS if method.name == experiments.ALONE]
     others = [method for method in experiments.METHODS if method.name != experiments.ALONE]
     baselined = [method for method in others if method.baseline]
     items: list[Item] = []
-    with _attempt(failed, others):
+    with _attempt(failures, others):
         items = _messages(case, seed)
     for name in experiments.IDENTIFIERS if items else ():
         readers = [method for method in others if method.identifier == name]
-        with _attempt(failed, readers):
+        with _attempt(failures, readers):
             found.update(_identify(case, name, readers, items))
     if items:
-        with _attempt(failed, baselined):
+        with _attempt(failures, baselined):
             found.update(_compare(case, baselined, items))
-    with _attempt(failed, alone):
-        found.update(_compare(case, alone, _own_run(case, seed)))
-    return _rows(case, seed, found, failed)
+    with _attempt(failures, alone):
+        found.update(_compare(case, alone, single_link_messages(case, seed)))
+    return _rows(case, seed, found, failures)
+
+
+def failed(case: Case, seed: int, error: BaseException) -> tuple[list[trial.Row], dict[str, Track]]:
+    """Return what ``run`` returns, for a run that ended with an error."""
+    return _rows(case, seed, {}, {method.name: trial.describe(error) for method in experiments.METHODS})
 
 
 @contextmanager
-def _attempt(failed: dict[str, str], methods: Sequence[Method]) -> Iterator[None]:
+def _attempt(failures: dict[str, str], methods: Sequence[Method]) -> Iterator[None]:
     """Record an exception as the error of these methods, and go on."""
     try:
         yield
     except Exception as error:
-        failed.update({method.name: trial.describe(error) for method in methods})
+        failures.update({method.name: trial.describe(error) for method in methods})
 
 
-def _rows(case: Case, seed: int, found: dict[str, MethodResult], failed: dict[str, str]
+def _rows(case: Case, seed: int, found: dict[str, MethodResult], failures: dict[str, str]
           ) -> tuple[list[trial.Row], dict[str, Track]]:
     rows: list[trial.Row] = []
     tracks: dict[str, Track] = {}
     for method in experiments.METHODS:
-        row: trial.Row = {'case': case.name, 'method': method.name, 'seed': seed, 'error': failed.get(method.name, '')}
+        row: trial.Row = {'case': case.name, 'method': method.name, 'seed': seed,
+                          'error': failures.get(method.name, '')}
         if method.name in found:
-            reading = found[method.name]
-            tracks[method.name] = track_of(reading.estimates)
-            row.update(_columns(reading.estimates, tracks[method.name], case))
-            row['us_per_sample'] = 1e6 * reading.wall / (experiments.WINDOW[1] * PlantParameters().rate)
+            estimates, wall = found[method.name]
+            tracks[method.name] = track_of(estimates)
+            row.update(_columns(estimates, tracks[method.name], case))
+            row['us_per_sample'] = 1e6 * wall / (experiments.WINDOW[1] * PlantParameters().rate)
         rows.append(row)
     return rows, tracks
 
@@ -175,7 +181,7 @@ def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[
     from its model, from the capture on.
     """
     configs = {method.name: _configured(case, method.name)[1].identifier for method in readers if method.settings}
-    found = {method.name: MethodResult([], 0.0) for method in readers}
+    found: dict[str, list[Estimate]] = {method.name: [] for method in readers}
     walls = dict.fromkeys(found, 0.0)
     begun = time.perf_counter()
     for state, estimate in pipeline.replay(_identifier(case, name), items):
@@ -185,13 +191,16 @@ def _identify(case: Case, name: str, readers: Sequence[Method], items: Sequence[
         captured = (now.stamp_ns - state.first_ns) * 1e-9 >= experiments.CAPTURE_TIME
         for method in found:
             started = time.perf_counter()
-            read = now
-            if method in configs:
-                read = (_with_block(configs[method], case, state, now) if captured else now._replace(payload=None))
-            found[method].estimates.append(read)
+            if method not in configs:
+                read = now
+            elif captured:
+                read = _with_block(configs[method], case, state, now)
+            else:
+                read = now._replace(payload=None)
+            found[method].append(read)
             walls[method] += time.perf_counter() - started
     shared = time.perf_counter() - begun - sum(walls.values())
-    return {method: reading._replace(wall=shared + walls[method]) for method, reading in found.items()}
+    return {method: (estimates, shared + walls[method]) for method, estimates in found.items()}
 
 
 def _with_block(config: IdentifierParameters, case: Case, state: pipeline.State, now: Estimate) -> Estimate:
@@ -219,7 +228,7 @@ def _compare(case: Case, methods: Sequence[Method], items: Sequence[Item]) -> di
     for method in methods:
         begun = time.perf_counter()
         estimates = list(baselines.run(method.baseline, config, recorded))
-        found[method.name] = MethodResult(estimates, shared + time.perf_counter() - begun)
+        found[method.name] = estimates, shared + time.perf_counter() - begun
     return found
 
 
@@ -239,13 +248,6 @@ def _configured(case: Case, name: str) -> tuple[Scenario, Run]:
 def _messages(case: Case, seed: int) -> list[Item]:
     made, configured = _configured(case, experiments.METHODS[0].name)
     return trial.messages(made, replace(configured, plant=replace(configured.plant, seed=seed)), seed)
-
-
-def _own_run(case: Case, seed: int) -> list[Item]:
-    return single_link_messages(
-        configure(ArmParameters, experiments.ARM), math.radians(case.angles_deg[1]), case.payload, seed,
-        duration=experiments.WINDOW[1], capture_time=experiments.CAPTURE_TIME,
-        snr_db=PlantParameters().snr_db)
 
 
 @cache

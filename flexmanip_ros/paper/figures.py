@@ -177,7 +177,8 @@ def frequency_tracks(tracks: Tracks, before: Sequence[float], after: Sequence[fl
     for ax, method in zip(axes, ('paper', experiments.BEST_MODEL), strict=False):
         for k in range(2):
             if tracks.get(method):
-                time, runs = tracks[method][0].time, frequency(tracks[method], k)
+                time = tracks[method][0].time
+                runs = np.column_stack([track.frequencies[:, k] for track in tracks[method]])
                 style = {'color': LOOKS[method][0], 'linestyle': plots.LINES[k]}
                 band(ax, time, runs, f'frequency {k + 1}', **style)
                 true = np.where(time < experiments.CAPTURE_TIME, before[k], after[k])
@@ -203,11 +204,6 @@ def frequency_tracks(tracks: Tracks, before: Sequence[float], after: Sequence[fl
     return drawn
 
 
-def frequency(tracks: Sequence[Track], k: int) -> Array:
-    """Return frequency k of every run (T, runs) [Hz]."""
-    return np.column_stack([track.frequencies[:, k] for track in tracks])
-
-
 def band(ax: Any, time: Array, runs: Array, label: str, **style: Any) -> None:
     """Draw the median over the runs (T, runs) and the band that contains ``SHARE`` of them."""
     low, high = quantile(runs, (1.0 - SHARE) / 2.0), quantile(runs, (1.0 + SHARE) / 2.0)
@@ -225,14 +221,24 @@ def quantile(runs: Array, share: float) -> Array:
     return found
 
 
+def _look(method: str) -> dict[str, Any]:
+    """Return how the payload of a method is drawn."""
+    colour, marker = LOOKS[method]
+    return {'color': colour, 'marker': marker, 'markersize': 4}
+
+
+def _masses(runs: Sequence[Track]) -> Array:
+    """Return the payload of every run (T, runs) [kg]."""
+    return np.column_stack([track.mass for track in runs])
+
+
 def payload_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Tracks]) -> Figure:
     """Figs. 7, 14 and 19: median and band of the runs in the paper's window."""
     drawn, axes = plots.figure([2.2] * len(cases))
     for ax, case in zip(axes, cases, strict=True):
         for method, runs in tracks[case.name].items():
             if runs:
-                colour, marker = LOOKS[method]
-                band(ax, runs[0].time, stack(runs, 'mass'), method, color=colour, marker=marker, markersize=4)
+                band(ax, runs[0].time, _masses(runs), method, **_look(method))
         ax.axhline(case.payload, **TRUE, label='true')
         ax.set_xlim(*experiments.WINDOW)
         ax.set_ylim(-0.05 * case.payload, 2.0 * case.payload)
@@ -250,10 +256,9 @@ def interval_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Trac
         for method in CLOSE:
             for track in tracks[case.name].get(method, ())[:1]:
                 late = track.time >= experiments.WINDOW[0]
-                colour, marker = LOOKS[method]
-                ax.fill_between(track.time, track.lower, track.upper, color=colour, alpha=0.25, linewidth=0,
+                ax.fill_between(track.time, track.lower, track.upper, color=LOOKS[method][0], alpha=0.25, linewidth=0,
                                 label=f'{method}, 95 % interval')
-                ax.plot(track.time, track.mass, color=colour, marker=marker, markersize=4, label=method)
+                ax.plot(track.time, track.mass, label=method, **_look(method))
                 ends = np.abs(np.concatenate([track.lower[late], track.upper[late]]) - case.payload)
                 known = ends[np.isfinite(ends)]
                 widest = max(widest, float(np.median(known)) if known.size else 0.0)
@@ -264,7 +269,12 @@ def interval_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Trac
         ax.set_ylabel('payload, close up\n[kg]')
         ax.set_title(case.title, loc='right', fontsize=10)  # the event's name is at the left
         plots.legend(ax)
-        _say_last(ax, tracks[case.name].get('structured', ()))
+        for track in tracks[case.name].get('structured', ())[:1]:  # its band may be thinner than the line
+            if np.isfinite(track.mass[-1]):
+                ax.annotate(f'structured at {track.time[-1]:.0f} s: {track.mass[-1]:.3f} kg, 95 %: '
+                            f'{track.lower[-1]:.3f} to {track.upper[-1]:.3f} kg', (1.0, 0.04),
+                            xycoords='axes fraction', ha='right', fontsize=9, fontweight='bold',
+                            color=LOOKS['structured'][0])
     plots.events(axes, CAPTURE)
     return drawn
 
@@ -277,10 +287,9 @@ def error_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Tracks]
             if not runs:
                 continue
             since = runs[0].time >= experiments.CAPTURE_TIME
-            error = np.maximum(np.abs(stack(runs, 'mass') - case.payload), LEAST_SHARE * case.payload)[since]
+            error = np.maximum(np.abs(_masses(runs) - case.payload), LEAST_SHARE * case.payload)[since]
             if np.isfinite(error).any():
-                colour, marker = LOOKS[method]
-                band(ax, runs[0].time[since], error, method, color=colour, marker=marker, markersize=4)
+                band(ax, runs[0].time[since], error, method, **_look(method))
         ax.set_yscale('log')
         ax.set_xlim(experiments.CAPTURE_TIME - 0.1, experiments.WINDOW[1])
         ax.set_ylim(LEAST_SHARE * case.payload, 100.0 * case.payload)
@@ -315,21 +324,6 @@ def error_points(
         ax.set_xlabel('mean relative error,\n4 to 6 s [%]')
         ax.set_title(case.title.replace(', ', ',\n'), loc='left', fontsize=10)
     return drawn
-
-
-def stack(tracks: Sequence[Track], what: str) -> Array:
-    """Return one column a run (T, runs) of a quantity."""
-    return np.column_stack([getattr(track, what) for track in tracks])
-
-
-def _say_last(ax: object, tracks: Sequence[Track]) -> None:
-    """Write the last estimate of the first run, whose band may be thinner than the line."""
-    if tracks and np.isfinite(tracks[0].mass[-1]):
-        track = tracks[0]
-        words = (f'structured at {track.time[-1]:.0f} s: {track.mass[-1]:.3f} kg, 95 %: '
-                 f'{track.lower[-1]:.3f} to {track.upper[-1]:.3f} kg')
-        ax.annotate(words, (1.0, 0.04), xycoords='axes fraction', ha='right',  # type: ignore[attr-defined]
-                    fontsize=9, fontweight='bold', color=LOOKS['structured'][0])
 
 
 def _time(run: Trajectory) -> Array:

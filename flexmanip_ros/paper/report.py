@@ -139,8 +139,9 @@ class Planned(NamedTuple):
     arguments: tuple[Any, ...]
 
 
-def drawing(planned: Planned) -> bytes:
-    """Draw a figure as PNG."""
+def drawing(task: tuple[int, Planned]) -> bytes:
+    """Draw a figure, which has its number in the page beside it, as PNG."""
+    planned = task[1]
     return png(planned.draw(*planned.arguments))
 
 
@@ -226,21 +227,23 @@ def _payloads(cases: Sequence[experiments.Case], numbers: tuple[str, str, str],
     if not there:
         return []
     kept = {case.name: tracks[case.name] for case in there}
+    titles = '; '.join(case.title for case in there)
     found = errors(rows)
     means = '; '.join(
         f'{method.name} {", ".join(_mean(found.get((case.name, method.name), ())) for case in there)} %'
         for method in experiments.METHODS)
-    bias = ', '.join(_bias(of(rows, case, 'rigid RLS')) for case in there)
+    rigid = [column(of(rows, case, 'rigid RLS'), 'payload_mass_kg') for case in there]
+    bias = ', '.join(_mean(100.0 * (masses / case.payload - 1.0)) for masses, case in zip(rigid, there, strict=True))
     own = '; '.join(
         f'{method} {", ".join(_held(of(rows, case, method)) for case in there)}'
         for method in figures.CLOSE)
     return [
         Planned(numbers[0], 'payload', claims[0],
-                f'mean error in per cent ({_titles(there)}): {means}. Bias of least squares at 6 s: {bias} %.'
+                f'mean error in per cent ({titles}): {means}. Bias of least squares at 6 s: {bias} %.'
                 f'{RUNS} Nothing is drawn while a method says that it knows nothing yet.',
                 figures.payload_tracks, (there, kept)),
         Planned(numbers[0], 'close up, with intervals', 'no intervals are given.', 'runs whose 95 % interval '
-                f'holds the payload at 6 s ({_titles(there)}): {own}. Drawn: the first run.',
+                f'holds the payload at 6 s ({titles}): {own}. Drawn: the first run.',
                 figures.interval_tracks, (there, kept)),
         Planned(numbers[1], 'absolute error', claims[1], f'from the capture on.{RUNS}',
                 figures.error_tracks, (there, kept)),
@@ -248,18 +251,8 @@ def _payloads(cases: Sequence[experiments.Case], numbers: tuple[str, str, str],
                 '(line), 4 to 6 s.', figures.error_points, (there, found))]
 
 
-def _titles(cases: Sequence[experiments.Case]) -> str:
-    return '; '.join(case.title for case in cases)
-
-
-def _mean(values: Sequence[float]) -> str:
-    return plain(float(np.mean(values)) if values else None)
-
-
-def _bias(rows: Sequence[trial.Row]) -> str:
-    values = [100.0 * (row['payload_mass_kg'] / row['payload_true_kg'] - 1.0) for row in rows
-              if row.get('payload_mass_kg') is not None]
-    return _mean(values)
+def _mean(values: Sequence[float] | Array) -> str:
+    return plain(float(np.mean(values)) if len(values) else None)
 
 
 def _held(rows: Sequence[trial.Row]) -> str:
@@ -275,36 +268,26 @@ def simulation(case: experiments.Case) -> simulator.Trajectory:
     return simulator.simulate(run.plant, torque, events)
 
 
-class Study(NamedTuple):
-    """The results of reproduce_paper. pictures: the planned figures, each with its PNG (empty: not drawn)."""
-
-    rows: Sequence[trial.Row]
-    bounds: Bounds
-    pictures: Sequence[tuple[Planned, bytes]]
-    runs: int
-    wall_s: float
-
-
-def report(path: str | Path, done: Study) -> None:
-    """Write the page."""
-    sections = [Section('Result', _result(done)), Section('Deviations', table(['the paper', 'here'], DEVIATIONS)),
+def report(path: str | Path, rows: Sequence[trial.Row], lines: Sequence[Line],
+           pictures: Sequence[tuple[Planned, bytes]], lead: str) -> None:
+    """Write the page. lines: ``summary`` of the rows; pictures: each figure with its PNG, empty: it was not drawn."""
+    sections = [Section('Result', _result(lines)), Section('Deviations', table(['the paper', 'here'], DEVIATIONS)),
                 Section('Table 1: the arm', _arm())]
-    for planned, drawn in done.pictures:
+    for planned, drawn in pictures:
         sections.append(_section(planned, drawn))
         if planned.numbers == '10':
-            sections.append(Section('Table 2: frequency errors', _frequencies(done.rows)))
-    lead = (f'{done.runs} runs per case, {len(done.rows)} rows, computed in {done.wall_s:.0f} s. Mean relative '
-            f'error over {experiments.WINDOW[0]:g} to {experiments.WINDOW[1]:g} s; '
-            'the interval is judged at the end.')
+            sections.append(Section('Table 2: frequency errors', _frequencies(rows)))
+    lead += (f' Mean relative error over {experiments.WINDOW[0]:g} to {experiments.WINDOW[1]:g} s; '
+             'the interval is judged at the end.')
     write_text(path, page("The paper's section 4, its method and ours", lead, sections))
 
 
-def _result(done: Study) -> str:
+def _result(lines: Sequence[Line]) -> str:
     shown = ('mean error [%]', 'rms error at 6 s [%]', 'bound at 6 s [%]', 'half width [%]', 'time per sample [us]')
     rows = [[line['case'], line['method'], *(line[name] for name in shown),
              ' '.join([number(line['95 % interval holds [%]'], 3),
                        f'({number(line["from [%]"], 3)} to {number(line["to [%]"], 3)})']), line['failed']]
-            for line in summary(done.rows, done.bounds)]
+            for line in lines]
     header = ['case', 'method', 'mean error, 4 to 6 s [%]', 'rms error at 6 s [%]', 'bound at 6 s [%]',
               'half width of the 95 % interval [%]', 'time per sample [us]',
               'the interval holds the payload (95 % interval of this) [%]', 'failed runs']
