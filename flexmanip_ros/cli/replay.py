@@ -14,7 +14,7 @@ from flexmanip_ros.cli.console import Report, require_matplotlib
 from flexmanip_ros.errors import BagError, FlexmanipError, MissingSignalError, ModelError, ParameterError, SignalError
 from flexmanip_ros.event_replay import FAR_EVENT_NS
 from flexmanip_ros.io import bag
-from flexmanip_ros.io.outputs import TableOutput, check_apart, check_place, open_output, write_rows, write_text
+from flexmanip_ros.io.outputs import Output, check_apart, check_place, write_rows, write_text
 from flexmanip_ros.numerics.background import REPLAY_THREADS, Threads, read_ahead
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import yaml_text
@@ -101,7 +101,7 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     messages = _Messages(request, progress)
     kept: list[Estimate] = []
     state, interrupted = pipeline.init(), False
-    output = None if request.output is None else open_output(request.output, request.config.payload_frame)
+    output = None if request.output is None else Output(request.output, request.config.payload_frame)
     with (output or nullcontext(), closing(Threads(REPLAY_THREADS)) as background,
           closing(read_ahead(messages)) as items):
         try:
@@ -124,7 +124,7 @@ def identify(request: Request, progress: Report | None = None) -> Result:
             raise KeyboardInterrupt
         if messages.fault is not None and state.counters.accepted == 0:  # an existing output file stays
             raise messages.fault
-        if isinstance(output, TableOutput):
+        if output is not None:
             output.start_ns = messages.first_ns
     progress.phase('fitting the last samples')
     last = pipeline.current(state)

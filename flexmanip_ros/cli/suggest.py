@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -69,14 +69,6 @@ class Found:
         return f'{self.name:28s} {self.rate:.4g} Hz   {what}{broken}'
 
 
-@dataclass
-class _Recording:
-    """The blocks of a recording up to a time, and the stamps of its events [ns]."""
-
-    blocks: list[JointBlock] = field(default_factory=list)
-    events: list[int] = field(default_factory=list)
-
-
 def given_values(path: str | None, overrides: list[str]) -> dict[str, Any]:
     """Return what --params and --set say, each value checked on its own. Raises ParameterError."""
     values = {**({} if path is None else read(path, NODE)), **parse_overrides(overrides)}
@@ -104,23 +96,23 @@ def suggest(source: str, place: str, given: Mapping[str, Any], topics: bag.Topic
     """
     check_place(place, '.yaml', '.yml')
     with console.progress('looking at the signals', 'messages') as shown:
-        recording = _recording(source, topics, until_s, shown)
-    signals = observe(recording.blocks)
+        blocks, events = _recording(source, topics, until_s, shown)
+    signals = observe(blocks)
     chosen, reasons = choose_signals(signals, given)
     config = configure(IdentifierParameters, {**given, **chosen})
-    collected, dt = _collect(config, recording)
+    collected, dt = _collect(config, blocks, events)
     for name, values in (('inputs', collected.u), ('outputs', collected.y)):
         if not np.any(np.ptp(values, axis=0) > 0.0):
             raise ParameterError(f'no signal of {name} moves: {", ".join(getattr(config, name))}',
                                  f'name others with --set {name}=[NAME/FIELD, ...]')
     with console.progress('trying models', 'steps') as shown:
-        found = suggestion.suggest({**given, **chosen}, collected, dt, horizon_s=horizon_s, progress=shown)
-    words = [f'{name}: {why}' for name, why in (*reasons, *found.reasons)]
+        found, more = suggestion.suggest({**given, **chosen}, collected, dt, horizon_s, shown)
+    words = [f'{name}: {why}' for name, why in (*reasons, *more)]
     heading = f'Suggested by identify_bag --suggest for {Path(source).resolve().name}.'
-    write_text(place, file_text(heading, words, found.values))
+    write_text(place, file_text(heading, words, found))
     lines = [*(f'signal       {signal.text()}' for signal in signals), *(f'suggested    {line}' for line in words),
              f'written      {place}']
-    return configure(IdentifierParameters, found.values), lines
+    return configure(IdentifierParameters, found), lines
 
 
 def file_text(heading: str, words: Sequence[str], values: Mapping[str, Any]) -> str:
@@ -128,43 +120,48 @@ def file_text(heading: str, words: Sequence[str], values: Mapping[str, Any]) -> 
     return '\n'.join([f'# {heading}', *(f'# * {line}' for line in words), yaml_text(NODE, values)])
 
 
-def _recording(source: str, topics: bag.Topics, until_s: float | None, progress: bag.Progress) -> _Recording:
-    """Read a recording up to a time; of a damaged one, read what comes before the damage."""
-    found, is_cut = _Recording(), until_s is None
+def _recording(source: str, topics: bag.Topics, until_s: float | None, progress: bag.Progress
+               ) -> tuple[list[JointBlock], list[int]]:
+    """Return the blocks of a recording up to a time, and the stamps of its events [ns].
+
+    Of a damaged recording they are what comes before the damage.
+    """
+    blocks: list[JointBlock] = []
+    events: list[int] = []
+    is_cut = until_s is None
     try:
         for item in bag.read_blocks(source, topics, progress):
             if isinstance(item, CaptureEvent):
-                found.events.append(item.stamp_ns)
+                events.append(item.stamp_ns)
                 continue
-            first = found.blocks[0].stamp_ns[0] if found.blocks else item.stamp_ns[0]
+            first = blocks[0].stamp_ns[0] if blocks else item.stamp_ns[0]
             used = np.full(len(item.stamp_ns), True) if until_s is None else (
                 item.stamp_ns < first + round(until_s * 1e9))
             is_cut |= not used.all()
             if used.any():
-                found.blocks.append(item if used.all() else item.part(used))
+                blocks.append(item if used.all() else item.part(used))
     except BagError:
-        if not found.blocks:
+        if not blocks:
             raise
-    if not found.blocks:
+    if not blocks:
         raise ParameterError(f'the recording has no sample before {until_s:g} s', 'choose a later time')
     if not is_cut:
         raise ParameterError(f'the recording has no sample to score from {until_s:g} s on', 'choose an earlier time')
-    return found
+    return blocks, events
 
 
 def observe(blocks: list[JointBlock]) -> list[Found]:
     """Return every signal of a recording, in the order of the messages."""
-    columns: dict[str, list[Array]] = {}
-    stamps: dict[str, list[Array]] = {}
+    parts: dict[str, list[Array]] = {}
+    """Stamps and values (2, N) of each signal in each block."""
     for block in blocks:
         for kind in FIELDS:
             values = getattr(block, kind)
             for k, joint in enumerate(block.names) if values.shape[1] == len(block.names) else ():
-                columns.setdefault(f'{joint}/{kind}', []).append(values[:, k])
-                stamps.setdefault(f'{joint}/{kind}', []).append(block.stamp_ns.astype(np.float64))
+                parts.setdefault(f'{joint}/{kind}', []).append(np.stack([block.stamp_ns, values[:, k]]))
     found = []
-    for name, parts in columns.items():
-        values, at = np.concatenate(parts), np.concatenate(stamps[name])
+    for name, tables in parts.items():
+        at, values = np.hstack(tables)
         good = values[np.isfinite(values)]
         interval = float(np.median(np.diff(at))) * 1e-9 if len(at) > 1 else 0.0
         found.append(Found(
@@ -230,10 +227,10 @@ def _check_there(group: str, names: tuple[str, ...], signals: list[Found]) -> No
                              f'the signals there are: {", ".join(sorted(there))}')
 
 
-def _collect(config: IdentifierParameters, recording: _Recording) -> tuple[Signals, float]:
+def _collect(config: IdentifierParameters, blocks: list[JointBlock], events: list[int]) -> tuple[Signals, float]:
     """Return the signals of the longest time between two events, and the sample time [s]."""
     clock, log = sampling.Clock(), sampling.EMPTY
-    for block in recording.blocks:
+    for block in blocks:
         clock, log, _ = sampling.push_whole(config, clock, log, block)
     clock, log, _ = sampling.flush(config, clock, log)
     pipeline.check_used(pipeline.State(clock))
@@ -241,8 +238,7 @@ def _collect(config: IdentifierParameters, recording: _Recording) -> tuple[Signa
     if len(whole.stamp_ns) < 2:
         raise ParameterError(f'{len(whole.stamp_ns)} samples are too few to choose parameters from',
                              'record for longer')
-    borders = np.searchsorted(whole.stamp_ns, sorted(recording.events)).tolist()
-    borders = [0, *borders, len(whole.stamp_ns)]
-    a, b = max(pairwise(borders), key=lambda pair: pair[1] - pair[0])
+    borders = np.searchsorted(whole.stamp_ns, sorted(events)).tolist()
+    a, b = max(pairwise([0, *borders, len(whole.stamp_ns)]), key=lambda pair: pair[1] - pair[0])
     return replace(whole, stamp_ns=whole.stamp_ns[a:b], u=whole.u[a:b], y=whole.y[a:b], angles=whole.angles[a:b],
                    gap=whole.gap[a:b], missing=whole.missing[a:b]), clock.dt

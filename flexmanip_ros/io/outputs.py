@@ -15,7 +15,6 @@ import io
 import json
 import os
 import stat
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -107,11 +106,11 @@ def write_text(path: str | Path, text: str) -> None:
     write_file(path, lambda file: file.write(text.encode('utf-8')))
 
 
-def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows of named values as .csv; a value that is None or not there is an empty cell."""
+def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]], names: Iterable[str] = ()) -> None:
+    """Write rows of named values as .csv; a value that is None or not there is an empty cell. names: first columns."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(dict.fromkeys(name for row in rows for name in row)), restval='',
-                            lineterminator='\n')
+    every = dict.fromkeys((*names, *(name for row in rows for name in row)))
+    writer = csv.DictWriter(text, list(every), restval='', lineterminator='\n')
     writer.writeheader()
     writer.writerows({name: '' if value is None else value for name, value in row.items()} for row in rows)
     write_text(path, text.getvalue())
@@ -179,8 +178,8 @@ def write_csv(path: str | Path, estimates: Sequence[Estimate], start_ns: int | N
             flat |= {f'{stem}{k + 1}_{unit}': values[:, k] for k in range(values.shape[1])}
         else:
             flat[name] = values
-    lines = [[_cell(values[row]) for values in flat.values()] for row in range(len(estimates))]
-    write_text(path, ''.join(','.join(line) + '\n' for line in [list(flat), *lines]))
+    rows = ({name: _cell(values[row]) for name, values in flat.items()} for row in range(len(estimates)))
+    write_rows(path, list(rows), flat)
 
 
 def write_npz(path: str | Path, estimates: Sequence[Estimate], start_ns: int | None = None) -> None:
@@ -189,91 +188,59 @@ def write_npz(path: str | Path, estimates: Sequence[Estimate], start_ns: int | N
     write_file(path, lambda file: np.savez_compressed(file, **arrays))
 
 
-def _cell(value: Any) -> str:
-    if isinstance(value, (np.integer, np.str_)):
-        return str(value)
-    return '' if np.isnan(value) else repr(float(value))
+def _cell(value: Any) -> Any:
+    """Return an element of an array as a plain value, None for NaN."""
+    return None if isinstance(value, np.floating) and np.isnan(value) else value.item()
 
 
-class Output(ABC):
-    """Takes estimates one by one. Use it in a ``with``, which closes it; after an exception only if it is not empty."""
+class Output:
+    """Takes estimates one by one: a table where the name ends in .csv or .npz, else a recording.
 
-    def __init__(self) -> None:
-        self.is_empty = True
+    A table is written when it is closed. A recording has the stamps of the input and grows from the first estimate on.
+    Use it in a ``with``, which closes it; after an exception only if it is not empty.
+    """
 
-    @abstractmethod
+    def __init__(self, path: str | Path, frame_id: str) -> None:
+        self.path = Path(path)
+        self.start_ns: int | None = None
+        """Stamp at which the time of a table is 0; None: the first estimate."""
+        self._frame_id = frame_id
+        self._is_table = ending(path) in ('.csv', '.npz')
+        self._estimates: list[Estimate] = []
+        """Rows of the table."""
+        self._writer: BagWriter | None = None
+        if not self._is_table and os.path.exists(path):  # check_place names what is wrong with a name that is too long
+            raise BagError(f"'{path}' exists already", 'remove it or give another name')
+        check_place(path)
+
     def write(self, estimate: Estimate) -> None:
-        """Take one estimate."""
-        self.is_empty = False
+        """Keep one estimate as a row of the table, or append the messages that the node would have published."""
+        if self._is_table:
+            self._estimates.append(estimate)
+            return
+        writer = self._opened()
+        for name, value in outgoing(estimate, self._frame_id):
+            latched = name not in (MODES, MODES_INTERVAL, PAYLOAD_MASS)
+            writer.write(f'/{NODE}/{name}', estimate.stamp_ns, value, latched=latched)
 
-    @abstractmethod
-    def close(self) -> None:
-        """Write what is left."""
+    def _opened(self) -> BagWriter:
+        if self._writer is None:
+            self._writer = BagWriter(self.path)
+        return self._writer
 
     def __enter__(self) -> Output:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
-        if kind is None or not self.is_empty:
-            self.close()
-
-
-class TableOutput(Output):
-    """A .csv or .npz file, written when closed."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        check_place(path)
-        self.path = path
-        self.estimates: list[Estimate] = []
-        self.start_ns: int | None = None
-        """Stamp at which the time of the table is 0; None: the first estimate."""
-
-    def write(self, estimate: Estimate) -> None:
-        """Keep one estimate as a row of the table."""
-        super().write(estimate)
-        self.estimates.append(estimate)
-
-    def close(self) -> None:
-        """Write the file."""
-        writer = write_csv if ending(self.path) == '.csv' else write_npz
-        writer(self.path, self.estimates, self.start_ns)
-
-
-class BagOutput(Output):
-    """A recording with the identifier's topics and the stamps of the input. The first estimate creates it."""
-
-    def __init__(self, path: Path, frame_id: str) -> None:
-        super().__init__()
-        if os.path.exists(path):  # check_place names what is wrong with a name that is too long
-            raise BagError(f"'{path}' exists already", 'remove it or give another name')
-        check_place(path)
-        self._path = path
-        self._frame_id = frame_id
-        self._writer: BagWriter | None = None
-
-    def write(self, estimate: Estimate) -> None:
-        """Append the messages that the node would have published."""
-        super().write(estimate)
-        for name, value in outgoing(estimate, self._frame_id):
-            latched = name not in (MODES, MODES_INTERVAL, PAYLOAD_MASS)
-            self._opened().write(f'/{NODE}/{name}', estimate.stamp_ns, value, latched=latched)
-
-    def close(self) -> None:
-        """Finish the recording."""
-        self._opened().close()
-
-    def _opened(self) -> BagWriter:
-        if self._writer is None:
-            self._writer = BagWriter(self._path)
-        return self._writer
-
-
-def open_output(path: str | Path, frame_id: str) -> Output:
-    """Return the output for a name: a table where it ends in .csv or .npz, else a recording."""
-    path = Path(path)
-    return TableOutput(path) if ending(path) in ('.csv', '.npz') else BagOutput(path, frame_id)
+        if kind is not None and not self._estimates and self._writer is None:
+            return
+        if not self._is_table:
+            self._opened().close()
+        elif ending(self.path) == '.csv':
+            write_csv(self.path, self._estimates, self.start_ns)
+        else:
+            write_npz(self.path, self._estimates, self.start_ns)
 
 
 Row = dict[str, Any]

@@ -66,10 +66,10 @@ class Shape(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """Samples without a gap: raw (N, r + m) at unit peak, number (N,) of each in the recording."""
+    """Samples without a gap: raw (N, r + m) at unit peak, number of the first one in the recording."""
 
     raw: Array
-    number: NDArray[np.int64]
+    first: int
 
 
 @dataclass
@@ -146,17 +146,14 @@ def stretches_of(signals: Signals, dt: float) -> list[Stretch]:
     peak = np.max(np.abs(joint), axis=0, initial=0.0)
     joint = joint / np.where(peak > 0.0, peak, 1.0)
     wide = np.flatnonzero(signals.gap & (np.diff(stamps, prepend=stamps[:1]) > BRIDGED_S + 1.5 * dt))
-    parts = []
+    found, first = [], 0
     for a, b in pairwise([0, *wide[wide > 0].tolist(), len(joint)]):
         part = joint[a:b]
         if signals.gap[a + 1:b].any():
             at = np.arange(stamps[a], stamps[b - 1] + 0.5 * dt, dt)
             part = np.column_stack([np.interp(at, stamps[a:b], column) for column in part.T])
-        parts.append(part)
-    begin, found = 0, []
-    for part in parts:
-        found.append(Stretch(part, np.arange(begin, begin + len(part))))
-        begin += len(part)
+        found.append(Stretch(part, first))
+        first += len(part)
     return found
 
 
@@ -242,7 +239,7 @@ def moments(search: Search, kept: list[Kept], past: int) -> list[Array]:
     for fold in range(FOLDS):
         R = np.zeros((0, (past + 1) * (search.r + search.m)))
         for (samples, rows), part in zip(kept, search.stretches, strict=True):
-            ends = np.flatnonzero(folds[part.number[rows]] == fold)
+            ends = np.flatnonzero(folds[part.first + rows] == fold)
             ends = ends[ends >= past]
             for some in np.array_split(ends, len(ends) // CHUNK + 1):
                 if len(some):
@@ -275,7 +272,7 @@ def powers(search: Search, model: StateSpace, kept: list[Kept], factor: int, pas
     targets, errors = [np.empty((0, search.m))], [np.empty((0, search.m))]
     with np.errstate(all='ignore'):
         for (samples, rows), part in zip(kept, search.stretches, strict=True):
-            inside = np.concatenate([[False], chosen[part.number[rows]], [False]])
+            inside = np.concatenate([[False], chosen[part.first + rows], [False]])
             borders = np.flatnonzero(inside[1:] != inside[:-1]).tolist()
             for first, end in zip(borders[::2], borders[1::2], strict=True):  # runs of samples that are chosen
                 begin = max(0, first - steps - WARM * past)

@@ -6,7 +6,6 @@ it runs through the recording and predicts the samples that follow.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.samples.sample_log import Signals, log_of
 from flexmanip_ros.studies import shape_search
 from flexmanip_ros.studies.shape_search import PRIOR, Progress, Search, Shape
-from flexmanip_ros.studies.whole_recording import HORIZON_S
 
 PLAIN = 1.03
 """Least factor by which another setting must reduce the error to replace the plain one."""
@@ -34,17 +32,11 @@ PARTS = 6
 """Number of parts of the recording: the model of the first half predicts the fourth sixth, and so on."""
 
 
-@dataclass(frozen=True)
-class Suggestion:
-    """Suggested parameters by dotted name; for each choice, its name and its reason in one line."""
-
-    values: dict[str, Any]
-    reasons: tuple[tuple[str, str], ...]
-
-
-def suggest(given: Mapping[str, Any], signals: Signals, dt: float, *, horizon_s: float = HORIZON_S,
-            progress: Progress | None = None) -> Suggestion:
+def suggest(given: Mapping[str, Any], signals: Signals, dt: float, horizon_s: float, progress: Progress
+            ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
     """Choose the parameters for a recording of one machine that does not change meanwhile.
+
+    Return them by dotted name, and for each choice its name and its reason in one line.
 
     given: dotted names and values that stay as they are, ``inputs`` and ``outputs`` among them; signals: those of
     these inputs and outputs; dt: sample time [s]; horizon_s: how far ahead the models are to predict [s].
@@ -57,14 +49,12 @@ def suggest(given: Mapping[str, Any], signals: Signals, dt: float, *, horizon_s:
     def step() -> None:
         nonlocal done
         done += 1
-        if progress is not None:
-            progress(done, total)
+        progress(done, total)
 
     shape = shape_search.search_shapes(search, step)
     values, told = _settings(search, shape, step)
-    if progress is not None:
-        progress(total, total)
-    return Suggestion(values, (*_shape_reasons(search, shape), *told))
+    progress(total, total)
+    return values, [*_shape_reasons(search, shape), *told]
 
 
 def _shape_reasons(search: Search, shape: Shape) -> list[tuple[str, str]]:
@@ -164,7 +154,7 @@ def _identified_error(search: Search, values: Mapping[str, Any]) -> float:
     config = configure(IdentifierParameters, values)
     raw = np.vstack([part.raw for part in search.stretches])
     gap = np.zeros(search.count, dtype=np.bool_)
-    gap[[part.number[0] for part in search.stretches[1:]]] = True
+    gap[[part.first for part in search.stretches[1:]]] = True
     stamps = (np.arange(search.count) * round(search.dt * 1e9)).astype(np.int64)
     log = log_of(raw[:, :search.r], raw[:, search.r:], stamp_ns=stamps, gap=gap)
     kept, number = search.kept(config.decimation), np.arange(search.count)
