@@ -88,22 +88,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.cli import first_use
     from flexmanip_ros.cli.replay import Request, identify, places
+    from flexmanip_ros.io.bag import Topics
     from flexmanip_ros.io.outputs import check_apart
 
     check_apart({'--suggest': given.suggest, **places(given)}, given.params, given.bag)
+    topics = Topics(given.joint_states, tuple(given.capture_event or Topics().events), given.capture_event is not None)
     if given.suggest is not None:
-        from flexmanip_ros.cli.suggest import suggest_for
+        from flexmanip_ros.cli.suggest import given_values, suggest
 
-        config, lines = suggest_for(given)
+        config, lines = suggest(given.bag, given.suggest, given_values(given.params, given.set), topics,
+                                given.validate_from, given.horizon)
         print('\n'.join(lines), flush=True)
     else:
         config = load(IdentifierParameters, NODE, given.params, given.set)
     request = Request(
-        given.bag, config, joint_states=given.joint_states,
-        events=tuple(given.capture_event or ('capture_event', 'capture_detected')),
-        events_required=given.capture_event is not None,
-        capture_time=given.capture_time, release_time=given.release_time, detect=given.detect,
-        validate_from=given.validate_from, horizon=given.horizon, smooth=given.smooth,
+        given.bag, config, topics, capture_time=given.capture_time, release_time=given.release_time,
+        detect=given.detect, validate_from=given.validate_from, horizon=given.horizon, smooth=given.smooth,
         output=given.output, report=given.report, save_arm=given.save_arm, configurations=given.configurations)
     sys.setswitchinterval(SWITCH_S)
     with console.progress('identifying', 'messages') as progress, first_use.announced():

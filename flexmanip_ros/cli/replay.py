@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from flexmanip_ros.cli.console import Report, require_matplotlib
 from flexmanip_ros.errors import BagError, FlexmanipError, MissingSignalError, ModelError, ParameterError, SignalError
 from flexmanip_ros.event_replay import FAR_EVENT_NS
 from flexmanip_ros.io import bag
+from flexmanip_ros.io.bag import Topics
 from flexmanip_ros.io.outputs import Output, check_apart, check_place, write_rows, write_text
 from flexmanip_ros.numerics.background import REPLAY_THREADS, Threads, read_ahead
 from flexmanip_ros.parameters import IdentifierParameters
@@ -38,10 +39,7 @@ class Request:
 
     bag: str | Path
     config: IdentifierParameters
-    joint_states: str = 'joint_states'
-    events: tuple[str, ...] = ('capture_event', 'capture_detected')
-    events_required: bool = False
-    """Whether a missing event topic is an error, as it is where the user named the topics."""
+    topics: Topics = field(default_factory=Topics)
     capture_time: float | None = None
     release_time: float | None = None
     detect: bool | None = None
@@ -143,9 +141,9 @@ def identify(request: Request, progress: Report | None = None) -> Result:
         events = [event.stamp_ns for event in messages.events]
         summary = replace(summary, smoothed=whole_recording.smooth(
             state.config or request.config, signals, events, state.clock.dt, request.validate_from))
-    fault = messages.fault or _dropped(state)
+    config, fault = state.config or request.config, messages.fault or _dropped(state)
     if request.save_arm is not None:
-        _save_arm(request, state, last)
+        _save_arm(request.save_arm, Path(request.bag).name, config, state, last)
     found = None if signals is None else whole_recording.sweep(state, _angles_held(signals, messages.events))
     if request.configurations is not None:
         if found is None:
@@ -155,13 +153,21 @@ def identify(request: Request, progress: Report | None = None) -> Result:
         write_rows(request.configurations, found.rows())
     remark = '; '.join((*messages.far_events(), *_remarks(state, messages.foreign)))
     if request.report is not None and signals is not None:
+        from flexmanip_ros.io import plots, report
+
         progress.phase('drawing the report')
-        _report(request, summary, messages, kept, signals, last, scores, state,
-                '; '.join(str(words) for words in (fault, remark) if words), found)
+        if last is not None and kept and last.stamp_ns > kept[-1].stamp_ns:
+            kept.append(last)  # so that pictures and replay end with the numbers of the answer
+        bound, mass = None, summary.payload_mass_kg
+        if summary.capture_time_s is not None and mass is not None:
+            bound = payload_bound(config, signals, summary.capture_time_s, mass, state.clock.dt)
+        report.identification_report(
+            request.report, Path(request.bag).name, config, summary, plots.run(config, signals, kept, messages.events),
+            last, scores, {**state.counters._asdict(), 'dropped': state.counters.dropped}, bound=bound,
+            fault='; '.join(str(words) for words in (fault, remark) if words), events=messages.search(summary.status),
+            player=embedded(messages.screen, messages.events, kept), configurations=found)
     return Result(
-        summary, () if last is None else last.modes, state.config or request.config,
-        tuple(str(place) for place in (request.output, request.report, request.save_arm, request.configurations)
-              if place is not None), fault,
+        summary, () if last is None else last.modes, config, tuple(filter(None, places(request).values())), fault,
         interrupted, messages.search(summary.status), remark)
 
 
@@ -178,7 +184,8 @@ class _Messages:
         """The events that are neither given nor found in the signals."""
         self.is_kept = (request.smooth or request.validate_from is not None or request.report is not None
                         or request.configurations is not None)
-        self._clock, self._log = sampling.Clock(), sampling.EMPTY
+        self._blocks: list[JointBlock] = []
+        """The joint states, where they are kept."""
         self._findings = capture_detection.Findings()
         self._looked = False
         self._search = ''
@@ -191,10 +198,9 @@ class _Messages:
 
     def __iter__(self) -> Iterator[pipeline.Item]:
         request = self._request
-        topics = bag.Topics(request.joint_states, request.events, request.events_required)
-        watch = self._watch(topics)
+        watch = self._watch()
         try:
-            items: Iterable[pipeline.Item] = self._noted(bag.read_blocks(request.bag, topics, self._progress))
+            items: Iterable[pipeline.Item] = self._noted(bag.read_blocks(request.bag, request.topics, self._progress))
             if watch is not None:
                 items = capture_detection.with_detected(watch, items, self._findings)
             for item in items:
@@ -216,7 +222,7 @@ class _Messages:
                 f'its samples, or give --{event.kind.value}-time'
                 for event in self._recorded if first_ns - event.stamp_ns > FAR_EVENT_NS]
 
-    def _watch(self, topics: bag.Topics) -> capture_detection.Watch | None:
+    def _watch(self) -> capture_detection.Watch | None:
         """Return the detector where events are to be looked for in the signals; say why where they are not.
 
         Detection costs about as much time as the payload estimate, so where events are announced it needs --detect.
@@ -235,7 +241,7 @@ class _Messages:
                 raise
             self._search = f'none recorded, and {error.problem}'
             return None
-        announced = bag.event_topics(request.bag, topics) if request.detect is None else ()
+        announced = bag.event_topics(request.bag, request.topics) if request.detect is None else ()
         if announced:
             self._search = f'none on {", ".join(announced)}; --detect looks for them in the signals'
             return None
@@ -270,7 +276,7 @@ class _Messages:
         block = item if isinstance(item, JointBlock) else JointBlock.of(item)
         self.foreign += len(block.stamp_ns) * self._joints.isdisjoint(block.names)
         if self.is_kept:
-            self._clock, self._log, _ = sampling.push_whole(self._request.config, self._clock, self._log, block)
+            self._blocks.append(block)
         if self._request.report is not None:
             self.screen.joint_states(block)
         if self.first_ns is None:
@@ -282,8 +288,7 @@ class _Messages:
 
     def signals(self) -> Signals:
         """Return the samples of the recording, held-out ones included."""
-        clock, log, _ = sampling.flush(self._request.config, self._clock, self._log)
-        return sampling.signals(self._request.config, clock, log)
+        return sampling.collect(self._request.config, self._blocks)
 
     def _known_events(self, first_ns: int) -> Iterator[CaptureEvent]:
         for at, kind in ((self._request.capture_time, EventKind.CAPTURE),
@@ -307,19 +312,18 @@ def _angles_held(signals: Signals, events: Sequence[CaptureEvent]) -> Array:
     return signals.angles[signals.stamp_ns >= since] if signals.angles.shape[1] == 2 else np.zeros((0, 2))
 
 
-def _save_arm(request: Request, state: pipeline.State, last: Estimate | None) -> None:
+def _save_arm(place: str, recording: str, config: IdentifierParameters, state: pipeline.State, last: Estimate | None
+              ) -> None:
     """Write the arm parameters that the recording gave as a file for every node. Raises SignalError without any."""
-    config = state.config or request.config
     found = () if state.payload is None else estimator.arm_parameters(config, state.payload.estimator)
     if not found:
         raise SignalError('the recording taught nothing of the arm, so --save-arm has nothing to write',
                           'it needs payload_method structured, torques, angles and some 0.1 s of samples')
     status = 'unknown' if last is None else last.status.name
     deviations = ', '.join(f'{one.name} {one.value:.6g} +- {one.std:.2g}' for one in found)
-    heading = (f"What the arm taught in the recording '{Path(request.bag).name}', status {status}. "
+    heading = (f"What the arm taught in the recording '{recording}', status {status}. "
                f'Values and standard deviations: {deviations}.')
-    assert request.save_arm is not None
-    write_text(request.save_arm, yaml_text('rpbsid_identifier', as_parameters(config, found), heading))
+    write_text(place, yaml_text('rpbsid_identifier', as_parameters(config, found), heading))
 
 
 def _dropped(state: pipeline.State) -> FlexmanipError | None:
@@ -361,24 +365,3 @@ def _remarks(state: pipeline.State, foreign: int) -> list[str]:
                          'between were estimated as if nothing had been caught or released; raise rewind_time, or '
                          'announce events earlier')
     return parts
-
-
-def _report(request: Request, summary: Summary, messages: _Messages, kept: list[Estimate], signals: Signals,
-            last: Estimate | None, scores: whole_recording.Scores | None, state: pipeline.State,
-            fault: str, found: whole_recording.Sweep | None) -> None:
-    from flexmanip_ros.io import plots, report
-
-    assert request.report is not None
-    config = state.config or request.config
-    if last is not None and kept and last.stamp_ns > kept[-1].stamp_ns:
-        kept = [*kept, last]  # so that pictures and replay end with the numbers of the answer
-    made = replace(plots.run(config, signals, kept, messages.events), smoothed=summary.smoothed or ())
-    bound, mass = None, summary.payload_mass_kg
-    if summary.capture_time_s is not None and mass is not None:
-        bound = payload_bound(config, signals, summary.capture_time_s, mass, state.clock.dt)
-    counts: dict[str, Any] = {**state.counters._asdict(), 'dropped': state.counters.dropped}
-    report.identification_report(
-        request.report, Path(request.bag).name, config, summary, made,
-        None if last is None else last.model, scores, counts, bound, fault,
-        modes=() if last is None else last.modes, events=messages.search(summary.status),
-        player=embedded(messages.screen, messages.events, kept), configurations=found)

@@ -1,6 +1,5 @@
 """What a recording holds, and the parameter file that suits it: ``identify_bag --suggest``."""
 
-import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -77,14 +76,6 @@ def given_values(path: str | None, overrides: list[str]) -> dict[str, Any]:
         if name not in declared:
             configure(IdentifierParameters, {name: values[name]})
     return {name: check(declared[name], value) for name, value in values.items()}
-
-
-def suggest_for(arguments: argparse.Namespace) -> tuple[IdentifierParameters, list[str]]:
-    """Run ``suggest`` with the arguments of identify_bag; return the configuration and the lines to print."""
-    topics = bag.Topics(arguments.joint_states, arguments.capture_event or bag.Topics().events,
-                        arguments.capture_event is not None)
-    return suggest(arguments.bag, arguments.suggest, given_values(arguments.params, arguments.set), topics,
-                   arguments.validate_from, arguments.horizon)
 
 
 def suggest(source: str, place: str, given: Mapping[str, Any], topics: bag.Topics, until_s: float | None,

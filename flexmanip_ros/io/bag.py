@@ -150,6 +150,7 @@ class Topics:
     joint_states: str = 'joint_states'
     events: tuple[str, ...] = ('capture_event', 'capture_detected')
     events_required: bool = False
+    """Whether a missing event topic is an error, as it is where the user named the topics."""
 
 
 def read(path: str | Path, topics: Topics | None = None, progress: Progress | None = None

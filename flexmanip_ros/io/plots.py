@@ -254,9 +254,7 @@ class Run:
     events: tuple[Event, ...]
     has_arm: bool
     """Whether the signals are those of an arm, so that positions of bends are in metres."""
-    truth: Truth = Truth()
-    smoothed: Sequence[Smoothed] = ()
-    """Models of whole stretches, each from all samples of its stretch."""
+    truth: Truth
 
     @property
     def start_ns(self) -> int:
@@ -338,11 +336,11 @@ def signals_figure(made: Run) -> Figure:
     return drawn
 
 
-def frequency_figure(made: Run) -> Figure:
-    """Draw the frequencies with their bands, and the status."""
+def frequency_figure(made: Run, smoothed: Sequence[Smoothed]) -> Figure:
+    """Draw the frequencies with their bands, and the status. smoothed: models of whole stretches, drawn in grey."""
     drawn, axes = figure([3.2, 0.35])
     _estimates(axes, made, with_payload=False)
-    for part in made.smoothed:
+    for part in smoothed:
         course = part.course or ((part.start_s, part.modes), (part.end_s, part.modes))
         for k in range(len(part.modes)):
             at = [(time, found[k]) for time, found in course if len(found) > k]

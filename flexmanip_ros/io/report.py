@@ -19,7 +19,7 @@ from flexmanip_ros.parameters.field import leaves
 from flexmanip_ros.studies.results import Score, Summary, result_rows, score, status_text
 from flexmanip_ros.studies.trial import Row
 from flexmanip_ros.studies.whole_recording import Scores, Smoothed, Sweep
-from flexmanip_ros.types import QUANTILE, Array, Mode, StateSpace, Status
+from flexmanip_ros.types import QUANTILE, Array, Estimate, Mode, StateSpace, Status
 from flexmanip_ros.view import screen
 
 STYLE = """
@@ -116,24 +116,24 @@ SHOWN_FAILURES = 50
 
 def identification_report(
     path: str | Path, source: str, config: IdentifierParameters, summary: Summary, made: plots.Run,
-    model: StateSpace | None, scores: Scores | None, messages: dict[str, int], bound: float | None = None,
-    fault: str = '', *, modes: Sequence[Mode] = (), events: str = '', player: str = '',
-    configurations: Sweep | None = None,
+    last: Estimate | None, scores: Scores | None, messages: dict[str, int], *, bound: float | None, fault: str,
+    events: str, player: str, configurations: Sweep | None,
 ) -> None:
     """Write the report of identify_bag: the answer, then pictures, then tables.
 
+    last: the last estimate; messages: what became of them, and how many; bound: Cramer-Rao bound of the payload [kg].
     events: text on the events that were detected in the signals; empty where the events are known. player: the page
     that plays the recording; configurations: the modes at other angles, where the model gives them.
     """
-    sections = [Section('Result', _answer(config, summary, modes, events, fault))]
-    if player:
-        sections.append(Section('Replay', frame(player, 'the arm, its signals, modes and payload over time')))
+    modes, model = (last.modes, last.model) if last is not None else ((), None)
+    sections = [Section('Result', _answer(config, summary, modes, events, fault)),
+                Section('Replay', frame(player, 'the arm, its signals, modes and payload over time'))]
     if any(estimate.payload is not None for estimate in made.estimates):
         sections.append(Section('Payload', picture(
             plots.payload_figure(made), 'payload with its 95 % interval, and residual power over time')))
     if any(estimate.modes for estimate in made.estimates):
         sections.append(Section('Frequencies', picture(
-            plots.frequency_figure(made), 'identified frequencies with 95 % bands over time')
+            plots.frequency_figure(made, summary.smoothed or ()), 'identified frequencies with 95 % bands over time')
             + _smoothed(summary.smoothed or ())))
     if configurations is not None:
         sections.append(Section('Configurations', picture(

@@ -75,8 +75,7 @@ class Scenario:
         # One random stream per name, so that a name's values do not depend on what else is varied.
         drawn = {name: _draw(how, np.random.default_rng([seed, crc32(name.encode('utf-8'))]))
                  for name, how in self.vary.items()}
-        groups: dict[str, dict[str, Any]] = {
-            name: dict(getattr(self, name)) for name in ('plant', 'excitation', 'identifier')}
+        groups: dict[str, dict[str, Any]] = {name: dict(getattr(self, name)) for name in GROUPS}
         capture = self.capture_time
         for name, value in drawn.items():
             group, _, rest = name.partition('.')
@@ -126,7 +125,7 @@ def scenario(tree: Any) -> Scenario:
         raise _wrong('name', given['name'], 'give a word')
     if 'name' in given:
         given['name'] = str(given['name'])
-    for name in ('plant', 'excitation', 'identifier'):
+    for name in GROUPS:
         given[name] = _flat(name, given.get(name) or {})
     if 'estimators' in given:
         given['estimators'] = {str(key): _flat(str(key), value or {})

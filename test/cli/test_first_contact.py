@@ -115,7 +115,7 @@ def test_where_events_are_announced_nobody_looks_unless_asked(
     assert len(looked) == 1
     assert 'found in the signals' in asked.events
     assert asked.summary.capture_time_s == pytest.approx(1.2)  # the announced one stays
-    given = replay.identify(replay.Request(place, config, capture_time=1.2, events=()))
+    given = replay.identify(replay.Request(place, config, bag.Topics(events=()), capture_time=1.2))
     assert (len(looked), given.events) == (1, '')
 
 
