@@ -32,13 +32,20 @@ TRACEBACK = 'FLEXMANIP_TRACEBACK'
 
 
 class Report:
-    """Progress of a program: this class shows nothing; ``progress`` yields one that shows a bar on a terminal."""
+    """Progress of a program, shown by a bar of rich where one is given. ``progress`` gives one on a terminal."""
+
+    def __init__(self, bar: Any = None, task: Any = None) -> None:
+        self._bar, self._task = bar, task
 
     def __call__(self, done: int, total: int | None) -> None:
         """Note the steps done and the steps in all (None: unknown)."""
+        if self._bar is not None:
+            self._bar.update(self._task, completed=done, total=total)
 
     def phase(self, words: str) -> None:
         """Begin another part of the work, whose duration is not known."""
+        if self._bar is not None:
+            self._bar.reset(self._task, description=words, total=None)
 
 
 class Parser(argparse.ArgumentParser):
@@ -118,16 +125,7 @@ def progress(words: str, unit: str) -> Iterator[Report]:
     bar = Progress(TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(), TextColumn(unit),
                    TimeRemainingColumn(), console=Console(stderr=True), transient=True)
     with bar:
-        task = bar.add_task(words, total=None)
-
-        class Shown(Report):
-            def __call__(self, done: int, total: int | None) -> None:
-                bar.update(task, completed=done, total=total)
-
-            def phase(self, words: str) -> None:
-                bar.reset(task, description=words, total=None)
-
-        yield Shown()
+        yield Report(bar, bar.add_task(words, total=None))
 
 
 def print_error(prog: str, error: BaseException | str) -> None:

@@ -11,7 +11,7 @@ import yaml
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import ArmParameters, PlantParameters, configure
 from flexmanip_ros.parameters.document import NODES, package_names, scalar
-from flexmanip_ros.parameters.field import leaves
+from flexmanip_ros.parameters.field import dotted, leaves
 
 Config = TypeVar('Config')
 STANDARD = re.compile(r'^(use_sim_time|start_type_description_service|autostart|qos_overrides\..*)$')
@@ -83,7 +83,7 @@ def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, An
     if not sections:
         raise ParameterError(f"{where} has no 'ros__parameters'", f"write '{node}: {{ros__parameters: {{...}}}}'")
     for section in sections.values():
-        _reject_mixed(section, '', where)
+        _reject_mixed(section, where)
     chosen = [name for name in sections if _applies(name, node)]
     if not chosen and not optional:
         near = difflib.get_close_matches(node, [name.rpartition('/')[2] for name in sections], n=1)
@@ -92,7 +92,7 @@ def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, An
                              f"add a section '{node}' or '/**'")
     values: dict[str, Any] = {}
     for name in chosen:
-        flat = _flatten(sections[name], '', where)
+        flat = _flatten(sections[name], where)
         foreign = package_names() - {leaf.name for leaf in leaves(NODES[node])} if name.endswith('*') else ()
         values.update((key, value) for key, value in flat.items() if not STANDARD.match(key) and key not in foreign)
     return values
@@ -114,29 +114,25 @@ def _applies(section: str, node: str) -> bool:
     return last in (node, '*', '**')
 
 
-def _flatten(tree: Any, prefix: str, where: str) -> dict[str, Any]:
+def _flatten(tree: Any, where: str) -> dict[str, Any]:
     if not isinstance(tree, Mapping):
         raise ParameterError(f"{where}: 'ros__parameters' is {tree!r:.60}", 'list the parameters below it')
     flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        name = f'{prefix}{key}'
-        below = _flatten(value, name + '.', where) if isinstance(value, Mapping) else {name: value}
-        for known, item in below.items():
-            if known in flat:
-                raise ParameterError(f"{where} gives '{known}' twice", 'keep one of them')
-            flat[known] = item
+    for name, value in dotted(tree):
+        if name in flat:
+            raise ParameterError(f"{where} gives '{name}' twice", 'keep one of them')
+        flat[name] = value
     return flat
 
 
-def _reject_mixed(tree: Any, name: str, where: str) -> None:
+def _reject_mixed(tree: Any, where: str) -> None:
     """Raise ParameterError for a list with integers and doubles: rcl refuses the whole file for it."""
-    if isinstance(tree, Mapping):
-        for key, value in tree.items():
-            _reject_mixed(value, f'{name}.{key}' if name else str(key), where)
-    elif isinstance(tree, list) and {int, float} <= set(map(type, tree)):
-        items = ', '.join(scalar(float(item) if type(item) is int else item) for item in tree)
-        raise ParameterError(f"{where}: the list '{name}' has numbers with and without a point, which ROS cannot read",
-                             f'write [{items}]')
+    for name, value in dotted(tree if isinstance(tree, Mapping) else {}):
+        if isinstance(value, list) and {int, float} <= set(map(type, value)):
+            items = ', '.join(scalar(float(item) if type(item) is int else item) for item in value)
+            raise ParameterError(
+                f"{where}: the list '{name}' has numbers with and without a point, which ROS cannot read",
+                f'write [{items}]')
 
 
 def parse_overrides(items: Iterable[str]) -> dict[str, Any]:

@@ -91,15 +91,13 @@ BEST_MODEL = 'restart'
 
 def scenario(case: Case, method: Method) -> Scenario:
     """Return the scenario of a case for one method."""
-    modes = 1 if case.model == 'linear' else 3
-    identifier: dict[str, Any] = {f'arm.{name}': value for name, value in ARM.items()}
-    identifier |= {'arm.modes': modes}
-    identifier |= {'publish_rate': TRACK_RATE, 'model_rate': TRACK_RATE, 'payload.dynamics': 'linear',
-                   'payload.working_point': [math.radians(angle) for angle in case.angles_deg],
-                   **IDENTIFIERS.get(method.identifier, {}), **method.settings}
+    arm = {f'arm.{name}': value for name, value in ARM.items()}
+    angles = [math.radians(angle) for angle in case.angles_deg]
     return Scenario(
         name=case.name, capture_time=CAPTURE_TIME, window=WINDOW,
-        plant={**{f'arm.{name}': value for name, value in ARM.items()}, 'model': case.model,
-               'capture_impact': 'continuous', 'payload_mass': case.payload,
-               'initial_angles': [math.radians(angle) for angle in case.angles_deg]},
-        identifier=identifier, estimators={method.name: {}})
+        plant={**arm, 'model': case.model, 'capture_impact': 'continuous', 'payload_mass': case.payload,
+               'initial_angles': angles},
+        identifier={**arm, 'arm.modes': 1 if case.model == 'linear' else 3, 'publish_rate': TRACK_RATE,
+                    'model_rate': TRACK_RATE, 'payload.dynamics': 'linear', 'payload.working_point': angles,
+                    **IDENTIFIERS.get(method.identifier, {}), **method.settings},
+        estimators={method.name: {}})

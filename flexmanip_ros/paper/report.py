@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -129,20 +130,18 @@ DEVIATIONS = (
 
 
 class Planned(NamedTuple):
-    """A figure to be drawn: its numbers in the paper, its title, the paper's claim, our result, and the call."""
+    """A figure to be drawn: its numbers in the paper, its title, the paper's claim, our result, and what draws it."""
 
     numbers: str
     title: str
     claim: str
     measured: str
-    draw: Callable[..., Figure]
-    arguments: tuple[Any, ...]
+    draw: Callable[[], Figure]
 
 
 def drawing(task: tuple[int, Planned]) -> bytes:
     """Draw a figure, which has its number in the page beside it, as PNG."""
-    planned = task[1]
-    return png(planned.draw(*planned.arguments))
+    return png(task[1].draw())
 
 
 def planned(tracks: Mapping[str, figures.Tracks], rows: Sequence[trial.Row]) -> list[Planned]:
@@ -179,15 +178,15 @@ def without_results() -> list[Planned]:
     along, across = (float(1e3 * np.abs(figures.mid_span(last)[0][k, :, 1]).max()) for k in (0, 1))
     return [
         Planned('2', 'input torques', 'square waves, so that the arm stays near its working point.',
-                '10 N m with a period of 1 s, 5 N m with 0.5 s.', figures.torques, (first,)),
+                '10 N m with a period of 1 s, 5 N m with 0.5 s.', partial(figures.torques, first)),
         Planned('3', 'responses, 20 kg at 60/45 deg', 'angles below 3 deg and small vibration: a linear model serves.',
-                f'angles turn by up to {angle:.2f} deg.', figures.responses, (first,)),
+                f'angles turn by up to {angle:.2f} deg.', partial(figures.responses, first)),
         Planned('10', 'configurations', 'three configurations for 100 kg.', 'the same, drawn to scale.',
-                figures.arms, (experiments.CONFIGURATIONS, figures.arm())),
+                partial(figures.arms, experiments.CONFIGURATIONS, figures.arm())),
         Planned('17, 18', 'finite element plant, middles of the links, 20 kg at 45/0 deg',
                 'link 2 hardly moves along X, because the signals are mainly lateral deflection.',
                 f'link 2 deflects up to {across:.3f} mm along Y, {along:.4f} mm along X.',
-                figures.finite_element, (last,))]
+                partial(figures.finite_element, last))]
 
 
 def _response(case: experiments.Case, numbers: str, tracks: Mapping[str, figures.Tracks]) -> Planned:
@@ -204,7 +203,7 @@ def _response(case: experiments.Case, numbers: str, tracks: Mapping[str, figures
         numbers, f'test response, {case.title}',
         'the responses of the identified and the original model agree in general.',
          'largest error, first run, in per cent of the largest response: '
-        f'{"; ".join(shown) or "no model"}.', figures.test_response, (true, found))
+        f'{"; ".join(shown) or "no model"}.', partial(figures.test_response, true, found))
 
 
 def _worst(found: Array, true: Array) -> str:
@@ -217,7 +216,7 @@ def _frequency_figure(case: experiments.Case, numbers: str, tracks: Mapping[str,
     shown = [f'{line[1]}: {plain(line[2])} and {plain(line[3])} %' for line in frequency_lines(rows, (case,))]
     return Planned(numbers, f'frequencies, {case.title}', 'the frequencies drop at the capture and are '
                    'tracked.', f'mean error of the two, 4 to 6 s: {"; ".join(shown)}.{RUNS}',
-                   figures.frequency_tracks, (tracks[case.name], before, after))
+                   partial(figures.frequency_tracks, tracks[case.name], before, after))
 
 
 def _payloads(cases: Sequence[experiments.Case], numbers: tuple[str, str, str],
@@ -241,14 +240,14 @@ def _payloads(cases: Sequence[experiments.Case], numbers: tuple[str, str, str],
         Planned(numbers[0], 'payload', claims[0],
                 f'mean error in per cent ({titles}): {means}. Bias of least squares at 6 s: {bias} %.'
                 f'{RUNS} Nothing is drawn while a method says that it knows nothing yet.',
-                figures.payload_tracks, (there, kept)),
+                partial(figures.payload_tracks, there, kept)),
         Planned(numbers[0], 'close up, with intervals', 'no intervals are given.', 'runs whose 95 % interval '
                 f'holds the payload at 6 s ({titles}): {own}. Drawn: the first run.',
-                figures.interval_tracks, (there, kept)),
+                partial(figures.interval_tracks, there, kept)),
         Planned(numbers[1], 'absolute error', claims[1], f'from the capture on.{RUNS}',
-                figures.error_tracks, (there, kept)),
+                partial(figures.error_tracks, there, kept)),
         Planned(numbers[2], 'average relative error', claims[2], 'mean of the runs (mark) and 95 % of them '
-                '(line), 4 to 6 s.', figures.error_points, (there, found))]
+                '(line), 4 to 6 s.', partial(figures.error_points, there, found))]
 
 
 def _mean(values: Sequence[float] | Array) -> str:

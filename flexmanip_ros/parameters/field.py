@@ -3,7 +3,7 @@
 import dataclasses
 import difflib
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
@@ -118,6 +118,15 @@ def _build(cls: type[Config], values: Mapping[str, Any], prefix: str) -> Config:
         elif name in values:
             arguments[item.name] = values[name]
     return cls(**arguments)
+
+
+def dotted(tree: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
+    """Yield the dotted name and the value of each leaf of nested names and values."""
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from dotted(value, f'{prefix}{key}.')
+        else:
+            yield f'{prefix}{key}', value
 
 
 def flatten(config: Any, prefix: str = '') -> dict[str, Any]:

@@ -58,12 +58,12 @@ class Summary:
     status: str
     frequencies_hz: tuple[float, ...]
     damping_ratios: tuple[float, ...]
-    payload_mass_kg: float | None
-    payload_std_kg: float | None
-    payload_ci95_kg: tuple[float | None, float | None] | None
-    consistency: float | None
-    capture_time_s: float | None
-    release_time_s: float | None
+    payload_mass_kg: float | None = None
+    payload_std_kg: float | None = None
+    payload_ci95_kg: tuple[float | None, float | None] | None = None
+    consistency: float | None = None
+    capture_time_s: float | None = None
+    release_time_s: float | None = None
     payload_com_m: tuple[float, ...] | None = None
     payload_com_std_m: tuple[float, ...] | None = None
     payload_inertia_kgm2: float | None = None
@@ -150,23 +150,22 @@ def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -
         model_status='WARMING_UP' if estimate is None else estimate.model_status.name,
         frequencies_hz=tuple(mode.frequency_hz for mode in modes),
         damping_ratios=tuple(mode.damping_ratio for mode in modes),
-        payload_mass_kg=None if payload is None else _known(payload.mass),
-        payload_std_kg=None if payload is None else _known(payload.std),
-        payload_ci95_kg=None if payload is None else (_known(payload.lower), _known(payload.upper)),
-        consistency=None if payload is None else _known(payload.consistency),
-        **_body(payload),
+        **({} if payload is None else _numbers(payload)),
         capture_time_s=event_time(state, EventKind.CAPTURE),
         release_time_s=event_time(state, EventKind.RELEASE),
     )
 
 
-def _body(payload: Payload | None) -> dict[str, Any]:
-    """Return centre of mass and inertia with their deviations; nothing where the object is a point."""
-    if payload is None or not payload.covariance:
-        return {}
-    std = np.sqrt(np.maximum(np.array(payload.covariance)[::5], 0.0)).tolist()
-    return {'payload_com_m': payload.com[:2], 'payload_com_std_m': tuple(std[1:3]),
-            'payload_inertia_kgm2': payload.inertia[5], 'payload_inertia_std_kgm2': std[3]}
+def _numbers(payload: Payload) -> dict[str, Any]:
+    """Return mass, interval and consistency; where the object is a body, centre of mass and inertia with deviations."""
+    found: dict[str, Any] = {
+        'payload_mass_kg': _known(payload.mass), 'payload_std_kg': _known(payload.std),
+        'payload_ci95_kg': (_known(payload.lower), _known(payload.upper)), 'consistency': _known(payload.consistency)}
+    if payload.covariance:
+        std = np.sqrt(np.maximum(np.array(payload.covariance)[::5], 0.0)).tolist()
+        found |= {'payload_com_m': payload.com[:2], 'payload_com_std_m': tuple(std[1:3]),
+                  'payload_inertia_kgm2': payload.inertia[5], 'payload_inertia_std_kgm2': std[3]}
+    return found
 
 
 def event_time(state: pipeline.State, kind: EventKind) -> float | None:

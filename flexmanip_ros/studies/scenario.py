@@ -12,7 +12,7 @@ import numpy as np
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure, leaves
-from flexmanip_ros.parameters.field import check_all, parameter
+from flexmanip_ros.parameters.field import check_all, dotted, parameter
 
 GROUPS: Mapping[str, type] = {
     'plant': PlantParameters, 'excitation': ExcitationParameters, 'identifier': IdentifierParameters}
@@ -153,12 +153,8 @@ def _mapping(name: str, value: Any) -> Mapping[str, Any]:
     return value
 
 
-def _flat(name: str, tree: Any, prefix: str = '') -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in _mapping(name, tree).items():
-        dotted = f'{prefix}{key}'
-        flat.update(_flat(dotted, value, dotted + '.') if isinstance(value, Mapping) else {dotted: value})
-    return flat
+def _flat(name: str, tree: Any) -> dict[str, Any]:
+    return dict(dotted(_mapping(name, tree)))
 
 
 def _number(name: str, value: Any) -> float:

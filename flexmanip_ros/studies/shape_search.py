@@ -109,12 +109,12 @@ class Search:
         return min(kept, key=lambda s: (self.error(s), s))
 
 
-def search_shapes(search: Search, step: Callable[[], None]) -> Shape:
-    """Try every shape that is not given; return the best. ``step`` is called ``steps_of(search)`` times.
+def search_shapes(search: Search, runs: Sequence[tuple[int, int]], step: Callable[[], None]) -> Shape:
+    """Try every shape that is not given; return the smallest order that is nearly as good as the best.
 
+    runs: ``plan`` of the search; ``step`` is called that many times, and ``FINALISTS`` times.
     Raises ParameterError when the recording is too short for any model, or none can be computed from it.
     """
-    runs = _plan(search)
     if not runs:
         raise ParameterError(f'{search.count} samples without a gap are too few to choose parameters from',
                              'record for longer, or set the parameters by hand')
@@ -126,17 +126,15 @@ def search_shapes(search: Search, step: Callable[[], None]) -> Shape:
     if not search.tried:
         raise ParameterError(f'no model of these {search.count} samples can be computed and scored',
                              'record for longer; check that every input and output moves')
-    for factor, past in _finalists(search):
+    ranked = sorted(search.tried, key=lambda s: (search.error(s), s))
+    for factor, past in list(dict.fromkeys((s.factor, s.past) for s in ranked))[:FINALISTS]:
         directs = _choices(search.given, 'direct_feedthrough', (True, False))
         weights = _choices(search.given, 'weighted_observability', (True, False))
         _try(search, factor, past, _futures(search, past)[1:], directs, weights, _orders(search, ORDERS))
         step()
-    return _simplest(search)
-
-
-def steps_of(search: Search) -> int:
-    """Return how many steps the search has."""
-    return len(_plan(search)) + FINALISTS
+    least = min(map(search.error, search.tried))
+    good = [s for s in search.tried if search.error(s) <= MARGIN * least]
+    return min(good, key=lambda s: (s.order, search.error(s), s))
 
 
 def stretches_of(signals: Signals, dt: float) -> list[Stretch]:
@@ -157,9 +155,9 @@ def stretches_of(signals: Signals, dt: float) -> list[Stretch]:
     return found
 
 
-def _plan(search: Search) -> list[tuple[int, int]]:
+def plan(search: Search) -> list[tuple[int, int]]:
     """Return the pairs of decimation and past window to try, the largest decimation first: its fits cost least."""
-    width, plan = search.r + search.m, []
+    width, runs = search.r + search.m, []
     for factor in _choices(search.given, 'decimation', DECIMATIONS):
         dt = factor * search.dt
         if 'decimation' not in search.given and factor > 1 and dt * STEPS > search.horizon_s:
@@ -171,8 +169,8 @@ def _plan(search: Search) -> list[tuple[int, int]]:
             least = -(-min(_orders(search, COARSE)) // search.m)
             if past >= max(least, search.given.get('future_window', 1)) and (
                     (past + 1) * width <= most or 'past_window' in search.given) and past <= 200:
-                plan.append((factor, past))
-    return plan[::-1]
+                runs.append((factor, past))
+    return runs[::-1]
 
 
 def _choices(given: Mapping[str, Any], name: str, otherwise: Sequence[Any]) -> tuple[Any, ...]:
@@ -190,18 +188,6 @@ def _futures(search: Search, past: int) -> tuple[int, ...]:
     if 'future_window' in search.given:
         return (search.given['future_window'],) * 2
     return min(past, 30), *dict.fromkeys(fine)
-
-
-def _finalists(search: Search) -> list[tuple[int, int]]:
-    ranked = sorted(search.tried, key=lambda s: (search.error(s), s))
-    return list(dict.fromkeys((s.factor, s.past) for s in ranked))[:FINALISTS]
-
-
-def _simplest(search: Search) -> Shape:
-    """Return the smallest order that is nearly as good as the best."""
-    least = min(map(search.error, search.tried))
-    good = [s for s in search.tried if search.error(s) <= MARGIN * least]
-    return min(good, key=lambda s: (s.order, search.error(s), s))
 
 
 def _try(search: Search, factor: int, past: int, futures: Sequence[int], directs: Sequence[bool],

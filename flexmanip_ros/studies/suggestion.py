@@ -44,14 +44,15 @@ def suggest(given: Mapping[str, Any], signals: Signals, dt: float, horizon_s: fl
     """
     stretches = shape_search.stretches_of(signals, dt)
     search = Search(given, stretches, signals.u.shape[1], signals.y.shape[1], dt, horizon_s)
-    total, done = shape_search.steps_of(search) + TRIALS, 0
+    runs = shape_search.plan(search)
+    total, done = len(runs) + shape_search.FINALISTS + TRIALS, 0
 
     def step() -> None:
         nonlocal done
         done += 1
         progress(done, total)
 
-    shape = shape_search.search_shapes(search, step)
+    shape = shape_search.search_shapes(search, runs, step)
     values, told = _settings(search, shape, step)
     progress(total, total)
     return values, [*_shape_reasons(search, shape), *told]
