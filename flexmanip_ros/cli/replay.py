@@ -1,5 +1,6 @@
 """The replay of a recording: its messages through the pipeline to a result, a table or recording, and a report."""
 
+import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, nullcontext
@@ -28,9 +29,6 @@ from flexmanip_ros.studies import whole_recording
 from flexmanip_ros.studies.results import Summary, payload_bound, summarize
 from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Mode, Status
 from flexmanip_ros.view.screen import Screen, embedded, of_identifier
-
-NEVER = (1 << 63) - 1
-"""The largest stamp [ns], which is after all others."""
 
 
 @dataclass(frozen=True)
@@ -298,11 +296,11 @@ class _Messages:
                 self.events.append(event)
                 yield event
 
-    def _limit_ns(self) -> int:
+    def _limit_ns(self) -> float:
         """Return the stamp from which on messages are held out of the identification [ns]."""
         limit = self._request.validate_from
         if limit is None or self.first_ns is None:
-            return NEVER
+            return math.inf
         return self.first_ns + round(limit * 1e9)
 
 

@@ -7,7 +7,7 @@ names and lengths are equal. That takes about 0.1 us a message, the general deco
 
 import struct
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,16 +34,14 @@ class Layout(NamedTuple):
     """Size of a message [bytes]."""
     names: tuple[str, ...]
     words: bytes
-    """The bytes of frame_id and names in the message."""
+    """The bytes of frame_id and names in the message, without the last zeros, which numpy leaves out."""
     counts: tuple[int, int, int]
     """Lengths of position, velocity and effort."""
     starts: tuple[int, int, int]
     """Offsets of position, velocity and effort."""
-    head: struct.Struct
-    """Unpacks encapsulation, seconds, nanoseconds, ``words`` and the three lengths of one message."""
     table: np.dtype[np.void]
-    """A message as one row of a table: order, seconds, nanoseconds, words, count0 .. count2, position, velocity,
-    effort. Bytes of padding belong to no column, as their content is undefined."""
+    """A message as one row of a table: order, seconds, nanoseconds, words, then count0, position, count1, velocity,
+    count2, effort. Bytes of padding belong to no column, as their content is undefined."""
 
 
 def stamp_ns(raw: bytes) -> int:
@@ -67,14 +65,12 @@ def joint_record(raw: bytes, layout: Layout | None) -> tuple[JointRecord, Layout
     """Return one JointState and its layout; pass that layout with the next message. Raises CdrError."""
     if layout is None or len(raw) != layout.size:
         layout = _joint_layout(raw)
-    order, seconds, nanoseconds, words, *counts = layout.head.unpack_from(raw)
-    if words != layout.words or tuple(counts) != layout.counts or order != LITTLE_ENDIAN:
+    row: Any = np.frombuffer(raw, layout.table)[0].item()
+    if (row[0], row[3], row[4::2]) != (LITTLE_ENDIAN, layout.words, layout.counts):
         layout = _joint_layout(raw)
-    (a, b, c), (at_a, at_b, at_c) = layout.counts, layout.starts
-    return JointRecord(
-        seconds * 1_000_000_000 + nanoseconds, layout.names, np.frombuffer(raw, '<f8', a, at_a) if a else _EMPTY,
-        np.frombuffer(raw, '<f8', b, at_b) if b else _EMPTY,
-        np.frombuffer(raw, '<f8', c, at_c) if c else _EMPTY), layout
+        row = np.frombuffer(raw, layout.table)[0].item()
+    _, seconds, nanoseconds, _, _, position, _, velocity, _, effort = row
+    return JointRecord(seconds * 1_000_000_000 + nanoseconds, layout.names, position, velocity, effort), layout
 
 
 def refilled(message: bytearray, layout: Layout, record: JointRecord) -> bytes:
@@ -83,10 +79,6 @@ def refilled(message: bytearray, layout: Layout, record: JointRecord) -> bytes:
     for start, values in zip(layout.starts, record[2:], strict=True):
         message[start:start + values.nbytes] = values.tobytes()
     return bytes(message)
-
-
-_EMPTY = np.empty(0)
-_EMPTY.setflags(write=False)
 
 
 def joint_block(raws: Sequence[bytes], layout: Layout | None) -> tuple[JointBlock, Layout]:
@@ -137,14 +129,12 @@ def _joint_layout(raw: bytes) -> Layout:
     words = raw[HEAD:at]
     columns = {'order': ('S2', 0), 'seconds': ('<i4', START), 'nanoseconds': ('<u4', START + 4),
                'words': (f'S{len(words)}', HEAD)}
-    pattern = f'<2s2xiI{len(words)}s'
     counts, starts = [], []
     for k, field in enumerate(('position', 'velocity', 'effort')):
         size, after = _count(raw, at)
         start = START + (after - START + 7 & -8) if size else after
         if start + 8 * size > len(raw):
             raise CdrError('an array runs past the end of its message')
-        pattern += f'{after - COUNT.size - at}xI{start + 8 * size - after}x'
         at = start + 8 * size
         columns[f'count{k}'] = ('<u4', after - COUNT.size)
         columns[field] = (f'({size},)<f8', start)
@@ -152,8 +142,8 @@ def _joint_layout(raw: bytes) -> Layout:
         starts.append(start)
     table = np.dtype({'names': list(columns), 'formats': [form for form, _ in columns.values()],
                       'offsets': [offset for _, offset in columns.values()], 'itemsize': len(raw)})
-    return Layout(len(raw), tuple(names), words, (counts[0], counts[1], counts[2]),
-                  (starts[0], starts[1], starts[2]), struct.Struct(pattern), table)
+    return Layout(len(raw), tuple(names), words.rstrip(b'\0'), (counts[0], counts[1], counts[2]),
+                  (starts[0], starts[1], starts[2]), table)
 
 
 def _string(raw: bytes, at: int) -> tuple[str, int]:

@@ -21,7 +21,7 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.whole_recording import Scores, Smoothed, Sweep
-from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, JointRecord, Status
+from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, JointRecord, Payload, Status
 from flexmanip_ros.view.screen import COLOURS, EVENT_COLOUR, KNOWN_BAND, MODES_APART, PAYLOAD_COLOUR, STATUS_LOOKS
 
 LINES: tuple[Any, ...] = ('-', (0, (4, 1.2)), (0, (1.2, 1)), (0, (6, 1.2, 1.2, 1.2)))
@@ -170,9 +170,7 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
 
     truth: (from [s], to [s], mass [kg]) of each stretch; zoom: show the range of the late estimates, without zero.
     """
-    rows = [estimate for estimate in estimates if estimate.payload is not None]
-    time = times(rows, start_ns)
-    payloads = [estimate.payload for estimate in estimates if estimate.payload is not None]
+    time, payloads = _payloads(estimates, start_ns)
     table = np.array([(p.mass, p.lower, p.upper) for p in payloads], dtype=np.float64).reshape(-1, 3)
     ax.fill_between(time, table[:, 1], table[:, 2], color=PAYLOAD_COLOUR, alpha=0.25, linewidth=0,
                     label='95 % interval')
@@ -190,6 +188,12 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
                     color=PAYLOAD_COLOUR, fontsize=10, fontweight='bold')
     ax.set_ylabel('payload, close up\n[kg]' if zoom else 'payload\n[kg]')
     legend(ax)
+
+
+def _payloads(estimates: Sequence[Estimate], start_ns: int) -> tuple[Array, list[Payload]]:
+    """Return the times (T,) [s] and the payloads of the estimates that have one."""
+    found = [(estimate, estimate.payload) for estimate in estimates if estimate.payload is not None]
+    return times([estimate for estimate, _ in found], start_ns), [payload for _, payload in found]
 
 
 def limit(ax: Any, values: Array, known: Sequence[float]) -> None:
@@ -210,16 +214,10 @@ def limit(ax: Any, values: Array, known: Sequence[float]) -> None:
 def statuses(ax: Any, estimates: Sequence[Estimate], start_ns: int) -> None:
     """Draw the status over time."""
     time = times(estimates, start_ns)
-    seen: list[Status] = []
-    begin = 0
-    for k in range(1, len(estimates) + 1):
-        if k < len(estimates) and estimates[k].status is estimates[begin].status:
-            continue
-        status = estimates[begin].status
-        ax.axvspan(time[begin], time[min(k, len(estimates) - 1)], **_status_look(status))
-        if status not in seen:
-            seen.append(status)
-        begin = k
+    changes = [k for k in range(1, len(estimates)) if estimates[k].status is not estimates[k - 1].status]
+    for begin, end in pairwise([0, *changes, len(estimates) - 1] if estimates else []):
+        ax.axvspan(time[begin], time[end], **_status_look(estimates[begin].status))
+    seen = dict.fromkeys(estimate.status for estimate in estimates)
     ax.set_yticks([])
     ax.set_ylabel('status', rotation=0, ha='right', va='center')
     ax.grid(False)
@@ -375,9 +373,9 @@ def payload_figure(made: Run) -> Figure:
     drawn, axes = figure([2.0, 2.4, 1.3])
     payload(axes[0], made.estimates, made.start_ns, _stretches(made)[1])
     payload(axes[1], made.estimates, made.start_ns, _stretches(made)[1], zoom=True)
-    rows = [estimate for estimate in made.estimates if estimate.payload is not None]
-    values = np.array([e.payload.consistency for e in rows if e.payload is not None], dtype=np.float64)
-    axes[2].plot(times(rows, made.start_ns), values, color=COLOURS[0], linewidth=1.2)
+    time, payloads = _payloads(made.estimates, made.start_ns)
+    values = np.array([found.consistency for found in payloads], dtype=np.float64)
+    axes[2].plot(time, values, color=COLOURS[0], linewidth=1.2)
     axes[2].axhline(1.0, color='#555555', linewidth=1.0, linestyle=':')
     finite = values[np.isfinite(values)]
     if finite.size:
