@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from flexmanip_ros.io import outputs
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
@@ -102,14 +103,11 @@ def times(estimates: Sequence[Estimate], start_ns: int) -> Array:
 
 def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int, truth: Sequence[Known] = ()) -> None:
     """Draw the identified frequencies with their 95 % bands."""
-    time = times(estimates, start_ns)
-    count = max((len(estimate.modes) for estimate in estimates), default=0)
-    values = np.full((len(estimates), count, 2), np.nan)
-    for row, estimate in enumerate(estimates):
-        for k, mode in enumerate(estimate.modes):
-            values[row, k] = mode.frequency_hz, mode.frequency_std_hz
+    found = outputs.columns(estimates, start_ns)
+    values, stds = found['frequency_hz'], found['frequency_std_hz']
+    count = values.shape[1]
     for k in range(count):
-        _band(ax, time, values[:, k, 0], values[:, k, 1], k)
+        _band(ax, found['time_s'], values[:, k], stds[:, k], k)
     for index, (begin, end, known) in enumerate(truth):
         for k, frequency in enumerate(known):
             ax.plot([begin, end], [frequency] * 2, color=TRUTH_COLOUR, linestyle=(0, (4, 3)), linewidth=1.1,
@@ -121,11 +119,11 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int, truth: Se
             ax.set_ylim(min(known_all) - room, max(known_all) + room)
         else:
             trusted = np.array([estimate.model_status is Status.TRACKING for estimate in estimates])
-            shown = _lowest(values[:, :, 0], values[:, :, 1], trusted)
+            shown = _lowest(values, stds, trusted)
             known = shown[trusted][np.isfinite(shown[trusted])]
             limit(ax, shown, np.percentile(known, [2, 98]).tolist() if known.size else [])
             ax.set_ylim(bottom=max(ax.get_ylim()[0], 0.0))
-        _note_beyond(ax, values[-1, :, 0])
+        _note_beyond(ax, values[-1])
     ax.set_ylabel('frequency\n[Hz]')
     legend(ax)
 

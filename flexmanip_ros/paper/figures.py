@@ -300,15 +300,13 @@ def error_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Tracks]
     return drawn
 
 
-def error_points(
-    cases: Sequence[experiments.Case], errors: Mapping[tuple[str, str], Sequence[float]],
-) -> Figure:
+def error_points(cases: Sequence[experiments.Case], errors: Mapping[tuple[str, str], Array]) -> Figure:
     """Figs. 9, 16 and 19: mean relative error of each method, and the stretch that holds 95 % of the runs."""
     drawn, columns = plots.figure([3.0], columns=len(cases), share_time=False)
     names = [method.name for method in experiments.METHODS]
     for ax, case in zip(columns, cases, strict=True):
         for place, name in enumerate(names):
-            values = np.array(errors.get((case.name, name), ()), dtype=np.float64)
+            values = errors[case.name, name]
             if values.size == 0:
                 continue
             colour, marker = LOOKS[name]

@@ -64,15 +64,6 @@ def column(rows: Sequence[trial.Row], name: str) -> Array:
     return np.array([row[name] for row in rows if row.get(name) is not None], dtype=np.float64)
 
 
-def errors(rows: Sequence[trial.Row]) -> dict[tuple[str, str], list[float]]:
-    """Return (case, method) -> mean relative error of each run [%]."""
-    found: dict[tuple[str, str], list[float]] = {}
-    for row in rows:
-        if not row['error'] and row['error_percent'] is not None:
-            found.setdefault((row['case'], row['method']), []).append(row['error_percent'])
-    return found
-
-
 def frequency_lines(rows: Sequence[trial.Row], cases: Sequence[experiments.Case]) -> list[list[Any]]:
     """Return Table 2: configuration, method, mean error [%] of both frequencies."""
     lines: list[list[Any]] = []
@@ -227,9 +218,10 @@ def _payloads(cases: Sequence[experiments.Case], numbers: tuple[str, str, str],
         return []
     kept = {case.name: tracks[case.name] for case in there}
     titles = '; '.join(case.title for case in there)
-    found = errors(rows)
+    errors = {(case.name, method.name): column(of(rows, case, method.name), 'error_percent')
+              for case in there for method in experiments.METHODS}
     means = '; '.join(
-        f'{method.name} {", ".join(_mean(found.get((case.name, method.name), ())) for case in there)} %'
+        f'{method.name} {", ".join(_mean(errors[case.name, method.name]) for case in there)} %'
         for method in experiments.METHODS)
     rigid = [column(of(rows, case, 'rigid RLS'), 'payload_mass_kg') for case in there]
     bias = ', '.join(_mean(100.0 * (masses / case.payload - 1.0)) for masses, case in zip(rigid, there, strict=True))
@@ -247,10 +239,10 @@ def _payloads(cases: Sequence[experiments.Case], numbers: tuple[str, str, str],
         Planned(numbers[1], 'absolute error', claims[1], f'from the capture on.{RUNS}',
                 partial(figures.error_tracks, there, kept)),
         Planned(numbers[2], 'average relative error', claims[2], 'mean of the runs (mark) and 95 % of them '
-                '(line), 4 to 6 s.', partial(figures.error_points, there, found))]
+                '(line), 4 to 6 s.', partial(figures.error_points, there, errors))]
 
 
-def _mean(values: Sequence[float] | Array) -> str:
+def _mean(values: Array) -> str:
     return plain(float(np.mean(values)) if len(values) else None)
 
 

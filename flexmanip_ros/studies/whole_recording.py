@@ -11,7 +11,6 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.errors import ModelError, ParameterError
@@ -166,9 +165,7 @@ def _of_every_configuration(config: IdentifierParameters, signals: Signals, a: i
     relative = relative_angle(config, signals.angles[a:b])
     if not np.nanmax(relative) - np.nanmin(relative) > MOST_TURN:
         return None
-    log = log_of(signals.u[a:b], signals.y[a:b], signals.angles[a:b], signals.stamp_ns[a:b], signals.gap[a:b],
-                 signals.missing[a:b])
-    found = _configurations(config, rpbsid.advance(config, rpbsid.init(config), log.rows(0, b - a)), dt)
+    found = _configurations(config, _after(config, signals, a, b, signals.angles[a:b]), dt)
     if found is None:
         return None
     course = []
@@ -180,6 +177,13 @@ def _of_every_configuration(config: IdentifierParameters, signals: Signals, a: i
                     course[-1][1], tuple(course))
 
 
+def _after(config: IdentifierParameters, signals: Signals, a: int, b: int, angles: Array | None = None
+           ) -> rpbsid.RpbsidState:
+    """Return the state of the identifier after rows a to b."""
+    log = log_of(signals.u[a:b], signals.y[a:b], angles, signals.stamp_ns[a:b], signals.gap[a:b], signals.missing[a:b])
+    return rpbsid.advance(config, rpbsid.init(config), log.rows(0, b - a))
+
+
 def _configurations(config: IdentifierParameters, state: rpbsid.RpbsidState, dt: float) -> Configurations | None:
     """Return the model of every configuration after the last sample; None where it holds at one configuration only."""
     found = rpbsid.identified(config, rpbsid.finish(config, state), dt)
@@ -187,17 +191,13 @@ def _configurations(config: IdentifierParameters, state: rpbsid.RpbsidState, dt:
 
 
 def _stretch(config: IdentifierParameters, signals: Signals, a: int, b: int, dt: float) -> Smoothed:
-    u, y, gap = signals.u[a:b], signals.y[a:b], signals.gap[a:b]
     noise = 'sensor' if config.refinement == 'output_error' else 'any'
     config = replace(config, estimator='factor', forgetting='innovation', forgetting_factor=(1.0,) * 3,
                      refinement='none', state_basis='fixed' if config.state_basis == 'fixed' else 'singular')
-    missing = signals.missing[a:b]
-    log = log_of(u, y, stamp_ns=signals.stamp_ns[a:b], gap=gap, missing=missing)
     found, method = None, 'none'
     try:
-        state = rpbsid.advance(config, rpbsid.init(config), log.rows(0, b - a))
-        found = _fit(config, state, _longest(config, u, y, gap, missing), noise, b - a, dt)
-        method = 'maximum likelihood'
+        state = _after(config, signals, a, b)
+        found, method = _fit(config, state, _longest(config, signals, a, b), noise, b - a, dt), 'maximum likelihood'
         if found is None:
             found, method = rpbsid.identified(config, state, dt), 'subspace'
     except np.linalg.LinAlgError:
@@ -208,19 +208,19 @@ def _stretch(config: IdentifierParameters, signals: Signals, a: int, b: int, dt:
     return Smoothed(start_s, end_s, b - a, method, found.status, modes(found))
 
 
-def _longest(config: IdentifierParameters, u: Array, y: Array, gap: NDArray[np.bool_], missing: NDArray[np.int64]
-             ) -> Array:
-    """Return inputs and outputs (N, r + m) of the longest part without a gap, as the identifier sees them.
+def _longest(config: IdentifierParameters, signals: Signals, a: int, b: int) -> Array:
+    """Return the longest part of rows a to b without a gap, as the identifier has it: inputs and outputs (N, r + m).
 
     Outputs that were not measured are NaN, and no fit counts them.
     """
-    borders = [0, *(k for k in np.flatnonzero(gap).tolist() if k), len(u)]
-    a, b = max(pairwise(borders), key=lambda part: part[1] - part[0])
-    samples, rows = decimation.whole(np.hstack([u[a:b], y[a:b]]), config.decimation)
-    absent = missing[a:b][rows] > config.decimation // 2  # as the identifier counts them
+    gaps = a + np.flatnonzero(signals.gap[a:b])
+    first, end = max(pairwise([a, *gaps[gaps > a].tolist(), b]), key=lambda part: part[1] - part[0])
+    r = signals.u.shape[1]
+    samples, rows = decimation.whole(np.hstack([signals.u[first:end], signals.y[first:end]]), config.decimation)
+    absent = signals.missing[first:end][rows] > config.decimation // 2  # as the identifier counts them
     if absent.any():
         samples = samples.copy()
-        samples[absent, u.shape[1]:] = np.nan
+        samples[absent, r:] = np.nan
     return samples
 
 
