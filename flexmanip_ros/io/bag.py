@@ -209,7 +209,7 @@ def event_topics(path: str | Path, topics: Topics | None = None) -> tuple[str, .
             for _ in messages:
                 if not recording.is_damaged:  # every topic is known from the start
                     break
-    return () if recording is None else recording.event_topics
+    return () if recording is None else tuple(sorted(set(recording.event_topics.values())))
 
 
 class _Recording:
@@ -222,9 +222,8 @@ class _Recording:
         self.taken = 0
         """Number of messages on the chosen topics that were read so far."""
         self.total: int | None = None
-        self._kinds: dict[str, str] = {}
-        self._found: set[str] = set()
-        """Wanted event topics that are there."""
+        self.event_topics: dict[str, str] = {}
+        """Event topics that were found so far, by the names that were asked for."""
         self._there: dict[str, str] = {}
         """Types of the topics of the messages that were read without the library."""
         self._metadata = ''
@@ -274,7 +273,7 @@ class _Recording:
             reader.open()
             with closing(reader):
                 self._choose({connection.topic: connection.msgtype for connection in reader.connections})
-                chosen = [item for item in reader.connections if item.topic in self._kinds]
+                chosen = [item for item in reader.connections if self._is_chosen(item.topic)]
                 self.total = sum(connection.msgcount for connection in chosen)
                 for connection, _, data in reader.messages(connections=chosen):
                     self.taken += 1
@@ -302,7 +301,8 @@ class _Recording:
                                    'are compressed', f'{_unpacking(file)}; then give that file or the directory')
                 for raw in salvaged(file):
                     self._there[raw.topic] = raw.msgtype
-                    if not self._choose({raw.topic: raw.msgtype}, complete=False):
+                    self._choose({raw.topic: raw.msgtype}, complete=False)
+                    if not self._is_chosen(raw.topic):
                         continue
                     if skip:
                         skip -= 1
@@ -319,10 +319,8 @@ class _Recording:
         """Whether the library failed to read the bag."""
         return bool(self._metadata or self._damage)
 
-    @property
-    def event_topics(self) -> tuple[str, ...]:
-        """Event topics that were found so far."""
-        return tuple(sorted(topic for topic, kind in self._kinds.items() if kind == HEADER))
+    def _is_chosen(self, topic: str) -> bool:
+        return topic == self.joint_topic or topic in self.event_topics.values()
 
     def joint_states(self, raws: list[bytes], first: int) -> Iterator[JointBlock]:
         """Decode consecutive joint states; ``first`` is the number of the first one among the messages read."""
@@ -359,7 +357,7 @@ class _Recording:
     def check(self) -> None:
         """Raise BagError if a fault was found, or no joint state."""
         count = f"{self._joint_states} messages on '{self.joint_topic}' were read"
-        missing = [name for name in self.topics.events if name not in self._found]
+        missing = [name for name in self.topics.events if name not in self.event_topics]
         if self.is_damaged and self.topics.events_required and missing:
             count += f", and none on '{missing[0]}' ({_event_topics(self._there)})"
         if self._metadata and not self._damage and not self.joint_topic:
@@ -381,28 +379,24 @@ class _Recording:
             raise BagError(f"bag '{self.path}' has no message on '{self.joint_topic}'",
                            'record while the joint states are published')
 
-    def _choose(self, there: dict[str, str], *, complete: bool = True) -> bool:
-        """Choose the topics to be read among ``there`` (topic -> type); return whether one of these is chosen."""
+    def _choose(self, there: dict[str, str], *, complete: bool = True) -> None:
+        """Choose the topics to be read among ``there`` (topic -> type). complete: these are all topics."""
         if not self.joint_topic:
             found = _resolve(self.topics.joint_states, there, JOINT_STATE, self.path, '--joint-states')
             if found is None and complete:
                 listed = ', '.join(f'{name} ({kind})' for name, kind in sorted(there.items())) or 'none'
                 raise BagError(f"bag '{self.path}' has no topic '{self.topics.joint_states}'",
                                f'name one with --joint-states NAME; the topics there are: {listed}')
-            if found is not None:
-                self.joint_topic = found
-                self._kinds[found] = JOINT_STATE
+            self.joint_topic = found or ''
         spaces = (self.joint_topic.rpartition('/')[0], '')
         for name in self.topics.events:
             near = there if name.startswith('/') else {
                 topic: kind for topic, kind in there.items() if topic.rpartition('/')[0] in spaces}
             event = _resolve(name, near, HEADER, self.path, '--capture-event')
             if event is not None:
-                self._kinds[event] = HEADER
-                self._found.add(name)
+                self.event_topics[name] = event
             elif complete and self.topics.events_required:
                 raise BagError(f"bag '{self.path}' has no topic '{name}'", _event_topics(there))
-        return any(topic in self._kinds for topic in there)
 
 
 def _event_topics(there: dict[str, str]) -> str:

@@ -18,7 +18,7 @@ from flexmanip_ros.samples.sampling import collect
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.studies.results import payload_bound, relative_error_percent, summarize
 from flexmanip_ros.studies.scenario import Faults, Run, Scenario
-from flexmanip_ros.types import CaptureEvent, Estimate, JointRecord, events_at
+from flexmanip_ros.types import CaptureEvent, JointRecord, events_at
 
 Message = JointRecord | CaptureEvent
 
@@ -115,8 +115,7 @@ def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_k
     last = pipeline.current(state)
     summary = summarize(state, last, wall)
     row: Row = summary.as_json()
-    interval: tuple[float | None, float | None] = row.pop('payload_ci95_kg') or (None, None)
-    low, high = interval
+    low, high = row.pop('payload_ci95_kg') or (None, None)
     for name in ('vaf_simulation_percent', 'vaf_prediction_percent', 'vaf_horizon_percent', 'wall_s'):
         row.pop(name)
     for kind in ('payload_com_m', 'payload_com_std_m'):
@@ -131,21 +130,16 @@ def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_k
     row['covered'] = None if true is None or low is None or high is None else bool(low <= true <= high)
     changed = row['capture_time_s'] if is_loaded else row['release_time_s']
     begin = window[0] if changed is None else max(window[0], changed + settled)
-    row['error_percent'] = None if true is None else _window_error(state, estimates, true, (begin, window[1]))
+    masses = np.array([
+        estimate.payload.mass for estimate in estimates if estimate.payload is not None
+        and begin <= (estimate.stamp_ns - state.first_ns) * 1e-9 <= window[1]], dtype=np.float64)
+    error = math.nan if true is None else relative_error_percent(masses, true)
+    row['error_percent'] = None if math.isnan(error) else error
     if bound and is_loaded and config.payload_method != 'none':
         mass = row['payload_mass_kg'] if true is None else true
         row['bound_std_kg'] = None if mass is None else payload_bound(
             config, collect(config, items), row['capture_time_s'], mass, state.clock.dt)
     return row
-
-
-def _window_error(state: pipeline.State, estimates: Sequence[Estimate], true: float,
-                  window: tuple[float, float]) -> float | None:
-    masses = np.array([
-        estimate.payload.mass for estimate in estimates if estimate.payload is not None
-        and window[0] <= (estimate.stamp_ns - state.first_ns) * 1e-9 <= window[1]], dtype=np.float64)
-    found = relative_error_percent(masses, true)
-    return None if math.isnan(found) else found
 
 
 def frequency_columns(run: Run, row: Mapping[str, Any]) -> Row:
