@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any, NoReturn
@@ -136,6 +136,11 @@ def print_error(prog: str, error: BaseException | str) -> None:
 def number(value: float | None, digits: int = 3) -> str:
     """Return a number as text; '-' where there is none."""
     return '-' if value is None or math.isnan(value) else f'{value:.{digits}g}'
+
+
+def aligned(rows: Iterable[Sequence[str]], formats: Sequence[str]) -> list[str]:
+    """Return the lines of a table. formats: of each column, such as '12' (to the left) or '>9' (to the right)."""
+    return [' '.join(f'{cell:{how}}' for cell, how in zip(row, formats, strict=True)) for row in rows]
 
 
 def require_matplotlib() -> None:

@@ -142,19 +142,18 @@ def describe(rows: Sequence[Row]) -> list[str]:
     """Return the scores of each estimator as the lines to print."""
     from flexmanip_ros.studies.results import score
 
-    lines = [f'{"estimator":24s} {"runs":>6s} {"failed":>6s} {"mean err %":>10s} {"median %":>9s} '
-             f'{"rms %":>8s} {"bias kg":>9s} {"95 % interval holds":>22s} '
-             f'{"rms/bound":>9s} {"us/sample":>9s}']
+    number = console.number
+    lines = [('estimator', 'runs', 'failed', 'mean err %', 'median %', 'rms %', 'bias kg', '95 % interval holds',
+              'rms/bound', 'us/sample')]
     for name in sorted({str(row.get('estimator', '')) for row in rows}):
         made = score([row for row in rows if str(row.get('estimator', '')) == name])
         coverage = '-' if math.isnan(made.coverage_percent) else (
             f'{made.coverage_percent:.1f} % ({made.coverage_low:.1f}..{made.coverage_high:.1f})')
-        errors = (f'{console.number(value, 4):>{width}s}' for value, width in (
-            (made.mean_error_percent, 10), (made.median_error_percent, 9), (made.rms_error_percent, 8)))
-        lines.append(f'{name or "(failed)":24s} {made.runs:6d} {made.failed:6d} {" ".join(errors)} '
-                     f'{console.number(made.bias_kg):>9s} {coverage:>22s} '
-                     f'{console.number(made.bound_ratio):>9s} {console.number(made.us_per_sample):>9s}')
-    return lines
+        lines.append((
+            name or '(failed)', str(made.runs), str(made.failed), number(made.mean_error_percent, 4),
+            number(made.median_error_percent, 4), number(made.rms_error_percent, 4), number(made.bias_kg), coverage,
+            number(made.bound_ratio), number(made.us_per_sample)))
+    return console.aligned(lines, ('24', '>6', '>6', '>10', '>9', '>8', '>9', '>22', '>9', '>9'))
 
 
 if __name__ == '__main__':

@@ -30,7 +30,6 @@ PAGE, ROWS, SUMMARY = 'report.html', 'runs.csv', 'summary.csv'
 SHOWN = {'mean error [%]': '4-6 s, %', 'rms error at 6 s [%]': 'rms 6 s %', 'bound at 6 s [%]': 'bound %',
          '95 % interval holds [%]': 'covered %', 'time per sample [us]': 'us/sample'}
 """Columns of the summary that are printed, and their headings."""
-WIDTHS = (9, 9, 9, 11, 10)
 
 
 def _parser() -> console.Parser:
@@ -126,8 +125,7 @@ def describe(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the summary as the lines to print."""
     rows = [('case', 'method', *SHOWN.values()),
             *((line['case'], line['method'], *(console.number(line[name]) for name in SHOWN)) for line in lines)]
-    return [f'{case:40s} {method:12s} ' + ' '.join(f'{text:>{width}s}' for text, width in zip(
-        numbers, WIDTHS, strict=True)) for case, method, *numbers in rows]
+    return console.aligned(rows, ('40', '12', '>9', '>9', '>9', '>11', '>10'))
 
 
 if __name__ == '__main__':

@@ -154,24 +154,34 @@ def matrices(estimates: Sequence[Estimate]) -> dict[str, Array]:
     n is the largest order in the run. A model of a smaller order fills the upper left part, the rest is NaN.
     """
     models = [estimate.model for estimate in estimates]
-    shapes = {name: np.max([getattr(model, name).shape for model in models if model is not None], axis=0)
-              for name in 'ABCDK'} if any(models) else {}
-    found = {name: np.full((len(estimates), *shape), np.nan) for name, shape in shapes.items()}
-    if shapes:
-        found['dt'] = np.full(len(estimates), np.nan)
-    for row, model in enumerate(models):
-        if model is not None:
-            found['dt'][row] = model.dt
-            for name in shapes:
-                matrix = getattr(model, name)
-                found[name][row, :matrix.shape[0], :matrix.shape[1]] = matrix
-    return found
+    if not any(models):
+        return {}
+    found = {name: _padded([None if model is None else getattr(model, name) for model in models]) for name in 'ABCDK'}
+    return {**found, 'dt': np.array([np.nan if model is None else model.dt for model in models])}
 
 
-def write_csv(path: str | Path, estimates: Sequence[Estimate], start_ns: int | None = None) -> None:
-    """Write one line for each estimate; columns of several modes are numbered from 1, NaN is an empty cell."""
+def _padded(parts: Sequence[Array | None]) -> Array:
+    """Return matrices as one array, each in the upper left of a largest one; what is missing is NaN."""
+    shape = np.max([part.shape for part in parts if part is not None], axis=0)
+    table = np.full((len(parts), *shape), np.nan)
+    for row, part in enumerate(parts):
+        if part is not None:
+            table[row, :part.shape[0], :part.shape[1]] = part
+    return table
+
+
+def write_table(path: str | Path, estimates: Sequence[Estimate], start_ns: int | None = None) -> None:
+    """Write columns and matrices as numpy arrays (.npz, nothing pickled), or a line for each estimate (.csv).
+
+    In the lines, columns of several modes are numbered from 1, and NaN is an empty cell.
+    """
+    found = columns(estimates, start_ns)
+    if ending(path) == '.npz':
+        found |= matrices(estimates)
+        write_file(path, lambda file: np.savez_compressed(file, **found))
+        return
     flat: dict[str, Any] = {}
-    for name, values in columns(estimates, start_ns).items():
+    for name, values in found.items():
         if values.ndim == 2:
             stem, _, unit = name.partition('_')
             flat |= {f'{stem}{k + 1}_{unit}': values[:, k] for k in range(values.shape[1])}
@@ -179,12 +189,6 @@ def write_csv(path: str | Path, estimates: Sequence[Estimate], start_ns: int | N
             flat[name] = values
     rows = ({name: _cell(values[row]) for name, values in flat.items()} for row in range(len(estimates)))
     write_rows(path, list(rows), flat)
-
-
-def write_npz(path: str | Path, estimates: Sequence[Estimate], start_ns: int | None = None) -> None:
-    """Write the columns and matrices as numpy arrays (nothing pickled)."""
-    arrays = columns(estimates, start_ns) | matrices(estimates)
-    write_file(path, lambda file: np.savez_compressed(file, **arrays))
 
 
 def _cell(value: Any) -> Any:
@@ -233,12 +237,10 @@ class Output:
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         if kind is not None and not self._estimates and self._writer is None:
             return
-        if not self._is_table:
-            self._opened().close()
-        elif ending(self.path) == '.csv':
-            write_csv(self.path, self._estimates, self.start_ns)
+        if self._is_table:
+            write_table(self.path, self._estimates, self.start_ns)
         else:
-            write_npz(self.path, self._estimates, self.start_ns)
+            self._opened().close()
 
 
 Row = dict[str, Any]
