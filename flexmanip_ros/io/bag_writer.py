@@ -53,7 +53,7 @@ class BagWriter:
                  flush_period: float | None = FLUSH_PERIOD) -> None:
         self.path = Path(path)
         self._types = get_typestore(Stores.ROS2_JAZZY)
-        self._connections: dict[str, tuple[str, Connection]] = {}
+        self._connections: dict[str, Connection] = {}
         self._lock = threading.Lock()
         self._flush_period = np.inf if flush_period is None else flush_period
         self._flushed = time.monotonic()
@@ -96,13 +96,12 @@ class BagWriter:
     def _connection(self, topic: str, kind: str, latched: bool) -> Connection:
         known = self._connections.get(topic)
         if known is None:
-            connection = self._writer.add_connection(
+            known = self._connections[topic] = self._writer.add_connection(
                 topic, kind, typestore=self._types, offered_qos_profiles=[_qos(latched)])
-            known = self._connections[topic] = (kind, connection)
-        if known[0] != kind:
-            raise BagError(f"topic '{topic}' of bag '{self.path}' carries {known[0]}",
+        if known.msgtype != kind:
+            raise BagError(f"topic '{topic}' of bag '{self.path}' carries {known.msgtype}",
                            f'use another topic for {kind}')
-        return known[1]
+        return known
 
     def _flush(self) -> None:
         store = self._writer.storage

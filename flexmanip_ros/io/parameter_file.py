@@ -84,7 +84,7 @@ def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, An
         raise ParameterError(f"{where} has no 'ros__parameters'", f"write '{node}: {{ros__parameters: {{...}}}}'")
     for section in sections.values():
         _reject_mixed(section, where)
-    chosen = [name for name in sections if _applies(name, node)]
+    chosen = [name for name in sections if name.rpartition('/')[2] in (node, '*', '**')]
     if not chosen and not optional:
         near = difflib.get_close_matches(node, [name.rpartition('/')[2] for name in sections], n=1)
         hint = f" ('{near[0]}' is close)" if near else ''
@@ -107,11 +107,6 @@ def _sections(tree: Any, prefix: str, where: str) -> Iterable[tuple[str, Any]]:
             yield name, value['ros__parameters'] or {}
         elif isinstance(value, Mapping) and any(isinstance(below, Mapping) for below in value.values()):
             yield from _sections({k: v for k, v in value.items() if isinstance(v, Mapping)}, name, where)
-
-
-def _applies(section: str, node: str) -> bool:
-    last = section.rpartition('/')[2]
-    return last in (node, '*', '**')
 
 
 def _flatten(tree: Any, where: str) -> dict[str, Any]:

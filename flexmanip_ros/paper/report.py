@@ -225,16 +225,17 @@ def _payloads(cases: Sequence[experiments.Case], numbers: tuple[str, str, str],
         for method in experiments.METHODS)
     rigid = [column(of(rows, case, 'rigid RLS'), 'payload_mass_kg') for case in there]
     bias = ', '.join(_mean(100.0 * (masses / case.payload - 1.0)) for masses, case in zip(rigid, there, strict=True))
-    own = '; '.join(
-        f'{method} {", ".join(_held(of(rows, case, method)) for case in there)}'
-        for method in figures.CLOSE)
+    own = []
+    for method in figures.CLOSE:
+        covered = [[bool(row.get('covered')) for row in of(rows, case, method)] for case in there]
+        own.append(f'{method} {", ".join(f"{sum(runs)} of {len(runs)}" for runs in covered)}')
     return [
         Planned(numbers[0], 'payload', claims[0],
                 f'mean error in per cent ({titles}): {means}. Bias of least squares at 6 s: {bias} %.'
                 f'{RUNS} Nothing is drawn while a method says that it knows nothing yet.',
                 partial(figures.payload_tracks, there, kept)),
         Planned(numbers[0], 'close up, with intervals', 'no intervals are given.', 'runs whose 95 % interval '
-                f'holds the payload at 6 s ({titles}): {own}. Drawn: the first run.',
+                f'holds the payload at 6 s ({titles}): {"; ".join(own)}. Drawn: the first run.',
                 partial(figures.interval_tracks, there, kept)),
         Planned(numbers[1], 'absolute error', claims[1], f'from the capture on.{RUNS}',
                 partial(figures.error_tracks, there, kept)),
@@ -244,10 +245,6 @@ def _payloads(cases: Sequence[experiments.Case], numbers: tuple[str, str, str],
 
 def _mean(values: Array) -> str:
     return plain(float(np.mean(values)) if len(values) else None)
-
-
-def _held(rows: Sequence[trial.Row]) -> str:
-    return f'{sum(bool(row.get("covered")) for row in rows)} of {len(rows)}'
 
 
 def simulation(case: experiments.Case) -> simulator.Trajectory:

@@ -109,7 +109,9 @@ def _settings(search: Search, shape: Shape, step: Callable[[], None]
         ('forgetting where the model ceases to fit', PLAIN, {'forgetting_factor': (0.99,) * 3}),
         (f'forgetting beyond {search.count * search.dt / FORGOTTEN:.3g} s', PLAIN,
          {'forgetting': 'constant', 'forgetting_factor': (memory,) * 3})]
-    light = [s for s in search.tried if _is_refinable(search, s)]
+    r, m = search.r, search.m
+    light = [s for s in search.tried  # fits of more parameters would take most of the time
+             if s.order * (s.order + r + 2 * m + 1) + m * r <= recursive_fit.USUAL]
     own = min(light, key=lambda s: (search.error(s), s), default=None)
     refined = own is not None and search.error(own) < NEARLY * search.error(shape)
     if own is not None and refined:
@@ -140,11 +142,6 @@ def _values(shape: Shape) -> dict[str, Any]:
     return {'decimation': shape.factor, 'order': shape.order, 'past_window': shape.past,
             'future_window': shape.future, 'direct_feedthrough': shape.direct,
             'weighted_observability': shape.weighted}
-
-
-def _is_refinable(search: Search, shape: Shape) -> bool:
-    n, r, m = shape.order, search.r, search.m
-    return n * (n + r + 2 * m + 1) + m * r <= recursive_fit.USUAL  # fits of more parameters would take most of the time
 
 
 def _identified_error(search: Search, values: Mapping[str, Any]) -> float:
