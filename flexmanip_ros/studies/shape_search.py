@@ -82,8 +82,8 @@ class Search:
     m: int
     dt: float
     horizon_s: float
-    tried: dict[Shape, Array] = field(default_factory=dict)
-    """Unexplained share of each output (m,), errors and powers summed over the folds."""
+    tried: dict[Shape, float] = field(default_factory=dict)
+    """Loss of each shape, errors and powers summed over the folds."""
 
     @property
     def count(self) -> int:
@@ -99,14 +99,10 @@ class Search:
         """Return the samples (k, r + m) of each stretch that a decimation keeps, and the row (k,) each describes."""
         return [decimation.whole(part.raw, factor) for part in self.stretches]
 
-    def error(self, shape: Shape) -> float:
-        """Return the loss of what a shape left unexplained."""
-        return loss(self.tried[shape])
-
     def best(self, **fixed: object) -> Shape:
-        """Return the shape of the least error, among those with the given parts."""
+        """Return the shape of the least loss, among those with the given parts."""
         kept = [s for s in self.tried if all(getattr(s, name) == value for name, value in fixed.items())]
-        return min(kept, key=lambda s: (self.error(s), s))
+        return min(kept, key=lambda s: (self.tried[s], s))
 
 
 def search_shapes(search: Search, runs: Sequence[tuple[int, int]], step: Callable[[], None]) -> Shape:
@@ -118,23 +114,19 @@ def search_shapes(search: Search, runs: Sequence[tuple[int, int]], step: Callabl
     if not runs:
         raise ParameterError(f'{search.count} samples without a gap are too few to choose parameters from',
                              'record for longer, or set the parameters by hand')
-    directs = _choices(search.given, 'direct_feedthrough', (True,))
-    weights = _choices(search.given, 'weighted_observability', (True,))
     for factor, past in runs:
-        _try(search, factor, past, _futures(search, past)[:1], directs, weights, _orders(search, COARSE))
+        _try(search, factor, past, _futures(search, past)[:1], (True,), _orders(search, COARSE))
         step()
     if not search.tried:
         raise ParameterError(f'no model of these {search.count} samples can be computed and scored',
                              'record for longer; check that every input and output moves')
-    ranked = sorted(search.tried, key=lambda s: (search.error(s), s))
+    ranked = sorted(search.tried, key=lambda s: (search.tried[s], s))
     for factor, past in list(dict.fromkeys((s.factor, s.past) for s in ranked))[:FINALISTS]:
-        directs = _choices(search.given, 'direct_feedthrough', (True, False))
-        weights = _choices(search.given, 'weighted_observability', (True, False))
-        _try(search, factor, past, _futures(search, past)[1:], directs, weights, _orders(search, ORDERS))
+        _try(search, factor, past, _futures(search, past)[1:], (True, False), _orders(search, ORDERS))
         step()
-    least = min(map(search.error, search.tried))
-    good = [s for s in search.tried if search.error(s) <= MARGIN * least]
-    return min(good, key=lambda s: (s.order, search.error(s), s))
+    least = min(search.tried.values())
+    good = [s for s in search.tried if search.tried[s] <= MARGIN * least]
+    return min(good, key=lambda s: (s.order, search.tried[s], s))
 
 
 def stretches_of(signals: Signals, dt: float) -> list[Stretch]:
@@ -190,23 +182,24 @@ def _futures(search: Search, past: int) -> tuple[int, ...]:
     return min(past, 30), *dict.fromkeys(fine)
 
 
-def _try(search: Search, factor: int, past: int, futures: Sequence[int], directs: Sequence[bool],
-         weights: Sequence[bool], orders: Sequence[int]) -> None:
-    """Identify on the other folds and predict each fold."""
+def _try(search: Search, factor: int, past: int, futures: Sequence[int], switches: Sequence[bool],
+         orders: Sequence[int]) -> None:
+    """Identify on the other folds and predict each fold. switches: values of direct term and weighting to try."""
+    directs = _choices(search.given, 'direct_feedthrough', switches)
+    weights = _choices(search.given, 'weighted_observability', switches)
     kept = search.kept(factor)
     sums = moments(search, kept, past)
     for future in futures:
         able = [n for n in orders if n <= future * search.m]
         for direct, weighted in product(directs, weights):
             shape = Shape(factor, past, future, direct, weighted, 0)
-            found = shares(search, kept, sums, shape, able, PRIOR)
-            search.tried.update({shape._replace(order=n): share for n, share in found.items()
-                                 if np.all(np.isfinite(share))})  # nan: a short recording leaves nothing to score
+            found = losses(search, kept, sums, shape, able, PRIOR)
+            search.tried.update({shape._replace(order=n): value for n, value in found.items()})
 
 
-def shares(search: Search, kept: list[Kept], sums: list[Array], shape: Shape, orders: Sequence[int], alpha: float
-            ) -> dict[int, Array]:
-    """Return the unexplained share (m,) of each order for which every fold has a model."""
+def losses(search: Search, kept: list[Kept], sums: list[Array], shape: Shape, orders: Sequence[int], alpha: float
+           ) -> dict[int, float]:
+    """Return the loss of each order for which every fold has a model, and every output varies where it is scored."""
     d = shape.past * (search.r + search.m)
     prior = np.zeros((d, d + search.r + search.m))
     prior[:, :d] = alpha ** 0.5 * np.eye(d)
@@ -216,7 +209,8 @@ def shares(search: Search, kept: list[Kept], sums: list[Array], shape: Shape, or
         for n, model in zip(orders, _models(R, search, orders, shape), strict=True):
             if model is not None:
                 found[n].append(powers(search, model, kept, shape.factor, shape.past, search.fold == fold))
-    return {n: share(np.sum(parts, axis=0)) for n, parts in found.items() if len(parts) == FOLDS}
+    totals = {n: np.sum(parts, axis=0) for n, parts in found.items() if len(parts) == FOLDS}
+    return {n: loss(total) for n, total in totals.items() if np.all(total[1] > 0.0)}
 
 
 def moments(search: Search, kept: list[Kept], past: int) -> list[Array]:
@@ -278,13 +272,12 @@ def powers(search: Search, model: StateSpace, kept: list[Kept], factor: int, pas
     return np.array([np.where(np.isfinite(left), left, np.inf), spread])
 
 
-def share(powers: Array) -> Array:
-    """Return the ratio (m,) of error variance to variance of each output; nan where the output is constant."""
+def loss(powers: Array) -> float:
+    """Return the mean of log(1 + share) over the outputs that vary; one wild output does not hide the rest.
+
+    powers: (2, m) variances of error and output, whose ratio is the share left unexplained. The mean is close to that
+    of small shares.
+    """
     left, spread = powers
     share = np.divide(left, spread, out=np.full(len(left), np.nan), where=spread > 0.0)
-    return np.asarray(np.minimum(share, WORST), dtype=np.float64)
-
-
-def loss(left: Array) -> float:
-    """Return the mean of log(1 + share), close to that of small shares (m,); one wild output does not hide the rest."""
-    return float(np.nanmean(np.log1p(left)))
+    return float(np.nanmean(np.log1p(np.minimum(share, WORST))))

@@ -72,7 +72,7 @@ def _shape_reasons(search: Search, shape: Shape) -> list[tuple[str, str]]:
             same['past'] = shape.past
         kinds = sorted({getattr(s, part) for s in search.tried if all(getattr(s, k) == v for k, v in same.items())})
         near = sorted(kinds, key=lambda kind: abs(kinds.index(kind) - kinds.index(value)))[:SHOWN]
-        shares = ', '.join(f'{text(kind)} {_percent(search.error(search.best(**same, **{part: kind})))}'
+        shares = ', '.join(f'{text(kind)} {_percent(search.tried[search.best(**same, **{part: kind})])}'
                            for kind in sorted(near))
         why = 'given; ' if name in search.given else (
             f'smallest within {100.0 * (shape_search.MARGIN - 1.0):.0f} % of the best; ' if part == 'order' else '')
@@ -91,8 +91,8 @@ def _prior(search: Search, shape: Shape) -> float:
     sums = shape_search.moments(search, kept, shape.past)
     errors = {}
     for alpha in (PRIOR, *PRIORS):
-        found = shape_search.shares(search, kept, sums, shape, (shape.order,), alpha)
-        errors[alpha] = shape_search.loss(found[shape.order]) if found else np.inf
+        found = shape_search.losses(search, kept, sums, shape, (shape.order,), alpha)
+        errors[alpha] = found.get(shape.order, np.inf)
     best = min(errors, key=lambda alpha: errors[alpha])
     return best if errors[best] * PLAIN < errors[PRIOR] else PRIOR
 
@@ -112,8 +112,8 @@ def _settings(search: Search, shape: Shape, step: Callable[[], None]
     r, m = search.r, search.m
     light = [s for s in search.tried  # fits of more parameters would take most of the time
              if s.order * (s.order + r + 2 * m + 1) + m * r <= recursive_fit.USUAL]
-    own = min(light, key=lambda s: (search.error(s), s), default=None)
-    refined = own is not None and search.error(own) < NEARLY * search.error(shape)
+    own = min(light, key=lambda s: (search.tried[s], s), default=None)
+    refined = own is not None and search.tried[own] < NEARLY * search.tried[shape]
     if own is not None and refined:
         trials += [(f'{kind} of order {own.order}', REFINED, {**_values(own), 'refinement': kind})
                    for kind in ('output_error', 'prediction_error')]
@@ -165,4 +165,4 @@ def _identified_error(search: Search, values: Mapping[str, Any]) -> float:
             return np.inf
         powers += shape_search.powers(search, found.model, kept, config.decimation, config.past_window,
                           (number >= now) & (number < later))
-    return shape_search.loss(shape_search.share(powers))
+    return shape_search.loss(powers)
