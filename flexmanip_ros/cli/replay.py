@@ -279,7 +279,11 @@ class _Messages:
             self.screen.joint_states(block)
         if self.first_ns is None:
             self.first_ns = int(block.stamp_ns[0])
-            yield from self._known_events(self.first_ns)
+            given = [CaptureEvent(self.first_ns + round(at * 1e9), kind) for at, kind in (
+                (self._request.capture_time, EventKind.CAPTURE), (self._request.release_time, EventKind.RELEASE))
+                if at is not None]
+            self.events += given
+            yield from given
         used = block.stamp_ns < self._limit_ns()
         if used.any():
             yield block if used.all() else block.part(used)
@@ -287,14 +291,6 @@ class _Messages:
     def signals(self) -> Signals:
         """Return the samples of the recording, held-out ones included."""
         return sampling.collect(self._request.config, self._blocks)
-
-    def _known_events(self, first_ns: int) -> Iterator[CaptureEvent]:
-        for at, kind in ((self._request.capture_time, EventKind.CAPTURE),
-                         (self._request.release_time, EventKind.RELEASE)):
-            if at is not None:
-                event = CaptureEvent(first_ns + round(at * 1e9), kind)
-                self.events.append(event)
-                yield event
 
     def _limit_ns(self) -> float:
         """Return the stamp from which on messages are held out of the identification [ns]."""
