@@ -24,14 +24,6 @@ FLUSH_PERIOD = 0.2
 """Time between two flushes [s]. The library itself flushes after one mebibyte, which is 4 s at 1 kHz."""
 
 Value = JointRecord | CaptureEvent | float | LabelledArray | Inertia | Diagnostics
-KINDS: dict[type, str] = {
-    JointRecord: 'sensor_msgs/msg/JointState',
-    CaptureEvent: 'std_msgs/msg/Header',
-    float: 'std_msgs/msg/Float64',
-    LabelledArray: 'std_msgs/msg/Float64MultiArray',
-    Inertia: 'geometry_msgs/msg/InertiaStamped',
-    Diagnostics: 'diagnostic_msgs/msg/DiagnosticArray',
-}
 
 
 def _qos(latched: bool) -> Qos:
@@ -68,11 +60,9 @@ class BagWriter:
 
     def write(self, topic: str, log_ns: int, value: Value, *, latched: bool = False) -> None:
         """Append a value as its message. log_ns: time of recording [ns], which must not decrease."""
-        kind = type(value)
-        if kind not in KINDS:
-            raise TypeError(f'no message for a {kind.__name__}')
-        data = bytes(self._types.serialize_cdr(_message(self._types.types, value), KINDS[kind]))
-        self.write_raw(topic, log_ns, data, KINDS[kind], latched=latched)
+        message = _message(self._types.types, value)
+        kind = message.__msgtype__
+        self.write_raw(topic, log_ns, bytes(self._types.serialize_cdr(message, kind)), kind, latched=latched)
 
     def write_raw(self, topic: str, log_ns: int, data: bytes, kind: str, *, latched: bool = False) -> None:
         """Append a serialized message. kind: its type, such as std_msgs/msg/Header."""
@@ -170,4 +160,6 @@ def _message(classes: Any, value: Value) -> Any:
                 [new('diagnostic_msgs/msg/KeyValue', key, text) for key, text in status.values])
             for status in value.statuses]
         return new('diagnostic_msgs/msg/DiagnosticArray', header(value.stamp_ns), statuses)
-    return new('std_msgs/msg/Float64', float(value))
+    if isinstance(value, float):
+        return new('std_msgs/msg/Float64', value)
+    raise TypeError(f'no message for a {type(value).__name__}')
