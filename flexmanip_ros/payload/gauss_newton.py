@@ -17,6 +17,7 @@ from flexmanip_ros.payload.filter_state import (
     COST_BEFORE,
     DOUBT,
     ENOUGH,
+    EXCESS_BIAS,
     FIT,
     HELD,
     HORIZON,
@@ -288,6 +289,8 @@ def close_horizon(motion: ProcessModel, sensors: MeasurementModel, m: FilterStat
              and evidence_against_delays(motion, sensors, m) > VERY_STRONG)
     if not again:
         m.counts[STORED] = HORIZON
+        if m.counts[HELD] == 0:
+            m.score[EXCESS_BIAS] = 0.0
         return
     first = m.x.size - motion.kind.size
     for c in range(motion.kind.size):

@@ -23,6 +23,7 @@ from flexmanip_ros.payload.filter_state import (
 )
 from flexmanip_ros.payload.gauss_newton import FITS
 from flexmanip_ros.payload.measurement_update import MeasurementModel, misfit, white_variance
+from flexmanip_ros.payload.moving_horizon import MOST_BIAS
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import QUANTILE, Array, Payload, Status
 
@@ -42,10 +43,6 @@ WIDENING_LIMIT = 4.0
 """Factor on the payload's deviation, by the moves and the misfit, beyond which the model does not fit."""
 FREE_BIAS = 2.0
 """Standard deviations that an empty arm may seem to hold before the interval is widened."""
-MOST_BIAS = 3.0
-"""Standard deviations, with the error of its inertia among them, that an empty arm may seem to hold. Chance exceeds
-them 1 time in 370. Beyond them the arm is not the one that was described or learned, and what it catches is estimated
-wrong."""
 SETTLED = 1000
 """Samples after a restart until the status is no longer DIVERGED."""
 

@@ -34,6 +34,8 @@ from flexmanip_ros.payload.filter_state import (
     LINEARIZED,
     MEASURED,
     MISFIT,
+    MOVED,
+    MOVES,
     NOW,
     POWER,
     REFITS,
@@ -112,6 +114,10 @@ fits."""
 STRAY, STRAY_EVERY = 3.0, 500
 """Innovation power over white noise, of every sensor, at which the filter is begun again; samples between two
 checks."""
+MOST_BIAS = 3.0
+"""Standard deviations, with the error of its inertia among them, that an empty arm may seem to hold. Chance exceeds
+them 1 time in 370. Beyond them the arm is not the one that was described or learned, and what it catches is estimated
+wrong."""
 SLACK = 1.0
 """Increase of the cost up to which a step is accepted: one is a change of the estimate by one standard deviation."""
 CHANCE = 3.0
@@ -341,12 +347,22 @@ def fails(m: FilterState) -> bool:
     return failed
 
 
+@kernel
+def seems_to_hold(motion: ProcessModel, m: FilterState) -> bool:
+    """Whether an empty arm seems to hold something, beyond chance and the error of its inertia."""
+    mass = m.x.size - motion.kind.size
+    variance = dot(m.S[mass], m.S[mass])
+    if m.counts[MOVED] > 0:
+        variance *= max(m.score[MOVES], 1.0)
+    return bool(abs(m.x[mass]) > MOST_BIAS * np.sqrt(variance + motion.considered * motion.considered))
+
+
 @inner
-def strays(sensors: MeasurementModel, m: FilterState) -> bool:
+def strays(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
     """Whether the filter has diverged after a fit: the sensors show far more than their white noise.
 
     While the arm holds something, every sensor must show it, as a fit that is begun again costs time. Of an empty arm
-    the mean must, weighted by what each sensor tells of the payload.
+    the mean must, weighted by what each sensor tells of the payload, or the arm seems to hold something.
     """
     if m.counts[REFITS] >= MOST_REFITS or (m.counts[HELD] == 1 and m.counts[LEARNED] == 0):
         return False
@@ -355,9 +371,11 @@ def strays(sensors: MeasurementModel, m: FilterState) -> bool:
     least = STRAY
     for i in range(m.noise.shape[0]):
         least = min(least, m.noise[i, POWER] / white_variance(m.noise[i], WHITE))
-    left = bool(least >= STRAY if m.counts[HELD] == 1 else misfit(m.noise, sensors.rate, WHITE) >= UNFIT)
+    left = least >= STRAY
+    if m.counts[HELD] == 0:
+        left = misfit(m.noise, sensors.rate, WHITE) >= UNFIT or seems_to_hold(motion, m)
     m.counts[REFITS] += left
-    return left
+    return bool(left)
 
 
 @kernel
@@ -428,7 +446,7 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
         return False
     keep_possible(motion, m, CHANCE)
     if came:
-        if strays(sensors, m):
+        if strays(motion, sensors, m):
             return False
         judge_moves(sensors, m)
     diffuse(motion, sensors, m, duration)

@@ -113,6 +113,8 @@ class ProcessModel(NamedTuple):
     """(n, n) nominal ``Manipulator.rotary``."""
     scale: float
     """Mass [kg] at the tip of the empty arm: that of the tip and a third of the last link."""
+    considered: float
+    """Deviation [kg] of the mass that an empty arm seems to hold, by the error of its inertia (``model_error``)."""
     least: Array
     """(2,) mass m_a [kg] and inertia I_a [kg m^2], both negative. The mass matrix stays positive for every payload with
     (m - m_a) (I - I_a) >= |h|^2 and m >= m_a / 2, h its first moments."""

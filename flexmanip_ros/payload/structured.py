@@ -16,9 +16,9 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured_model
 from flexmanip_ros.payload.capture_detection_kernel import filtered
-from flexmanip_ros.payload.interval import inertia_error, innovation_power, judge, moves
+from flexmanip_ros.payload.interval import POWER_LIMIT, inertia_error, innovation_power, judge, moves
 from flexmanip_ros.payload.measurement_update import MeasurementModel
-from flexmanip_ros.payload.moving_horizon import STARTS, keep_possible
+from flexmanip_ros.payload.moving_horizon import STARTS, keep_possible, seems_to_hold
 from flexmanip_ros.payload.process_model import Kind, predict
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.samples.sample_log import Rows
@@ -209,14 +209,10 @@ def _open_body(config: IdentifierParameters, model: Model, m: mem.FilterState) -
     if m.S0[body][1:].any():
         there = m.x0 + m.S0 @ m.accepted
         _refit(m)
-        aim = np.zeros(m.x.size)
+        aim = m.x0.copy()
         aim[body] = structured_model.body_mean(config, model)
         aim[model.payload + 1:model.payload + 3] = -there[model.payload + 1:model.payload + 3]
-        aim[body] -= m.x0[body]
-        unknown = m.S0.any(axis=1)
-        rank = int(unknown.sum())
-        m.xi[:rank] = scipy.linalg.solve_triangular(m.S0[unknown, :rank], aim[unknown], lower=True)
-        m.accepted[:] = m.xi
+        _fit_from(m, aim)
         return
     opened = np.zeros((m.x.size, model.body))
     opened[body] = np.diag(structured_model.body_std(config, model))
@@ -224,6 +220,37 @@ def _open_body(config: IdentifierParameters, model: Model, m: mem.FilterState) -
     m.S0[:] = structured_model.widen(m.S0, opened)
     m.x0[body] = structured_model.body_mean(config, model)
     _refit(m)
+
+
+def _fit_from(m: mem.FilterState, start: Array) -> None:
+    """Let the first iteration of the fit be linearized at a state (nx,) at the event that is not its prior mean x0."""
+    unknown = m.S0.any(axis=1)
+    rank = int(unknown.sum())
+    departure = (start - m.x0)[unknown]
+    m.xi[:rank] = scipy.linalg.solve_triangular(m.S0[unknown, :rank], departure, lower=True)
+    m.accepted[:] = m.xi
+
+
+def _fit_empty_arm_again(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Array) -> None:
+    """Fit an empty arm that seems to hold something to further samples, after measurements y (m,).
+
+    The fit begins where the last one ended: it had not converged when its horizon closed. The priors are those of the
+    start, as the samples of that fit are not used again.
+    """
+    p = slice(model.payload, m.x.size)
+    learned, known = m.x[p].copy(), ~m.S[p].any(axis=1)
+    bias = m.x[model.payload] / math.hypot(np.linalg.norm(m.S[model.payload]), model.motion.considered)
+    structured_model.first(config, model, m, y)
+    given = np.where(known, learned, m.x[p])
+    m.x[p] = learned
+    m.S[p][known] = 0.0
+    m.S[:] = structured_model.triangular(m.S)
+    structured_model.guess_noise(model, m.noise)
+    _set_arrival_cost(model, m)
+    start = m.x0.copy()
+    m.x0[p] = given
+    m.score[mem.EXCESS_BIAS] = bias  # until the horizon closes the arm is not trusted
+    _fit_from(m, start)
 
 
 def _begin_horizon(model: Model, m: mem.FilterState) -> None:
@@ -454,7 +481,8 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
 
     The first fit estimates few parameters of the arm and a point mass; later ones all of ``payload.learn`` and a rigid
     body. The object begins with its prior. The arm begins with what was learned before the event, or, if that fails
-    within ``FIRST_LOOK`` samples, with its given parameters.
+    within ``FIRST_LOOK`` samples, with its given parameters. An empty arm that only seems to hold something begins with
+    what was learned.
     """
     assert before.memory is not None
     assert state.model is not None
@@ -467,13 +495,18 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
         m = mem.copy(m)
         _open_body(config, model, m)
         return state._replace(memory=m)
+    y = measurements(model, last)[0]
+    if unfit and refits > 1 and not m.counts[mem.HELD] and is_off(state):  # the simplest arm is given up
+        m = mem.copy(m)
+        _fit_empty_arm_again(config, model, m, y)
+        return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.efforts, state.rates))
     at_once = m.counts[mem.SINCE_EVENT] < FIRST_LOOK  # what was learned moves as no arm does
     if m.counts[mem.HELD] and m.counts[mem.LEARNED] and np.isfinite(m.S0).all() and not at_once:
         m = mem.copy(m)
         m.x[:], m.S[:] = m.x0, m.S0
         payload = model.payload
         parameters, spread = m.x[payload:].copy(), m.S[payload:].copy()
-        structured_model.first(config, model, m, measurements(model, last)[0])
+        structured_model.first(config, model, m, y)
         body = slice(payload, payload + model.body)
         spread[:model.body] = 0.0
         m.x[payload:], m.S[payload:] = parameters, 0.0
@@ -495,6 +528,16 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
         grasped = CaptureEvent(state.last_ns, EventKind.CAPTURE)
         fresh = fresh._replace(early=((state.cursor, grasped),))
     return fresh
+
+
+def is_off(state: StructuredState) -> bool:
+    """Whether an empty arm whose horizon has closed fits the samples and yet seems to hold something."""
+    assert state.model is not None
+    assert state.sensors is not None
+    m = state.memory
+    if m is None or m.counts[mem.STORED] < mem.HORIZON or not seems_to_hold(state.model.motion, m):
+        return False
+    return innovation_power(state.sensors, m)[0] < POWER_LIMIT
 
 
 def measurements(model: Model, rows: Rows) -> Array:

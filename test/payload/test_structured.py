@@ -73,6 +73,28 @@ def test_a_state_is_never_written_to(caught, begin):
         assert all(np.array_equal(a, b) for a, b in zip(values, one.memory, strict=True))
 
 
+def test_a_fit_of_the_empty_arm_that_ended_ten_deviations_off_is_fitted_again():
+    samples = record(3.0)
+    state = run(config(), samples.between(0, 1500))
+    m = mem.copy(state.memory)
+    m.x[state.model.payload] -= 10.0 * np.linalg.norm(m.S[state.model.payload]) + 0.2
+    off = state._replace(memory=m)
+    assert structured.estimate(config(), off).status is Status.INCONSISTENT
+    again = structured.advance(config(), off, samples.between(1500, 3000))
+    found = structured.estimate(config(), again)
+    assert again.memory.counts[mem.REFITS] == 1
+    assert found.status is Status.TRACKING
+    assert abs(again.memory.x[again.model.payload]) < 3.0 * found.std
+
+
+def test_an_arm_that_holds_an_object_nobody_told_of_is_never_trusted():
+    samples = record(5.0, (event(1.5),))
+    state = structured.init(config())
+    for begin in range(1500, 5000, 20):
+        state = structured.advance(config(), state, samples.between(begin, begin + 20))
+        assert structured.estimate(config(), state).status is not Status.TRACKING
+
+
 def test_an_empty_arm_holds_nothing(caught):
     found = structured.estimate(config(), run(config(), caught.between(0, 1500)))
     assert found.mass == 0.0
