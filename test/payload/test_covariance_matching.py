@@ -22,9 +22,9 @@ CAUGHT = event(2.0)
 
 def test_the_factor_is_the_mean_square_of_the_moves_over_the_falls_of_the_variances() -> None:
     """Taken sample by sample, means and variances written down where a batch begins. The arm has modes beyond those
-    of the model."""
+    of the model, and Coulomb friction."""
     without_noise = replace(CONFIG, payload=replace(CONFIG.payload, memory_time=1e6))
-    samples = record(3.2, arm=replace(ARM, modes=5, torque_gain=(1.04, 1.04), bend_gain=(0.98, 0.98)))
+    samples = record(3.2, arm=replace(ARM, modes=5, joint_coulomb_friction=(1.0, 0.5)))
     state, ratios, begun = structured.init(without_noise), [], None
     for k in range(len(samples)):
         state = structured.advance(without_noise, state, samples.between(k, k + 1))
