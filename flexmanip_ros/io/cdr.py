@@ -37,8 +37,6 @@ class Layout(NamedTuple):
     """The bytes of frame_id and names in the message, without the last zeros, which numpy leaves out."""
     counts: tuple[int, int, int]
     """Lengths of position, velocity and effort."""
-    starts: tuple[int, int, int]
-    """Offsets of position, velocity and effort."""
     table: np.dtype[np.void]
     """A message as one row of a table: order, seconds, nanoseconds, words, then count0, position, count1, velocity,
     count2, effort. Bytes of padding belong to no column, as their content is undefined."""
@@ -71,14 +69,6 @@ def joint_record(raw: bytes, layout: Layout | None) -> tuple[JointRecord, Layout
         row = np.frombuffer(raw, layout.table)[0].item()
     _, seconds, nanoseconds, _, _, position, _, velocity, _, effort = row
     return JointRecord(seconds * 1_000_000_000 + nanoseconds, layout.names, position, velocity, effort), layout
-
-
-def refilled(message: bytearray, layout: Layout, record: JointRecord) -> bytes:
-    """Return a message of this layout with the stamp and the numbers of a record of the same names and lengths."""
-    STAMP.pack_into(message, START, *divmod(record.stamp_ns, 1_000_000_000))
-    for start, values in zip(layout.starts, record[2:], strict=True):
-        message[start:start + values.nbytes] = values.tobytes()
-    return bytes(message)
 
 
 def joint_block(raws: Sequence[bytes], layout: Layout | None) -> tuple[JointBlock, Layout]:
@@ -129,7 +119,7 @@ def _joint_layout(raw: bytes) -> Layout:
     words = raw[HEAD:at]
     columns = {'order': ('S2', 0), 'seconds': ('<i4', START), 'nanoseconds': ('<u4', START + 4),
                'words': (f'S{len(words)}', HEAD)}
-    counts, starts = [], []
+    counts = []
     for k, field in enumerate(('position', 'velocity', 'effort')):
         size, after = _count(raw, at)
         start = START + (after - START + 7 & -8) if size else after
@@ -139,11 +129,9 @@ def _joint_layout(raw: bytes) -> Layout:
         columns[f'count{k}'] = ('<u4', after - COUNT.size)
         columns[field] = (f'({size},)<f8', start)
         counts.append(size)
-        starts.append(start)
     table = np.dtype({'names': list(columns), 'formats': [form for form, _ in columns.values()],
                       'offsets': [offset for _, offset in columns.values()], 'itemsize': len(raw)})
-    return Layout(len(raw), tuple(names), words.rstrip(b'\0'), (counts[0], counts[1], counts[2]),
-                  (starts[0], starts[1], starts[2]), table)
+    return Layout(len(raw), tuple(names), words.rstrip(b'\0'), (counts[0], counts[1], counts[2]), table)
 
 
 def _string(raw: bytes, at: int) -> tuple[str, int]:
