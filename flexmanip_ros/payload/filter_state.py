@@ -59,7 +59,8 @@ class FilterState(NamedTuple):
     """(13,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
     squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
     EMPTY_ARM_BIAS: payload that the arm seemed to hold before the event, when it was empty, in the filter's standard
-    deviations; EXCESS_BIAS: the same over the deviation that its moves give, with the error of the inertia; COST: of
+    deviations; EXCESS_BIAS: the same over the deviation that its moves give, with the error of the inertia, and that
+    of an empty arm while it is fitted again; COST: of
     the samples read in this iteration, COST_BEFORE: of the last accepted one; LAMBDA: damping of Levenberg and
     Marquardt; MOVES: mean of the squared moves of payload and arm parameters, over the variance that the filter says,
     see ``judge_moves``; SANDWICH: factor, at least 1, by which the variances of the last fit of the empty arm are too

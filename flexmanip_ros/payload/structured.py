@@ -179,13 +179,18 @@ def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterSta
             if m.counts[mem.SINCE_EVENT] > mem.ENOUGH:
                 m.score[mem.EMPTY_ARM_BIAS] = m.x[payload] / math.sqrt(square)
             if m.counts[mem.SINCE_EVENT] > mem.ENOUGH or m.counts[mem.REFITS]:  # a fit begun again is doubted sooner
-                std = math.hypot(math.sqrt(moves(m) * square), inertia_error(config, model, 0.0))
-                m.score[mem.EXCESS_BIAS] = m.x[payload] / std
+                m.score[mem.EXCESS_BIAS] = _excess_bias(config, model, m)
             gain = m.S @ f / square
             m.x[:] -= gain * m.x[payload]
             m.S[:] -= np.outer(gain, f)
     m.x[payload:payload + model.body] = 0.0
     m.S[payload:payload + model.body] = 0.0
+
+
+def _excess_bias(config: IdentifierParameters, model: Model, m: mem.FilterState) -> float:
+    """Return the mass that an empty arm seems to hold, in deviations by its moves and the error of its inertia."""
+    f = m.S[model.payload]
+    return float(m.x[model.payload]) / math.hypot(math.sqrt(moves(m) * float(f @ f)), inertia_error(config, model, 0.0))
 
 
 def _set_arrival_cost(model: Model, m: mem.FilterState) -> None:
@@ -234,12 +239,12 @@ def _fit_from(m: mem.FilterState, start: Array) -> None:
 def _fit_empty_arm_again(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Array) -> None:
     """Fit an empty arm that seems to hold something to further samples, after measurements y (m,).
 
-    The fit begins where the last one ended: it had not converged when its horizon closed. The priors are those of the
-    start, as the samples of that fit are not used again.
+    The fit begins where the last one ended, which may not have converged when its horizon closed. The priors are those
+    of the start, as the samples of that fit are not used again.
     """
     p = slice(model.payload, m.x.size)
     learned, known = m.x[p].copy(), ~m.S[p].any(axis=1)
-    bias = m.x[model.payload] / math.hypot(np.linalg.norm(m.S[model.payload]), model.motion.considered)
+    bias = _excess_bias(config, model, m)
     structured_model.first(config, model, m, y)
     given = np.where(known, learned, m.x[p])
     m.x[p] = learned
@@ -249,7 +254,7 @@ def _fit_empty_arm_again(config: IdentifierParameters, model: Model, m: mem.Filt
     _set_arrival_cost(model, m)
     start = m.x0.copy()
     m.x0[p] = given
-    m.score[mem.EXCESS_BIAS] = bias  # until the horizon closes the arm is not trusted
+    m.score[mem.EXCESS_BIAS] = bias  # makes the arm INCONSISTENT until the new horizon closes
     _fit_from(m, start)
 
 
