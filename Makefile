@@ -108,7 +108,7 @@ $(DOCS)/.ready: requirements/docs.txt
 
 # A warning is an error: a link to a page or heading that is not there, a page that is in no contents.
 docs: $(VENV)/.package $(DOCS)/.ready
-	@$(BIN)/python -m flexmanip_ros.cli.write_parameters
+	@$(BIN)/python docs/write_parameters.py
 	@$(BIN)/python benchmarks/tables.py
 	@$(BIN)/python docs/write_reference.py
 	@$(DOCS)/bin/sphinx-build -W --keep-going --nitpicky --quiet -b html -d build/doctrees docs build/html

@@ -395,7 +395,8 @@ def _advance(state: State, until: int, background: Background) -> State:
 def _without_old_rows(state: State) -> State:
     """Drop the rows that neither estimator reads again."""
     _, payload, identifier = _running(state)
-    needed = min(event_replay.first_needed(payload), event_replay.first_needed(identifier),
+    needed = min(sampling.first_needed(state.log),
+                 event_replay.first_needed(payload), event_replay.first_needed(identifier),
                  identifier.cursor - prediction_check.length(state.clock.dt))
     return state._replace(log=state.log.from_row(needed))
 

@@ -123,7 +123,7 @@ def table(cls: type) -> str:
 def markdown() -> str:
     """Return the reference page of all parameters."""
     parts = ['# Parameters', '',
-             'This page is written by `python -m flexmanip_ros.cli.write_parameters` from the declarations in '
+             'This page is written by `docs/write_parameters.py` (`make docs`) from the declarations in '
              '`flexmanip_ros/parameters/`. A test fails when it is out of date.', '',
              'A parameter marked `live` may be changed while the node runs.', '']
     for node in NODES:

@@ -320,4 +320,5 @@ def look(now: Watch, item: JointRecord | JointBlock) -> tuple[Watch, tuple[Captu
         trigger = replace(trigger, outputs=clock.outputs)
         state, cursor = init(trigger), 0
     state, events = advance(trigger, state, log.rows(cursor, log.end))
-    return Watch(config, clock, log.from_row(first_needed(state)), trigger, state, log.end), events
+    needed = min(first_needed(state), sampling.first_needed(log))
+    return Watch(config, clock, log.from_row(needed), trigger, state, log.end), events

@@ -48,6 +48,8 @@ class StructuredState(NamedTuple):
     horizon: Horizon | None = None
     """Where the moving horizon begins."""
     last_ns: int = 0
+    time_ns: int = 0
+    """Instant of the state [ns]: when the last row was sampled, or the event after it."""
     efforts: Array | None = None
     """(P, L) effort held since then, and those of the samples before, newest last [N m]."""
     rates: Array = np.empty(0)
@@ -72,7 +74,7 @@ class Horizon(NamedTuple):
     row: int
     """Its first row."""
     before_ns: int
-    """Stamp of the state from which it starts [ns]."""
+    """Instant of the state from which it starts [ns]."""
     efforts: Array
     """(P, L) effort held from there on, and those of the samples before [N m]."""
     rates: Array
@@ -124,13 +126,13 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     m = mem.copy(state.memory)
     assert state.efforts is not None
     assert state.sensors is not None
-    ahead = max(event.stamp_ns - state.last_ns, 0)
+    ahead = max(event.stamp_ns - state.time_ns, 0)
     rows, rates = np.pad(state.efforts, ((0, 0), (1, 0))), np.full(state.rates.size, np.nan)
     predict(state.model.motion, m.x, m.S, m.x.size, rows, state.sensors.period, min(ahead * 1e-9, LONGEST_S))
     _change(config, state.model, state.sensors, m, event)
-    last_ns = state.last_ns + ahead
-    return state._replace(memory=m, last_ns=last_ns, rates=rates,
-                          horizon=Horizon(state.cursor, last_ns, state.efforts, rates))
+    time_ns = state.time_ns + ahead
+    return state._replace(memory=m, last_ns=max(event.stamp_ns, state.last_ns), time_ns=time_ns, rates=rates,
+                          horizon=Horizon(state.cursor, time_ns, state.efforts, rates))
 
 
 def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
@@ -300,11 +302,11 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     m.counts[mem.REFITS] = state.refits
     seen = sensors(config, model, dt, structured_model.diffusion(config, model, m))
     events = state.early
-    first_ns, efforts = int(rows.stamp_ns[0]), latest(seen, rows.u[:1], state.efforts)
+    time_ns, efforts = int(rows.time_ns[0]), latest(seen, rows.u[:1], state.efforts)
     rates = np.full(efforts.shape[1], np.nan)
     state = state._replace(
-        memory=m, sensors=seen, begin=None, early=(), cursor=rows.first, last_ns=first_ns, efforts=efforts,
-        rates=rates, horizon=Horizon(rows.first, first_ns, efforts, rates))
+        memory=m, sensors=seen, begin=None, early=(), cursor=rows.first, last_ns=int(rows.stamp_ns[0]),
+        time_ns=time_ns, efforts=efforts, rates=rates, horizon=Horizon(rows.first, time_ns, efforts, rates))
     for row, item in events:
         state = event(config, _part(config, state, rows, row), item)
     return _part(config, state, rows, rows.until)
@@ -322,9 +324,9 @@ def _resume(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
     fresh = reopen(config, state, measurements(state.model, rows.between(rows.first, rows.first + 1))[0])
     assert fresh.memory is not None
     assert state.sensors is not None
-    last_ns, efforts = int(rows.stamp_ns[0]), latest(state.sensors, rows.u[:1])
-    return fresh._replace(last_ns=last_ns, efforts=efforts,
-                          horizon=Horizon(rows.first, last_ns, efforts, state.rates))
+    time_ns, efforts = int(rows.time_ns[0]), latest(state.sensors, rows.u[:1])
+    return fresh._replace(last_ns=int(rows.stamp_ns[0]), time_ns=time_ns, efforts=efforts,
+                          horizon=Horizon(rows.first, time_ns, efforts, state.rates))
 
 
 def latest(sensors: MeasurementModel, efforts: Array, before: Array | None = None) -> Array:
@@ -350,7 +352,7 @@ def _bridge(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
     if m.counts[mem.STORED] < mem.HORIZON:  # the horizon has no process noise
         _begin_horizon(state.model, m)
     return state._replace(memory=m, missing=0,
-                          horizon=Horizon(state.cursor, state.last_ns, state.efforts, state.rates))
+                          horizon=Horizon(state.cursor, state.time_ns, state.efforts, state.rates))
 
 
 UNKNOWN_TORQUE = 0.1
@@ -409,7 +411,7 @@ def reopen(
     m.S[:] = structured_model.widen(m.S, np.vstack([np.zeros((2 * n, spread.shape[1])), spread]))
     _set_arrival_cost(state.model, m)
     assert state.efforts is not None
-    return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.efforts, state.rates))
+    return state._replace(memory=m, horizon=Horizon(state.cursor, state.time_ns, state.efforts, state.rates))
 
 
 def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
@@ -440,7 +442,8 @@ def after_rows(state: StructuredState, m: mem.FilterState, taken: Rows, table: A
     if len(measured):
         last = int(measured[-1])
         slope = taken.u[last] - (taken.u[last - 1] if last else state.efforts[-1])
-    return state._replace(memory=m, cursor=taken.until, last_ns=int(taken.stamp_ns[-1]), efforts=efforts,
+    return state._replace(memory=m, cursor=taken.until, last_ns=int(taken.stamp_ns[-1]),
+                          time_ns=int(taken.time_ns[-1]), efforts=efforts,
                           rates=table[-1, 1 + 2 * links:1 + 3 * links].copy(), slope=slope,
                           missing=int(taken.missing[-1]), peak=peak)
 
@@ -453,21 +456,21 @@ def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
     row; before that come the efforts that a late torque needs.
     """
     assert state.model is not None
-    before_ns, efforts, rates, horizon = state.last_ns, state.efforts, state.rates, state.horizon
+    before_ns, efforts, rates, horizon = state.time_ns, state.efforts, state.rates, state.horizon
     begin = first_needed(state)
     if begin < rows.first:
         assert horizon is not None
         before_ns, efforts, rates = horizon.before_ns, horizon.efforts, horizon.rates
     reach = rows.since(begin)
     assert efforts is not None
-    stamps, y = reach.stamp_ns, measurements(state.model, reach)
+    times, y = reach.time_ns, measurements(state.model, reach)
     before, links = len(efforts) - 1, efforts.shape[1]
     first = 1 + 3 * links
     whole = np.zeros((before + len(y), first + y.shape[1]))
     whole[:before + 1, 1:1 + links] = efforts
     table = whole[before:]
-    table[0, 0] = stamps[0] - before_ns
-    table[1:, 0], table[1:, 1:1 + links] = stamps[1:] - stamps[:-1], reach.u[:-1]
+    table[0, 0] = times[0] - before_ns
+    table[1:, 0], table[1:, 1:1 + links] = times[1:] - times[:-1], reach.u[:-1]
     np.maximum(table[:, 0], 0.0, out=table[:, 0])
     table[:, 0] *= 1e-9
     begins, ends = table[:, 1 + links:1 + 2 * links], table[:, 1 + 2 * links:first]
@@ -504,7 +507,7 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
     if unfit and refits > 1 and not m.counts[mem.HELD] and is_off(state):  # the simplest arm is given up
         m = mem.copy(m)
         _fit_empty_arm_again(config, model, m, y)
-        return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.efforts, state.rates))
+        return state._replace(memory=m, horizon=Horizon(state.cursor, state.time_ns, state.efforts, state.rates))
     at_once = m.counts[mem.SINCE_EVENT] < FIRST_LOOK  # what was learned moves as no arm does
     if m.counts[mem.HELD] and m.counts[mem.LEARNED] and np.isfinite(m.S0).all() and not at_once:
         m = mem.copy(m)
@@ -524,7 +527,7 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
         for column in (mem.EFFECTIVE, mem.POWER, mem.SLOW):  # what did not fit was taken for noise
             m.noise[:, column] = m.noise[:, mem.AT_EVENT]
         _set_arrival_cost(model, m)
-        return state._replace(memory=m, horizon=Horizon(state.cursor, state.last_ns, state.efforts, state.rates))
+        return state._replace(memory=m, horizon=Horizon(state.cursor, state.time_ns, state.efforts, state.rates))
     fresh = init(config)._replace(restarts=state.restarts + (not unfit), cursor=state.cursor, refits=refits,
                                   efforts=state.efforts)
     if unfit and m.counts[mem.SEEN] >= UNTAUGHT:

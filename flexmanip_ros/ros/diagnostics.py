@@ -241,6 +241,7 @@ class JointStateFaults:
         self._dropped, self._resets, self._gaps, self._unordered = Recent(), Recent(), Recent(), Recent()
         self._why = ''
         """Why the latest message of the configured joints was dropped."""
+        self._jitter_ns = 0.0
         self._is_used = False
         """Whether a message became a sample since the last report."""
         self._unused: Rejection | None = None
@@ -252,6 +253,7 @@ class JointStateFaults:
         None is returned where none was dropped, and for messages with none of the configured joints.
         """
         then, now = before.counters, clock.counters
+        self._jitter_ns = clock.jitter.std_ns
         self._is_used |= now.accepted > then.accepted
         self._resets.add(now.resets - then.resets)
         self._gaps.add(now.gaps - then.gaps)
@@ -293,7 +295,7 @@ class JointStateFaults:
         topic: the full name of the topic.
         """
         self.losses.report(report, 'lost', 'message')
-        report.values['foreign'] = self.foreign
+        report.values.update(foreign=self.foreign, stamp_jitter_ms=self._jitter_ns * 1e-6)
         unused, self._unused = None if self._is_used else self._unused, None
         self._is_used = False
         dropped, cause = self._dropped.count(), self.likely_cause(topic)

@@ -42,6 +42,7 @@ class _Buffer:
     filled: int
     """Number of the row after the last one written."""
     stamp_ns: NDArray[np.int64]
+    time_ns: NDArray[np.int64]
     values: Array
     gap: NDArray[np.bool_]
     missing: NDArray[np.int64]
@@ -76,18 +77,20 @@ class SampleLog:
         return first + int(np.searchsorted(stamps, stamp_ns, side='left'))
 
     def append(self, stamp_ns: NDArray[np.int64], u: Array, y: Array, angles: Array, gap: NDArray[np.bool_],
-               delay: int = 0, missing: NDArray[np.int64] | None = None, rates: Array | None = None) -> SampleLog:
+               delay: int = 0, missing: NDArray[np.int64] | None = None, rates: Array | None = None,
+               time_ns: NDArray[np.int64] | None = None) -> SampleLog:
         """Return the log with N more rows.
 
         stamp_ns: (N,); u: (N, r), whose row k holds the inputs of the row ``delay`` rows before row k; y: (N, m);
         angles: (N, a); gap: (N,); missing: (N,), see ``Rows.missing``; None: all were measured; rates: (N, a), where
-        they are kept. A row is shown once its inputs are known.
+        they are kept; time_ns: (N,), None: the stamps. A row is shown once its inputs are known.
         """
         buffer = self._with_room(len(stamp_ns))
         r, m, a = self.width[:3]
         at = self.end + self.waiting - buffer.first
         stop = at + len(stamp_ns)
         buffer.stamp_ns[at:stop] = stamp_ns
+        buffer.time_ns[at:stop] = stamp_ns if time_ns is None else time_ns
         buffer.values[at:stop, r:r + m] = y
         buffer.values[at:stop, r + m:r + m + a] = angles
         if rates is not None:
@@ -129,11 +132,12 @@ class SampleLog:
             return old
         kept = last - self.start
         size = max(SMALLEST, 2 * (kept + count))
-        new = _Buffer(self.start, last, np.zeros(size, dtype=np.int64), np.zeros((size, sum(self.width))),
-                      np.zeros(size, dtype=np.bool_), np.zeros(size, dtype=np.int64))
+        new = _Buffer(self.start, last, np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int64),
+                      np.zeros((size, sum(self.width))), np.zeros(size, dtype=np.bool_), np.zeros(size, dtype=np.int64))
         if old is not None and kept:
             a, b = self.start - old.first, last - old.first
             new.stamp_ns[:kept] = old.stamp_ns[a:b]
+            new.time_ns[:kept] = old.time_ns[a:b]
             new.values[:kept] = old.values[a:b]
             new.gap[:kept] = old.gap[a:b]
             new.missing[:kept] = old.missing[a:b]
@@ -184,6 +188,11 @@ class Rows:
     def stamp_ns(self) -> NDArray[np.int64]:
         """(N,) stamps [ns]."""
         return self._column('stamp_ns', np.int64)
+
+    @property
+    def time_ns(self) -> NDArray[np.int64]:
+        """(N,) when the rows were sampled, by the clock of the publisher [ns]; without jitter the stamps."""
+        return self._column('time_ns', np.int64)
 
     @property
     def u(self) -> Array:

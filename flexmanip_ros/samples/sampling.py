@@ -9,9 +9,10 @@ row is marked with ``gap`` too where the torque changed too much while messages 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import SampleLog, Signals, Width
@@ -25,6 +26,7 @@ from flexmanip_ros.samples.signals import (
     resolve,
     wrong_size,
 )
+from flexmanip_ros.samples.stamp_jitter import Jitter
 from flexmanip_ros.types import Array, CaptureEvent, JointBlock, JointRecord, Sample
 
 LEARNING = 20
@@ -37,6 +39,10 @@ UNKNOWN_TORQUE = 3.0
 """Limit of (change of a torque over missing samples / its peak) x number of missing samples; beyond it the torque
 counts as unknown. At 1 kHz, the limit leaves the vibration of a 6 Hz mode uncertain by some 3 % of what a step of the
 peak torque excites."""
+CHUNK = 32
+"""Rows of which it is asked at once whether their samples jitter as their stamps do."""
+NEVER = 6.0
+"""Standard deviations of a stamp that chance does not reach in years: 1e-9."""
 RELEARN = 20
 """Number of consecutive irregular intervals after which the sample time is learned again."""
 
@@ -88,11 +94,23 @@ class Clock(NamedTuple):
     """(r,) largest size of each input so far."""
     jump_candidate: Sample | None = None
     """A sample with a stamp far ahead. The next one tells whether the clock was set or one stamp was wrong."""
+    jitter: Jitter = Jitter()
 
     @property
     def dt(self) -> float:
-        """Sample time, the mean of the regular intervals [s]; 0 before it is known."""
+        """Sample time, the mean interval from sample to sample [s]; 0 before it is known."""
         return self.interval_sum_ns / self.interval_count * 1e-9 if self.interval_count else 0.0
+
+    def after(self, interval_ns: int, steps: int = 1) -> Clock:
+        """Return the clock after an interval of ``steps`` sample times."""
+        jitter = self.jitter.after(interval_ns, steps, self.interval_sum_ns / self.interval_count)
+        return self._replace(interval_sum_ns=self.interval_sum_ns + interval_ns, jitter=jitter,
+                             interval_count=self.interval_count + steps)
+
+    def after_equal(self, interval_ns: int, count: int) -> Clock:
+        """Return the clock after ``count`` intervals that are equal to all before."""
+        return self._replace(interval_sum_ns=self.interval_sum_ns + count * interval_ns,
+                             interval_count=self.interval_count + count, jitter=self.jitter.after_equal(count))
 
 
 class Sampled(NamedTuple):
@@ -134,34 +152,26 @@ def push_block(config: IdentifierParameters, clock: Clock, log: SampleLog, block
     Messages that follow one another regularly are taken at once, any other message alone. The rows equal those of
     ``push``.
     """
-    regular = _regular(config, clock, block, first)
+    times, advanced = _regular(config, clock, log, block, first)
+    regular = len(times)
     if regular == 0:
         return push(config, clock, log, block.record(first)), 1
     channels = clock.channels
     assert channels is not None
     taken = slice(first, first + regular)
-    stamps = block.stamp_ns[taken]
     u, y, angles = (columns(block, places, taken) for places in (channels.u, channels.y, channels.angles))
     rates = joint_rates(channels, block, taken)
-    finite = np.isfinite(u).all(axis=1) & np.isfinite(y).all(axis=1) & np.isfinite(angles).all(axis=1)
-    if not finite.all():
-        regular = int(np.argmin(finite))
-        if regular == 0:
-            return push(config, clock, log, block.record(first)), 1
-        stamps = stamps[:regular]
-        u, y, angles, rates = (part[:regular] for part in (u, y, angles, rates))
-    assert clock.last_ns is not None
-    last = int(stamps[-1])
+    last = int(block.stamp_ns[taken][-1])
     counters = clock.counters
     latest = Sample(last, u[-1].copy(), y[-1].copy(), angles[-1].copy(), rates[-1].copy())
-    clock = clock._replace(
-        last_ns=last, latest=latest, peak=_peak(clock, np.abs(u).max(axis=0)),
-        interval_sum_ns=clock.interval_sum_ns + last - clock.last_ns,
-        interval_count=clock.interval_count + regular, irregular=0,
+    clock = advanced._replace(
+        last_ns=last, latest=latest, peak=_peak(clock, np.abs(u).max(axis=0)), irregular=0,
         counters=counters._replace(received=counters.received + regular,
                                    accepted=counters.accepted + regular))
-    log = log.append(stamps, u, y, angles, np.zeros(regular, dtype=np.bool_), config.arm.effort_delay, rates=rates)
-    return Sampled(clock, log), regular
+    before = log.end
+    log = log.append(block.stamp_ns[taken], u, y, angles, np.zeros(regular, dtype=np.bool_), config.arm.effort_delay,
+                     rates=rates, time_ns=times)
+    return Sampled(_judged(clock, log, before), log), regular
 
 
 def _is_expected(clock: Clock, message: JointBlock) -> bool:
@@ -171,27 +181,58 @@ def _is_expected(clock: Clock, message: JointBlock) -> bool:
             and channels.names == message.names and _fault(channels, message) is None)
 
 
-def _is_on_time(config: IdentifierParameters, interval: Any, total: Any, count: Any) -> Any:
-    """Whether intervals [ns] agree with the mean of those before, whose sum is ``total``; numbers or arrays.
+def _is_on_time(config: IdentifierParameters, interval_ns: int, clock: Clock) -> bool:
+    """Whether an interval [ns] agrees with the mean of those before.
 
     The comparison is one of integers, nanoseconds times count: equal stamps give the same result on any machine.
     """
-    return ((interval * count < config.gap_factor * total)
-            & (interval * count > (2.0 - config.gap_factor) * total))
+    interval, mean = interval_ns * clock.interval_count, clock.interval_sum_ns
+    return (2.0 - config.gap_factor) * mean < interval < config.gap_factor * mean
 
 
-def _regular(config: IdentifierParameters, clock: Clock, block: JointBlock, first: int) -> int:
-    """Return how many messages, from ``first`` on, are regular by their stamps and layout."""
+def _lost(config: IdentifierParameters, clock: Clock, interval_ns: int) -> int:
+    """Return how many messages were lost before the next stamp, by the publisher's clock; -1: it comes too early."""
+    if not clock.interval_sum_ns:
+        return -1  # after a single sample the sample time is not known
+    period, regular = clock.interval_sum_ns / clock.interval_count, config.gap_factor - 1.0
+    ahead = clock.jitter.ahead_ns(interval_ns, period)
+    if ahead <= -max(regular * period, NEVER * clock.jitter.std_ns):
+        return -1
+    return max(int(ahead / period + 0.5), 1) if ahead >= clock.jitter.most_ns(period, regular) else 0
+
+
+def _regular(config: IdentifierParameters, clock: Clock, log: SampleLog, block: JointBlock, first: int
+             ) -> tuple[NDArray[np.int64], Clock]:
+    """Return the instants [ns] of the messages from ``first`` on that are regular and finite, and the clock after them.
+
+    The clock has their intervals alone.
+    """
+    none = np.zeros(0, dtype=np.int64)
     if not _is_expected(clock, block):
-        return 0
+        return none, clock
     assert clock.last_ns is not None
+    assert clock.channels is not None
     stamps = block.stamp_ns[first:]
     intervals = np.diff(stamps, prepend=np.int64(clock.last_ns))
-    sums = clock.interval_sum_ns + np.concatenate([[0], np.cumsum(intervals[:-1])])
-    counts = clock.interval_count + np.arange(len(stamps))
-    regular = _is_on_time(config, intervals, sums, counts) & (intervals * 1e-9 <= config.max_time_jump)  # no far jump
-    regular &= intervals > 0  # with a large gap_factor a repeated or late stamp would be on time, too
-    return len(stamps) if regular.all() else int(np.argmin(regular))
+    finite = np.logical_and.reduce([
+        np.isfinite(columns(block, places, slice(first, len(block.stamp_ns)))).all(axis=1)
+        for places in (clock.channels.u, clock.channels.y, clock.channels.angles)])
+    usable = finite & (intervals > 0) & (intervals * 1e-9 <= config.max_time_jump)  # no far jump
+    count = len(stamps) if usable.all() else int(np.argmin(usable))
+    if clock.jitter.late_ns == clock.jitter.square == 0.0:  # equal intervals leave the clock as it is but for its sums
+        equal = intervals[:count] * clock.interval_count == clock.interval_sum_ns
+        exact = count if equal.all() else int(np.argmin(equal))
+        if exact:
+            return stamps[:exact], clock.after_equal(int(intervals[0]), exact)
+    times: list[int] = []
+    for stamp, interval in zip(stamps[:count].tolist(), intervals[:count].tolist(), strict=True):
+        if not _is_on_time(config, interval, clock) or _lost(config, clock, interval):
+            break
+        clock = clock.after(interval)
+        times.append(stamp - round(clock.jitter.correction_ns))
+        if not clock.jitter.is_sharp and (log.end + len(times)) % CHUNK == 0:
+            break  # ``_judged``
+    return np.array(times, dtype=np.int64), clock
 
 
 def flush(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Sampled:
@@ -289,8 +330,8 @@ def _placed(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sam
         log = log.wait(raw)
         return _learned(config, clock, log) if log.waiting > LEARNING else Sampled(clock, log)
     before = clock.counters
-    clock, log, gap = _next(config, clock._replace(counters=before.received_and('accepted')), log, raw)
-    if gap and clock.irregular >= RELEARN:
+    clock, log = _next(config, clock._replace(counters=before.received_and('accepted')), log, raw)
+    if clock.irregular >= RELEARN:
         return _restart(clock._replace(counters=before.plus('gaps')), log, raw)
     return Sampled(clock, log)
 
@@ -317,44 +358,64 @@ def _learned(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Samp
                            interval_sum_ns=intervals[len(intervals) // 2] if intervals else 0)
     log = log.without_waiting()
     for raw in samples:
-        clock, log, _ = _next(config, clock, log, raw)
+        clock, log = _next(config, clock, log, raw)
     return Sampled(clock._replace(irregular=0), log)
 
 
-def _next(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sample
-          ) -> tuple[Clock, SampleLog, bool]:
-    """Advance the clock by one sample; return clock, log and whether a gap precedes ``raw``."""
-    gap = unknown = False
+def _next(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sample) -> tuple[Clock, SampleLog]:
+    """Advance clock and log by one sample."""
+    unknown = False
     if clock.last_ns is not None:
         interval = raw.stamp_ns - clock.last_ns
-        total, count = clock.interval_sum_ns, clock.interval_count
-        gap = not _is_on_time(config, interval, total, count)
-        if gap:
-            absent = _absent(config, clock, raw)
-            log = _filled(log, clock, raw, absent, config.arm.effort_delay) if absent else log.without_waiting()
-            unknown = not absent or _is_torque_unknown(clock, raw, absent)
-            clock = clock._replace(irregular=clock.irregular + 1, counters=clock.counters.plus('gaps'))
+        irregular = 0 if _is_on_time(config, interval, clock) else clock.irregular + 1
+        lost = _lost(config, clock, interval)
+        if lost:
+            log, clock, unknown = _after_gap(config, log, clock, raw, lost)
         else:
-            clock = clock._replace(irregular=0, interval_sum_ns=total + interval, interval_count=count + 1)
+            clock = clock.after(interval)
+        clock = clock._replace(irregular=irregular)
     clock = clock._replace(last_ns=raw.stamp_ns, latest=raw, peak=_peak(clock, np.abs(raw.u)))
+    before = log.end
     log = log.append(np.array([raw.stamp_ns]), raw.u[None], raw.y[None], raw.angles[None], np.array([unknown]),
-                     config.arm.effort_delay, rates=raw.rates[None])
-    return clock, log, gap
+                     config.arm.effort_delay, rates=raw.rates[None],
+                     time_ns=np.array([raw.stamp_ns - round(clock.jitter.correction_ns)]))
+    return _judged(clock, log, before), log
+
+
+def _judged(clock: Clock, log: SampleLog, before: int) -> Clock:
+    """Return the clock after the rows from ``before`` on, if they complete rows that tell more of its jitter."""
+    until = log.end - log.end % CHUNK
+    if clock.jitter.is_sharp or until <= before or until - CHUNK < log.start:
+        return clock
+    rows = log.rows(until - CHUNK, until)
+    if rows.gap[1:].any() or rows.missing.any():
+        return clock
+    return clock._replace(jitter=clock.jitter.judged(rows.stamp_ns, np.hstack([rows.y, rows.angles, rows.rates])))
+
+
+def first_needed(log: SampleLog) -> int:
+    """Return the first row that will be read again."""
+    return max(log.end - CHUNK, log.start)
+
+
+def _after_gap(config: IdentifierParameters, log: SampleLog, clock: Clock, raw: Sample, lost: int
+               ) -> tuple[SampleLog, Clock, bool]:
+    """Return log and clock where messages before ``raw`` were lost or it came too early.
+
+    Return as well whether motion or torques just before it are unknown.
+    """
+    assert clock.last_ns is not None
+    counters = clock.counters.plus('gaps')
+    interval = raw.stamp_ns - clock.last_ns
+    if clock.latest is None or interval * 1e-9 > config.max_gap or not 0 < lost <= MOST_MISSING:
+        return log.without_waiting(), clock._replace(counters=counters, jitter=clock.jitter.restarted()), True
+    after = clock._replace(counters=counters).after(interval, lost + 1)
+    log = _filled(log, clock, raw, lost, config.arm.effort_delay, after.jitter.correction_ns)
+    return log, after, _is_torque_unknown(clock, raw, lost)
 
 
 def _peak(clock: Clock, size: Array) -> Array:
     return np.maximum(clock.peak, size) if clock.peak.size else np.array(size, dtype=np.float64)
-
-
-def _absent(config: IdentifierParameters, clock: Clock, raw: Sample) -> int:
-    """Return how many samples never came before ``raw``; 0 where too many, or where it came too early."""
-    assert clock.last_ns is not None
-    interval = raw.stamp_ns - clock.last_ns
-    if clock.latest is None or not clock.interval_sum_ns or interval * 1e-9 > config.max_gap:
-        return 0  # after a single sample the sample time is not known either
-    # whole numbers: the same on any machine
-    count = (2 * interval * clock.interval_count + clock.interval_sum_ns) // (2 * clock.interval_sum_ns) - 1
-    return count if 0 < count <= MOST_MISSING else 0
 
 
 def _is_torque_unknown(clock: Clock, raw: Sample, absent: int) -> bool:
@@ -364,7 +425,7 @@ def _is_torque_unknown(clock: Clock, raw: Sample, absent: int) -> bool:
     return bool(np.any(absent * change > UNKNOWN_TORQUE * np.maximum(clock.peak, np.abs(raw.u))))
 
 
-def _filled(log: SampleLog, clock: Clock, raw: Sample, absent: int, delay: int) -> SampleLog:
+def _filled(log: SampleLog, clock: Clock, raw: Sample, absent: int, delay: int, late_ns: float) -> SampleLog:
     """Append the rows of samples that never came, interpolated between the one before and ``raw``."""
     before = clock.latest
     assert before is not None
@@ -372,4 +433,6 @@ def _filled(log: SampleLog, clock: Clock, raw: Sample, absent: int, delay: int) 
     share = (number / (absent + 1))[:, None]
     stamps = before.stamp_ns + (raw.stamp_ns - before.stamp_ns) * number // (absent + 1)
     u, y, angles, rates = (np.asarray(a + share * (b - a)) for a, b in zip(before[1:], raw[1:], strict=True))
-    return log.append(stamps, u, y, angles, np.zeros(absent, dtype=np.bool_), delay, number, rates)
+    late = clock.jitter.correction_ns + share[:, 0] * (late_ns - clock.jitter.correction_ns)
+    return log.append(stamps, u, y, angles, np.zeros(absent, dtype=np.bool_), delay, number, rates,
+                      stamps - np.round(late).astype(np.int64))

@@ -210,7 +210,7 @@ def test_every_program_imports_and_is_callable(distribution: Distribution) -> No
 def test_every_module_with_a_main_is_a_program(distribution: Distribution) -> None:
     modules = [path for door in ('ros', 'cli') for path in (ROOT / 'flexmanip_ros' / door).rglob('*.py')]
     mains = {path.stem for path in modules if '\ndef main(' in path.read_text(encoding='utf-8')}
-    assert mains - {'warm_up', 'write_parameters'} == set(programs(distribution))
+    assert mains - {'warm_up'} == set(programs(distribution))
 
 
 def test_every_package_is_installed(distribution: Distribution) -> None:

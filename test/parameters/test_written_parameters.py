@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 
 import pytest
 import yaml
 
-from flexmanip_ros.cli.write_parameters import documents, main
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters.document import NODES, number, scalar, yaml_text
 
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.parametrize(('name', 'text'), list(documents()))
+def _documents() -> list[tuple[str, str]]:
+    spec = importlib.util.spec_from_file_location('write_parameters', ROOT / 'docs/write_parameters.py')
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return list(module.documents())
+
+
+@pytest.mark.parametrize(('name', 'text'), _documents())
 def test_what_is_written_from_the_declarations_is_current(name, text):
     assert (ROOT / name).read_text(encoding='utf-8') == text, \
-        'stale: run python -m flexmanip_ros.cli.write_parameters'
+        'stale: run python docs/write_parameters.py'
 
 
 @pytest.mark.parametrize('node', list(NODES))
@@ -40,20 +49,3 @@ def test_only_what_differs_is_written_on_request():
     text = yaml_text('rpbsid_identifier', {'order': 2, 'arm.modes': 1, 'angles': ()})
     assert yaml.safe_load(text) == {
         '/**': {'ros__parameters': {'order': 2, 'angles': [''], 'arm': {'modes': 1}}}}
-
-
-def test_the_files_are_written_once(tmp_path, capsys):
-    assert main([str(tmp_path)]) == 0
-    assert 'config/rpbsid_identifier.yaml' in capsys.readouterr().out
-    assert main([str(tmp_path)]) == 0
-    assert capsys.readouterr().out == ''
-
-
-@pytest.mark.parametrize('argument', ['--help', '--unknown', 'no/such/folder'])
-def test_an_argument_that_is_no_checkout_writes_nothing(argument, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        main([argument])
-    assert ended.value.code == (0 if argument == '--help' else 2)
-    assert list(tmp_path.iterdir()) == []
-    assert capsys.readouterr()
