@@ -281,6 +281,14 @@ def payload_elements(rows: list[dict[str, Any]]) -> Claims:
             yield Claim(f'coverage after {second} s', row['coverage'][k], 0.965)
 
 
+def payload_jitter(rows: list[dict[str, Any]]) -> Claims:
+    """Header stamps may jitter by a fifth of the sample time, alone or with their samples; payloads stay right."""
+    for row in rows:
+        name = 'no jitter' if row['jitter'] == 'none' else f'{row["jitter"]}, {row["std_ms"]:g} ms'
+        yield Claim(f'{name}: TRACKING', row['tracking_percent'], 90.0, unit='%')  # the first 0.3 s are mostly not
+        yield Claim(f'{name}: TRACKING and outside', row['wrong_and_tracking_percent'], high=5.0, unit='%')
+
+
 def payload_linear(rows: list[dict[str, Any]]) -> Claims:
     """On the paper's linear plant `structured` is within 1.5 x the Cramer-Rao bound at 0.25, 1 and 3 s.
 
@@ -470,10 +478,9 @@ CLAIMS: dict[str, Callable[[Any], Claims]] = {
         control_payload, detection_delay, detection_real_arms, identification_coverage, identification_measured_arms,
         identification_missions, identification_moving_arm, identification_paper_settings, identification_soak,
         identification_speed, identification_status, identification_suggested, identification_ten_minutes,
-        io_bag_reading, payload_block, payload_bounds, payload_coverage, payload_elements, payload_linear,
+        io_bag_reading, payload_block, payload_bounds, payload_coverage, payload_elements, payload_jitter, payload_linear,
         payload_minute, payload_mismatched, payload_real_arms, payload_speed, plant_convergence, plant_hour, plant_live,
-        plant_segment_chain, plant_speed,
-        replay_speed, ros_fuzz, ros_latency, ros_loss, ros_signals, setup_time, study_scaling)}
+        plant_segment_chain, plant_speed, replay_speed, ros_fuzz, ros_latency, ros_loss, ros_signals, setup_time, study_scaling)}
 
 
 def claims_of(name: str, result: Any) -> list[Claim]:
