@@ -190,7 +190,8 @@ def choose_signals(signals: list[Found], given: Mapping[str, Any]
 
 
 def _inputs(moving: list[str]) -> tuple[tuple[str, ...], str]:
-    if set(DEFAULTS.inputs) <= set(moving):
+    there = set(moving)
+    if set(DEFAULTS.inputs) <= there and not there.isdisjoint(DEFAULTS.outputs):  # many robots have joint1 and joint2
         return DEFAULTS.inputs, 'the names say it'
     return tuple(name for name in moving if name.endswith('/effort')), 'every effort that moves'
 

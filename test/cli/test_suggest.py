@@ -179,6 +179,14 @@ def test_signals_whose_names_say_what_they_are_are_taken_by_name():
     assert chosen['outputs'] == ('link1_bend/position', 'link2_bend/position')
 
 
+def test_a_robot_whose_first_two_joints_have_the_names_of_the_arm_has_every_effort():
+    joints = [f'joint{k}' for k in range(1, 7)]
+    signals = _found(*(f'{joint}/{kind}' for joint in joints for kind in ('position', 'effort')))
+    chosen, _ = choose_signals(signals, {})
+    assert chosen['inputs'] == tuple(f'{joint}/effort' for joint in joints)
+    assert chosen['outputs'] == tuple(f'{joint}/position' for joint in joints)
+
+
 def test_a_given_arm_keeps_its_payload_method():
     signals = _found('joint1/effort', 'joint2/effort', 'link1_bend/position')
     assert choose_signals(signals, {'arm.tip_mass': 3.0})[0]['payload_method'] == 'structured'
