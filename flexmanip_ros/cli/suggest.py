@@ -176,6 +176,9 @@ def choose_signals(signals: list[Found], given: Mapping[str, Any]
         if not names:
             bad = ', '.join(signal.name for signal in signals if not signal.finite)
             why += f'; most values are not finite of {bad}' if bad else ''
+            still = [signal.name for signal in signals if signal.finite and not signal.varies]
+            still = [signal for signal in still if signal.endswith('/effort')] if name == 'inputs' else still
+            why += f'; where it was looked at, these stand still: {", ".join(still)}' if still else ''
             raise ParameterError(f'nothing in the recording serves for {name}: they would be {why}',
                                  f'name them with --set {name}=[NAME/FIELD, ...]')
         chosen[name] = names

@@ -207,6 +207,12 @@ def test_without_an_effort_that_moves_the_inputs_are_asked_for():
         choose_signals(_found('a/position', 'b/velocity'), {})
 
 
+def test_efforts_that_stand_still_are_named():
+    still = replace(_found('a/effort')[0], low=0.05, high=0.05, std=0.0)
+    with pytest.raises(ParameterError, match='these stand still: a/effort'):
+        choose_signals([still, *_found('a/position')], {})
+
+
 def test_a_recording_too_short_to_be_scored_asks_for_a_longer_one(tmp_path, capsys):
     path = _bag(tmp_path / 'bag', _machine(65))
     assert main([str(path), '--suggest', str(tmp_path / 'no.yaml')]) == 2
