@@ -2,7 +2,8 @@
 
 ``shape_search`` chooses decimation, windows, order and direct term on moments. The prior is chosen here, by
 cross-validation on these moments. What they cannot tell (forgetting, refinement) is tried with the identifier itself:
-it runs through the recording and predicts the samples that follow.
+it runs through the recording and predicts the samples that follow. It may change the prior too: the folds of the
+moments are mixed in time, and a prior that serves between them may be too strong or too weak for what follows.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,10 +23,15 @@ NEARLY, REFINED = 1.3, 1.1
 """Factors of the error: a refined model, of small order, is tried if the order costs less than the first of them, and
 taken if the refinement gains more than the second."""
 PRIORS = (1e-5, 0.1)
+"""Ridges tried on the moments beside ``PRIOR``."""
+RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
+"""Ridges tried with the identifier itself."""
+TOLD = float(np.log1p(0.5))
+"""Error above which a run of the identifier tells nothing of the ridge: it misses over half of what follows."""
 SHOWN = 5
 """Number of values that the reason for a choice compares."""
-TRIALS = 5
-"""Number of runs of the identifier itself."""
+TRIALS = 5 + len(RIDGES)
+"""Number of runs of the identifier itself, at most."""
 FORGOTTEN = 3
 """Length of the recording over the time constant of the constant forgetting that is tried."""
 PARTS = 6
@@ -97,6 +103,18 @@ def _prior(search: Search, shape: Shape) -> float:
     return best if errors[best] * PLAIN < errors[PRIOR] else PRIOR
 
 
+def _ridge(errors: Mapping[float, float], alpha: float) -> float:
+    """Return the ridge for errors of the identifier: that of the moments where it is nearly as good as the best.
+
+    errors: by ridge; alpha: the ridge that the moments chose, one of them. Else it is the largest that is nearly as
+    good as the best; where no run predicts what follows, that of the moments.
+    """
+    least = min(errors.values())
+    if not least < TOLD or errors[alpha] <= PLAIN * least:
+        return alpha
+    return max(ridge for ridge, error in errors.items() if error <= PLAIN * least)
+
+
 def _settings(search: Search, shape: Shape, step: Callable[[], None]
               ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
     """Choose what the moments cannot tell by runs of the identifier itself; return all values, and the reasons."""
@@ -105,6 +123,16 @@ def _settings(search: Search, shape: Shape, step: Callable[[], None]
     plain: dict[str, Any] = {
         **_values(shape), 'forgetting': 'innovation', 'forgetting_factor': (1.0,) * 3, 'regularization': (alpha,) * 3,
         'refinement': 'none', **search.given}
+    errors = {alpha: _identified_error(search, plain)}
+    step()
+    is_free = 'regularization' not in search.given and plain['refinement'] == 'none'  # a refined model takes long
+    for ridge in RIDGES if is_free else ():
+        if ridge != alpha:
+            errors[ridge] = _identified_error(search, {**plain, 'regularization': (ridge,) * 3})
+        step()
+    chosen = _ridge(errors, alpha)
+    if chosen != alpha:
+        plain['regularization'] = (chosen,) * 3
     trials: list[tuple[str, float, dict[str, Any]]] = [
         ('forgetting where the model ceases to fit', PLAIN, {'forgetting_factor': (0.99,) * 3}),
         (f'forgetting beyond {search.count * search.dt / FORGOTTEN:.3g} s', PLAIN,
@@ -117,9 +145,8 @@ def _settings(search: Search, shape: Shape, step: Callable[[], None]
     if own is not None and refined:
         trials += [(f'{kind} of order {own.order}', REFINED, {**_values(own), 'refinement': kind})
                    for kind in ('output_error', 'prediction_error')]
-    settled, name, least = plain, 'no forgetting', _identified_error(search, plain)
+    settled, name, least = plain, 'no forgetting', errors[chosen]
     told = [f'no forgetting {_percent(least)}']
-    step()
     for words, gain, trial in trials:
         values = {**plain, **trial, **search.given}
         error = np.inf
@@ -130,12 +157,16 @@ def _settings(search: Search, shape: Shape, step: Callable[[], None]
             settled, name, least = values, words, error
         step()
     beside = '' if refined else '; no refinement, which needs a smaller order than these signals do'
-    ridge = 'given' if 'regularization' in search.given else (
-        f'best of {", ".join(f"{value:g}" for value in sorted((PRIOR, *PRIORS)))} by the same error')
+    if least > TOLD:
+        beside += '; what was learned hardly holds later: record every kind of motion, several times'
+    tried = sorted((PRIOR, *PRIORS))
+    why = 'given' if 'regularization' in search.given else (
+        f'best of {", ".join(f"{value:g}" for value in tried)} by the same error' if chosen == alpha else
+        f'run through the recording, {", ".join(f"{value:g} {_percent(errors[value])}" for value in sorted(errors))}')
     return settled, [
         ('forgetting, refinement', f'{name}: run through the recording, unexplained {search.horizon_s:g} s ahead with '
                                    f'{", ".join(told)}{beside}'),
-        ('regularization', f'{settled["regularization"][0]:g}: {ridge}')]
+        ('regularization', f'{settled["regularization"][0]:g}: {why}')]
 
 
 def _values(shape: Shape) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.studies import suggestion
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
 START = 1_700_000_000_000_000_000
@@ -200,6 +201,15 @@ def test_an_arm_of_one_link_needs_no_angle_of_a_second(tmp_path, capsys):
     _json(capsys, path, '--suggest', place, '--set=arm.link_length=[0.41]', '--set=arm.linear_density=[1.0]',
           '--set=arm.bending_stiffness=[5.0]')
     assert load(IdentifierParameters, 'rpbsid_identifier', place).payload_method == 'structured'
+
+
+@pytest.mark.parametrize(('errors', 'ridge'), [
+    ({1e-6: 0.05, 1e-4: 0.0505, 1e-3: 0.051}, 1e-3),  # the moments' choice is nearly as good
+    ({1e-6: 0.05, 1e-4: 0.051, 1e-3: 0.3}, 1e-4),  # the largest that is nearly as good
+    ({1e-6: 1.0, 1e-4: 0.6, 1e-3: 20.0}, 1e-3),  # no run tells anything
+])
+def test_the_ridge_is_that_of_the_moments_unless_a_run_of_the_identifier_gains(errors, ridge):
+    assert suggestion._ridge(errors, 1e-3) == ridge
 
 
 def test_without_an_effort_that_moves_the_inputs_are_asked_for():
