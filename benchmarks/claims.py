@@ -478,9 +478,10 @@ CLAIMS: dict[str, Callable[[Any], Claims]] = {
         control_payload, detection_delay, detection_real_arms, identification_coverage, identification_measured_arms,
         identification_missions, identification_moving_arm, identification_paper_settings, identification_soak,
         identification_speed, identification_status, identification_suggested, identification_ten_minutes,
-        io_bag_reading, payload_block, payload_bounds, payload_coverage, payload_elements, payload_jitter, payload_linear,
-        payload_minute, payload_mismatched, payload_real_arms, payload_speed, plant_convergence, plant_hour, plant_live,
-        plant_segment_chain, plant_speed, replay_speed, ros_fuzz, ros_latency, ros_loss, ros_signals, setup_time, study_scaling)}
+        io_bag_reading, payload_block, payload_bounds, payload_coverage, payload_elements, payload_jitter,
+        payload_linear, payload_minute, payload_mismatched, payload_real_arms, payload_speed, plant_convergence,
+        plant_hour, plant_live, plant_segment_chain, plant_speed, replay_speed,
+        ros_fuzz, ros_latency, ros_loss, ros_signals, setup_time, study_scaling)}
 
 
 def claims_of(name: str, result: Any) -> list[Claim]:
