@@ -152,8 +152,6 @@ class IdentifierParameters:
         if len(self.payload.working_point) not in (0, links):
             raise ParameterError(f"parameter 'payload.working_point' has {len(self.payload.working_point)} elements",
                                  f'give {links}, or [] for the measured ones')
-        for group in ('inputs', 'outputs', 'angles'):
-            check_signals(group, getattr(self, group))
         for group in ('inputs', 'outputs'):
             if not getattr(self, group):
                 raise ParameterError(f"parameter '{group}' is empty", 'name at least one NAME/FIELD')
@@ -173,15 +171,19 @@ class IdentifierParameters:
 
 
 def fit_signals(config: Any, links: int) -> None:
-    """Leave the signals of the second link out of the default inputs, outputs and angles of an arm of one link."""
+    """Leave the signals of the second link out of the default inputs, outputs and angles of an arm of one link.
+
+    Raises ParameterError for a signal that is not NAME/FIELD, or named twice in a group.
+    """
     for item in fields(config):
-        value = getattr(config, item.name)
-        if item.name in ('inputs', 'outputs', 'angles') and value == item.default:
-            object.__setattr__(config, item.name, of_links(value, links))
+        if item.name in ('inputs', 'outputs', 'angles'):
+            names = getattr(config, item.name)
+            if names == item.default:
+                object.__setattr__(config, item.name, of_links(names, links))
+            _check_signals(item.name, names)
 
 
-def check_signals(group: str, names: tuple[str, ...]) -> None:
-    """Raise ParameterError for a signal that is not NAME/FIELD, or named twice in a group."""
+def _check_signals(group: str, names: tuple[str, ...]) -> None:
     for name in names:
         joint, _, what = name.rpartition('/')
         if not joint or what not in FIELDS:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.arm import ArmParameters
 from flexmanip_ros.parameters.field import check_all, fit_links, parameter
-from flexmanip_ros.parameters.identifier import PayloadParameters, check_signals, fit_signals
+from flexmanip_ros.parameters.identifier import PayloadParameters, fit_signals
 
 LARGEST_SETPOINT = round(4.0 * math.pi, 2)
 """Largest setpoint [rad]: two turns, which joints seldom exceed, but angles in degrees and encoder counts do."""
@@ -208,5 +208,3 @@ class ViewParameters:
                                  f'give one of {", ".join(map(str, WINDOWS))}')
         if not self.identifier:
             raise ParameterError("parameter 'identifier' is empty", 'name the node, such as rpbsid_identifier')
-        for group in ('inputs', 'outputs', 'angles'):
-            check_signals(group, getattr(self, group))

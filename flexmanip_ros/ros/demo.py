@@ -8,6 +8,7 @@ bit.
 import argparse
 import json
 import os
+import select
 import shutil
 import signal
 import subprocess
@@ -102,7 +103,9 @@ def ros_arguments(arguments: Sequence[str]) -> list[str]:
 def _url(process: subprocess.Popen[bytes]) -> str:
     """Return the address of the page, which the node prints on stdout."""
     assert process.stdout is not None
-    for word in process.stdout.readline().decode().split():
+    ready, _, _ = select.select([process.stdout], [], [], PAGE_TIMEOUT_S)
+    line = process.stdout.readline() if ready else b''
+    for word in line.decode().split():
         if word.startswith('http://'):
             return word
     raise ViewerError('the live view did not start', 'see its log above, or leave --view away')

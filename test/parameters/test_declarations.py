@@ -69,6 +69,13 @@ def test_a_wrong_parameter_is_named_with_the_way_out(values: dict[str, object], 
     assert '\n' not in str(caught.value)
 
 
+@pytest.mark.parametrize('cls', [parameters.TriggerParameters, parameters.ViewParameters])
+@pytest.mark.parametrize(('signals', 'words'), [(['joint1'], 'NAME/FIELD'), (['a/effort', 'a/effort'], 'twice')])
+def test_each_node_refuses_a_signal_that_is_none(cls: type, signals: list[str], words: str) -> None:
+    with pytest.raises(ParameterError, match=words):
+        configure(cls, {'inputs': signals})
+
+
 def test_an_empty_text_stands_for_the_empty_list_that_ros_cannot_write() -> None:
     assert configure(IdentifierParameters, {'angles': ['']}).angles == ()
 
