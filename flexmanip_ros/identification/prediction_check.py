@@ -47,8 +47,9 @@ OFF, VAGUE = 0.02, 0.01
 UNSHOWN = 0.1
 """Half 95 % interval of a relative frequency error above which the samples do not show the frequency. It was at most
 0.066 in 4762 readings of right models, and 0.21 to 0.41 for a mode that the plant did not have."""
-EARLY = 4096
-"""Number of samples since the last event below which uncertain modes mean WARMING_UP, not POORLY_EXCITED."""
+EARLY_S = 4.0
+"""Time since the last event [s] below which an uncertain mode means WARMING_UP, not POORLY_EXCITED: 22 periods of the
+default arm's first mode. It is a time, as a slow sensor tells no more about a mode in as many samples."""
 DAMPED = 0.3
 """Damping ratio above which the frequency of a mode is not judged."""
 LOOSE = 0.1
@@ -276,6 +277,11 @@ def lacks_modes(oscillations: Sequence[Mode], bends: int) -> bool:
     return sum(abs(mode.damping_ratio) < DAMPED for mode in oscillations) < bends
 
 
+def is_early(found: Identified, since: float) -> bool:
+    """Whether a model is of the first ``EARLY_S``. since: as in ``judged``."""
+    return max(found.samples, since) * found.model.dt < EARLY_S
+
+
 def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int = 0, turned: float = 0.0,
            since: float = 0.0, *, filtered: bool = False) -> Identified:
     """Return the model with the status that its predictions of the last samples give; outputs: the outputs' names.
@@ -286,7 +292,7 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
     not looked for in them, as right ones were not found (a mode 0.3 % off seemed to be 3.1 +- 1.3 % off).
 
     INCONSISTENT: the predictions miss over half of the outputs' mean power, or the last samples show another frequency.
-    ORDER_TOO_LOW: they miss over half of one output. POORLY_EXCITED, in the first ``EARLY`` samples WARMING_UP: a mode
+    ORDER_TOO_LOW: they miss over half of one output. POORLY_EXCITED, in the first ``EARLY_S`` WARMING_UP: a mode
     of a model of one configuration is too uncertain, or the last samples do not show its frequency. Where the model
     should be one of every configuration, the same status means that it has fewer lightly damped modes than there are
     bends, or that it is still of one configuration and the links have turned by more than ``MOST_TURN``.
@@ -309,7 +315,7 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
     whole, U = affine(found.model, found.constant, rows.u)
     model = replace(whole, C=whole.C[chosen], D=whole.D[chosen])
     seen = rows.missing == 0
-    unknown = Status.WARMING_UP if max(found.samples, since) < EARLY else Status.POORLY_EXCITED
+    unknown = Status.WARMING_UP if is_early(found, since) else Status.POORLY_EXCITED
     of_one = found.configurations is None
     if bends and (lacks_modes(modes(found), bends) or (of_one and turned > MOST_TURN)):
         return found._replace(status=unknown)

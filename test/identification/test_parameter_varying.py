@@ -387,6 +387,14 @@ def test_a_frequency_that_is_not_known_to_one_per_cent_is_not_tracking() -> None
     assert prediction_check.judged(early, rows, ('a/position', 'b/position')).status is Status.WARMING_UP
 
 
+def test_a_mode_that_stays_uncertain_is_said_after_as_many_seconds_at_any_sample_rate() -> None:
+    for dt in (1e-4, 1e-3, 2e-2):
+        model = replace(swinging((5.6, 6.1))[0], dt=dt)
+        found = Identified(model, np.zeros((44, 1)), np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=3.9 / dt)
+        assert prediction_check.is_early(found, 0.0)
+        assert not prediction_check.is_early(found, 4.1 / dt)
+
+
 @pytest.mark.parametrize(('deviation', 'said'), [(0.06, Status.TRACKING), (0.12, Status.POORLY_EXCITED)])
 def test_a_damped_mode_is_tracking_only_if_its_damping_ratio_is_known(deviation: float, said: Status) -> None:
     u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
