@@ -10,7 +10,7 @@ import numpy as np
 
 from flexmanip_ros import event_replay
 from flexmanip_ros.event_replay import EventReplay
-from flexmanip_ros.identification import parameter_varying, prediction_check, rpbsid
+from flexmanip_ros.identification import held_back, parameter_varying, prediction_check, rpbsid
 from flexmanip_ros.identification.factor import FILLED, REJECTED, USED
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.numerics.background import INLINE, Background
@@ -175,11 +175,13 @@ class ModelRequest:
         if found is not None:
             role = parameter_varying.roles(config)
             filtered = rpbsid.latest(config, identifier.rpbsid, identifier.since_ns, self.dt)
+            since = float(identifier.rpbsid.counts[USED])
             found = prediction_check.judged(
                 found, self.rows if filtered is None else filtered, config.outputs,
                 0 if role is None else len(role.displacements),
                 float(np.ptp(identifier.turned)) if identifier.turned.size else 0.0,
-                float(identifier.rpbsid.counts[USED]), filtered=filtered is not None)
+                since, filtered=filtered is not None)
+            found = held_back.judged(found, identifier.rpbsid.held, prediction_check.is_early(found, since))
         if config.payload_method == 'block' and found is not None:
             payload = block_extraction.estimate(config, found, identifier.angles, identifier.configuration_range)
         if found is None:

@@ -114,11 +114,8 @@ def publish(
 ) -> Identified | None:
     """Model, spread and status in JointState units. scale: (r + m,) of the signals, 0 for a silent signal."""
     r, m = len(config.inputs), len(config.outputs)
-    su = np.where(scale[:r] > 0.0, scale[:r], 1.0)
-    sy = np.where(scale[r:] > 0.0, scale[r:], 1.0)
-    raw = Tangent(*_in_units(realized.A, realized.B, realized.C, realized.D, realized.K, su, sy))
-    model = StateSpace(*raw, dt=dt)
-    if not all(np.all(np.isfinite(part)) for part in (model.A, model.B, model.C, model.D, model.K)):
+    model, su, sy = raw_model(config, realized, scale, dt)
+    if model is None:
         return None
     effective = scalars[WEIGHT] ** 2 / scalars[WEIGHT2]
     free = max(effective - d, 0.05 * effective)
@@ -147,6 +144,20 @@ def publish(
         model=model, spread=spread, singular_values=realized.singular_values,
         excitation=excitation(realized.regression), condition=condition, innovation_power=power,
         status=judge(used, d, condition, unexplained, too_low), samples=float(effective))
+
+
+def raw_model(config: IdentifierParameters, realized: Realized, scale: Array, dt: float
+              ) -> tuple[StateSpace | None, Array, Array]:
+    """Return the model in JointState units, in the basis it was found in, and the scales (r,), (m,) of the signals.
+
+    The model is None where it is not finite.
+    """
+    r = len(config.inputs)
+    su = np.where(scale[:r] > 0.0, scale[:r], 1.0)
+    sy = np.where(scale[r:] > 0.0, scale[r:], 1.0)
+    parts = _in_units(realized.A, realized.B, realized.C, realized.D, realized.K, su, sy)
+    model = StateSpace(*parts, dt=dt)
+    return model if all(np.all(np.isfinite(part)) for part in parts) else None, su, sy
 
 
 def _in_units(

@@ -17,6 +17,7 @@ from flexmanip_ros.errors import SignalError
 from flexmanip_ros.identification import (
     decimation,
     factor,
+    held_back,
     model_output,
     paper_recursion,
     prediction_check,
@@ -46,7 +47,8 @@ class RpbsidState(NamedTuple):
     variance: (m,) of the innovations, scaled; scalars, counts: see ``factor``; memory: the arrays of the estimator, in
     the order of its kernel's arguments; refined: the prediction-error fit, None where it is off; decimator: the
     anti-alias filter, None without decimation; decimated: the log of filtered samples, None without decimation; cursor:
-    row of the sample log that is taken next.
+    row of the sample log that is taken next; held: the models that are held back, None
+    where nobody asks for a status.
     """
 
     z: Array
@@ -60,13 +62,14 @@ class RpbsidState(NamedTuple):
     decimator: decimation.Decimator | None
     decimated: SampleLog | None
     cursor: int = 0
+    held: held_back.HeldBack | None = None
 
     def owned(self) -> RpbsidState:
         """Return a copy whose arrays may be overwritten."""
         return RpbsidState(
             self.z.copy(), self.scale.copy(), self.mean.copy(), self.variance.copy(), self.scalars.copy(),
             self.counts.copy(), tuple(array.copy() for array in self.memory), self.refined,
-            self.decimator, self.decimated, self.cursor)
+            self.decimator, self.decimated, self.cursor, self.held)
 
 
 def init(config: IdentifierParameters) -> RpbsidState:
@@ -81,7 +84,7 @@ def init(config: IdentifierParameters) -> RpbsidState:
         scalars=scalars, counts=np.zeros(factor.COUNTS, dtype=np.int64), memory=memory,
         refined=recursive_fit.start(0) if _is_refined(config) else None,
         decimator=decimation.start(config.decimation, r + m) if config.decimation > 1 else None,
-        decimated=SampleLog(Width(r, m, 0)) if config.decimation > 1 else None)
+        decimated=SampleLog(Width(r, m, 0)) if config.decimation > 1 else None, held=held_back.HeldBack())
 
 
 def _is_refined(config: IdentifierParameters) -> bool:
@@ -135,9 +138,15 @@ def advance(config: IdentifierParameters, state: RpbsidState, rows: Rows, backgr
 
 def first_needed(state: RpbsidState) -> int:
     """Return the first row of the sample log that will be read again."""
-    if state.refined is None or state.decimated is not None:
+    if state.decimated is not None:
         return state.cursor
-    return recursive_fit.first_needed(state.refined)
+    return min(state.cursor, _first_read(state, state.cursor))
+
+
+def _first_read(state: RpbsidState, row: int) -> int:
+    """Return the first row, of the log of filtered samples if there is one, that will be read again."""
+    first = row if state.held is None else held_back.first_needed(state.held, row)
+    return first if state.refined is None else min(first, recursive_fit.first_needed(state.refined))
 
 
 def _advance(config: IdentifierParameters, state: RpbsidState, rows: Rows, background: Background
@@ -147,8 +156,13 @@ def _advance(config: IdentifierParameters, state: RpbsidState, rows: Rows, backg
     if new.decimator is not None and new.decimated is not None:
         new, rows = _decimate(config, new, new.decimator, new.decimated, rows)
     done = rows.first
+    regressors = _regressors(config, len(config.inputs), len(config.outputs))
     while done < rows.until:
         until = rows.until
+        if new.held is not None:
+            left = rows.between(done, rows.until)
+            held = held_back.due(config, new.held, left, _learned(config, new), regressors, background)
+            new, until = new._replace(held=held), held_back.until(held, left, int(new.counts[USED]), regressors)
         if new.refined is not None:
             until = min(until, done + recursive_fit.until_chunk(new.refined))
         some = rows.between(done, until)
@@ -161,6 +175,12 @@ def _advance(config: IdentifierParameters, state: RpbsidState, rows: Rows, backg
     return new
 
 
+def _learned(config: IdentifierParameters, state: RpbsidState) -> held_back.Learned:
+    """Return what has been learned so far, as a view of the state."""
+    parts = state.memory if config.estimator == 'paper' else state.memory[:1]
+    return held_back.Learned(parts, state.scale, state.mean, float(state.scalars[WEIGHT]), int(state.counts[USED]))
+
+
 def _decimate(config: IdentifierParameters, state: RpbsidState, decimator: decimation.Decimator,
               log: SampleLog, rows: Rows) -> tuple[RpbsidState, Rows]:
     """Filter rows; return the new state and the rows that they add to the decimated log."""
@@ -168,9 +188,7 @@ def _decimate(config: IdentifierParameters, state: RpbsidState, decimator: decim
     decimator, kept, at = decimation.decimate(decimator, rows.u_y, config.decimation)
     r = log.width.inputs
     first = log.end
-    needed = first - prediction_check.MOST_ROWS
-    if state.refined is not None:
-        needed = min(needed, recursive_fit.first_needed(state.refined))
+    needed = min(first - prediction_check.MOST_ROWS, _first_read(state, first))
     absent = rows.missing[at]
     gap = np.zeros(len(at), dtype=np.bool_)
     gap[:1] = was_empty and first > 0
@@ -219,7 +237,9 @@ def latest(config: IdentifierParameters, state: RpbsidState, since_ns: int, dt: 
 
 
 def finish(config: IdentifierParameters, state: RpbsidState, background: Background = INLINE) -> RpbsidState:
-    """Take the result of the fit under way now, as no sample follows."""
+    """Take the results of the fit and of the prediction under way now, as no sample follows."""
+    if state.held is not None:
+        state = state._replace(held=held_back.delivered(state.held, background))
     if state.refined is None:
         return state
     return state._replace(refined=recursive_fit.delivered(state.refined, background))
@@ -229,6 +249,8 @@ def window_restart(config: IdentifierParameters, state: RpbsidState, background:
                    ) -> RpbsidState:
     """Empty the past window where samples are missing, so no regressor spans the gap; what was learnt is kept."""
     new = state.owned()
+    if new.held is not None:
+        new = new._replace(held=held_back.broken(new.held))
     new.counts[FILLED] = 0
     if config.estimator == 'paper':
         new.memory[-1][-1] = 0.0
@@ -250,6 +272,8 @@ def restart(config: IdentifierParameters, state: RpbsidState, background: Backgr
         new = new._replace(refined=recursive_fit.restart(new.refined))
     if not config.restart_on_event or not new.counts[USED]:
         return new
+    if new.held is not None:
+        new = new._replace(held=held_back.HeldBack())
     new.counts[USED] = 0
     new.scalars[[WEIGHT, WEIGHT2]] = 0.0
     new.scalars[[PRIOR, POWER]] = 1.0

@@ -187,7 +187,7 @@ def _identified_error(search: Search, values: Mapping[str, Any]) -> float:
     stamps = (np.arange(search.count) * round(search.dt * 1e9)).astype(np.int64)
     log = log_of(raw[:, :search.r], raw[:, search.r:], stamp_ns=stamps, gap=gap)
     kept, number = search.kept(config.decimation), np.arange(search.count)
-    state, powers = rpbsid.init(config), np.zeros((2, search.m))
+    state, powers = rpbsid.init(config)._replace(held=None), np.zeros((2, search.m))
     borders = [0, *(search.count * part // PARTS for part in range(PARTS // 2, PARTS + 1))]
     for before, now, later in zip(borders, borders[1:], borders[2:], strict=False):
         state = rpbsid.advance(config, state, log.rows(before, now))

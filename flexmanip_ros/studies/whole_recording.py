@@ -181,7 +181,7 @@ def _after(config: IdentifierParameters, signals: Signals, a: int, b: int, angle
            ) -> rpbsid.RpbsidState:
     """Return the state of the identifier after rows a to b."""
     log = log_of(signals.u[a:b], signals.y[a:b], angles, signals.stamp_ns[a:b], signals.gap[a:b], signals.missing[a:b])
-    return rpbsid.advance(config, rpbsid.init(config), log.rows(0, b - a))
+    return rpbsid.advance(config, rpbsid.init(config)._replace(held=None), log.rows(0, b - a))
 
 
 def _configurations(config: IdentifierParameters, state: rpbsid.RpbsidState, dt: float) -> Configurations | None:
