@@ -181,7 +181,8 @@ class ModelRequest:
                 0 if role is None else len(role.displacements),
                 float(np.ptp(identifier.turned)) if identifier.turned.size else 0.0,
                 since, filtered=filtered is not None)
-            found = held_back.judged(found, identifier.rpbsid.held, prediction_check.is_early(found, since))
+            found = held_back.judged(
+                found, identifier.rpbsid.held, config.outputs, prediction_check.is_early(found, since))
         if config.payload_method == 'block' and found is not None:
             payload = block_extraction.estimate(config, found, identifier.angles, identifier.configuration_range)
         if found is None:
@@ -192,7 +193,8 @@ class ModelRequest:
         return Estimate(
             self.stamp_ns, _overall(config, found.status, payload), found.model, oscillations, payload,
             excitation=found.excitation, condition=found.condition, singular_values=found.singular_values,
-            innovation_power=found.innovation_power, model_status=found.status, constant=found.constant)
+            innovation_power=found.innovation_power, model_status=found.status, constant=found.constant,
+            reason=found.reason)
 
 
 def with_payload(config: IdentifierParameters, estimate: Estimate, payload: Payload | None) -> Estimate:

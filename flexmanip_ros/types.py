@@ -198,3 +198,10 @@ class Estimate(NamedTuple):
     """(n,) constant term of the model's state equation: offsets of sensors, bends under gravity."""
     arm_parameters: tuple[ArmParameter, ...] = ()
     """The learned arm parameters, in the first estimate of each second only."""
+    reason: str = ''
+    """What gave the model its status, with numbers; empty where the status says it all."""
+
+    @property
+    def status_reason(self) -> str:
+        """``reason`` where ``status`` is that of the model."""
+        return self.reason if self.status is self.model_status else ''

@@ -209,7 +209,7 @@ def delivered(held: HeldBack, background: Background) -> HeldBack:
     return held._replace(latest=latest, total=total + latest, tried=tried)
 
 
-def judged(found: Identified, held: HeldBack | None, early: bool) -> Identified:
+def judged(found: Identified, held: HeldBack | None, outputs: tuple[str, ...], early: bool) -> Identified:
     """Return the model with the status that its forerunners give it: a subspace model that is TRACKING must have them.
 
     WARMING_UP: none has been tried yet, or they missed over half of an output ``early``. INCONSISTENT: later. A refined
@@ -219,17 +219,23 @@ def judged(found: Identified, held: HeldBack | None, early: bool) -> Identified:
     if found.refined or found.status is not Status.TRACKING or held is None:
         return found
     wrong = misses(held)
-    if wrong is None or (wrong and early):
-        return found._replace(status=Status.WARMING_UP)
-    return found._replace(status=Status.INCONSISTENT) if wrong else found
+    if wrong is None:
+        return found._replace(status=Status.WARMING_UP, reason='no samples were predicted before they were learned')
+    if not wrong.any():
+        return found
+    first = outputs[int(np.argmax(wrong))]
+    return found._replace(
+        status=Status.WARMING_UP if early else Status.INCONSISTENT,
+        reason=f'models of earlier samples missed over half of what {first} did next')
 
 
-def misses(held: HeldBack) -> bool | None:
-    """Whether models held back missed over half of an output, lately or in the mean; None: none was tried yet.
+def misses(held: HeldBack) -> NDArray[np.bool_] | None:
+    """(m,) outputs of which models held back missed over half, lately or in the mean; None: none was tried yet.
 
     An output that was silent in every stretch does not count.
     """
     if held.latest is None or held.total is None:
         return None
     lately, mean = (part[0] > MISSED * part[1] for part in (held.latest, held.total))
-    return bool(np.any(lately | (mean & held.tried)))
+    found: NDArray[np.bool_] = lately | (mean & held.tried)
+    return found

@@ -140,10 +140,16 @@ def publish(
     covariance = innovation.T @ innovation
     total = np.einsum('ij,ij->j', R[:, -m:], R[:, -m:]) / scalars[WEIGHT]
     unexplained = float(np.min(np.diag(covariance) / np.where(total > 0.0, total, np.inf)))
+    status = judge(used, d, condition, unexplained, too_low)
+    reasons = {
+        Status.WARMING_UP: f'{used} samples were learned of the {2 * d} that {d} regressors need',
+        Status.POORLY_EXCITED: 'one step ahead the model explains less than a tenth of every output',
+        Status.ORDER_TOO_LOW: f'the order adds {100.0 * float(realized.neglected.max()):.2g} % to the variance of an '
+                              'innovation'}
     return Identified(
         model=model, spread=spread, singular_values=realized.singular_values,
         excitation=excitation(realized.regression), condition=condition, innovation_power=power,
-        status=judge(used, d, condition, unexplained, too_low), samples=float(effective))
+        status=status, samples=float(effective), reason=reasons.get(status, ''))
 
 
 def raw_model(config: IdentifierParameters, realized: Realized, scale: Array, dt: float

@@ -261,15 +261,21 @@ def with_errors(found: Identified, errors: Array) -> Identified:
         (k, 1j * logs[k].imag * error / QUANTILE) for k, error in zip(chosen, errors.tolist(), strict=True)])
 
 
-def is_vague(oscillations: Sequence[Mode]) -> bool:
-    """Whether the frequency of a low lightly damped mode, or the damping ratio of any low mode, is too uncertain.
+def uncertain(oscillations: Sequence[Mode]) -> str:
+    """Return which frequency of a low lightly damped mode, or damping ratio of any low mode, is too uncertain, or ''.
 
     A mode damped above ``DAMPED`` may have an uncertain frequency, but no uncertain damping ratio: a mode that the
     samples do not contain may also drift to such a damping.
     """
-    light = [mode for mode in oscillations if abs(mode.damping_ratio) < DAMPED][:MOST_MODES]
-    return (any(mode.frequency_std_hz > VAGUE * mode.frequency_hz for mode in light)
-            or any(mode.damping_ratio_std > LOOSE for mode in oscillations[:MOST_MODES]))
+    for mode in [mode for mode in oscillations if abs(mode.damping_ratio) < DAMPED][:MOST_MODES]:
+        if mode.frequency_std_hz > VAGUE * mode.frequency_hz:
+            return (f'the frequency of the mode at {mode.frequency_hz:.3g} Hz has a standard deviation of '
+                    f'{100.0 * mode.frequency_std_hz / mode.frequency_hz:.2g} %')
+    for mode in oscillations[:MOST_MODES]:
+        if mode.damping_ratio_std > LOOSE:
+            return (f'the damping ratio of the mode at {mode.frequency_hz:.3g} Hz has a standard deviation of '
+                    f'{mode.damping_ratio_std:.2g}')
+    return ''
 
 
 def lacks_modes(oscillations: Sequence[Mode], bends: int) -> bool:
@@ -317,18 +323,20 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
     seen = rows.missing == 0
     unknown = Status.WARMING_UP if is_early(found, since) else Status.POORLY_EXCITED
     of_one = found.configurations is None
-    if bends and (lacks_modes(modes(found), bends) or (of_one and turned > MOST_TURN)):
-        return found._replace(status=unknown)
+    if bends and lacks_modes(modes(found), bends):
+        return found._replace(status=unknown, reason='the model has fewer modes than there are bends')
+    if bends and of_one and turned > MOST_TURN:
+        return found._replace(status=unknown, reason=f'the links have turned by {turned:.2g} rad while it was learned')
     if of_one:  # ``varying_model.judge`` has those of every configuration
         last = slice(max(0, len(rows) - round(found.samples)), None)
         if len(seen[last]) > STRETCHES * model.order:
             with np.errstate(over='ignore', invalid='ignore'):
                 share = unfitted(model, U[last], rows.y[last][:, chosen], seen[last])
             if not math.isfinite(share):
-                return found._replace(status=Status.INCONSISTENT)
+                return found._replace(status=Status.INCONSISTENT, reason='the model runs away')
             found = widened(found, share)
-        if is_vague(modes(found)):
-            return found._replace(status=unknown)
+        if reason := uncertain(modes(found)):
+            return found._replace(status=unknown, reason=reason)
     dt = found.model.dt
     stretch = max(2, min(round(AHEAD_S / dt), len(rows) // STRETCHES))
     horizon = max(2, min(round(AHEAD_S / dt), len(rows) // 3))
@@ -338,21 +346,26 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
         shares = missed(whole, U, rows.y, horizon, seen)
     heard = shares[~np.isnan(shares)]
     if heard.size and float(heard.mean()) > MISSED:
-        return found._replace(status=Status.INCONSISTENT)
+        return found._replace(status=Status.INCONSISTENT,
+                              reason='predictions 0.25 s ahead miss over half of the power of the outputs')
     if np.any(shares[chosen] > MISSED):
-        return found._replace(status=Status.ORDER_TOO_LOW)
+        worst = outputs[int(np.argmax(np.where(chosen & ~np.isnan(shares), shares, -1.0)))]
+        return found._replace(status=Status.ORDER_TOO_LOW,
+                              reason=f'predictions 0.25 s ahead miss over half of the power of {worst}')
     if filtered:
         return found
     with np.errstate(over='ignore', invalid='ignore'):
         error, chance = frequency_errors(model, U, rows.y[:, chosen], stretch, seen)
     if np.any(np.abs(error) - chance > OFF):
-        return found._replace(status=Status.INCONSISTENT)
+        return found._replace(status=Status.INCONSISTENT, reason='the last samples show another frequency')
     if not of_one or not np.all(np.isfinite(chance)):  # nan: too few stretches
         return found
     shown = np.abs(error)
     errors = shown + chance if bends and found.samples * dt > 2.0 * LAST_S else np.where(shown > chance, shown, 0.0)
     if errors.any():
         found = with_errors(found, errors)
-    if np.any(chance > UNSHOWN) or (errors.any() and is_vague(modes(found))):
-        return found._replace(status=unknown)
+    if np.any(chance > UNSHOWN):
+        return found._replace(status=unknown, reason='the last samples do not show the frequency of each mode')
+    if errors.any() and (reason := uncertain(modes(found))):
+        return found._replace(status=unknown, reason=reason)
     return found

@@ -329,6 +329,7 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float, rows
     early = refined is not None and (state.counts[USED] < recursive_fit.FIRST + recursive_fit.SOONEST
                                      or recursive_fit.is_first_under_way(refined))
     if found is not None and early and found.status is Status.TRACKING:
-        return found._replace(status=Status.WARMING_UP)  # a short past window gives a bias, and no fit has been made
+        return found._replace(  # a short past window gives a bias
+            status=Status.WARMING_UP, reason='the first fit has not been made yet')
     return found
 

@@ -44,6 +44,8 @@ class Identified(NamedTuple):
     of the spread."""
     configurations: AnyConfiguration | None = None
     """The model of every configuration, where ``model`` is that at one configuration."""
+    reason: str = ''
+    """What gave the model its status, with numbers; empty where the status says it all."""
 
     def at(self, angles: Array) -> Identified:
         """Return the model at other measured angles (2,) [rad]. Raises ModelError where it does not depend on them."""

@@ -166,9 +166,10 @@ def _answer(config: IdentifierParameters, summary: Summary, modes: Sequence[Mode
     if events:
         parts.append(f'<p>Captures and releases: {escape(events)}.</p>')
     look = '' if status is Status.TRACKING else ' class="changed"'
-    parts.append(f'<p{look}>Status: {escape(status_text(status, config))}.</p>')
+    parts.append(f'<p{look}>Status: {escape(status_text(status, config, summary.status_reason))}.</p>')
     if summary.model_status not in (summary.status, Status.TRACKING.name):
-        parts.append(f'<p class="changed">Model: {escape(status_text(Status[summary.model_status]))}.</p>')
+        model = status_text(Status[summary.model_status], known=summary.reason)
+        parts.append(f'<p class="changed">Model: {escape(model)}.</p>')
     found = [mode for mode in modes if np.isfinite(mode.frequency_hz)]
     if found:
         shown = [f'{mode.frequency_hz:.4g}'

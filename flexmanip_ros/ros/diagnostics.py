@@ -327,9 +327,11 @@ UNANNOUNCED = ('nothing is known of the payload and no capture was announced: pu
 """Log line for a payload interval of [0, inf] when no event was announced: what to do."""
 
 
-def status_line(config: IdentifierParameters, status: Status) -> str:
+def status_line(config: IdentifierParameters, status: Status, known: str = '') -> str:
     """Return a status with its meaning, its reason where that is known, and what to do about it."""
-    reason = f': {unobservable_reason(config)}' if status is Status.UNOBSERVABLE else ''
+    reason = f': {known}' if known else ''
+    if status is Status.UNOBSERVABLE:
+        reason = f': {unobservable_reason(config)}'
     return f'status {status.name}: {status.value}{reason}; {ADVICE[status]}'
 
 

@@ -37,9 +37,12 @@ MODEL_ADVICE = 'check inputs and outputs, or let --suggest choose order and wind
 """The same for a model of which no payload is asked, and which is INCONSISTENT."""
 
 
-def status_text(status: Status, config: IdentifierParameters | None = None) -> str:
-    """Return a status in words, with its reason where the configuration shows it, and what to do next."""
-    reason, advice = '', ADVICE[status]
+def status_text(status: Status, config: IdentifierParameters | None = None, known: str = '') -> str:
+    """Return a status in words, with its reason where that is known or the configuration shows it, and what to do next.
+
+    known: the reason that came with the estimate, if any.
+    """
+    reason, advice = f': {known}' if known else '', ADVICE[status]
     if status is Status.UNOBSERVABLE and config is not None:
         reason = f': {unobservable_reason(config)}'
     if status is Status.INCONSISTENT and config is not None and config.payload_method == 'none':
@@ -75,11 +78,13 @@ class Summary:
     """Models of whole stretches, where they are asked for; only then are they in the JSON."""
     model_status: str = 'TRACKING'
     """Status of the model, where ``status`` is that of the payload. It is not in the JSON."""
+    reason: str = ''
+    """What gave the model its status. It is not in the JSON."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the values as JSON has them: no NaN, no infinity, lists instead of tuples."""
-        return {item.name: _json(getattr(self, item.name)) for item in fields(self)
-                if item.name != 'model_status' and (item.name != 'smoothed' or self.smoothed is not None)}
+        left_out = {'model_status', 'reason', *(['smoothed'] if self.smoothed is None else [])}
+        return {item.name: _json(getattr(self, item.name)) for item in fields(self) if item.name not in left_out}
 
     def payload_text(self) -> str:
         """Return payload and interval in words; where they are not reliable, the reason and what to do next."""
@@ -98,6 +103,11 @@ class Summary:
         return f'{mass:.6g} kg, {interval}'
 
     @property
+    def status_reason(self) -> str:
+        """``reason`` where ``status`` is that of the model."""
+        return self.reason if self.status == self.model_status else ''
+
+    @property
     def held_since_s(self) -> float | None:
         """Time of the capture of what is held at the end [s]; None where nothing is held."""
         capture, release = self.capture_time_s, self.release_time_s
@@ -114,9 +124,10 @@ def result_rows(summary: Summary, config: IdentifierParameters, modes: Sequence[
               f'identified in {summary.wall_s:.2f} s'), *([('events', events)] if events else ())]
     found += [(name, f'at {time:.3f} s{", before the first sample" if time < 0.0 else ""}') for name, time in (
         ('capture', summary.capture_time_s), ('release', summary.release_time_s)) if time is not None]
-    found.append(('status', f'{summary.status}: {status_text(Status[summary.status], config)}'))
+    found.append(('status', f'{summary.status}: {status_text(Status[summary.status], config, summary.status_reason)}'))
     if summary.model_status not in (summary.status, Status.TRACKING.name):
-        found.append(('model', f'{summary.model_status}: {status_text(Status[summary.model_status])}'))
+        model = status_text(Status[summary.model_status], known=summary.reason)
+        found.append(('model', f'{summary.model_status}: {model}'))
     for k, mode in enumerate(modes):
         spread = f' +- {QUANTILE * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else ''
         found.append((f'mode {k + 1}',
@@ -148,6 +159,7 @@ def summarize(state: pipeline.State, estimate: Estimate | None, wall_s: float) -
         wall_s=wall_s,
         status='WARMING_UP' if estimate is None else estimate.status.name,
         model_status='WARMING_UP' if estimate is None else estimate.model_status.name,
+        reason='' if estimate is None else estimate.reason,
         frequencies_hz=tuple(mode.frequency_hz for mode in modes),
         damping_ratios=tuple(mode.damping_ratio for mode in modes),
         **({} if payload is None else _numbers(payload)),

@@ -46,7 +46,7 @@ def held(run: Run) -> held_back.HeldBack:
 def said(run: Run, early: bool = False) -> Status:
     found = rpbsid.identified(run.config, run.state, 1e-3)
     assert found is not None
-    return held_back.judged(found._replace(status=Status.TRACKING), held(run), early).status
+    return held_back.judged(found._replace(status=Status.TRACKING), held(run), run.config.outputs, early).status
 
 
 @pytest.mark.parametrize('choice', [{}, {'decimation': 2}, {'estimator': 'paper'}])
@@ -64,12 +64,20 @@ def test_a_model_whose_forerunner_missed_what_followed_is_not_tracking() -> None
     assert said(run, early=True) is Status.WARMING_UP
 
 
+def test_the_reason_names_the_output() -> None:
+    run = fed(CONFIG, *signals(4000, 3000))
+    found = rpbsid.identified(run.config, run.state, 1e-3)
+    assert found is not None
+    verdict = held_back.judged(found._replace(status=Status.TRACKING), held(run), run.config.outputs, early=False)
+    assert verdict.reason == 'models of earlier samples missed over half of what out0/position did next'
+
+
 def test_a_refined_model_is_judged_by_other_samples_than_those_of_its_fit_anyway() -> None:
     run = fed(CONFIG, *signals(4000, 3000))
     found = rpbsid.identified(run.config, run.state, 1e-3)
     assert found is not None
     refined = found._replace(status=Status.TRACKING, refined=True)
-    assert held_back.judged(refined, held(run), early=False) is refined
+    assert held_back.judged(refined, held(run), run.config.outputs, early=False) is refined
 
 
 def test_a_whole_stretch_must_have_been_predicted_first() -> None:
@@ -130,4 +138,4 @@ def test_where_nobody_asks_for_a_status_no_model_is_held_back() -> None:
     assert run.state.held is None
     found = rpbsid.identified(CONFIG, run.state, 1e-3)
     assert isinstance(found, Identified)
-    assert held_back.judged(found, None, early=False) is found
+    assert held_back.judged(found, None, CONFIG.outputs, early=False) is found

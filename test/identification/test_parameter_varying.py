@@ -382,7 +382,9 @@ def test_a_frequency_that_is_not_known_to_one_per_cent_is_not_tracking() -> None
     found = Identified(model, along, np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=1e4)
     largest = max(mode.frequency_std_hz / mode.frequency_hz for mode in modes(found))
     found = found._replace(spread=0.02 / largest * along)
-    assert prediction_check.judged(found, rows, ('a/position', 'b/position')).status is Status.POORLY_EXCITED
+    late = prediction_check.judged(found, rows, ('a/position', 'b/position'))
+    assert late.status is Status.POORLY_EXCITED
+    assert late.reason.startswith('the frequency of the mode at ')
     early = found._replace(samples=1000.0)
     assert prediction_check.judged(early, rows, ('a/position', 'b/position')).status is Status.WARMING_UP
 

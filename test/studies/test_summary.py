@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.studies.results import ADVICE, Summary, status_text
+from flexmanip_ros.studies.results import ADVICE, Summary, result_rows, status_text
 from flexmanip_ros.types import Status
 
 
@@ -45,6 +45,19 @@ def test_the_advice_for_a_model_without_a_payload_is_about_the_model():
 def test_signals_that_give_no_payload_are_said_with_the_reason():
     config = IdentifierParameters(angles=())
     assert 'angles does not name the position of two joints' in status_text(Status.UNOBSERVABLE, config)
+
+
+def test_the_reason_of_a_model_s_status_is_said_where_the_status_is_that_of_the_model():
+    reason = 'the frequency of the mode at 40 Hz has a standard deviation of 3 %'
+    model = replace(summary(Status.POORLY_EXCITED, 0.0, 0.0, None), payload_ci95_kg=None, reason=reason,
+                    model_status='POORLY_EXCITED')
+    config = IdentifierParameters(payload_method='none')
+    assert dict(result_rows(model, config, ()))['status'].startswith(
+        f'POORLY_EXCITED: the signals carry too little information: {reason}; ')
+    rows = dict(result_rows(replace(model, status='UNOBSERVABLE'), IdentifierParameters(angles=()), ()))
+    assert reason not in rows['status']
+    assert reason in rows['model']
+    assert 'reason' not in model.as_json()
 
 
 @pytest.mark.parametrize('status', Status)

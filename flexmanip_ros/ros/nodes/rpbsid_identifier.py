@@ -405,7 +405,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         log = self.get_logger()
         if self._logged.get('status') is not estimate.status:
             self._logged['status'] = estimate.status
-            log.info(status_line(self.config, estimate.status))
+            log.info(status_line(self.config, estimate.status, estimate.status_reason))
         payload, since_ns = estimate.payload, self.state.stamp_of(EventKind.CAPTURE)
         if payload is None:
             return
