@@ -1,4 +1,4 @@
-"""What every program shares: progress on a terminal, one line for an error, exit codes.
+"""What every program shares: progress on a terminal, a word while kernels compile, one line for an error, exit codes.
 
 The programs import numpy, scipy, numba, rosbags and matplotlib only after their arguments are parsed, so that
 ``--help`` and a mistake in the arguments are answered at once.
@@ -15,9 +15,12 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from flexmanip_ros.errors import FlexmanipError, ModelError
+
+if TYPE_CHECKING:
+    from multiprocessing.sharedctypes import Synchronized
 
 SUCCESS, DEFECT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 LONGEST = 1e9
@@ -29,6 +32,10 @@ UNINTERRUPTED = ('llvmlite.', 'flexmanip_ros.io.bag_writer')
 or ends the process with SIGSEGV; one between two writes to a recording leaves a file without its end."""
 TRACEBACK = 'FLEXMANIP_TRACEBACK'
 """Environment variable; where it is set, a defect prints its traceback."""
+PATIENCE = 2.0
+"""Duration of a compilation [s] from which on the user is told of it; a shorter one is not worth a line."""
+COMPILING = ('flexmanip_ros: compiling the kernels for this machine. It takes a minute or two, at the first use of '
+             'each method after an installation.')
 
 
 class Report:
@@ -126,6 +133,66 @@ def progress(words: str, unit: str) -> Iterator[Report]:
                    TimeRemainingColumn(), console=Console(stderr=True), transient=True)
     with bar:
         yield Report(bar, bar.add_task(words, total=None))
+
+
+def tell_compiling() -> None:
+    """Write ``COMPILING`` on stderr."""
+    print(COMPILING, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def announced(say: Callable[[], None] = tell_compiling) -> Iterator[None]:
+    """Tell the user at most once, on stderr unless ``say`` does otherwise, that kernels are being compiled.
+
+    `make setup` and `colcon build` compile all kernels beforehand (`warm_up`); a wheel is only files. numba then
+    compiles each kernel when it is called first, and keeps it on disk.
+    """
+    from numba.core import event
+
+    with event.install_listener('numba:compile', _listener(say)):
+        yield
+
+
+def announce_in_worker(told: 'Synchronized[bool]') -> None:
+    """Do as ``announced`` in a worker process. The workers of a pool share ``told``, so only one tells the user."""
+    from numba.core import event
+
+    def once() -> None:
+        with told.get_lock():
+            if told.value:
+                return
+            told.value = True
+        tell_compiling()
+
+    event.register('numba:compile', _listener(once))  # type: ignore[no-untyped-call]
+
+
+def _listener(say: Callable[[], None]) -> Any:
+    """Return a listener to numba's compilations that calls ``say`` once if one takes long."""
+    from numba.core import event
+
+    class Listener(event.Listener):
+        depth = 0  # the compilation of one kernel may contain that of another
+        told = False
+        timer: threading.Timer | None = None
+
+        def on_start(self, event: Any) -> None:
+            self.depth += 1
+            if self.depth == 1 and not self.told:
+                self.timer = threading.Timer(PATIENCE, self.tell)
+                self.timer.daemon = True
+                self.timer.start()
+
+        def on_end(self, event: Any) -> None:
+            self.depth -= 1
+            if self.depth == 0 and self.timer is not None:
+                self.timer.cancel()
+
+        def tell(self) -> None:
+            self.told = True
+            say()
+
+    return Listener()
 
 
 def print_error(prog: str, error: BaseException | str) -> None:

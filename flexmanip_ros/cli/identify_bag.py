@@ -86,7 +86,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(given: argparse.Namespace) -> int:
-    from flexmanip_ros.cli import first_use
     from flexmanip_ros.cli.replay import Request, identify, places
     from flexmanip_ros.io.bag import Topics
     from flexmanip_ros.io.outputs import check_apart
@@ -106,7 +105,7 @@ def _main(given: argparse.Namespace) -> int:
         detect=given.detect, validate_from=given.validate_from, horizon=given.horizon, smooth=given.smooth,
         output=given.output, report=given.report, save_arm=given.save_arm, configurations=given.configurations)
     sys.setswitchinterval(SWITCH_S)
-    with console.progress('identifying', 'messages') as progress, first_use.announced():
+    with console.progress('identifying', 'messages') as progress, console.announced():
         result = identify(request, progress)
     if not given.json:
         print('\n'.join(describe(result)))

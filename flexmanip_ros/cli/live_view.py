@@ -78,7 +78,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _play(options: argparse.Namespace) -> int:
-    from flexmanip_ros.cli import first_use
     from flexmanip_ros.io import bag
     from flexmanip_ros.payload import capture_detection
     from flexmanip_ros.view.screen import of_identifier, page
@@ -87,7 +86,7 @@ def _play(options: argparse.Namespace) -> int:
     config = load(IdentifierParameters, 'rpbsid_identifier', options.params, options.set)
     source = of_identifier(config, Path(options.bag).name)
     topics = bag.Topics(options.joint_states)
-    with console.progress('identifying', 'messages') as progress, first_use.announced():
+    with console.progress('identifying', 'messages') as progress, console.announced():
         items: Iterable[pipeline.Item] = bag.read_blocks(options.bag, topics, progress)
         if config.payload_method != 'none' and not bag.event_topics(options.bag, topics):
             with suppress(ParameterError):  # as in identify_bag, captures are looked for in signals that can show them

@@ -79,7 +79,6 @@ def configurations(given: argparse.Namespace) -> tuple[PlantParameters, Excitati
 
 
 def _main(given: argparse.Namespace) -> int:
-    from flexmanip_ros.cli import first_use
     from flexmanip_ros.io.bag_writer import BagWriter
     from flexmanip_ros.io.outputs import check_place, write_text
     from flexmanip_ros.simulation import excitation, simulator
@@ -97,7 +96,7 @@ def _main(given: argparse.Namespace) -> int:
     if target.exists():
         raise BagError(f"'{target}' exists already", 'remove it or give another name')
     check_place(truth_path)
-    with console.progress('simulating', 'samples'), first_use.announced():
+    with console.progress('simulating', 'samples'), console.announced():
         trajectory = simulator.simulate(plant, excitation.sequence(torque, count), events, START_NS)
     with (console.progress('writing', 'samples') as progress, BagWriter(target, flush_period=None) as writer):
         for k, item in enumerate(simulator.records(trajectory, events)):

@@ -21,7 +21,7 @@ from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from flexmanip_ros.cli import first_use
+from flexmanip_ros.cli import console
 from flexmanip_ros.errors import BagError, FlexmanipError
 from flexmanip_ros.io import bag
 from flexmanip_ros.parameters import IdentifierParameters
@@ -133,7 +133,7 @@ def compute(work: Work, tasks: Iterable[Task], count: int | None) -> Iterator[Ou
 
 def serial(work: Work, tasks: Iterable[Task]) -> Iterator[Outcome]:
     """Compute the tasks in this process, one after the other."""
-    with first_use.announced():
+    with console.announced():
         for task in tasks:
             try:
                 result = work(task)
@@ -205,7 +205,7 @@ def _serve(told: Synchronized[bool]) -> None:
     """Set up a worker: it ignores Ctrl-C, which its parent handles, and ends when its parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.set_threshold(GARBAGE)
-    first_use.announce_in_worker(told)
+    console.announce_in_worker(told)
     warnings.simplefilter('ignore')  # as in the parent: numbers out of range are told by the status
     parent = multiprocessing.parent_process()
     if parent is not None:

@@ -30,6 +30,7 @@ from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import JointState
 
+from flexmanip_ros.cli import console
 from flexmanip_ros.errors import FlexmanipError, ParameterError
 from flexmanip_ros.io import cdr
 from flexmanip_ros.messages import Diagnostics
@@ -153,8 +154,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
             self.get_logger().warning(arm)
         elif arm:
             self.get_logger().info(arm)
-        from flexmanip_ros.cli import first_use  # it loads numba, which --help does not need
-        with first_use.announced(lambda: self.get_logger().warning(first_use.WORDS)):
+        with console.announced(lambda: self.get_logger().warning(console.COMPILING)):
             self.start()
         if not self._entities_made:  # last: messages that come while kernels load would overflow the queues
             self.make_entities()

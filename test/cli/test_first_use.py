@@ -9,7 +9,7 @@ import pytest
 from numba import njit
 from numba.core import event
 
-from flexmanip_ros.cli import first_use
+from flexmanip_ros.cli import console
 
 
 def compile_something() -> None:
@@ -24,20 +24,20 @@ def compile_something() -> None:
 def test_it_is_told_once_however_many_kernels_are_compiled(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(first_use, 'PATIENCE', 1e-4)
-    with first_use.announced():
+    monkeypatch.setattr(console, 'PATIENCE', 1e-4)
+    with console.announced():
         compile_something()
         compile_something()
     said = capsys.readouterr()
-    assert said.err.splitlines() == [first_use.WORDS]
+    assert said.err.splitlines() == [console.COMPILING]
     assert said.out == ''  # which belongs to the results
 
 
 def test_a_short_compilation_is_not_worth_a_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(first_use, 'PATIENCE', 120.0)
-    with first_use.announced():
+    monkeypatch.setattr(console, 'PATIENCE', 120.0)
+    with console.announced():
         compile_something()
     assert capsys.readouterr().err == ''
 
@@ -45,21 +45,21 @@ def test_a_short_compilation_is_not_worth_a_line(
 def test_what_is_compiled_already_is_not_told(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(first_use, 'PATIENCE', 1e-4)
-    with first_use.announced():
+    monkeypatch.setattr(console, 'PATIENCE', 1e-4)
+    with console.announced():
         pass
     compile_something()  # after the program has ended
     assert capsys.readouterr().err == ''
 
 
 def test_of_many_workers_one_speaks(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(first_use, 'PATIENCE', 1e-4)
+    monkeypatch.setattr(console, 'PATIENCE', 1e-4)
     told = multiprocessing.get_context('spawn').Value(c_bool, False)
     before = list(event._registered['numba:compile'])
     try:
-        first_use.announce_in_worker(told)
-        first_use.announce_in_worker(told)
+        console.announce_in_worker(told)
+        console.announce_in_worker(told)
         compile_something()
     finally:
         event._registered['numba:compile'][:] = before
-    assert capsys.readouterr().err.splitlines() == [first_use.WORDS]
+    assert capsys.readouterr().err.splitlines() == [console.COMPILING]

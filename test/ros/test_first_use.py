@@ -20,7 +20,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from flexmanip_ros import messages
-from flexmanip_ros.cli import first_use
+from flexmanip_ros.cli import console
 from flexmanip_ros.cli.suggest import file_text
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import yaml_text
@@ -122,10 +122,10 @@ def test_a_node_logs_its_arm_and_where_it_comes_from(
 
 def test_a_node_that_compiles_kernels_says_so_while_it_does(
         ros: Ros, log: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(first_use, 'PATIENCE', 1e-4)
+    monkeypatch.setattr(console, 'PATIENCE', 1e-4)
     monkeypatch.setattr(CaptureTrigger, 'start', lambda node: njit(lambda x: x + 1.0)(1.0))
     ros.managed(CaptureTrigger(context=ros.context))
-    assert log(first_use.WORDS).index(first_use.WORDS) < log('ready: ').index('ready: ')
+    assert log(console.COMPILING).index(console.COMPILING) < log('ready: ').index('ready: ')
 
 
 def test_nodes_of_two_arms_have_diagnostics_of_their_own(ros: Ros) -> None:
