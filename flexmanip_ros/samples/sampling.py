@@ -39,7 +39,7 @@ UNKNOWN_TORQUE = 3.0
 """Limit of (change of a torque over missing samples / its peak) x number of missing samples; beyond it the torque
 counts as unknown. At 1 kHz, the limit leaves the vibration of a 6 Hz mode uncertain by some 3 % of what a step of the
 peak torque excites."""
-CHUNK = 32
+REGRESSED = 32
 """Rows of which it is asked at once whether their samples jitter as their stamps do."""
 NEVER = 6.0
 """Standard deviations of a stamp that chance does not reach in years: 1e-9."""
@@ -212,10 +212,12 @@ def _regular(config: IdentifierParameters, clock: Clock, log: SampleLog, block: 
         return none, clock
     assert clock.last_ns is not None
     assert clock.channels is not None
-    stamps = block.stamp_ns[first:]
+    # with jitter at most ``REGRESSED`` rows are taken at once, and no more are looked at
+    taken = slice(first, len(block.stamp_ns) if clock.jitter.is_sharp else min(first + REGRESSED, len(block.stamp_ns)))
+    stamps = block.stamp_ns[taken]
     intervals = np.diff(stamps, prepend=np.int64(clock.last_ns))
     finite = np.logical_and.reduce([
-        np.isfinite(columns(block, places, slice(first, len(block.stamp_ns)))).all(axis=1)
+        np.isfinite(columns(block, places, taken)).all(axis=1)
         for places in (clock.channels.u, clock.channels.y, clock.channels.angles)])
     usable = finite & (intervals > 0) & (intervals * 1e-9 <= config.max_time_jump)  # no far jump
     count = len(stamps) if usable.all() else int(np.argmin(usable))
@@ -230,7 +232,7 @@ def _regular(config: IdentifierParameters, clock: Clock, log: SampleLog, block: 
             break
         clock = clock.after(interval)
         times.append(stamp - round(clock.jitter.correction_ns))
-        if not clock.jitter.is_sharp and (log.end + len(times)) % CHUNK == 0:
+        if not clock.jitter.is_sharp and (log.end + len(times)) % REGRESSED == 0:
             break  # ``_judged``
     return np.array(times, dtype=np.int64), clock
 
@@ -384,10 +386,10 @@ def _next(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sampl
 
 def _judged(clock: Clock, log: SampleLog, before: int) -> Clock:
     """Return the clock after the rows from ``before`` on, if they complete rows that tell more of its jitter."""
-    until = log.end - log.end % CHUNK
-    if clock.jitter.is_sharp or until <= before or until - CHUNK < log.start:
+    until = log.end - log.end % REGRESSED
+    if clock.jitter.is_sharp or until <= before or until - REGRESSED < log.start:
         return clock
-    rows = log.rows(until - CHUNK, until)
+    rows = log.rows(until - REGRESSED, until)
     if rows.gap[1:].any() or rows.missing.any():
         return clock
     return clock._replace(jitter=clock.jitter.judged(rows.stamp_ns, np.hstack([rows.y, rows.angles, rows.rates])))
@@ -395,7 +397,7 @@ def _judged(clock: Clock, log: SampleLog, before: int) -> Clock:
 
 def first_needed(log: SampleLog) -> int:
     """Return the first row that will be read again."""
-    return max(log.end - CHUNK, log.start)
+    return max(log.end - REGRESSED, log.start)
 
 
 def _after_gap(config: IdentifierParameters, log: SampleLog, clock: Clock, raw: Sample, lost: int
@@ -425,14 +427,18 @@ def _is_torque_unknown(clock: Clock, raw: Sample, absent: int) -> bool:
     return bool(np.any(absent * change > UNKNOWN_TORQUE * np.maximum(clock.peak, np.abs(raw.u))))
 
 
-def _filled(log: SampleLog, clock: Clock, raw: Sample, absent: int, delay: int, late_ns: float) -> SampleLog:
-    """Append the rows of samples that never came, interpolated between the one before and ``raw``."""
+def _filled(log: SampleLog, clock: Clock, raw: Sample, absent: int, delay: int, correction_ns: float
+            ) -> SampleLog:
+    """Append the rows of samples that never came, interpolated between the one before and ``raw``.
+
+    correction_ns: by how much the stamp of ``raw`` is later than its sample [ns].
+    """
     before = clock.latest
     assert before is not None
     number = np.arange(1, absent + 1)
     share = (number / (absent + 1))[:, None]
     stamps = before.stamp_ns + (raw.stamp_ns - before.stamp_ns) * number // (absent + 1)
     u, y, angles, rates = (np.asarray(a + share * (b - a)) for a, b in zip(before[1:], raw[1:], strict=True))
-    late = clock.jitter.correction_ns + share[:, 0] * (late_ns - clock.jitter.correction_ns)
+    late = clock.jitter.correction_ns + share[:, 0] * (correction_ns - clock.jitter.correction_ns)
     return log.append(stamps, u, y, angles, np.zeros(absent, dtype=np.bool_), delay, number, rates,
                       stamps - np.round(late).astype(np.int64))

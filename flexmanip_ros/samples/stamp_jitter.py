@@ -2,8 +2,8 @@
 
 The interval between two stamps is the sample time T plus e. Stamps that are off by white noise of variance v have
 E(e_k e_k-1) = -v, and a publisher whose period varies by q has E(e^2) = 2 v + q. In this local level model the steady
-Kalman filter is exponential smoothing (Muth 1960): of what a stamp differs from the prediction, the share a goes on
-to all later stamps, a^2 / (1 - a) = q / v.
+Kalman filter is exponential smoothing (Muth 1960) with the gain a: of what a stamp differs from its prediction, the
+part a goes on to all later stamps, a^2 / (1 - a) = q / v.
 
 The rest is either in the stamps alone (a robot samples regularly, its driver stamps what arrives) or in the samples
 too (a loop that wakes up late samples late). The signals tell: where a sample is late by d, it is y' d off.
@@ -21,8 +21,8 @@ from flexmanip_ros.types import Array
 
 SHARP_NS = 1e3
 """Jitter [ns] up to which stamps are taken as they are: it moves a mode of 100 Hz by 6e-4 rad."""
-LEAST_SHARE = 0.01
-"""Least share a. It leaves 7 % of the jitter, and follows a clock that is set right by 500 parts in a million to 0.05
+LEAST_GAIN = 0.01
+"""Least gain a. It leaves 7 % of the jitter, and follows a clock that is set right by 500 parts in a million to 0.05
 sample times."""
 MEMORY = 10_000
 """Intervals over which the moments of e are averaged."""
@@ -30,7 +30,7 @@ LOSS = 1e-3
 """Probability of a lost message that is assumed where jitter could explain an interval as well."""
 CHANCE = 3.0
 """Standard deviations of the moments that may be chance."""
-PRIOR = 10.0
+PRIOR_INFORMATION = 10.0
 """Information on the share of the jitter that is in the samples, before any: 1/2 +- 1/2. That is 4, times 2.63, as
 successive fourth differences are correlated (sum of their squared autocorrelations)."""
 
@@ -50,7 +50,6 @@ class Jitter(NamedTuple):
     """Mean of the products of successive e [ns^2]."""
     intervals: int = 0
     """Number of intervals in these means, at most ``MEMORY``."""
-
     in_samples: float = 0.0
     """Sum of the products of what the signals show and what jitter of the samples would add to them, ``regress``."""
     information: float = 0.0
@@ -67,12 +66,12 @@ class Jitter(NamedTuple):
 
         The share in the samples is the coefficient of a linear regression, with a prior (ridge).
         """
-        share = (self.in_samples + 0.5 * PRIOR) / (self.information + PRIOR)
+        share = (self.in_samples + 0.5 * PRIOR_INFORMATION) / (self.information + PRIOR_INFORMATION)
         return (1.0 - min(max(share, 0.0), 1.0)) * self.late_ns
 
     @property
-    def share(self) -> float:
-        """Share a of what a stamp differs from the prediction that goes on to later stamps, 0 to 1."""
+    def gain(self) -> float:
+        """Gain a of the smoothing, 0 to 1; 1: each stamp is taken as it is."""
         if self.is_sharp:
             return 1.0
         # chance: where q = 0, 2 product / square scatters by sqrt(2 / intervals) (Bartlett 1946)
@@ -80,29 +79,28 @@ class Jitter(NamedTuple):
         v = 0.5 * (self.square - q)
         ratio = q / v if v > 0.0 else math.inf
         steady = 0.5 * (math.sqrt(ratio * (ratio + 4.0)) - ratio) if ratio < 1e3 else 1.0
-        return max(steady, LEAST_SHARE, 1.0 / (self.since + 1.0))
+        return max(steady, LEAST_GAIN, 1.0 / (self.since + 1.0))
 
     @property
     def std_ns(self) -> float:
         """Standard deviation of a stamp from its prediction [ns]."""
-        return math.sqrt(self.square / (1.0 + (1.0 - self.share) ** 2))
+        return math.sqrt(self.square / (1.0 + (1.0 - self.gain) ** 2))
 
     def ahead_ns(self, interval_ns: float, period_ns: float) -> float:
         """Return by how much the next stamp is later than predicted [ns], if no message was lost."""
         return interval_ns + self.late_ns - period_ns
 
-    def most_ns(self, period_ns: float, share: float = 0.5) -> float:
+    def most_ns(self, period_ns: float, regular: float = 0.5) -> float:
         """Return how late a stamp may be until a lost message explains it better [ns].
 
-        Without jitter that is ``share`` of the sample time T, half of it. Jitter of variance s^2 adds s^2 / T ln(1 /
-        LOSS): there both explanations have the same posterior probability.
+        Without jitter that is ``regular`` times the sample time T, half of it. Jitter of variance s^2 adds s^2 / T
+        times ln(1 / LOSS): there both explanations have the same posterior probability.
         """
-        return share * period_ns - self.std_ns ** 2 / period_ns * math.log(LOSS)
+        return regular * period_ns - self.std_ns ** 2 / period_ns * math.log(LOSS)
 
     def after(self, interval_ns: float, steps: int, period_ns: float) -> Jitter:
         """Return the state after an interval of ``steps`` sample times; more than one: messages were lost."""
-        share = self.share
-        late = (1.0 - share) * self.ahead_ns(interval_ns, steps * period_ns)
+        late = (1.0 - self.gain) * self.ahead_ns(interval_ns, steps * period_ns)
         if steps != 1:
             return self._replace(late_ns=late, since=self.since + 1, deviation_ns=0.0)
         e = min(interval_ns - period_ns, period_ns)  # one interval far from all others may not count for ever

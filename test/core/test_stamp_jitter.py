@@ -68,7 +68,7 @@ def test_the_stamps_of_a_loop_that_sleeps_for_a_sample_time_are_the_instants() -
     intervals = np.random.default_rng(2).normal(T, 0.1 * T, COUNT).astype(np.int64)
     stamps = START + np.cumsum(intervals)
     clock, rows = _rows(_block(stamps, stamps))
-    assert clock.jitter.share > 0.8
+    assert clock.jitter.gain > 0.8
     assert _off_us(rows.time_ns, stamps) < 10.0
 
 
