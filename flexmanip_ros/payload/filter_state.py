@@ -22,10 +22,12 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
 # Elements of ``counts``.
 (HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, MOVED, SEEN, BEFORE,
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
- IN_SPECTRUM, SPECTRA, LINEARIZED) = range(23)
+ IN_SPECTRUM, SPECTRA, LINEARIZED, EFFORTS) = range(24)
 # Elements of ``score``.
 (SHIFT, DOUBT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES, SANDWICH,
- WHITENED, MISFIT, EMPTY_MISFIT) = range(13)
+ WHITENED, MISFIT, EMPTY_MISFIT, VOLUME, LIKELIHOOD) = range(15)
+# Values of ``counts[EFFORTS]``: whether the white part of the reported efforts is noise or acts on the arm.
+NOISY, COMPARED, EXACT, CONFIRMED = range(4)
 
 
 class FilterState(NamedTuple):
@@ -43,7 +45,7 @@ class FilterState(NamedTuple):
     """(m, 3, TONES) of its fourth differences: both states of Goertzel's filter, mean power over that of white noise
     of unit variance."""
     counts: NDArray[np.int64]
-    """(23,) counters and flags (1: yes).
+    """(24,) counters and flags (1: yes).
 
     Filter: HELD: the arm holds something; LEARNED: it was seen empty before; SEEN: samples measured, at most 2000;
     SINCE_EVENT: those since the last event; IN_A_ROW: those since the last one that was missing; SINCE_NOISE: samples
@@ -53,10 +55,11 @@ class FilterState(NamedTuple):
     ITERATING: an iteration is under way; ITERATED, MEASURED: samples that it has read, and those of them that were not
     missing; BEFORE: samples of the last accepted iteration; REJECTED: steps rejected since then; AGAIN: the next one
     reads the same samples, as it has not converged; TRIED: iterations over the same samples so far; REFITS: fits begun
-    again since the event; LINEARIZED: the iteration
-    carries a linearized Kalman filter."""
+    again since the event; LINEARIZED: the iteration carries a linearized Kalman filter; EFFORTS: NOISY: their white
+    part is taken for noise; COMPARED: the iteration takes
+    it for true; EXACT: it fits better so; CONFIRMED: it does not."""
     score: Array
-    """(13,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
+    """(15,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
     squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
     EMPTY_ARM_BIAS: payload that the arm seemed to hold before the event, when it was empty, in the filter's standard
     deviations; EXCESS_BIAS: the same over the deviation that its moves give, with the error of the inertia, and that
@@ -66,7 +69,9 @@ class FilterState(NamedTuple):
     see ``judge_moves``; SANDWICH: factor, at least 1, by which the variances of the last fit of the empty arm are too
     small, see ``sandwich``; WHITENED: sum of the squared normalised innovations of the linearized filter in
     this iteration; MISFIT: that of the last accepted iteration, without a linearized filter its COST;
-    EMPTY_MISFIT: innovation power over white noise before the last capture."""
+    EMPTY_MISFIT: innovation power over white noise before the last capture; VOLUME: sum of the logarithms of the
+    variances of the innovations of the linearized filter over those of the noise, in this iteration; LIKELIHOOD: -2
+    times the logarithm of the likelihood of the last accepted iteration."""
     moved: Array
     """(nx, 2) mean and variance of payload and arm parameters when their moves were last judged, with the process noise
     since then in the variance; see ``judge_moves``."""
@@ -95,9 +100,11 @@ class FilterState(NamedTuple):
     """(nx,) that gradient at the end of the last batch of samples."""
     B: Array
     """(nx, nx) sum over the batches of b b', b the part of the gradient that comes from one batch; lower triangle."""
-    friction: Array
-    """(2, L) variance of the share of Coulomb friction, summed over the samples since its process noise was added: in
-    the filter, and in the linearized one."""
+    torque_noise: Array
+    """(2, L) variance of the torque of each joint [N^2 m^2], summed over the samples since its process noise was added:
+    in the filter, and in the linearized one."""
+    effort_noise: Array
+    """(L,) variance of the white part of each reported effort [N^2 m^2]."""
     innovation: Array
     """(m, 2) the latest, and its variance before the update."""
     power: Array
@@ -108,11 +115,11 @@ def memory(nx: int, m: int, links: int) -> FilterState:
     """Allocate for nx states, m sensors and the joints of ``links`` links."""
     return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)),
-        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(23, dtype=np.int64), score=np.zeros(13),
+        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(24, dtype=np.int64), score=np.zeros(15),
         moved=np.zeros((nx, 2)), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
         normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, 2 * nx + 1)),
         N=np.zeros((nx, nx)), g=np.zeros(nx), batch=np.zeros(nx), B=np.zeros((nx, nx)),
-        friction=np.zeros((2, links)), innovation=np.zeros((m, 2)), power=np.ones(m))
+        torque_noise=np.zeros((2, links)), effort_noise=np.zeros(links), innovation=np.zeros((m, 2)), power=np.ones(m))
 
 
 def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
@@ -121,12 +128,12 @@ def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
     horizon False: what belongs to a complete moving horizon is shared; then only an event writes it.
     """
     (x, S, noise, recent, spectrum, counts, score, moved, x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g,
-     batch, B, friction, innovation, power) = state
+     batch, B, torque_noise, effort_noise, innovation, power) = state
     if horizon or counts[STORED] < HORIZON:
         x0, S0, xi = x0.copy(), S0.copy(), xi.copy()
         accepted, normal, gradient = accepted.copy(), normal.copy(), gradient.copy()
         xr, Sr, N, g, batch, B = xr.copy(), Sr.copy(), N.copy(), g.copy(), batch.copy(), B.copy()
     return FilterState(
         x.copy(), S.copy(), noise.copy(), recent.copy(), spectrum.copy(), counts.copy(), score.copy(), moved.copy(),
-        x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g, batch, B, friction.copy(), innovation.copy(),
-        power.copy())
+        x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g, batch, B, torque_noise.copy(),
+        effort_noise.copy(), innovation.copy(), power.copy())

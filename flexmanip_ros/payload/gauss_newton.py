@@ -13,10 +13,15 @@ from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, fact
 from flexmanip_ros.payload.filter_state import (
     AGAIN,
     BEFORE,
+    COMPARED,
+    CONFIRMED,
     COST,
     COST_BEFORE,
     DOUBT,
+    EFFECTIVE,
+    EFFORTS,
     ENOUGH,
+    EXACT,
     EXCESS_BIAS,
     FIT,
     HELD,
@@ -24,21 +29,26 @@ from flexmanip_ros.payload.filter_state import (
     ITERATED,
     ITERATING,
     LAMBDA,
+    LEVEL,
+    LIKELIHOOD,
     LINEARIZED,
     MEASURED,
     MISFIT,
+    NOISY,
     POWER,
     REJECTED,
     SANDWICH,
+    SEEN,
     SHIFT,
     SLOW,
     STORED,
     TRIED,
     USED,
+    VOLUME,
     WHITENED,
     FilterState,
 )
-from flexmanip_ros.payload.measurement_update import BATCH, MeasurementModel
+from flexmanip_ros.payload.measurement_update import BATCH, OVERLAP, MeasurementModel, white_variance
 from flexmanip_ros.payload.process_model import (
     COULOMB,
     INERTIA,
@@ -81,9 +91,11 @@ FRICTION = 3.0
 
 
 @inner
-def has_friction(motion: ProcessModel, m: FilterState) -> bool:
-    """Whether a joint has Coulomb friction beyond chance."""
+def has_torque_noise(motion: ProcessModel, m: FilterState) -> bool:
+    """Whether torques have process noise: that of the reported efforts, or of Coulomb friction beyond chance."""
     first, found = m.x.size - motion.kind.size, False
+    for i in range(m.effort_noise.size):
+        found |= m.effort_noise[i] > 0.0 and m.counts[EFFORTS] != EXACT
     for c in range(motion.kind.size):
         if motion.kind[c] == COULOMB:
             found |= m.x[first + c] > FRICTION * np.sqrt(dot(m.S[first + c], m.S[first + c]))
@@ -96,9 +108,10 @@ def begin_iteration(motion: ProcessModel, m: FilterState) -> None:
     nx, used = m.x.size, m.counts[USED]
     m.score[COST] = 0.0
     m.score[WHITENED] = 0.0
-    m.counts[LINEARIZED] = has_friction(motion, m)
+    m.score[VOLUME] = 0.0
+    m.counts[LINEARIZED] = has_torque_noise(motion, m)
     for i in range(motion.effort.size):
-        m.friction[1, i] = 0.0
+        m.torque_noise[1, i] = 0.0
     for i in range(nx):
         m.g[i] = 0.0
         m.batch[i] = 0.0
@@ -114,6 +127,10 @@ def begin_iteration(motion: ProcessModel, m: FilterState) -> None:
             m.B[i, c] = 0.0
     for i in range(m.noise.shape[0]):
         m.noise[i, FIT] = 0.0
+        if m.counts[HELD] == 0:
+            # the first guess, from few samples, may be below the white noise that three deviations allow by now
+            least = 1.0 - 3.0 * np.sqrt(2.0 * OVERLAP / max(m.counts[SEEN], 1))
+            m.noise[i, EFFECTIVE] = max(m.noise[i, EFFECTIVE], least * white_variance(m.noise[i], LEVEL))
     m.counts[ITERATED] = 0
     m.counts[MEASURED] = 0
     m.counts[ITERATING] = 1
@@ -135,7 +152,9 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
              and m.score[COST_BEFORE] - m.score[COST] < enough)
     m.counts[BEFORE] = m.counts[ITERATED]
     m.score[COST_BEFORE] = m.score[COST]
-    m.score[MISFIT] = m.score[WHITENED] if m.counts[LINEARIZED] == 1 else m.score[COST]
+    rejected = are_efforts_noisy(m)
+    if not rejected:
+        m.score[MISFIT] = m.score[WHITENED] if m.counts[LINEARIZED] == 1 else m.score[COST]
     m.score[LAMBDA] = m.score[LAMBDA] / FADING if m.score[LAMBDA] > FADED * first_damping(m) else 0.0
     m.counts[REJECTED] = 0
     m.counts[ITERATING] = 0
@@ -144,7 +163,10 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
     gained = dot(m.g, m.gradient)
     m.counts[AGAIN] = 0 if fits or still or gained < enough else 1
     m.counts[TRIED] = m.counts[TRIED] + 1 if m.counts[AGAIN] else 0
-    if m.counts[ITERATED] == m.counts[STORED]:
+    if rejected:  # the filter has gone on with noisy efforts
+        m.counts[AGAIN] = 0
+        close_horizon(motion, sensors, m)
+    elif m.counts[ITERATED] == m.counts[STORED]:
         if not factor_information(m.N):
             return False
         for i in range(m.noise.shape[0]):
@@ -159,7 +181,9 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
             forward(m.N, m.Sr[i, :used])
             for c in range(nx):
                 m.S[i, c] = m.Sr[i, c] if c < used else 0.0
-        if m.counts[LINEARIZED] == 1 and part == 1.0:  # it is right near the minimum
+        # its linearization holds near the minimum, and where its innovations are those of the noise
+        explains = m.score[WHITENED] < FITS * (nx + m.noise.shape[0] * m.counts[MEASURED])
+        if m.counts[LINEARIZED] == 1 and (part == 1.0 or explains):
             for i in range(nx):
                 m.x[i] = m.xr[i] + m.Sr[i, 2 * used]
                 for c in range(used):
@@ -175,6 +199,27 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
                 and phase_std(motion, m, sensors.period * m.counts[ITERATED]) < LINEAR):
             close_horizon(motion, sensors, m)
     return True
+
+
+@inner
+def are_efforts_noisy(m: FilterState) -> bool:
+    """Compare efforts that act on the arm as reported with noisy ones; True: the noisy ones fit better.
+
+    The likelihood is that of the innovations of the linearized filter, at the greatest over a factor of all variances:
+    -2 log p = sum of log(variance / r) + N log(mean of innovation^2 r / variance) of each sensor.
+    """
+    if m.counts[LINEARIZED] == 0:
+        return False
+    count = max(m.counts[MEASURED], 1)
+    value = m.score[VOLUME]
+    for i in range(m.noise.shape[0]):
+        value += count * np.log(max(m.noise[i, FIT], 1e-300) / count)
+    compared = m.counts[EFFORTS] == COMPARED
+    if compared:
+        m.counts[EFFORTS] = EXACT if value < m.score[LIKELIHOOD] else CONFIRMED
+        m.score[SHIFT] = AT_REST  # the next iteration is due
+    m.score[LIKELIHOOD] = value
+    return bool(compared and m.counts[EFFORTS] == CONFIRMED)
 
 
 @inner
@@ -282,13 +327,22 @@ def condition(x: Array, S: Array, row: int, value: float, f: Array) -> None:
 def close_horizon(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> None:
     """Close the horizon; where an empty arm shows no late signal, fit its samples again with the given delays.
 
+    Where its efforts have a white part, that was taken for noise. Another iteration takes it for true.
+
     What the shape functions lack looks like a delay of some 0.1 ms. A delay that is learned and not there shifts the
     mass that is caught later, by 0.5 % for 0.1 ms.
     """
-    again = (m.counts[HELD] == 0 and m.counts[STORED] < HORIZON
-             and evidence_against_delays(motion, sensors, m) > VERY_STRONG)
+    empty = m.counts[HELD] == 0 and m.counts[STORED] < HORIZON
+    again = empty and evidence_against_delays(motion, sensors, m) > VERY_STRONG
+    if empty and not again and m.counts[EFFORTS] == NOISY and m.counts[LINEARIZED] == 1 and m.effort_noise.any():
+        m.counts[EFFORTS] = COMPARED
+        m.counts[ITERATING] = 0
+        m.counts[AGAIN] = 1
+        return
     if not again:
         m.counts[STORED] = HORIZON
+        if m.counts[EFFORTS] == COMPARED:  # not to its end
+            m.counts[EFFORTS] = NOISY
         if m.counts[HELD] == 0:
             m.score[EXCESS_BIAS] = 0.0
         return

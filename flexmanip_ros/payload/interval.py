@@ -18,11 +18,12 @@ from flexmanip_ros.payload.filter_state import (
     MOVED,
     MOVES,
     REFITS,
+    SEEN,
     SHIFT,
     STORED,
 )
 from flexmanip_ros.payload.gauss_newton import FITS
-from flexmanip_ros.payload.measurement_update import MeasurementModel, misfit, white_variance
+from flexmanip_ros.payload.measurement_update import OVERLAP, MeasurementModel, misfit, white_variance
 from flexmanip_ros.payload.moving_horizon import MOST_BIAS
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import QUANTILE, Array, Payload, Status
@@ -217,8 +218,9 @@ def misjudged(noise: Array, counts: Integers, block: int) -> float:
     explains if the samples are independent, and 1 from what chance explains if only blocks are independent.
     """
     # a mean of N squares scatters by sqrt(2 / N); 2.5 times that is exceeded by chance in 0.6 % of the blocks
-    most = 2.5 * math.sqrt(2.0 / max(counts[BLOCKS], 1))
-    least = most / math.sqrt(block)
+    blocks, of_white = max(counts[BLOCKS], 1), 2.0 * OVERLAP / max(counts[SEEN], 1)
+    most = 2.5 * math.sqrt(2.0 / blocks + of_white)
+    least = 2.5 * math.sqrt(2.0 / (blocks * block) + of_white)
     excess = 0.0
     for i in range(noise.shape[0]):
         excess = max(excess, noise[i, EFFECTIVE] / white_variance(noise[i], LEVEL) - 1.0)

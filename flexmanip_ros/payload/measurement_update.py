@@ -60,6 +60,9 @@ HANN = np.sin(np.pi * (np.arange(SPECTRUM) + 0.5) / SPECTRUM) ** 2
 """Hann's window."""
 SHARE = 1.0 / (np.sum(HANN ** 2) * (2.0 * np.sin(np.pi * TONE)) ** 8)
 """One over the mean power, at each frequency, of the fourth differences of white noise of unit variance."""
+OVERLAP = 2.63
+"""Samples for each independent fourth difference: 1 + 2 sum of r^2, r = 56, 28, 8 and 1 / 70 their correlation at lags
+1 to 4. So the variance of white noise by N of them has the relative deviation sqrt(2 OVERLAP / N)."""
 MEDIAN_STD = 1.25 / np.sqrt(TONES)
 """Relative standard deviation of the median of the powers in one spectrum of white noise: sqrt(pi / 2) of a mean's."""
 
@@ -83,13 +86,18 @@ class MeasurementModel(NamedTuple):
     """Efforts that a torque depends on."""
     block: int
     """Samples in a block: a tenth of the slowest vibration."""
+    kicks_every: int
+    """Samples after which the process noise of the torques is added: a fortieth of the slowest vibration, as they shake
+    faster modes, too. After a tenth, the moves of mass and stiffness were three times what their variances say."""
     noise_every: int
     """Samples between additions of process noise, a hundredth of ``memory_time``: one costs as much as three
     samples."""
     diffusion: Array
     """(nx,) standard deviation that each state gains in the square root of a second."""
     noise: Array
-    """(nx, nx + L) scratch for the process noise: of each state, and of the friction of each joint."""
+    """(nx, nx) scratch for the process noise of each state."""
+    kicks: Array
+    """(nx, L) scratch for that of the torque of each joint."""
     f: Array
     """(nx,) scratch."""
     wide: Array
@@ -97,7 +105,9 @@ class MeasurementModel(NamedTuple):
     L: Array
     """(nx, nx) scratch."""
     W: Array
-    """(nx, 2 nx + L) scratch."""
+    """(nx, 2 nx) scratch."""
+    W_kicks: Array
+    """(nx, nx + L) scratch."""
 
 
 @inner
@@ -232,7 +242,7 @@ def take_spectrum(m: FilterState, i: int, difference: float) -> None:
     median = 0.5 * (first[TONES // 2 - 1] + first[TONES // 2])
     # a mean of N powers is chi-square with 2 N degrees of freedom, whose median is below its mean (Wilson and Hilferty)
     level = median / (1.0 - 1.0 / (9.0 * count)) ** 3
-    m.noise[i, LEVEL] = level * (1.0 + 3.0 * MEDIAN_STD / np.sqrt(count))
+    m.noise[i, LEVEL] = level * np.exp(3.0 * MEDIAN_STD / np.sqrt(count))
 
 
 @inner

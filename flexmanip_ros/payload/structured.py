@@ -16,9 +16,9 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured_model
 from flexmanip_ros.payload.capture_detection_kernel import filtered
-from flexmanip_ros.payload.interval import POWER_LIMIT, inertia_error, innovation_power, judge, moves
+from flexmanip_ros.payload.interval import POWER_LIMIT, innovation_power, judge
 from flexmanip_ros.payload.measurement_update import MeasurementModel
-from flexmanip_ros.payload.moving_horizon import STARTS, keep_possible, seems_to_hold
+from flexmanip_ros.payload.moving_horizon import MOST_BIAS, STARTS, excess_bias, keep_possible
 from flexmanip_ros.payload.process_model import Kind, predict
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.samples.sample_log import Rows
@@ -153,25 +153,25 @@ def _change(config: IdentifierParameters, model: Model, sensors: MeasurementMode
     if kind is EventKind.CAPTURE:
         m.score[mem.EMPTY_MISFIT], _ = innovation_power(sensors, m)
         if not held:
-            _forget_payload(config, model, m)  # the arm was empty: its payload was the bias of the model
+            _forget_payload(model, m)  # the arm was empty: its payload was the bias of the model
         opened[payload, 0] = structured_model.body_std(config, model)[0]  # a point first
         m.x[payload] += structured_model.body_mean(config, model)[0]
         m.counts[mem.REFITS] = 0
         m.counts[mem.LEARNED] = m.counts[mem.SEEN] >= UNTAUGHT
         m.counts[mem.HELD] = 1
     else:
-        _forget_payload(config, model, m)
+        _forget_payload(model, m)
         opened[payload, 0] = structured_model.EMPTY_STD * model.motion.scale + 0.3 * before
         m.counts[mem.HELD] = 0
     m.S[:] = structured_model.widen(m.S, np.hstack([columns, opened]))
-    if mem.ENOUGH > m.counts[mem.SEEN] >= UNTAUGHT:  # the variances are still guessed from the first samples
+    if m.counts[mem.STORED] < mem.HORIZON and m.counts[mem.SEEN] >= UNTAUGHT:  # guessed from the first samples
         structured_model.guess_noise(model, m.noise)
     structured_model.shake(model, m)
     m.noise[:, mem.AT_EVENT] = m.noise[:, mem.EFFECTIVE]
     _set_arrival_cost(model, m)
 
 
-def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterState) -> None:
+def _forget_payload(model: Model, m: mem.FilterState) -> None:
     """Condition an empty arm on a payload of zero; forget a payload that is let go."""
     payload = model.payload
     if not m.counts[mem.HELD]:
@@ -181,18 +181,12 @@ def _forget_payload(config: IdentifierParameters, model: Model, m: mem.FilterSta
             if m.counts[mem.SINCE_EVENT] > mem.ENOUGH:
                 m.score[mem.EMPTY_ARM_BIAS] = m.x[payload] / math.sqrt(square)
             if m.counts[mem.SINCE_EVENT] > mem.ENOUGH or m.counts[mem.REFITS]:  # a fit begun again is doubted sooner
-                m.score[mem.EXCESS_BIAS] = _excess_bias(config, model, m)
+                m.score[mem.EXCESS_BIAS] = excess_bias(model.motion, m)
             gain = m.S @ f / square
             m.x[:] -= gain * m.x[payload]
             m.S[:] -= np.outer(gain, f)
     m.x[payload:payload + model.body] = 0.0
     m.S[payload:payload + model.body] = 0.0
-
-
-def _excess_bias(config: IdentifierParameters, model: Model, m: mem.FilterState) -> float:
-    """Return the mass that an empty arm seems to hold, in deviations by its moves and the error of its inertia."""
-    f = m.S[model.payload]
-    return float(m.x[model.payload]) / math.hypot(math.sqrt(moves(m) * float(f @ f)), inertia_error(config, model, 0.0))
 
 
 def _set_arrival_cost(model: Model, m: mem.FilterState) -> None:
@@ -246,7 +240,7 @@ def _fit_empty_arm_again(config: IdentifierParameters, model: Model, m: mem.Filt
     """
     p = slice(model.payload, m.x.size)
     learned, known = m.x[p].copy(), ~m.S[p].any(axis=1)
-    bias = _excess_bias(config, model, m)
+    bias = excess_bias(model.motion, m)
     structured_model.first(config, model, m, y)
     given = np.where(known, learned, m.x[p])
     m.x[p] = learned
@@ -275,6 +269,8 @@ def _refit(m: mem.FilterState) -> None:
     for counter in (mem.ITERATED, mem.ITERATING, mem.SINCE_NOISE, mem.IN_BATCH, mem.BEFORE, mem.REJECTED, mem.AGAIN,
                     mem.TRIED):
         m.counts[counter] = 0
+    if m.counts[mem.EFFORTS] == mem.COMPARED:
+        m.counts[mem.EFFORTS] = mem.NOISY
     m.score[mem.LAMBDA] = 0.0
 
 
@@ -286,7 +282,7 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     dt = float(np.median(np.diff(rows.stamp_ns) * 1e-9))
     m = mem.memory(2 * model.motion.arm.stiffness.size + model.motion.kind.size, len(model.roles),
                    model.motion.effort.size)
-    m.noise[:] = structured_model.noise(model, Y)
+    m.noise[:] = structured_model.noise(model, Y, rows.missing)
     structured_model.first(config, model, m, Y[0])
     structured_model.freeze(config, model, np.mean(rows.angles, axis=0))
     if state.white.size:
@@ -543,7 +539,7 @@ def is_off(state: StructuredState) -> bool:
     assert state.model is not None
     assert state.sensors is not None
     m = state.memory
-    if m is None or m.counts[mem.STORED] < mem.HORIZON or not seems_to_hold(state.model.motion, m):
+    if m is None or m.counts[mem.STORED] < mem.HORIZON or abs(excess_bias(state.model.motion, m)) <= MOST_BIAS:
         return False
     return innovation_power(state.sensors, m)[0] < POWER_LIMIT
 

@@ -33,12 +33,12 @@ def event(seconds: float, kind: EventKind = EventKind.CAPTURE) -> CaptureEvent:
 def record(
         seconds: float, events: tuple[CaptureEvent, ...] = (), degrees=(60.0, 45.0), payload: float = 20.0,
         outputs: tuple[str, ...] = BENDS + RATES, seed: int = 1, arm: ArmParameters = ARM, scale: float = 1.0,
-        peaks: tuple[float, float] = (10.0, 5.0), **plant,
+        peaks: tuple[float, float] = (10.0, 5.0), added: np.ndarray | float = 0.0, **plant,
 ) -> Rows:
-    """Samples at 1 kHz under the paper's square waves, 40 dB."""
+    """Samples at 1 kHz under the paper's square waves and the torques ``added``, 40 dB."""
     parameters = PlantParameters(
         initial_angles=tuple(np.radians(degrees)), payload_mass=payload, seed=seed, arm=arm, **plant)
-    efforts = scale * excitation.sequence(ExcitationParameters(amplitude=peaks), round(1000 * seconds))
+    efforts = scale * excitation.sequence(ExcitationParameters(amplitude=peaks), round(1000 * seconds)) + added
     trajectory = simulator.simulate(parameters, efforts, events)
     columns = {'position': trajectory.position, 'velocity': trajectory.velocity}
     parts = [name.split('/') for name in outputs]
