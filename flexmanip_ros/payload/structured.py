@@ -282,7 +282,7 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     dt = float(np.median(np.diff(rows.stamp_ns) * 1e-9))
     m = mem.memory(2 * model.motion.arm.stiffness.size + model.motion.kind.size, len(model.roles),
                    model.motion.effort.size)
-    m.noise[:] = structured_model.noise(model, Y, rows.missing)
+    m.noise[:] = structured_model.noise(model, Y)
     structured_model.first(config, model, m, Y[0])
     structured_model.freeze(config, model, np.mean(rows.angles, axis=0))
     if state.white.size:

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from flexmanip_ros.arm.capture import tip_jacobian
 from flexmanip_ros.arm.late_torque import efforts_needed
@@ -316,8 +315,6 @@ OTHER_JUMP = 0.01
 """Share of the rate jump at a capture that an impulse at the tip does not explain, as the shape functions are few."""
 RATE_NOISE = 10.0
 """Variance of rates over their white noise, as long as none is measured: rates show the modes that are left out."""
-LEAST_DIFFERENCES = 8
-"""Number of fourth differences without a missing sample from which on the others are left out."""
 FLOORS = {Quantity.ANGLE: 1e-6, Quantity.ANGLE_RATE: 1e-5, Quantity.BEND: 1e-7, Quantity.BEND_RATE: 1e-6}
 """Least standard deviations of a sensor [rad, rad/s, m, m/s], as no signal is exact."""
 
@@ -374,15 +371,9 @@ def _least_rotor(arm: Manipulator) -> Array:
     return np.array([-0.25 / float(row @ np.linalg.solve(M, row)) for row in arm.joint])
 
 
-def noise(model: Model, Y: Array, missing: NDArray[np.int64]) -> Array:
-    """Return a first guess of every sensor's noise, as ``FilterState.noise``, from its first samples Y (N, m).
-
-    missing: (N,) above zero where a sample is missing; the reading between its neighbours has less noise.
-    """
+def noise(model: Model, Y: Array) -> Array:
+    """Return a first guess of every sensor's noise, as ``FilterState.noise``, from its first samples Y (N, m)."""
     differences = np.diff(Y, n=4, axis=0)
-    measured = np.convolve(missing > 0, np.ones(5), 'valid') == 0.0
-    if measured.sum() >= LEAST_DIFFERENCES:
-        differences = differences[measured]
     white = (1.4826 * np.median(np.abs(differences), axis=0)) ** 2 / 70
     rows = np.zeros((len(model.roles), 11))
     rows[:, mem.LEVEL] = np.inf  # no spectrum yet
