@@ -267,6 +267,13 @@ def add_torque_noise(motion: ProcessModel, sensors: MeasurementModel, variance: 
 
 
 @inner
+def kick(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> None:
+    """Add the process noise of the torques since it was last added to the filter; ``predict`` was just called."""
+    add_torque_noise(motion, sensors, m.torque_noise[0])
+    absorb_noise(m.S, sensors.kicks, sensors.W_kicks)
+
+
+@inner
 def find_effort_noise(sensors: MeasurementModel, m: FilterState, table: Array) -> None:
     """Estimate the variance of the white part of each reported effort since the event, by its fourth differences.
 
@@ -441,8 +448,11 @@ def keep_possible(motion: ProcessModel, m: FilterState, chance: float) -> None:
 
 
 @kernel
-def diffuse(sensors: MeasurementModel, m: FilterState, duration: float) -> None:
-    """Add the process noise of the states since it was last added, which keeps the memory finite after the horizon."""
+def diffuse(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, duration: float) -> None:
+    """Add the process noise since it was last added, which keeps the memory finite once the horizon has closed.
+
+    That of the torques is here that of a friction within chance. ``predict`` was just called.
+    """
     m.score[NOW] += duration
     if m.counts[STORED] < HORIZON or m.counts[SINCE_NOISE] < sensors.noise_every:
         return
@@ -454,6 +464,7 @@ def diffuse(sensors: MeasurementModel, m: FilterState, duration: float) -> None:
             sensors.noise[i, i] = sensors.diffusion[i] * root
         m.moved[i, 1] += sensors.noise[i, i] * sensors.noise[i, i]
     absorb_noise(m.S, sensors.noise, sensors.W)
+    kick(motion, sensors, m)
     m.counts[SINCE_NOISE] = 0
     m.score[NOW] = 0.0
 
@@ -483,8 +494,7 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     gather_torque_noise(motion, m, m.torque_noise[0], m.counts[EFFORTS] != EXACT)
     told = m.counts[HELD] == 1 or m.counts[STORED] >= TELLS  # before that an empty arm's friction may be anything
     if told and m.counts[SINCE_NOISE] % sensors.kicks_every == 0 and has_torque_noise(motion, m):
-        add_torque_noise(motion, sensors, m.torque_noise[0])
-        absorb_noise(m.S, sensors.kicks, sensors.W_kicks)
+        kick(motion, sensors, m)
     if not iterate(motion, sensors, m, table):
         return False
     keep_possible(motion, m, CHANCE)
@@ -492,5 +502,5 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
         if strays(motion, sensors, m):
             return False
         judge_moves(sensors, m)
-    diffuse(sensors, m, duration)
+    diffuse(motion, sensors, m, duration)
     return True
