@@ -25,7 +25,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
  IN_SPECTRUM, SPECTRA, LINEARIZED, EFFORTS) = range(24)
 # Elements of ``score``.
 (SHIFT, DOUBT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES, SANDWICH,
- WHITENED, MISFIT, EMPTY_MISFIT, VOLUME, LIKELIHOOD) = range(15)
+ WHITENED, MISFIT, EMPTY_MISFIT, LOG_DETERMINANT, LIKELIHOOD) = range(15)
 # Values of ``counts[EFFORTS]``: whether the white part of the reported efforts is noise or acts on the arm.
 NOISY, COMPARED, EXACT, CONFIRMED = range(4)
 
@@ -56,8 +56,8 @@ class FilterState(NamedTuple):
     missing; BEFORE: samples of the last accepted iteration; REJECTED: steps rejected since then; AGAIN: the next one
     reads the same samples, as it has not converged; TRIED: iterations over the same samples so far; REFITS: fits begun
     again since the event; LINEARIZED: the iteration carries a linearized Kalman filter; EFFORTS: NOISY: their white
-    part is taken for noise; COMPARED: the iteration takes
-    it for true; EXACT: it fits better so; CONFIRMED: it does not."""
+    part is taken for noise; COMPARED: the iteration takes it for true; EXACT: it fits better so; CONFIRMED: it does
+    not."""
     score: Array
     """(15,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
     squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
@@ -69,8 +69,8 @@ class FilterState(NamedTuple):
     see ``judge_moves``; SANDWICH: factor, at least 1, by which the variances of the last fit of the empty arm are too
     small, see ``sandwich``; WHITENED: sum of the squared normalised innovations of the linearized filter in
     this iteration; MISFIT: that of the last accepted iteration, without a linearized filter its COST;
-    EMPTY_MISFIT: innovation power over white noise before the last capture; VOLUME: sum of the logarithms of the
-    variances of the innovations of the linearized filter over those of the noise, in this iteration; LIKELIHOOD: -2
+    EMPTY_MISFIT: innovation power over white noise before the last capture; LOG_DETERMINANT: sum of the logarithms of
+    the variances of the innovations of the linearized filter over those of the noise, in this iteration; LIKELIHOOD: -2
     times the logarithm of the likelihood of the last accepted iteration."""
     moved: Array
     """(nx, 2) mean and variance of payload and arm parameters when their moves were last judged, with the process noise

@@ -32,6 +32,7 @@ from flexmanip_ros.payload.filter_state import (
     LEVEL,
     LIKELIHOOD,
     LINEARIZED,
+    LOG_DETERMINANT,
     MEASURED,
     MISFIT,
     NOISY,
@@ -44,7 +45,6 @@ from flexmanip_ros.payload.filter_state import (
     STORED,
     TRIED,
     USED,
-    VOLUME,
     WHITENED,
     FilterState,
 )
@@ -108,7 +108,7 @@ def begin_iteration(motion: ProcessModel, m: FilterState) -> None:
     nx, used = m.x.size, m.counts[USED]
     m.score[COST] = 0.0
     m.score[WHITENED] = 0.0
-    m.score[VOLUME] = 0.0
+    m.score[LOG_DETERMINANT] = 0.0
     m.counts[LINEARIZED] = has_torque_noise(motion, m)
     for i in range(motion.effort.size):
         m.torque_noise[1, i] = 0.0
@@ -211,7 +211,7 @@ def are_efforts_noisy(m: FilterState) -> bool:
     if m.counts[LINEARIZED] == 0:
         return False
     count = max(m.counts[MEASURED], 1)
-    value = m.score[VOLUME]
+    value = m.score[LOG_DETERMINANT]
     for i in range(m.noise.shape[0]):
         value += count * np.log(max(m.noise[i, FIT], 1e-300) / count)
     compared = m.counts[EFFORTS] == COMPARED

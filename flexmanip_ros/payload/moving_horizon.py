@@ -36,6 +36,7 @@ from flexmanip_ros.payload.filter_state import (
     LAMBDA,
     LEARNED,
     LINEARIZED,
+    LOG_DETERMINANT,
     MEASURED,
     MISFIT,
     MOVED,
@@ -50,7 +51,6 @@ from flexmanip_ros.payload.filter_state import (
     STORED,
     TRIED,
     USED,
-    VOLUME,
     WHITE,
     WHITENED,
     FilterState,
@@ -231,7 +231,7 @@ def update_linearized(m: FilterState, f: Array, e: float, r: float) -> float:
         for c in range(used):
             m.Sr[i, used + c] -= gain * own[c]
     m.score[WHITENED] += e * e / variance
-    m.score[VOLUME] += np.log(variance / r)
+    m.score[LOG_DETERMINANT] += np.log(variance / r)
     return float(e * e / variance * r)
 
 
