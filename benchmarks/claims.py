@@ -333,6 +333,16 @@ def payload_mismatched(rows: list[dict[str, Any]]) -> Claims:
 """docs/lab/payload.md, "Model check": estimates at 25 dB whose interval misses the truth untold, with the check [%]."""
 
 
+def payload_random_arms(result: dict[str, Any]) -> Claims:
+    """Whatever arm, torques and sensors are, at most 5 % of the payloads are TRACKING and outside their interval."""
+    yield Claim('TRACKING', result['tracking_percent'], 85.0, unit='%')  # the first 0.3 s are mostly not
+    yield Claim('TRACKING and outside', result['wrong_and_tracking_percent'], high=5.0, unit='%')
+    yield Claim('runs TRACKING at the end', result['tracking_at_the_end'] / result['runs'], 0.9)
+    yield covers('these: inside their interval', result['inside_at_the_end'] / max(result['tracking_at_the_end'], 1),
+                 result['tracking_at_the_end'])
+    yield Claim('these: error, median', result['median_error_percent'], high=0.7, unit='%')
+
+
 def payload_speed(rows: list[dict[str, Any]]) -> Claims:
     """`structured` takes 60 us or less a sample at kappa = 3; its ratio to the bare plant is shown."""
     for row in rows:
@@ -479,7 +489,8 @@ CLAIMS: dict[str, Callable[[Any], Claims]] = {
         identification_missions, identification_moving_arm, identification_paper_settings, identification_soak,
         identification_speed, identification_status, identification_suggested, identification_ten_minutes,
         io_bag_reading, payload_block, payload_bounds, payload_coverage, payload_elements, payload_jitter,
-        payload_linear, payload_minute, payload_mismatched, payload_real_arms, payload_speed, plant_convergence,
+        payload_linear, payload_minute, payload_mismatched, payload_random_arms, payload_real_arms,
+        payload_speed, plant_convergence,
         plant_hour, plant_live, plant_segment_chain, plant_speed, replay_speed,
         ros_fuzz, ros_latency, ros_loss, ros_signals, setup_time, study_scaling)}
 
