@@ -115,15 +115,15 @@ def records(case: Case) -> Iterator[JointRecord | CaptureEvent]:
         yield item._replace(velocity=velocity if case.rates == 'joints' else velocity[:0])
 
 
-def one(run: int) -> dict[str, Any]:
+def judged(run: int) -> dict[str, Any]:
     """Return what a run says: shares of its estimates, and the last one."""
     case = draw(run)
     truth = case.plant.payload_mass
     found: list[Payload] = [
         estimate.payload for estimate in pipeline.run(told(case), records(case))
         if estimate.payload is not None and estimate.stamp_ns > case.capture.stamp_ns + round(JUDGED_S * 1e9)]
-    trusted = np.array([one.status is Status.TRACKING for one in found])
-    inside = np.array([one.lower <= truth <= one.upper for one in found])
+    trusted = np.array([payload.status is Status.TRACKING for payload in found])
+    inside = np.array([payload.lower <= truth <= payload.upper for payload in found])
     last = found[-1]
     return {'run': run, 'tracking': float(trusted.mean()), 'wrong': float((trusted & ~inside).mean()),
             'status': last.status.value, 'inside': bool(inside[-1]),
@@ -139,7 +139,7 @@ def main() -> None:
     given = parser.parse_args()
     rows = []
     with ProcessPoolExecutor() as pool:
-        for row in pool.map(one, range(given.first, given.first + given.runs)):
+        for row in pool.map(judged, range(given.first, given.first + given.runs)):
             rows.append(row)
             print(row, flush=True)
     at_end = [row for row in rows if row['status'] == Status.TRACKING.value]
