@@ -20,7 +20,7 @@ from parts.real_arms import CAPTURE, SAMPLES, plant_of, told
 from flexmanip_ros import pipeline
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import CaptureEvent, JointRecord, Payload, Status
+from flexmanip_ros.types import CaptureEvent, JointRecord, Payload
 
 ARMS = ('ideal', 'friction and rotor', 'all')
 CASES = (('none', 0.0), ('stamps', 0.05), ('stamps', 0.1), ('stamps', 0.2), ('loop', 0.1))
@@ -73,10 +73,9 @@ def main() -> None:
                 plant, rng = plant_of(arm, seed), np.random.default_rng(1000 + seed)
                 items = (looped if kind == 'loop' else stamped)(plant, efforts, std_ms, rng)
                 found = estimates(plant, items)
-                trusted = [one.status is Status.TRACKING for one in found]
-                inside = [one.lower <= plant.payload_mass <= one.upper for one in found]
-                tracking.append(np.mean(trusted))
-                wrong.append(np.mean(np.array(trusted) & ~np.array(inside)))
+                trusted, outside = trials.trusted_and_outside(found, plant.payload_mass)
+                tracking.append(trusted)
+                wrong.append(outside)
                 errors.append(100.0 * abs(found[-1].mass / plant.payload_mass - 1.0))
         rows.append({'jitter': kind, 'std_ms': std_ms, 'runs': len(errors),
                      'tracking_percent': round(100.0 * float(np.mean(tracking)), 1),

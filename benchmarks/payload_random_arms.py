@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from parts import payload_trials as trials
-from parts.real_arms import IDEAL, SINES
+from parts.real_arms import IDEAL, SINES, told
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
@@ -31,6 +31,7 @@ AFTER_S = 4.0
 JUDGED_S = 0.1
 """Seconds from the capture to the first estimate that is counted."""
 FIRST_SEED = 77_000
+"""Seed of the first draw, far from those of the noise, which are the numbers of the runs."""
 
 
 class Case(NamedTuple):
@@ -93,10 +94,9 @@ def draw(run: int) -> Case:
     return Case(plant, torques, rates, CaptureEvent(round(at_s * 1000) * 1_000_000, EventKind.CAPTURE))
 
 
-def told(case: Case) -> IdentifierParameters:
+def configuration(case: Case) -> IdentifierParameters:
     """Return the parameters of an estimator that is told the ideal arm, its base, and which signals there are."""
-    base = {name: getattr(case.plant.arm, name) for name in ('base_mass', 'base_inertia', 'base_joint_offset')}
-    config = IdentifierParameters(arm=replace(IDEAL, **base), model_rate=0.1)
+    config = told(case.plant)
     if case.rates != 'joints':
         return config
     return replace(config, outputs=tuple(name for name in config.outputs if 'velocity' not in name))
@@ -120,13 +120,12 @@ def judged(run: int) -> dict[str, Any]:
     case = draw(run)
     truth = case.plant.payload_mass
     found: list[Payload] = [
-        estimate.payload for estimate in pipeline.run(told(case), records(case))
+        estimate.payload for estimate in pipeline.run(configuration(case), records(case))
         if estimate.payload is not None and estimate.stamp_ns > case.capture.stamp_ns + round(JUDGED_S * 1e9)]
-    trusted = np.array([payload.status is Status.TRACKING for payload in found])
-    inside = np.array([payload.lower <= truth <= payload.upper for payload in found])
+    tracking, wrong = trials.trusted_and_outside(found, truth)
     last = found[-1]
-    return {'run': run, 'tracking': float(trusted.mean()), 'wrong': float((trusted & ~inside).mean()),
-            'status': last.status.value, 'inside': bool(inside[-1]),
+    return {'run': run, 'tracking': tracking, 'wrong': wrong,
+            'status': last.status.value, 'inside': last.lower <= truth <= last.upper,
             'error_percent': round(100.0 * (last.mass / truth - 1.0), 3),
             'half_width_percent': round(50.0 * min(last.upper - last.lower, 1e6) / truth, 3)}
 

@@ -12,7 +12,7 @@ import numpy as np
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, PayloadParameters
 from flexmanip_ros.payload import structured
 from flexmanip_ros.samples.sample_log import Rows, log_of
-from flexmanip_ros.types import CaptureEvent, EventKind, Payload
+from flexmanip_ros.types import CaptureEvent, EventKind, Payload, Status
 
 RESULTS = Path(__file__).resolve().parents[1] / 'results'
 BENDS = ('link1_bend/position', 'link2_bend/position')
@@ -55,6 +55,13 @@ def follow(
         start = capture + mark
         found.append(structured.estimate(config, state))
     return Trial(truth, tuple(found))
+
+
+def trusted_and_outside(found: Sequence[Payload], truth: float) -> tuple[float, float]:
+    """Return the share of payloads that are TRACKING, and of those that are TRACKING without the truth [kg] inside."""
+    trusted = np.array([one.status is Status.TRACKING for one in found])
+    inside = np.array([one.lower <= truth <= one.upper for one in found])
+    return float(np.mean(trusted)), float(np.mean(trusted & ~inside))
 
 
 def errors(trials: Sequence[Trial]) -> np.ndarray:

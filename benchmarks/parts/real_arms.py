@@ -65,5 +65,5 @@ def simulate(plant: PlantParameters) -> simulator.Trajectory:
 
 def told(plant: PlantParameters) -> IdentifierParameters:
     """Return the parameters of an estimator that is told the ideal arm and the constants of the base."""
-    arm = replace(IDEAL, base_mass=plant.arm.base_mass, base_inertia=plant.arm.base_inertia)
-    return IdentifierParameters(arm=arm, model_rate=0.1)
+    base = {name: getattr(plant.arm, name) for name in ('base_mass', 'base_inertia', 'base_joint_offset')}
+    return IdentifierParameters(arm=replace(IDEAL, **base), model_rate=0.1)

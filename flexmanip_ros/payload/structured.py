@@ -181,7 +181,7 @@ def _forget_payload(model: Model, m: mem.FilterState) -> None:
             if m.counts[mem.SINCE_EVENT] > mem.ENOUGH:
                 m.score[mem.EMPTY_ARM_BIAS] = m.x[payload] / math.sqrt(square)
             if m.counts[mem.SINCE_EVENT] > mem.ENOUGH or m.counts[mem.REFITS]:  # a fit begun again is doubted sooner
-                # the bias of a fit stays until the one that was begun for it has read enough to be done
+                # the bias for which a fit was begun again counts until that fit closes its horizon, which clears it
                 m.score[mem.EXCESS_BIAS] = max(m.score[mem.EXCESS_BIAS], excess_bias(model.motion, m), key=abs)
             gain = m.S @ f / square
             m.x[:] -= gain * m.x[payload]
