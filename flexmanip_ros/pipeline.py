@@ -39,6 +39,9 @@ microsecond a row."""
 ABSORB_GROUP = 16_000
 """Number of rows that wait in ``absorb``, which makes no estimate on the way. Both estimators take some tenths of a
 second for them. A fit takes up to 0.1 s, so it seldom makes the other estimator wait."""
+TRAILING = 8_000
+"""Number of rows by which the identifier is behind the payload's estimator in ``absorb``. Its first fits take a second
+longer than those of the payload, which need not wait for them."""
 EARLY_STAMP = 0.1
 """Fraction of the sample time by which the predicted stamp of a sample may be before the instant of an estimate, while
 the node still expects the estimate with this sample. The prediction uses the mean interval and may be too early. The
@@ -157,7 +160,7 @@ def absorb(config: IdentifierParameters, items: Iterable[Item], background: Back
             begun = state.payload.cursor if ahead is None else ahead.request.until
             if state.log.end - begun >= ABSORB_GROUP:
                 state = _joined(state, ahead, background)
-                ahead = _ahead(state, state.log.end, background)
+                ahead = _ahead(state, state.log.end, background, TRAILING)
         yield state
         if _hopeless(state):
             break
@@ -346,7 +349,8 @@ def _sampled(config: IdentifierParameters, state: State, sampled: sampling.Sampl
 def _insert(state: State, event: CaptureEvent, background: Background) -> State:
     if state.payload is None or state.config is None:
         return state._replace(early=(*state.early, event)[-event_replay.MOST_EVENTS:])
-    state = _advance(state, state.log.end, background)
+    if state.log.row_at(event.stamp_ns, state.log.start) < state.log.end:  # a late one may rewind what was taken
+        state = _advance(state, state.log.end, background)
     config, payload, identifier = _running(state)
     given = state.log, event, state.first_ns, background
     return state._replace(payload=event_replay.insert(config, payload, *given),
@@ -370,13 +374,16 @@ class Ahead(NamedTuple):
     """The identifier after these rows."""
 
 
-def _ahead(state: State, until: int, background: Background) -> Ahead:
-    """Let both estimators begin with the rows up to ``until``; in a replay they work in parallel."""
+def _ahead(state: State, until: int, background: Background, behind: int = 0) -> Ahead:
+    """Let both estimators begin with the rows up to ``until``; in a replay they work in parallel.
+
+    behind: number of these rows that the identifier leaves for later.
+    """
     config, payload, identifier = _running(state)
     request = estimator.PayloadRequest(config, payload, state.log, until)
     if until - payload.cursor >= REPLAY_GROUP:
         background.start(request)
-    return Ahead(request, event_replay.advance(config, identifier, state.log, until, background))
+    return Ahead(request, event_replay.advance(config, identifier, state.log, until - behind, background))
 
 
 def _joined(state: State, ahead: Ahead | None, background: Background) -> State:

@@ -11,13 +11,9 @@ Python. Outputs are linear: positions = ``arm.output @ q``, rates = ``arm.output
 bends.
 
 The shape functions of a link are those of a pinned link. ``sines``: phi_j = sin(j pi x / L). ``component_modes``
-(Craig and Bampton): the sines and three static shapes. Two are the shapes of moments at the ends, since sines have no
-curvature there, where the torques act. The third is that of a uniform load: a link bends like it when its middle is
-accelerated (a residual vector: what the sines beyond the last would add). The shapes are combined into the modes of
-the pinned link, so that mass and stiffness matrix of a single link are diagonal; each sine remains a mode. The last
-mode is what the load's shape adds to the others. Its frequency would be two to four times theirs and far above that of
-its load. So its inertia is increased until its frequency is the highest one of the link without the load's shape (mass
-scaling, Olovsson et al. 2005).
+(Craig and Bampton): the sines and the static shapes of moments at the two ends, since sines have no curvature there,
+where the torques act. The shapes are combined into the modes of the pinned link, so that mass and stiffness matrix of a
+single link are diagonal; each sine remains a mode.
 """
 
 from functools import lru_cache
@@ -30,21 +26,21 @@ from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ArmParameters
 from flexmanip_ros.types import Array
 
-MOMENTS, STATIC = 2, 3
-"""Number of static shapes of a link: 2 for moments at its ends, 3 with that of a uniform load."""
+STATIC = 2
+"""Number of static shapes of a link: those of a moment at either end."""
+INERTIA = 0.5
+"""Mean of phi^2 of every shape, as that of a sine; the inertia of a mode is rho L times this [kg]."""
 
 
 class ShapeFunctions(NamedTuple):
-    """Shapes of a pinned link of length 1, k of them: phi(0) = phi(1) = 0 and the mean of phi^2 is 1/2."""
+    """Shapes of a pinned link of length 1, k of them: phi(0) = phi(1) = 0 and the mean of phi^2 is ``INERTIA``."""
 
     sines: int
     """Number of sines."""
     combination: Array
-    """(k, k) coefficients of each shape (row) on the sines, then x (1 - x), x (1 - x) (1 - 2 x), (x (1 - x))^2."""
+    """(k, k) coefficients of each shape (row) on the sines, then x (1 - x) and x (1 - x) (1 - 2 x)."""
     stiffness: Array
     """(k,) integral of phi''^2; the stiffness of a mode is EI / L^3 times this [N/m]."""
-    inertia: Array
-    """(k,) mean of phi^2, the last one with mass scaling; the inertia of a mode is rho L times this [kg]."""
 
     def at(self, x: Array) -> tuple[Array, Array, Array]:
         """Return phi, phi' and phi'' at x (N,) of a link of length 1, (k, N) each."""
@@ -53,9 +49,9 @@ class ShapeFunctions(NamedTuple):
         static = len(self.combination) - self.sines
         phi, slope, curvature = (
             self.combination @ np.vstack([sines, *shapes[:static]]) for sines, shapes in (
-                (np.sin(turn * x), (u, u * v, u ** 2)),
-                (turn * np.cos(turn * x), (v, 1.0 - 6.0 * u, 2.0 * u * v)),
-                (-turn ** 2 * np.sin(turn * x), (np.full_like(x, -2.0), -6.0 * v, 2.0 - 12.0 * u))))
+                (np.sin(turn * x), (u, u * v)),
+                (turn * np.cos(turn * x), (v, 1.0 - 6.0 * u)),
+                (-turn ** 2 * np.sin(turn * x), (np.full_like(x, -2.0), -6.0 * v))))
         return phi, slope, curvature
 
 
@@ -67,7 +63,7 @@ def count(arm: ArmParameters) -> int:
 def fastest_mode(arm: ArmParameters) -> float:
     """Return the highest modal frequency of the links, each pinned at both ends [rad/s]."""
     shapes = shape_functions(arm.modes, arm.shape_functions == 'component_modes')
-    square = np.max(shapes.stiffness / shapes.inertia)
+    square = np.max(shapes.stiffness) / INERTIA
     return max(float(np.sqrt(square * EI / rho)) / L ** 2 for EI, rho, L in zip(
         arm.bending_stiffness, arm.linear_density, arm.link_length, strict=True))
 
@@ -75,22 +71,15 @@ def fastest_mode(arm: ArmParameters) -> float:
 @lru_cache(maxsize=64)
 def shape_functions(sines: int, static: bool) -> ShapeFunctions:
     """Return the shapes of a pinned link, in the order of their frequencies."""
-    turn: Array = np.pi * np.arange(1, sines + 1, dtype=np.float64)
     if not static:
-        return ShapeFunctions(sines, np.eye(sines), np.asarray(turn ** 4 / 2.0, dtype=np.float64), np.full(sines, 0.5))
-    loaded, others = _pinned_modes(sines, STATIC), _pinned_modes(sines, MOMENTS)
-    loaded.inertia[-1] *= loaded.stiffness[-1] / others.stiffness[-1]
-    return loaded
-
-
-def _pinned_modes(sines: int, static: int) -> ShapeFunctions:
-    size = sines + static
-    raw = ShapeFunctions(sines, np.eye(size), np.zeros(0), np.zeros(0))
+        turn: Array = np.pi * np.arange(1, sines + 1, dtype=np.float64)
+        return ShapeFunctions(sines, np.eye(sines), np.asarray(INERTIA * turn ** 4, dtype=np.float64))
+    raw = ShapeFunctions(sines, np.eye(sines + STATIC), np.zeros(0))
     x, weight = quadrature(20 + 4 * sines)
     phi, _, curvature = raw.at(x)
     square, V = scipy.linalg.eigh((curvature * weight) @ curvature.T, (phi * weight) @ phi.T)
-    V *= np.sqrt(0.5) * np.sign(raw.at(np.zeros(1))[1].T @ V)
-    return ShapeFunctions(sines, V.T.copy(), square / 2.0, np.full(size, 0.5))
+    V *= np.sqrt(INERTIA) * np.sign(raw.at(np.zeros(1))[1].T @ V)
+    return ShapeFunctions(sines, V.T.copy(), INERTIA * square)
 
 
 def quadrature(points: int) -> tuple[Array, Array]:
@@ -142,7 +131,7 @@ class Manipulator(NamedTuple):
     tip_slope: Array
     """(L, k) phi'(L)."""
     rotary: Array
-    """(n, n) constant part of M: hubs, rotors, bodies that turn with a slope, base, mass scaling of the last modes."""
+    """(n, n) constant part of M: hubs, rotors, bodies that turn with a slope, base."""
     stiffness: Array
     """(n,) diagonal of K."""
     damping: Array
@@ -268,7 +257,7 @@ def manipulator(arm: ArmParameters, kappa: int | None = None, points: int | None
         phi=phi, G=np.moveaxis(G / scale[..., None], 2, 1), slope=slope / scale,
         curvature=curvature / scale ** 2, along=weight * length[:, None] * arm.shortening,
         tip_shortening=G[-1] / scale, root_slope=root, tip_slope=tip,
-        rotary=_rotary(arm, shapes, root, tip, joint), stiffness=stiffness, damping=_damping(arm, shapes, stiffness),
+        rotary=_rotary(arm, root, tip, joint), stiffness=stiffness, damping=_damping(arm, stiffness, k),
         unit_stiffness=unit, torque=_torque_matrix(arm, joint), joint=joint,
         output=_output_matrix(arm, shapes, joint),
         viscous=np.array(arm.joint_viscous_friction), coulomb=np.array(arm.joint_coulomb_friction),
@@ -300,8 +289,8 @@ def joint_rows(arm: ArmParameters, root: Array, tip: Array, n: int) -> Array:
     return rows
 
 
-def _rotary(arm: ArmParameters, shapes: ShapeFunctions, root: Array, tip: Array, joint: Array) -> Array:
-    """Constant part (n, n) of M: bodies whose angle is a chord plus a slope, rotors, base, mass scaling of a mode."""
+def _rotary(arm: ArmParameters, root: Array, tip: Array, joint: Array) -> Array:
+    """Constant part (n, n) of M: bodies whose angle is a chord plus a slope, rotors, base."""
     links, k = root.shape
     R = np.zeros((joint.shape[1], joint.shape[1]))
     for i in range(links):
@@ -311,22 +300,20 @@ def _rotary(arm: ArmParameters, shapes: ShapeFunctions, root: Array, tip: Array,
             row[i], row[modal(arm, k, i)] = 1.0, slopes[i]
             R += J * np.outer(row, row)
         R += arm.rotor_inertia[i] * np.outer(joint[i], joint[i])
-        at = modal(arm, k, i)
-        R[at, at] += arm.linear_density[i] * arm.link_length[i] * np.diag(shapes.inertia - 0.5)
     if arm.base_mass:
         R[-1, -1] += arm.base_inertia
     return R
 
 
-def _damping(arm: ArmParameters, shapes: ShapeFunctions, stiffness: Array) -> Array:
+def _damping(arm: ArmParameters, stiffness: Array, kappa: int) -> Array:
     """Diagonal of the modal damping matrix, (n,) [N s/m].
 
     ``stiffness``: D = (2 zeta / omega_i1) K; ``modal``: 2 zeta omega_ij M, omega_ij of the pinned link.
     """
     D = np.zeros(stiffness.size)
     for i, (L, rho) in enumerate(zip(arm.link_length, arm.linear_density, strict=True)):
-        at = modal(arm, len(shapes.inertia), i)
-        M, K = rho * L * shapes.inertia, stiffness[at]
+        at = modal(arm, kappa, i)
+        M, K = rho * L * INERTIA, stiffness[at]
         omega = np.sqrt(K / M)
         D[at] = 2 * arm.damping_ratio * (K / omega[0] if arm.damping_model == 'stiffness' else M * omega)
     return D

@@ -248,47 +248,67 @@ def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, sin
           ) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
     """G, G1, H, H1, D, E, Q of ``simulate_block`` at the configuration c; by_s, rates, sine: see ``Block``."""
     value, by_c, _, _ = basis(c, float(theta[-1]))
-    G, H, E = (part(theta, name, h, r) for name in 'GHE')
-    D = np.tensordot(rates, part(theta, 'D', h, r), 1)
-    direct = np.hstack([np.tensordot(value, E, 1), part(theta, 'F', h, r), part(theta, 'b', h, r)[:, None]])
-    by_products = np.hstack([sine * np.tensordot(value, part(theta, 'Q', h, r), 1), part(theta, 'R', h, r)])
-    return (np.tensordot(value, G, 1), np.tensordot(by_c * by_s, G, 1), np.tensordot(value, H, 1),
-            np.tensordot(by_c * by_s, H, 1), D, direct, by_products)
+
+    def mean(weight: Array, name: str) -> Array:
+        where, shape = parts(h, r)[name]
+        return np.asarray((weight @ theta[where].reshape(len(weight), -1)).reshape(shape[1:]))
+
+    direct = np.hstack([mean(value, 'E'), part(theta, 'F', h, r), part(theta, 'b', h, r)[:, None]])
+    by_products = np.hstack([sine * mean(value, 'Q'), part(theta, 'R', h, r)])
+    return (mean(value, 'G'), mean(by_c * by_s, 'G'), mean(value, 'H'), mean(by_c * by_s, 'H'), mean(rates, 'D'),
+            direct, by_products)
 
 
 def to_local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, sine: float = 0.0) -> Array:
     """(l, k + 2h) derivative of [local parameters; state] with respect to [theta; state]; see ``local``."""
     value, by_c, by_zeta, by_both = basis(c, float(theta[-1]))
-    at = {name: where.start for name, (where, _) in parts(h, r).items()}
-    a, b, q, k, d, t = h * h, h * r, 2 * r + 1, len(theta), 2 * pairs(h), triples(h)
-    at_e = 3 * a + 2 * b
-    at_q = at_e + h * q
-    T = np.zeros((at_q + h * (d + t) + 2 * h, k + 2 * h))
-    for i in range(FUNCTIONS):
-        j = np.arange(a)
-        T[j, at['G'] + i * a + j], T[a + j, at['G'] + i * a + j] = value[i], by_c[i] * by_s
-        T[2 * a + 2 * b + j, at['D'] + i * a + j] = rates[i]
-        j = np.arange(b)
-        T[2 * a + j, at['H'] + i * b + j], T[2 * a + b + j, at['H'] + i * b + j] = value[i], by_c[i] * by_s
-        T[at_e + j // r * q + j % r, at['E'] + i * b + j] = value[i]
-        if i == 0:
-            T[at_e + j // r * q + r + j % r, at['F'] + j] = 1.0
-        j = np.arange(h * d)
-        T[at_q + j // d * (d + t) + j % d, at['Q'] + i * h * d + j] = sine * value[i]
-    j = np.arange(h * t)
-    T[at_q + j // t * (d + t) + d + j % t, at['R'] + j] = 1.0
-    j = np.arange(h)
-    T[at_e + j * q + 2 * r, at['b'] + j] = 1.0
-    G, H, E = (part(theta, name, h, r).reshape(FUNCTIONS, -1) for name in 'GHE')
-    T[:a, at['zeta']], T[a:2 * a, at['zeta']] = by_zeta @ G, by_s * by_both @ G
-    T[2 * a:2 * a + b, at['zeta']], T[2 * a + b:2 * a + 2 * b, at['zeta']] = by_zeta @ H, by_s * by_both @ H
-    j = np.arange(b)
-    T[at_e + j // r * q + j % r, at['zeta']] = by_zeta @ E
-    j = np.arange(h * d)
-    T[at_q + j // d * (d + t) + j % d, at['zeta']] = sine * by_zeta @ part(theta, 'Q', h, r).reshape(FUNCTIONS, -1)
-    j = np.arange(2 * h)
-    T[at_q + h * (d + t) + j, k + j] = 1.0
+    row, column, weight, size = _entries(h, r)
+    T = np.zeros(size)
+    T[row, column] = np.concatenate([value, by_c * by_s, rates, sine * value, [1.0]])[weight]
+    G, H, E, Q = (part(theta, name, h, r).reshape(FUNCTIONS, -1) for name in 'GHEQ')
+    at = parts(h, r)['zeta'][0].start
+    a, b, d, t = h * h, h * r, 2 * pairs(h), triples(h)
+    products = T[3 * a + 4 * b + h:len(T) - 2 * h].reshape(h, d + t, -1)
+    direct = T[3 * a + 2 * b:3 * a + 4 * b + h].reshape(h, 2 * r + 1, -1)
+    T[:a, at], T[a:2 * a, at] = by_zeta @ G, by_s * by_both @ G
+    T[2 * a:2 * a + b, at], T[2 * a + b:2 * a + 2 * b, at] = by_zeta @ H, by_s * by_both @ H
+    direct[:, :r, at], products[:, :d, at] = (by_zeta @ E).reshape(h, r), (sine * by_zeta @ Q).reshape(h, d)
     return T
+
+
+@cache
+def _entries(h: int, r: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], tuple[int, int]]:
+    """Rows, columns and numbers of the weights in the derivative ``to_local``, zeta's column excepted, and its shape.
+
+    Its weights are those of the functions of c, of their derivatives, of ``rates``, and of the functions with the sine,
+    then 1.
+    """
+    places, found = {name: where.start for name, (where, _) in parts(h, r).items()}, []
+    a, b, q, d, t = h * h, h * r, 2 * r + 1, 2 * pairs(h), triples(h)
+
+    def put(row: int, entries: int, name: str, weight: int, width: int = 1, stride: int = 1) -> None:
+        """Give each entry of a part one row, from ``row`` on; ``width`` of them stand in each ``stride`` rows."""
+        j = np.arange(entries)
+        functions = parts(h, r)[name][1][0] if weight < 4 * FUNCTIONS else 1
+        for i in range(functions):
+            found.append((row + j // width * stride + j % width, places[name] + i * entries + j,
+                          np.full(entries, weight + i)))
+
+    direct, products = 3 * a + 2 * b, 3 * a + 4 * b + h
+    put(0, a, 'G', 0)
+    put(a, a, 'G', FUNCTIONS)
+    put(2 * a, b, 'H', 0)
+    put(2 * a + b, b, 'H', FUNCTIONS)
+    put(2 * a + 2 * b, a, 'D', 2 * FUNCTIONS)
+    put(direct, b, 'E', 0, r, q)
+    put(direct + r, b, 'F', 4 * FUNCTIONS, r, q)
+    put(direct + 2 * r, h, 'b', 4 * FUNCTIONS, 1, q)
+    put(products, h * d, 'Q', 3 * FUNCTIONS, d, d + t)
+    put(products + d, h * t, 'R', 4 * FUNCTIONS, t, d + t)
+    state, end = np.arange(2 * h), products + h * (d + t)
+    found.append((end + state, places['zeta'] + 1 + state, np.full(2 * h, 4 * FUNCTIONS)))
+    row, column, weight = (np.concatenate(one) for one in zip(*found, strict=True))
+    return row, column, weight, (end + 2 * h, places['zeta'] + 1 + 2 * h)
 
 
 def _filter(v: Varying) -> tuple[Array, Array, Array]:

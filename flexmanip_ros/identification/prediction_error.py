@@ -154,36 +154,37 @@ def residual_moments(
 def condition(H: Array, root: Array, gradient: Array, step: Array) -> None:
     """Update in square-root form: root (k, k) <- root L^-T with L L' = I + H, step = (I + H)^-1 gradient.
 
-    H: (k, k) symmetric, overwritten with L (lower); gradient, step: (k,). The loops are written out because a routine
-    of the LAPACK library would start threads.
+    H: (k, k) symmetric, whose upper triangle is overwritten with L^T; gradient, step: (k,). The loops are written out
+    because a routine of the LAPACK library would start threads. The inner ones run along rows, without sums.
     """
     k = H.shape[0]
     for i in range(k):
         H[i, i] += 1.0
-        for j in range(i + 1):
-            total = H[i, j]
-            for q in range(j):
-                total -= H[i, q] * H[j, q]
-            if i == j:
-                H[i, i] = math.sqrt(max(total, 1.0))  # I + H is never below I
-            else:
-                H[i, j] = total / H[j, j]
+    for j in range(k):
+        H[j, j] = math.sqrt(max(H[j, j], 1.0))  # I + H is never below I
+        for t in range(j + 1, k):
+            H[j, t] /= H[j, j]
+        for i in range(j + 1, k):
+            size = H[j, i]
+            for t in range(i, k):
+                H[i, t] -= size * H[j, t]
     for i in range(k):
-        total = gradient[i]
-        for q in range(i):
-            total -= H[i, q] * step[q]
-        step[i] = total / H[i, i]
+        step[i] = gradient[i]
+    for i in range(k):
+        step[i] /= H[i, i]
+        for t in range(i + 1, k):
+            step[t] -= H[i, t] * step[i]
     for i in range(k - 1, -1, -1):
         total = step[i]
         for q in range(i + 1, k):
-            total -= H[q, i] * step[q]
+            total -= H[i, q] * step[q]
         step[i] = total / H[i, i]
     for row in range(root.shape[0]):
         for i in range(k):
-            total = root[row, i]
-            for q in range(i):
-                total -= H[i, q] * root[row, q]
-            root[row, i] = total / H[i, i]
+            root[row, i] /= H[i, i]
+            size = root[row, i]
+            for t in range(i + 1, k):
+                root[row, t] -= size * H[i, t]
 
 
 DAMPING = 1e-9

@@ -45,8 +45,9 @@ THREADS = 2
 REPLAY_THREADS = 3
 """Threads of a replay: one more, for the payload."""
 KEPT = 8
-"""Number of requests kept with their results. A late event rewinds the estimator by 0.2 s and needs the results of that
-time again: at most a fit and, where every estimate has a model of its own, the models of the last few estimates."""
+"""Number of requests kept with their results after these were taken. A late event rewinds the estimator by 0.2 s and
+needs the results of that time again: at most a fit and, where every estimate has a model of its own, the models of the
+last few estimates."""
 
 
 class Threads:
@@ -54,33 +55,37 @@ class Threads:
 
     def __init__(self, threads: int = THREADS) -> None:
         self._pool = ThreadPoolExecutor(threads, 'background')
-        self._solved: dict[Request, Future[Any]] = {}
+        self._awaited: dict[Request, Future[Any]] = {}
+        self._taken: dict[Request, Future[Any]] = {}
         self._closed = False
 
     def start(self, request: Request) -> None:
-        """Begin to solve a request; the oldest one beyond ``KEPT`` that is not being solved is dropped.
+        """Begin to solve a request; after ``close`` do nothing.
 
-        After ``close`` do nothing.
+        A request that nobody waits for any more, as after a rewind, is dropped when ``KEPT`` newer ones are awaited.
         """
         if self._closed:
             return
-        self._solved[request] = self._pool.submit(request.solve)
-        if len(self._solved) > KEPT:
-            oldest = (known for known, future in self._solved.items() if future.done() or future.cancel())
-            self._solved.pop(next(oldest))
+        self._awaited[request] = self._pool.submit(request.solve)
+        if len(self._awaited) > KEPT:
+            oldest = (known for known, future in self._awaited.items() if future.done() or future.cancel())
+            self._awaited.pop(next(oldest))
 
     def result(self, request: Request) -> Any:
         """Return the result of a request: wait for the thread that solves it, or solve it here if none does yet."""
-        future = self._solved.get(request)
+        future = self._awaited.pop(request, None) or self._taken.get(request)
         if future is None or future.cancel():
-            self._solved.pop(request, None)
             return request.solve()
+        self._taken[request] = future
+        if len(self._taken) > KEPT:
+            self._taken.pop(next(iter(self._taken)))
         return future.result()
 
     def close(self) -> None:
         """Drop every request; wait for those that are being solved. Later requests are solved by ``result``."""
         self._closed = True
-        self._solved.clear()
+        self._awaited.clear()
+        self._taken.clear()
         self._pool.shutdown(cancel_futures=True)
 
 

@@ -36,8 +36,8 @@ class ArmParameters:
         'stiffness', 'damping ratio of the higher modes: stiffness, grows with the frequency; modal, the same for '
         'every mode', choices=('stiffness', 'modal'))
     shape_functions: str = parameter(
-        'component_modes', 'shapes of a bent link: component_modes, sines and three static shapes, of moments at the '
-        'ends, as of torques, and of a uniform load; sines, sines alone (the paper)',
+        'component_modes', 'shapes of a bent link: component_modes, sines and the static shapes of moments at the two '
+        'ends, where the torques act; sines, sines alone (the paper)',
         choices=('component_modes', 'sines'))
     modes: int = parameter(
         3, 'number of sines among the shape functions of each link (payload_method block uses order / 4 sines instead)',

@@ -141,7 +141,8 @@ def test_frequencies_over_configurations_are_right_where_the_arm_has_been_and_ba
     assert np.count_nonzero(seen) > 3
     assert np.all(np.abs(found.frequency[seen] / truth[seen] - 1.0) < 0.012)
     assert np.all(np.abs(found.frequency - truth)[seen] < 3.0 * 1.96 * found.std[seen])
-    assert np.nanmedian(found.std[~seen]) > np.median(found.std[seen])
+    narrower = found.std.min(axis=1)  # the band of the better known mode: near 90 degrees the modes exchange places
+    assert np.nanmedian(narrower[~seen]) > np.median(narrower[seen])
     _, labels = plots.configurations_figure(found).axes[0].get_legend_handles_labels()
     assert labels == ['configurations\nof the recording', 'mode 1, 95 % band', 'mode 2, 95 % band']
 

@@ -30,7 +30,7 @@ def bent(arm, n: int) -> np.ndarray:
     rng = np.random.default_rng(0)
     x = np.zeros(2 * n + arm.kind.size)
     x[:2], x[n:n + 2] = (1.0, 0.6), (0.3, -0.4)
-    size = np.tile([1.0, 0.1, 0.02, 0.01, 0.01, 0.002], 2)
+    size = np.tile([1.0, 0.1, 0.02, 0.01, 0.002], 2)
     x[2:2 + size.size] = rng.normal(size=size.size) * 5e-3 * size
     x[n + 2:n + 2 + size.size] = rng.normal(size=size.size) * 0.5 * size
     values = {Kind.MASS: 0.7, Kind.FIRST_X: 0.05, Kind.FIRST_Y: 0.02, Kind.INERTIA: 0.02, Kind.STIFFNESS: 0.02,
@@ -167,6 +167,7 @@ def test_what_is_learned_moves_a_vibration_that_turns_by_a_radian_in_a_sample_as
     n = arm.arm.stiffness.size
     assert 1e-3 / arm.substeps > 0.5  # a step is at most two radians of the fastest mode
     x = bent(arm, n)
+    x[n] -= 0.3  # so that no joint reverses: a jump of the friction is no line over a sample
     moment = np.array([[0.0, *(TORQUE / arm.gain)]]), 20
     spread, none = np.eye(x.size), np.zeros((x.size, 0))
     carried(arm, x, spread, *moment)
@@ -179,7 +180,7 @@ def test_what_is_learned_moves_a_vibration_that_turns_by_a_radian_in_a_sample_as
         high, low = (carried(arm, state, none, *moment) for state in (x + step, x - step))
         exact = (high - low) / 2e-4 / size
         found = spread[:2 * n, 2 * n + c] / size
-        # held over a sample, a rotor is 3 % off, a first moment 1 %
+        # held over a sample, a rotor is 3 % off, a first moment 1 %; a line over it: the damping is 0.6 % off
         assert np.linalg.norm(found - exact) <= 0.003 * np.linalg.norm(exact), Kind(arm.kind[c]).name
 
 

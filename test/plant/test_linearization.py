@@ -96,5 +96,5 @@ def test_the_default_shape_functions_are_converged(inertia: float) -> None:
         found.append((np.array(response), np.sqrt(squares[2:4])))
     (ours, frequencies), (converged, exact) = found
     assert ours[:, :2] == pytest.approx(converged[:, :2], rel=3e-3)
-    assert ours[:2, 2:] == pytest.approx(converged[:2, 2:], rel=2e-5)
+    assert ours[:2, 2:] == pytest.approx(converged[:2, 2:], rel=2e-4)
     assert frequencies == pytest.approx(exact, rel=5e-5)

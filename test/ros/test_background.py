@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
+import weakref
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -12,7 +14,7 @@ from estimates import one_a_stamp
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.identification.recursive_fit import FitRequest
-from flexmanip_ros.numerics.background import KEPT, Deferred, Request, Threads
+from flexmanip_ros.numerics.background import KEPT, THREADS, Deferred, Request, Threads
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord
@@ -130,11 +132,27 @@ def test_a_request_that_no_thread_has_begun_is_solved_in_place() -> None:
 
 def test_requests_whose_result_nobody_takes_do_not_pile_up() -> None:
     background = Threads()
+    started = weakref.WeakSet[Sum]()
     for k in range(5 * KEPT):
-        background.start(Sum(k))
-    assert len(background._solved) == KEPT
+        request = Sum(k)
+        started.add(request)
+        background.start(request)
+    del request
+    gc.collect()
+    assert len(started) <= KEPT + THREADS  # the threads may hold one each
     background.close()
-    assert not background._solved
+    gc.collect()
+    assert not started
+
+
+def test_an_awaited_result_is_kept_however_many_later_ones_were_taken() -> None:
+    background, awaited = Threads(), Sum(1, 2)
+    background.start(awaited)
+    for k in range(5 * KEPT):
+        background.start(later := Sum(k))
+        assert background.result(later) == k
+    assert (background.result(awaited), awaited.solved) == (3, 1)
+    background.close()
 
 
 def test_what_is_asked_for_after_the_end_is_solved_in_place() -> None:
