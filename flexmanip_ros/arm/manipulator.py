@@ -13,7 +13,8 @@ bends.
 The shape functions of a link are those of a pinned link. ``sines``: phi_j = sin(j pi x / L). ``component_modes``
 (Craig and Bampton): the sines and the static shapes of moments at the two ends, since sines have no curvature there,
 where the torques act. The shapes are combined into the modes of the pinned link, so that mass and stiffness matrix of a
-single link are diagonal; each sine remains a mode.
+single link are diagonal; each sine remains a mode. The last mode stands for all faster ones. It is slowed by additional
+inertia (mass scaling, Olovsson et al. 2005), see ``SLOWED``.
 """
 
 from functools import lru_cache
@@ -28,12 +29,14 @@ from flexmanip_ros.types import Array
 
 STATIC = 2
 """Number of static shapes of a link: those of a moment at either end."""
-INERTIA = 0.5
-"""Mean of phi^2 of every shape, as that of a sine; the inertia of a mode is rho L times this [kg]."""
+SLOWED = 0.9
+"""Frequency of the last mode of a link over that of its shape. Modes of the whole arm with rotors or a body at the tip
+are too fast, as those of a truncated basis are; of 0.72 to 1 this has the least errors (docs/lab/plant.md). And an
+integration step is a third more exact."""
 
 
 class ShapeFunctions(NamedTuple):
-    """Shapes of a pinned link of length 1, k of them: phi(0) = phi(1) = 0 and the mean of phi^2 is ``INERTIA``."""
+    """Shapes of a pinned link of length 1, k of them: phi(0) = phi(1) = 0 and the mean of phi^2 is 1/2."""
 
     sines: int
     """Number of sines."""
@@ -41,6 +44,8 @@ class ShapeFunctions(NamedTuple):
     """(k, k) coefficients of each shape (row) on the sines, then x (1 - x) and x (1 - x) (1 - 2 x)."""
     stiffness: Array
     """(k,) integral of phi''^2; the stiffness of a mode is EI / L^3 times this [N/m]."""
+    inertia: Array
+    """(k,) mean of phi^2, the last one with mass scaling; the inertia of a mode is rho L times this [kg]."""
 
     def at(self, x: Array) -> tuple[Array, Array, Array]:
         """Return phi, phi' and phi'' at x (N,) of a link of length 1, (k, N) each."""
@@ -63,7 +68,7 @@ def count(arm: ArmParameters) -> int:
 def fastest_mode(arm: ArmParameters) -> float:
     """Return the highest modal frequency of the links, each pinned at both ends [rad/s]."""
     shapes = shape_functions(arm.modes, arm.shape_functions == 'component_modes')
-    square = np.max(shapes.stiffness) / INERTIA
+    square = np.max(shapes.stiffness / shapes.inertia)
     return max(float(np.sqrt(square * EI / rho)) / L ** 2 for EI, rho, L in zip(
         arm.bending_stiffness, arm.linear_density, arm.link_length, strict=True))
 
@@ -73,13 +78,15 @@ def shape_functions(sines: int, static: bool) -> ShapeFunctions:
     """Return the shapes of a pinned link, in the order of their frequencies."""
     if not static:
         turn: Array = np.pi * np.arange(1, sines + 1, dtype=np.float64)
-        return ShapeFunctions(sines, np.eye(sines), np.asarray(INERTIA * turn ** 4, dtype=np.float64))
-    raw = ShapeFunctions(sines, np.eye(sines + STATIC), np.zeros(0))
+        return ShapeFunctions(sines, np.eye(sines), np.asarray(turn ** 4 / 2.0, dtype=np.float64), np.full(sines, 0.5))
+    raw = ShapeFunctions(sines, np.eye(sines + STATIC), np.zeros(0), np.zeros(0))
     x, weight = quadrature(20 + 4 * sines)
     phi, _, curvature = raw.at(x)
     square, V = scipy.linalg.eigh((curvature * weight) @ curvature.T, (phi * weight) @ phi.T)
-    V *= np.sqrt(INERTIA) * np.sign(raw.at(np.zeros(1))[1].T @ V)
-    return ShapeFunctions(sines, V.T.copy(), INERTIA * square)
+    V *= np.sqrt(0.5) * np.sign(raw.at(np.zeros(1))[1].T @ V)
+    inertia = np.full(sines + STATIC, 0.5)
+    inertia[-1] /= SLOWED ** 2
+    return ShapeFunctions(sines, V.T.copy(), square / 2.0, inertia)
 
 
 def quadrature(points: int) -> tuple[Array, Array]:
@@ -131,7 +138,7 @@ class Manipulator(NamedTuple):
     tip_slope: Array
     """(L, k) phi'(L)."""
     rotary: Array
-    """(n, n) constant part of M: hubs, rotors, bodies that turn with a slope, base."""
+    """(n, n) constant part of M: hubs, rotors, bodies that turn with a slope, base, mass scaling of the last modes."""
     stiffness: Array
     """(n,) diagonal of K."""
     damping: Array
@@ -257,7 +264,7 @@ def manipulator(arm: ArmParameters, kappa: int | None = None, points: int | None
         phi=phi, G=np.moveaxis(G / scale[..., None], 2, 1), slope=slope / scale,
         curvature=curvature / scale ** 2, along=weight * length[:, None] * arm.shortening,
         tip_shortening=G[-1] / scale, root_slope=root, tip_slope=tip,
-        rotary=_rotary(arm, root, tip, joint), stiffness=stiffness, damping=_damping(arm, stiffness, k),
+        rotary=_rotary(arm, shapes, root, tip, joint), stiffness=stiffness, damping=_damping(arm, shapes, stiffness),
         unit_stiffness=unit, torque=_torque_matrix(arm, joint), joint=joint,
         output=_output_matrix(arm, shapes, joint),
         viscous=np.array(arm.joint_viscous_friction), coulomb=np.array(arm.joint_coulomb_friction),
@@ -289,8 +296,8 @@ def joint_rows(arm: ArmParameters, root: Array, tip: Array, n: int) -> Array:
     return rows
 
 
-def _rotary(arm: ArmParameters, root: Array, tip: Array, joint: Array) -> Array:
-    """Constant part (n, n) of M: bodies whose angle is a chord plus a slope, rotors, base."""
+def _rotary(arm: ArmParameters, shapes: ShapeFunctions, root: Array, tip: Array, joint: Array) -> Array:
+    """Constant part (n, n) of M: bodies whose angle is a chord plus a slope, rotors, base, mass scaling of a mode."""
     links, k = root.shape
     R = np.zeros((joint.shape[1], joint.shape[1]))
     for i in range(links):
@@ -300,20 +307,22 @@ def _rotary(arm: ArmParameters, root: Array, tip: Array, joint: Array) -> Array:
             row[i], row[modal(arm, k, i)] = 1.0, slopes[i]
             R += J * np.outer(row, row)
         R += arm.rotor_inertia[i] * np.outer(joint[i], joint[i])
+        at = modal(arm, k, i)
+        R[at, at] += arm.linear_density[i] * arm.link_length[i] * np.diag(shapes.inertia - 0.5)
     if arm.base_mass:
         R[-1, -1] += arm.base_inertia
     return R
 
 
-def _damping(arm: ArmParameters, stiffness: Array, kappa: int) -> Array:
+def _damping(arm: ArmParameters, shapes: ShapeFunctions, stiffness: Array) -> Array:
     """Diagonal of the modal damping matrix, (n,) [N s/m].
 
     ``stiffness``: D = (2 zeta / omega_i1) K; ``modal``: 2 zeta omega_ij M, omega_ij of the pinned link.
     """
     D = np.zeros(stiffness.size)
     for i, (L, rho) in enumerate(zip(arm.link_length, arm.linear_density, strict=True)):
-        at = modal(arm, kappa, i)
-        M, K = rho * L * INERTIA, stiffness[at]
+        at = modal(arm, len(shapes.inertia), i)
+        M, K = rho * L * shapes.inertia, stiffness[at]
         omega = np.sqrt(K / M)
         D[at] = 2 * arm.damping_ratio * (K / omega[0] if arm.damping_model == 'stiffness' else M * omega)
     return D
