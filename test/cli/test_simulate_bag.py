@@ -43,8 +43,8 @@ def test_the_truth_stands_beside_the_recording(tmp_path):
     assert truth['payload_mass_kg'] == 20.0
     assert truth['capture_time_s'] == 0.1
     assert truth['release_time_s'] is None
-    assert truth['frequencies_before_hz'] == pytest.approx([5.757197, 6.893483], abs=2e-6)
-    assert truth['frequencies_after_hz'] == pytest.approx([5.63383, 6.54450], abs=1e-5)
+    assert truth['frequencies_before_hz'] == pytest.approx([5.757197, 6.893488], abs=2e-6)
+    assert truth['frequencies_after_hz'] == pytest.approx([5.63383, 6.54451], abs=1e-5)
     assert truth['plant']['arm.modes'] == 5
 
 

@@ -168,7 +168,7 @@ def test_an_event_with_a_stamp_of_another_clock_is_warned_of(ros: Ros, log: Call
 
 def test_an_unannounced_capture_is_hinted_at_once(ros: Ros, log: Callable[[str], str]) -> None:
     live = Live(ros)
-    live.send(*recording(700))  # it catches its object after 0.4 s
+    live.send(*recording(560))  # it catches its object after 0.4 s
     said = log('trigger_mode:=auto)')
     assert 'no capture was announced' in said
     assert 'status INCONSISTENT: ' in said
