@@ -30,9 +30,9 @@ from flexmanip_ros.types import Array
 STATIC = 2
 """Number of static shapes of a link: those of a moment at either end."""
 SLOWED = 0.9
-"""Frequency of the last mode of a link over that of its shape. Modes of the whole arm with rotors or a body at the tip
-are too fast, as those of a truncated basis are; of 0.72 to 1 this has the least errors (docs/lab/plant.md). And an
-integration step is a third more exact."""
+"""Frequency of the last mode of a link over that of its shape. A truncated basis makes the modes of the whole arm too
+fast. Of 0.72 to 1 this has the least error of the fifth mode (docs/lab/plant.md). Over a minute of four undamped arms
+95 % of the payload's intervals hold the truth, 75 % with 1 (docs/lab/payload.md)."""
 
 
 class ShapeFunctions(NamedTuple):

@@ -262,14 +262,14 @@ def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, sin
 def to_local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, sine: float = 0.0) -> Array:
     """(l, k + 2h) derivative of [local parameters; state] with respect to [theta; state]; see ``local``."""
     value, by_c, by_zeta, by_both = basis(c, float(theta[-1]))
-    row, column, weight, size = _entries(h, r)
-    T = np.zeros(size)
+    row, column, weight, (first_direct, first_product, end) = _entries(h, r)
+    T = np.zeros((end + 2 * h, len(theta) + 2 * h))
     T[row, column] = np.concatenate([value, by_c * by_s, rates, sine * value, [1.0]])[weight]
     G, H, E, Q = (part(theta, name, h, r).reshape(FUNCTIONS, -1) for name in 'GHEQ')
     at = parts(h, r)['zeta'][0].start
-    a, b, d, t = h * h, h * r, 2 * pairs(h), triples(h)
-    products = T[3 * a + 4 * b + h:len(T) - 2 * h].reshape(h, d + t, -1)
-    direct = T[3 * a + 2 * b:3 * a + 4 * b + h].reshape(h, 2 * r + 1, -1)
+    a, b, d = h * h, h * r, 2 * pairs(h)
+    direct, products = (T[begin:stop].reshape(h, (stop - begin) // h, -1)
+                        for begin, stop in ((first_direct, first_product), (first_product, end)))
     T[:a, at], T[a:2 * a, at] = by_zeta @ G, by_s * by_both @ G
     T[2 * a:2 * a + b, at], T[2 * a + b:2 * a + 2 * b, at] = by_zeta @ H, by_s * by_both @ H
     direct[:, :r, at], products[:, :d, at] = (by_zeta @ E).reshape(h, r), (sine * by_zeta @ Q).reshape(h, d)
@@ -277,11 +277,11 @@ def to_local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, 
 
 
 @cache
-def _entries(h: int, r: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], tuple[int, int]]:
-    """Rows, columns and numbers of the weights in the derivative ``to_local``, zeta's column excepted, and its shape.
+def _entries(h: int, r: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], tuple[int, int, int]]:
+    """Rows, columns and numbers of the weights in the derivative ``to_local``, zeta's column excepted.
 
-    Its weights are those of the functions of c, of their derivatives, of ``rates``, and of the functions with the sine,
-    then 1.
+    The weights are those of the functions of c, of their derivatives, of ``rates``, and of the functions with the sine,
+    then 1. Last come three row numbers: the first rows of the local E, of the local Q and of the state.
     """
     places, found = {name: where.start for name, (where, _) in parts(h, r).items()}, []
     a, b, q, d, t = h * h, h * r, 2 * r + 1, 2 * pairs(h), triples(h)
@@ -308,7 +308,7 @@ def _entries(h: int, r: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDAr
     state, end = np.arange(2 * h), products + h * (d + t)
     found.append((end + state, places['zeta'] + 1 + state, np.full(2 * h, 4 * FUNCTIONS)))
     row, column, weight = (np.concatenate(one) for one in zip(*found, strict=True))
-    return row, column, weight, (end + 2 * h, places['zeta'] + 1 + 2 * h)
+    return row, column, weight, (direct, products, end)
 
 
 def _filter(v: Varying) -> tuple[Array, Array, Array]:

@@ -195,7 +195,7 @@ def test_what_is_learned_moves_a_vibration_that_turns_by_a_radian_in_a_sample_as
         high, low = (carried(arm, state, none, *moment) for state in (x + step, x - step))
         exact = (high - low) / 2e-4 / size
         found = spread[:2 * n, 2 * n + c] / size
-        # held over a sample, a rotor is 3 % off, a first moment 1 %; a line over it: the damping is 0.6 % off
+        # held over a sample, a rotor is 3 % off, a first moment 1 %
         assert np.linalg.norm(found - exact) <= 0.003 * np.linalg.norm(exact), Kind(arm.kind[c]).name
 
 
