@@ -11,7 +11,7 @@ from flexmanip_ros import pipeline
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Rows
-from flexmanip_ros.samples.stamp_jitter import LOSS, Jitter
+from flexmanip_ros.samples.stamp_jitter import LEAST_GAIN, LOSS, Jitter
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, JointRecord, Status
 
@@ -58,6 +58,20 @@ def test_jitter_of_the_stamps_alone_is_taken_from_the_instants_of_the_samples(st
     assert _off_us(rows.time_ns, regular) < 0.25 * _off_us(stamps, regular)
 
 
+def test_the_clock_is_a_line_fitted_to_all_stamps_at_first() -> None:
+    count, off, fitted = 400, [], []
+    for seed in range(40):
+        regular, stamps = _jittered(0.1, seed, count)
+        clock = sampling.Clock(last_ns=int(stamps[0]), interval_count=1, interval_sum_ns=T)
+        for interval in np.diff(stamps).tolist():
+            clock = clock.after(interval)
+        off.append(stamps[-1] - clock.jitter.late_ns - regular[-1])
+        k = np.arange(count)
+        fitted.append(np.polyval(np.polyfit(k, stamps - regular, 1), count - 1))
+    assert np.sqrt(np.mean(np.square(off))) < 1.1 * np.sqrt(np.mean(np.square(fitted)))
+    assert np.mean(np.abs(np.array(off) - fitted)) < 0.2 * np.mean(np.abs(fitted))
+
+
 def test_where_samples_jitter_with_their_stamps_the_stamps_are_the_instants() -> None:
     regular, stamps = _jittered(0.1)
     _, rows = _rows(_block(stamps, stamps))
@@ -88,7 +102,8 @@ def test_a_lost_message_is_seen_through_the_jitter() -> None:
 
 
 def test_a_loss_is_assumed_where_both_explanations_are_as_likely() -> None:
-    jitter = Jitter(square=2.0 * (0.2 * T) ** 2, product=-(0.2 * T) ** 2, intervals=10_000, since=10_000)
+    jitter = Jitter(square=2.0 * (0.2 * T) ** 2, product=-(0.2 * T) ** 2, intervals=10_000,
+                    variance=(LEAST_GAIN, 0.0, 0.0))
     most, s = jitter.most_ns(T), jitter.std_ns
     assert s == pytest.approx(0.2 * T, rel=0.02)
     assert -0.5 * (most / s) ** 2 == pytest.approx(np.log(LOSS) - 0.5 * ((most - T) / s) ** 2)
