@@ -86,8 +86,9 @@ from flexmanip_ros.types import Array
 
 FIRST_ITERATION = 8
 """Samples after an event before the first Gauss-Newton iteration: fewer tell less than the prior."""
-ROWS = 8
-"""Rows that are read again for each new sample."""
+ROWS, ROWS_TIME = 8, 1e-3
+"""Rows that are read again for each new sample, at a sample time up to this [s]. Slower samples leave more processor
+time, in proportion to their sample time, and a fit must not take longer with them."""
 CLOSING = 16_384
 """Rows that are read again at most when the horizon closes: a fit of an empty arm takes up to ten times all of them."""
 LATEST = 1024
@@ -314,7 +315,7 @@ def at_rest(m: FilterState) -> bool:
 
 @merged
 def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array) -> bool:
-    """Let the Gauss-Newton iteration take ``ROWS`` samples at most; when the horizon closes, until it converges."""
+    """Let the Gauss-Newton iteration take a few samples (``ROWS``); when the horizon closes, until it converges."""
     stored = m.counts[STORED]
     if stored >= HORIZON:
         return True
@@ -327,7 +328,7 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
     if last and rests:  # the filter goes on from there
         close_horizon(motion, sensors, m)
         return True
-    rows = CLOSING if last else ROWS
+    rows = CLOSING if last else int(ROWS * max(sensors.period / ROWS_TIME, 1.0))
     work = WORK * rows * max(sensors.period / motion.substeps, 1.0)
     for _ in range(rows):
         if m.counts[STORED] == HORIZON > stored + 1:  # it has closed
