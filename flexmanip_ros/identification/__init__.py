@@ -1,1 +1,1 @@
-"""Recursive and batch predictor-based subspace identification."""
+"""State-space models: subspace identification, its maximum-likelihood refinement, and models of every configuration."""

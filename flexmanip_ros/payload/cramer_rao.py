@@ -1,7 +1,7 @@
 """Cramer-Rao bounds: the least standard deviation any unbiased payload estimate can have from given signals.
 
-Four kinds of knowledge. ``structure_known``: the linear vibration model at a working point but for the
-payload and the first state. ``structure_unknown``: nothing of (A, B) and the first state; the payload is read
+Four kinds of knowledge. ``structure_known``: the linear vibration model at a working point is known but for the
+payload and the first state. ``structure_unknown``: nothing of (A, B) and the first state is known; the payload is read
 from them by the block extraction, so the bound belongs to that formula (name it wherever it is quoted).
 ``nonlinear``: the moving arm, its stiffness, damping and rates as uncertain as the parameters say.
 ``everything``: the same from before the capture on, and bounds of all that is unknown of arm and object.
