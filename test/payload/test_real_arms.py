@@ -19,10 +19,17 @@ from recording import event, record, run
 from flexmanip_ros import pipeline
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.parameter_file import read
-from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
+from flexmanip_ros.parameters import (
+    ArmParameters,
+    ExcitationParameters,
+    IdentifierParameters,
+    PlantParameters,
+    configure,
+)
 from flexmanip_ros.payload import structured
 from flexmanip_ros.payload.arm_parameters import as_parameters, taught
-from flexmanip_ros.types import ArmParameter, Payload, Status
+from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.types import ArmParameter, CaptureEvent, EventKind, Payload, Status
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -51,6 +58,21 @@ def test_the_mass_is_within_seven_tenths_of_a_percent_inside_its_interval_and_tr
     assert found.status is Status.TRACKING
     assert found.mass == pytest.approx(truth['payload'], rel=0.007)
     assert found.lower < truth['payload'] < found.upper
+
+
+@pytest.mark.parametrize('inertia', [0.2, 0.5])
+def test_rotors_that_nobody_told_of_are_learned_from_a_hundred_samples_a_second_too(inertia: float) -> None:
+    arm = ArmParameters(damping_ratio=0.003)
+    plant = PlantParameters(arm=replace(arm, modes=5, rotor_inertia=(inertia, inertia)), rate=100.0, payload_mass=20.0)
+    capture = CaptureEvent(3_000_000_000, EventKind.CAPTURE)
+    trajectory = simulator.simulate(plant, excitation.sequence(ExcitationParameters(rate=100.0), 600), (capture,))
+    config, found = IdentifierParameters(arm=arm, model_rate=0.1), None
+    for estimate in pipeline.run(config, simulator.records(trajectory, (capture,))):
+        found = estimate.payload
+    assert found is not None
+    assert found.status is Status.TRACKING
+    assert found.mass == pytest.approx(20.0, rel=0.007)
+    assert found.lower < 20.0 < found.upper
 
 
 @pytest.mark.parametrize('name', ['arm_body', 'arm_orbit'])
