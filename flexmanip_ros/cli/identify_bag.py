@@ -96,7 +96,8 @@ def _main(given: argparse.Namespace) -> int:
         from flexmanip_ros.cli.suggest import given_values, suggest
 
         config, lines = suggest(given.bag, given.suggest, given_values(given.params, given.set), topics,
-                                given.validate_from, given.horizon)
+                                given.validate_from, given.horizon,
+                                [at for at in (given.capture_time, given.release_time) if at is not None])
         print('\n'.join(lines), flush=True)
     else:
         config = load(IdentifierParameters, NODE, given.params, given.set)

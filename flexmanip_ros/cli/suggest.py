@@ -79,15 +79,17 @@ def given_values(path: str | None, overrides: list[str]) -> dict[str, Any]:
 
 
 def suggest(source: str, place: str, given: Mapping[str, Any], topics: bag.Topics, until_s: float | None,
-            horizon_s: float) -> tuple[IdentifierParameters, list[str]]:
+            horizon_s: float, events_s: Sequence[float] = ()) -> tuple[IdentifierParameters, list[str]]:
     """Look at a recording and write the parameters to identify it with; return them and the lines to print.
 
-    given: parameters that stay as they are; until_s: time from which on samples are not looked at [s].
+    given: parameters that stay as they are; until_s: time from which on samples are not looked at [s]; events_s:
+    captures and releases beside those recorded, seconds after the first message.
     Raises FlexmanipError where the recording tells too little, and where the file cannot be written.
     """
     check_place(place, '.yaml', '.yml')
     with console.progress('looking at the signals', 'messages') as shown:
         blocks, events = _recording(source, topics, until_s, shown)
+    events += [int(blocks[0].stamp_ns[0]) + round(at * 1e9) for at in events_s]
     signals = observe(blocks)
     chosen, reasons = choose_signals(signals, given)
     config = configure(IdentifierParameters, {**given, **chosen})

@@ -12,8 +12,9 @@ import pytest
 from scipy.linalg import block_diag, expm
 
 from flexmanip_ros.cli.identify_bag import main
-from flexmanip_ros.cli.suggest import Found, choose_signals
+from flexmanip_ros.cli.suggest import Found, choose_signals, suggest
 from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.io.bag import Topics
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import IdentifierParameters
@@ -129,6 +130,17 @@ def test_a_model_with_modes_that_nothing_determines_is_not_tracking_whatever_its
                       '--set=past_window=20', '--set=future_window=10', f'--set=order={order}',
                       f'--set=decimation={decimation}')
         assert (found['status'] == 'TRACKING') is tracking
+
+
+def test_a_capture_that_is_told_divides_a_recording_as_one_that_it_holds(recording, tmp_path):
+    records = _machine()
+    capture = CaptureEvent(records[0].stamp_ns + 3_000_000_000, EventKind.CAPTURE)
+    announced = _bag(tmp_path / 'announced', records, capture)
+    (held, _), (told, _), (whole, _) = (
+        suggest(str(source), str(tmp_path / 'some.yaml'), {}, Topics(), None, 0.25, events_s)
+        for source, events_s in ((announced, ()), (recording, (3.0,)), (recording, ())))
+    assert told == held
+    assert told != whole
 
 
 def test_what_is_set_stays_as_it_is(recording, tmp_path, capsys):
