@@ -221,7 +221,7 @@ def _regular(config: IdentifierParameters, clock: Clock, log: SampleLog, block: 
         for places in (clock.channels.u, clock.channels.y, clock.channels.angles)])
     usable = finite & (intervals > 0) & (intervals * 1e-9 <= config.max_time_jump)  # no far jump
     count = len(stamps) if usable.all() else int(np.argmin(usable))
-    if clock.jitter.late_ns == clock.jitter.square == 0.0:  # equal intervals leave the clock as it is but for its sums
+    if clock.jitter.square == 0.0:  # equal intervals leave the clock as it is but for its sums
         equal = intervals[:count] * clock.interval_count == clock.interval_sum_ns
         exact = count if equal.all() else int(np.argmin(equal))
         if exact:

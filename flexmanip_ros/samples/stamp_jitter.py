@@ -83,7 +83,7 @@ class Jitter(NamedTuple):
     def walk(self) -> float:
         """Ratio q / v, at most ``WALK``; what chance may explain is no walk."""
         # where q = 0, 2 product / square scatters by sqrt(2 / intervals) (Bartlett 1946)
-        chance = CHANCE * math.sqrt(2.0 / max(self.intervals, 1)) * self.square
+        chance = CHANCE * math.sqrt(2.0 / self.intervals) * self.square
         q = max(self.square + 2.0 * self.product - chance, 0.0)
         v = 0.5 * (self.square - q)
         return min(q / v, WALK) if v > 0.0 else WALK
