@@ -277,15 +277,16 @@ def _refit(m: mem.FilterState) -> None:
 
 def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
     """Start the filter with its first rows, and take them and the events among them."""
-    model = state.model
+    dt = float(np.median(np.diff(rows.stamp_ns) * 1e-9))
+    told = structured_model.sampled(config, dt)
+    model = state.model if told is config else build(told)
     assert model is not None
     Y = measurements(model, rows)
-    dt = float(np.median(np.diff(rows.stamp_ns) * 1e-9))
     m = mem.memory(2 * model.motion.arm.stiffness.size + model.motion.kind.size, len(model.roles),
                    model.motion.effort.size)
     m.noise[:] = structured_model.noise(model, Y)
     structured_model.first(config, model, m, Y[0])
-    structured_model.freeze(config, model, np.mean(rows.angles, axis=0))
+    structured_model.freeze(told, model, np.mean(rows.angles, axis=0))
     if state.white.size:
         m.noise[:, [mem.WHITE, mem.LEVEL]] = state.white
         structured_model.guess_noise(model, m.noise)
@@ -302,7 +303,7 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     time_ns, efforts = int(rows.time_ns[0]), latest(seen, rows.u[:1], state.efforts)
     rates = np.full(efforts.shape[1], np.nan)
     state = state._replace(
-        memory=m, sensors=seen, begin=None, early=(), cursor=rows.first, last_ns=int(rows.stamp_ns[0]),
+        model=model, memory=m, sensors=seen, begin=None, early=(), cursor=rows.first, last_ns=int(rows.stamp_ns[0]),
         time_ns=time_ns, efforts=efforts, rates=rates, horizon=Horizon(rows.first, time_ns, efforts, rates))
     for row, item in events:
         state = event(config, _part(config, state, rows, row), item)

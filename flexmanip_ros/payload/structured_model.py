@@ -1,5 +1,6 @@
 """The structured estimator before its first step: which signals it reads, its model of the arm, its first state."""
 
+import math
 import re
 from dataclasses import replace
 from enum import IntEnum
@@ -145,6 +146,20 @@ class Model(NamedTuple):
     def body(self) -> int:
         """Number of states that describe the payload: 1 for a point mass, 4 for a rigid body."""
         return int(np.count_nonzero(self.motion.kind <= int(Kind.INERTIA)))
+
+
+def sampled(config: IdentifierParameters, dt: float) -> IdentifierParameters:
+    """Return the parameters without the sines that are faster than half the sample rate; dt: sample time [s].
+
+    Sine j of a pinned link has the frequency j^2 f_1. Samples do not tell one above half their rate from a slower one
+    (Nyquist), and the static shapes keep what it adds to slow motion (component mode synthesis, Craig and Bampton
+    1968). A light short link has shapes that turn by tens of radians in a slow sample, which cost as many steps.
+    """
+    arm = config.arm
+    if arm.shape_functions != 'component_modes':
+        return config
+    told = math.isqrt(int(0.5 / (dt * min(pinned_frequencies(arm)))))
+    return config if told >= arm.modes else replace(config, arm=replace(arm, modes=max(told, 1)))
 
 
 def build(config: IdentifierParameters) -> Model | None:
