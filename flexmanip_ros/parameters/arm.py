@@ -40,7 +40,8 @@ class ArmParameters:
         'ends, where the torques act; sines, sines alone (the paper)',
         choices=('component_modes', 'sines'))
     modes: int = parameter(
-        3, 'number of sines among the shape functions of each link (payload_method block uses order / 4 sines instead)',
+        3, 'number of sines among the shape functions of each link (payload_method block uses order / 4 sines instead; '
+        'beside the static shapes, method structured leaves out those faster than the sample rate)',
         low=1, high=12)
     shortening: bool = parameter(True, 'model the shortening of a bent link to second order (the paper: false)')
     rotor_inertia: tuple[float, ...] = parameter(

@@ -278,15 +278,15 @@ def _refit(m: mem.FilterState) -> None:
 def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
     """Start the filter with its first rows, and take them and the events among them."""
     dt = float(np.median(np.diff(rows.stamp_ns) * 1e-9))
-    told = structured_model.sampled(config, dt)
-    model = state.model if told is config else build(told)
+    fewer = structured_model.sampled(config, dt)
+    model = state.model if fewer is config else build(fewer)
     assert model is not None
     Y = measurements(model, rows)
     m = mem.memory(2 * model.motion.arm.stiffness.size + model.motion.kind.size, len(model.roles),
                    model.motion.effort.size)
     m.noise[:] = structured_model.noise(model, Y)
     structured_model.first(config, model, m, Y[0])
-    structured_model.freeze(told, model, np.mean(rows.angles, axis=0))
+    structured_model.freeze(fewer, model, np.mean(rows.angles, axis=0))
     if state.white.size:
         m.noise[:, [mem.WHITE, mem.LEVEL]] = state.white
         structured_model.guess_noise(model, m.noise)

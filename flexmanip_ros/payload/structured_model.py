@@ -149,17 +149,18 @@ class Model(NamedTuple):
 
 
 def sampled(config: IdentifierParameters, dt: float) -> IdentifierParameters:
-    """Return the parameters without the sines that are faster than half the sample rate; dt: sample time [s].
+    """Return the parameters without the sines that are faster than the sample rate; dt: sample time [s].
 
-    Sine j of a pinned link has the frequency j^2 f_1. Samples do not tell one above half their rate from a slower one
-    (Nyquist), and the static shapes keep what it adds to slow motion (component mode synthesis, Craig and Bampton
-    1968). A light short link has shapes that turn by tens of radians in a slow sample, which cost as many steps.
+    Sine j of a pinned link has the frequency j^2 f_1, f_1 that of the slowest link. Samples show motion up to half
+    their rate (Nyquist). Shapes up to twice the highest frequency of interest represent it, as the static shapes keep
+    what the others add to slow motion (component mode synthesis, Craig and Bampton 1968). The filter takes fewer
+    integration steps in a sample without these.
     """
     arm = config.arm
     if arm.shape_functions != 'component_modes':
         return config
-    told = math.isqrt(int(0.5 / (dt * min(pinned_frequencies(arm)))))
-    return config if told >= arm.modes else replace(config, arm=replace(arm, modes=max(told, 1)))
+    slower = math.isqrt(int(1.0 / (dt * min(pinned_frequencies(arm)))))
+    return config if slower >= arm.modes else replace(config, arm=replace(arm, modes=max(slower, 1)))
 
 
 def build(config: IdentifierParameters) -> Model | None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from recording import ARM, BENDS, RATES, altered, config, event, joined, record, rows_of, run
 
+from flexmanip_ros import pipeline
 from flexmanip_ros.parameters import (
     ArmParameters,
     ExcitationParameters,
@@ -16,7 +17,7 @@ from flexmanip_ros.parameters import (
     PlantParameters,
 )
 from flexmanip_ros.payload import filter_state as mem
-from flexmanip_ros.payload import structured
+from flexmanip_ros.payload import structured, structured_model
 from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.simulation import excitation, simulator
@@ -38,6 +39,37 @@ def test_payload_is_found_on_the_moving_arm(degrees, payload):
     assert abs(found.mass - payload) < 4 * found.std  # the share inside 95 % is benchmarks/payload_coverage
     assert found.upper - found.lower < 0.05 * payload
     assert found.status is Status.TRACKING
+
+
+SMALL = ArmParameters(link_length=(0.5, 0.45), linear_density=(0.35, 0.25), bending_stiffness=(6.0, 3.0),
+                      joint_mass=0.4, tip_mass=0.1, damping_ratio=0.01)
+"""Its links bend at 26.0 and 26.9 Hz, pinned at both ends."""
+
+
+@pytest.mark.parametrize(('rate', 'sines'), [(20.0, 1), (104.0, 1), (105.0, 2), (234.0, 2), (235.0, 3)])
+def test_sines_faster_than_the_sample_rate_are_left_out(rate, sines):
+    told = structured_model.sampled(config(SMALL), 1.0 / rate)
+    assert told == replace(config(SMALL), arm=replace(SMALL, modes=sines))
+
+
+@pytest.mark.parametrize(('arm', 'dt'), [(ARM, 1e-3), (ARM, 2e-2), (replace(SMALL, shape_functions='sines'), 5e-3)])
+def test_a_large_arm_and_one_of_sines_alone_keep_all(arm, dt):
+    settings = config(arm)
+    assert structured_model.sampled(settings, dt) is settings
+
+
+def test_the_mass_on_a_small_arm_is_known_from_200_samples_a_second():
+    capture = event(2.0)
+    plant = PlantParameters(arm=replace(SMALL, modes=8), rate=200.0, payload_mass=0.3)
+    torques = ExcitationParameters(rate=200.0, amplitude=(0.3, 0.1))
+    trajectory = simulator.simulate(plant, excitation.sequence(torques, 1000), (capture,))
+    found = None
+    for estimate in pipeline.run(IdentifierParameters(arm=SMALL), simulator.records(trajectory, (capture,))):
+        found = estimate.payload
+    assert found is not None
+    assert found.status is Status.TRACKING
+    assert found.mass == pytest.approx(0.3, rel=0.007)
+    assert found.lower < 0.3 < found.upper
 
 
 def test_displacements_alone_are_enough():
