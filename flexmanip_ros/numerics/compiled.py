@@ -4,15 +4,22 @@ Compiled functions are cached on disk at first use; those that are older than th
 """
 
 import contextlib
+import hashlib
+import importlib
 import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from numba import njit, typeof
-from numba.extending import register_jitable
+from numba import njit, typeof, types
+from numba.core import cgutils
+from numba.core.codegen import ll
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import lower_builtin, register_jitable
 
 Function = TypeVar('Function', bound=Callable[..., Any])
+Types = tuple[Any, ...]
+"""numba's types of the arguments of a function."""
 
 
 def kernel(function: Function) -> Function:
@@ -79,7 +86,78 @@ def _compiled(function: Function, **more: Any) -> Function:
     return compiled
 
 
-COMPILED = re.compile(r'^@(kernel|inlined|inner|merged|library)$', re.MULTILINE)
+class Separate:
+    """A kernel that is compiled once: the kernels that call it call its machine code.
+
+    numba compiles a kernel again within each kernel that calls it. Here a caller refers to a symbol, which LLVM looks
+    up in its table of the process when it links the caller. So the kernel must be compiled, or loaded from the cache,
+    before its callers are linked. Compiling a caller compiles it; loading a caller loads it (``_Needed``).
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.kernel: Any = _compiled(function)
+        self.__name__, self.__doc__, self.__module__ = function.__name__, function.__doc__, function.__module__
+        calls = type(f'calls_of_{self.__name__}', (AbstractTemplate,),
+                     {'key': self, 'generic': lambda _, arguments, named: self._typed(arguments)})
+        infer_global(self, types.Function(calls))
+        lower_builtin(self, types.VarArg(types.Any))(self._call)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Run it, called from Python."""
+        return self.kernel(*arguments)
+
+    def compile(self, arguments: Types) -> Any:
+        """Compile it for arguments of these types, and define its symbol; return the type of its result."""
+        self.kernel.compile(arguments)
+        made = self.kernel.overloads[arguments]
+        ll.add_symbol(self._symbol(arguments), made.library.get_pointer_to_function(made.fndesc.llvm_func_name))
+        return made.signature.return_type
+
+    def _symbol(self, arguments: Types) -> str:
+        digest = hashlib.sha256(repr(arguments).encode()).hexdigest()[:16]
+        return f'{self.__module__}.{self.__name__}.{digest}'
+
+    def _typed(self, arguments: Types) -> Any:
+        """Return the signature of a call with arguments of these types."""
+        plain = tuple(types.unliteral(argument) for argument in arguments)
+        return signature(self.compile(plain), *plain)
+
+    def _call(self, context: Any, builder: Any, typed: Any, values: Any) -> Any:
+        """Write the call into its caller, in LLVM's language and with numba's calling convention."""
+        context.environment.consts.append(_Needed(self.__module__, self.__name__, typed.args))
+        form = context.call_conv.get_function_type(typed.return_type, typed.args)
+        target = cgutils.get_or_insert_function(builder.module, form, self._symbol(typed.args))
+        _, result = context.call_conv.call_function(builder, target, typed.return_type, typed.args, values)
+        return result
+
+
+class _Needed:
+    """A constant of a kernel that calls a separate one. Reading it from the cache loads the one that is called."""
+
+    def __init__(self, module: str, name: str, arguments: Types) -> None:
+        self.called = module, name, arguments
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _load, self.called
+
+
+def _load(module: str, name: str, arguments: Types) -> _Needed:
+    getattr(importlib.import_module(module), name).compile(arguments)
+    return _Needed(module, name, arguments)
+
+
+def separate(function: Function) -> Function:
+    """Compile a kernel once, for all kernels that call it.
+
+    For kernels that take seconds to compile and microseconds to run. They must raise nothing, as their callers do not
+    look for it.
+    """
+    made: Any = Separate(function)
+    called: Function = made
+    return called
+
+
+COMPILED = re.compile(r'^@(kernel|separate|inlined|inner|merged|library)$', re.MULTILINE)
 IMPORT = re.compile(r'^ *from ([\w.]+) import (\([^)]*\)|.*)$', re.MULTILINE)
 CONSTANT = re.compile(r'\b[A-Z][A-Z_]+\b')
 
@@ -103,12 +181,12 @@ def drop_stale(package: Path) -> int:
 
 
 def _sources(package: Path) -> set[Path]:
-    """Return the files of compiled functions, and those of which they import constants."""
+    """Return the files of compiled functions, those of which they import constants, and this one."""
     texts = {path: path.read_text(encoding='utf-8') for path in package.rglob('*.py')}
     found = {path: text for path, text in texts.items() if COMPILED.search(text)}
     imported = (module for text in found.values() for module, names in IMPORT.findall(text) if CONSTANT.search(names))
     modules = {package.parent / f'{module.replace(".", "/")}.py' for module in imported}
-    return found.keys() | (modules & texts.keys())
+    return found.keys() | (modules & texts.keys()) | {Path(__file__)}
 
 
 with contextlib.suppress(OSError):  # numba keeps those of a read-only folder elsewhere

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexmanip_ros.arm.equations_of_motion import solve
-from flexmanip_ros.numerics.compiled import inner, kernel
+from flexmanip_ros.numerics.compiled import inner, kernel, separate
 from flexmanip_ros.numerics.square_root import factor_information, forward
 from flexmanip_ros.payload.filter_state import (
     AGAIN,
@@ -127,7 +127,7 @@ def transition(motion: ProcessModel, flow: Array, state: Array, dt: float) -> No
                 flow[i, c] = value
 
 
-@kernel
+@separate
 def traces(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr: GlrState, prior: Array, dt: float
            ) -> None:
     """Compute the traces of an onset from the linearization; prior: (3, 3) deviations by order and component."""

@@ -8,7 +8,7 @@ the horizon. Kernels of their own, as each runs once an iteration, not once a sa
 
 import numpy as np
 
-from flexmanip_ros.numerics.compiled import inner, kernel
+from flexmanip_ros.numerics.compiled import inner, separate
 from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, factor_information, forward, least_distance
 from flexmanip_ros.payload.filter_state import (
     AGAIN,
@@ -136,7 +136,7 @@ def begin_iteration(motion: ProcessModel, m: FilterState) -> None:
     m.counts[ITERATING] = 1
 
 
-@kernel
+@separate
 def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
     """Accept the iteration and take the next step. Where it has read all samples, the filter goes on from there."""
     nx = m.x.size
@@ -323,7 +323,7 @@ def condition(x: Array, S: Array, row: int, value: float, f: Array) -> None:
         S[row, c] = 0.0
 
 
-@kernel
+@separate
 def close_horizon(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> None:
     """Close the horizon; where an empty arm shows no late signal, fit its samples again with the given delays.
 
@@ -425,7 +425,7 @@ def damped_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState)
     return True
 
 
-@kernel
+@separate
 def reject_step(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
     """Take a shorter step from the accepted xi, nearer to the gradient, and begin the iteration again."""
     m.counts[REJECTED] += 1

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.numerics.compiled import inlined, inner
+from flexmanip_ros.numerics.compiled import inlined, inner, separate
 from flexmanip_ros.numerics.square_root import absorb_measurement, dot, project
 from flexmanip_ros.payload.filter_state import (
     BLOCK_POWER,
@@ -156,7 +156,7 @@ def observe(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Ar
     return predicted
 
 
-@inner
+@separate
 def measure(sensors: MeasurementModel, m: FilterState, y: Array, qdd: Array, opened: NDArray[np.int64]) -> None:
     """Update the filter with one sample; gather the power of its innovations and their information on the payload.
 

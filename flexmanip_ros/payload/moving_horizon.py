@@ -14,7 +14,7 @@ the samples, its state replaces that of the filter.
 import numpy as np
 
 from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, solve
-from flexmanip_ros.numerics.compiled import inner, kernel, merged
+from flexmanip_ros.numerics.compiled import inner, merged, separate
 from flexmanip_ros.numerics.square_root import absorb_noise, dot, least_distance
 from flexmanip_ros.payload.filter_state import (
     AGAIN,
@@ -401,7 +401,7 @@ def fails(m: FilterState) -> bool:
     return failed
 
 
-@kernel
+@separate
 def excess_bias(motion: ProcessModel, m: FilterState) -> float:
     """Return the mass that an empty arm seems to hold, in deviations by its moves and the error of its inertia."""
     mass = m.x.size - motion.kind.size
@@ -411,7 +411,7 @@ def excess_bias(motion: ProcessModel, m: FilterState) -> float:
     return float(m.x[mass] / np.sqrt(max(variance + motion.considered * motion.considered, 1e-300)))
 
 
-@inner
+@separate
 def strays(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
     """Whether the filter has diverged after a fit: the sensors show far more than their white noise.
 
@@ -432,7 +432,7 @@ def strays(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> b
     return bool(left)
 
 
-@kernel
+@separate
 def keep_possible(motion: ProcessModel, m: FilterState, chance: float) -> None:
     """Move the state to the most likely one within the bounds of p (constrained filter of Simon and Chia, 2002).
 
@@ -448,7 +448,7 @@ def keep_possible(motion: ProcessModel, m: FilterState, chance: float) -> None:
     keep_inertia(motion, m.x[first:])
 
 
-@kernel
+@separate
 def diffuse(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, duration: float) -> None:
     """Add the process noise since it was last added, which keeps the memory finite once the horizon has closed.
 

@@ -15,7 +15,7 @@ from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, balance, inerti
 from flexmanip_ros.arm.jacobian import add_body_forces, complete_jacobian, force_jacobian, solve_columns
 from flexmanip_ros.arm.late_torque import late_torque
 from flexmanip_ros.arm.manipulator import Manipulator, Workspace
-from flexmanip_ros.numerics.compiled import inner, kernel
+from flexmanip_ros.numerics.compiled import inner, kernel, separate
 from flexmanip_ros.numerics.square_root import Bounds, dot, multiply
 from flexmanip_ros.types import Array
 
@@ -526,7 +526,7 @@ def note_opened(motion: ProcessModel, S: Array, used: int) -> None:
     motion.opened[0] = count
 
 
-@kernel
+@separate
 def predict(
     motion: ProcessModel, x: Array, S: Array, used: int, rows: Array, period: float, duration: float,
 ) -> int:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 from flexmanip_ros.numerics.compiled import drop_stale
@@ -35,3 +37,26 @@ def test_caches_older_than_constants_that_a_kernel_reads_are_dropped(tmp_path: P
     assert drop_stale(package) == 0
     os.utime(package / 'layout.py', (400, 400))
     assert drop_stale(package) == 1
+
+
+SEPARATE = """
+from flexmanip_ros.numerics.compiled import kernel, separate
+
+@separate
+def halve(x, count):
+    return x / 2.0 ** count
+
+@kernel
+def twice(x):
+    return halve(x, 1) + halve(x, 2)
+"""
+
+
+def test_a_kernel_from_the_cache_brings_the_separate_kernels_that_it_calls(tmp_path: Path) -> None:
+    (tmp_path / 'halves.py').write_text(SEPARATE)
+    environment = os.environ | {'PYTHONPATH': os.pathsep.join((str(tmp_path), *sys.path)),
+                                'NUMBA_CACHE_DIR': str(tmp_path)}
+    call = 'import halves; print(halves.twice(8.0), halves.halve(8.0, 1), sum(halves.twice.stats.cache_hits.values()))'
+    said = [subprocess.run([sys.executable, '-c', call], env=environment, capture_output=True, text=True, check=True,
+                           timeout=100).stdout.split() for _ in range(2)]
+    assert said == [['6.0', '4.0', '0'], ['6.0', '4.0', '1']]
