@@ -25,6 +25,7 @@ from flexmanip_ros.payload.filter_state import (
 from flexmanip_ros.payload.gauss_newton import FITS
 from flexmanip_ros.payload.measurement_update import OVERLAP, MeasurementModel, misfit, white_variance
 from flexmanip_ros.payload.moving_horizon import MOST_BIAS
+from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import QUANTILE, Array, Payload, Status
 
@@ -85,6 +86,8 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         if status is Status.TRACKING and std > UNTOLD * structured_model.EMPTY_STD * model.motion.scale:
             return Payload(0.0, prior, 0.0, QUANTILE * prior, consistency, Status.POORLY_EXCITED)
         return empty(float(body[0]), std, considered, consistency, status)
+    moved = by_rotors(model, m)
+    spread += moved @ moved.T
     if consistency > (POWER_LIMIT if m.counts[REFITS] else UNKNOWN_POWER):
         return Payload(max(float(body[0]), 0.0), math.inf, 0.0, math.inf, consistency, status)
     known_point = model.body > 1 and not spread[1:, 1:].any()
@@ -188,6 +191,21 @@ def empty(seeming: float, std: float, considered: float, consistency: float, sta
     if abs(seeming) > MOST_BIAS * std and status is Status.TRACKING:
         return Payload(0.0, math.inf, 0.0, math.inf, consistency, Status.INCONSISTENT)
     return Payload(0.0, std, 0.0, upper, consistency, status)
+
+
+def by_rotors(model: Model, m: mem.FilterState) -> Array:
+    """Return by how much the body's parameters (body, rotors) move with one consider deviation of each rotor inertia.
+
+    The shape functions that are left out respond to fast torques much as a rotor does, so a rotor that is learned has a
+    bias that its variance P_rr does not hold. A bias b of the rotor moves the body by P_br / P_rr b, the regression on
+    it (consider covariance, Schmidt).
+    """
+    rotors = np.flatnonzero(model.motion.kind == Kind.ROTOR)
+    S, body = m.S[model.payload + rotors], m.S[model.payload:model.payload + model.body]
+    own = (S * S).sum(axis=1)
+    regression = np.divide(body @ S.T, own, out=np.zeros((model.body, rotors.size)), where=own > 0.0)
+    moved: Array = regression * model.rotor_error[model.motion.link[rotors]]
+    return moved
 
 
 def inertia_error(config: IdentifierParameters, model: Model, mass: float) -> float:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
@@ -54,6 +55,8 @@ class StructuredState(NamedTuple):
     """(P, L) effort held since then, and those of the samples before, newest last [N m]."""
     rates: Array = np.empty(0)
     """(L,) measured rates of the joints in that sample [rad/s]; NaN: unknown."""
+    unused: NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
+    """(L,) joints whose measured rates are too noisy to tell the Coulomb friction."""
     missing: int = 0
     """How many rows in a row were missing up to now."""
     peak: Array = np.empty(0)
@@ -302,9 +305,11 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     events = state.early
     time_ns, efforts = int(rows.time_ns[0]), latest(seen, rows.u[:1], state.efforts)
     rates = np.full(efforts.shape[1], np.nan)
+    unused = structured_model.too_noisy(rows.rates, dt) if rows.rates.shape[1] else np.zeros(rates.size, dtype=np.bool_)
     state = state._replace(
         model=model, memory=m, sensors=seen, begin=None, early=(), cursor=rows.first, last_ns=int(rows.stamp_ns[0]),
-        time_ns=time_ns, efforts=efforts, rates=rates, horizon=Horizon(rows.first, time_ns, efforts, rates))
+        time_ns=time_ns, efforts=efforts, rates=rates, unused=unused,
+        horizon=Horizon(rows.first, time_ns, efforts, rates))
     for row, item in events:
         state = event(config, _part(config, state, rows, row), item)
     return _part(config, state, rows, rows.until)
@@ -473,6 +478,7 @@ def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
     table[:, 0] *= 1e-9
     begins, ends = table[:, 1 + links:1 + 2 * links], table[:, 1 + 2 * links:first]
     ends[:] = reach.rates if reach.rates.shape[1] else np.nan
+    ends[:, state.unused] = np.nan
     table[:, first:] = y
     table[reach.missing > 0, 1 + 2 * links:] = np.nan
     begins[0], begins[1:] = rates, ends[:-1]

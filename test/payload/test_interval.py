@@ -1,0 +1,93 @@
+"""The interval holds what is not estimated: the bias of a rotor by the shape functions that are left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flexmanip_ros import pipeline
+from flexmanip_ros.arm.linearization import mass_matrix
+from flexmanip_ros.arm.manipulator import manipulator
+from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, IdentifierParameters, PlantParameters
+from flexmanip_ros.payload.filter_state import memory
+from flexmanip_ros.payload.interval import by_rotors
+from flexmanip_ros.payload.process_model import Kind
+from flexmanip_ros.payload.structured_model import ROTOR_ERROR, build, too_noisy
+from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.types import CaptureEvent, EventKind, Status
+
+MODEL = build(IdentifierParameters())
+assert MODEL is not None
+BODY = np.arange(MODEL.payload, MODEL.payload + MODEL.body)
+ROTORS = MODEL.payload + np.flatnonzero(MODEL.motion.kind == Kind.ROTOR)
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 2 ** 32 - 1))
+def test_a_bias_of_a_rotor_moves_the_body_as_a_gaussian_conditioned_on_that_rotor(seed: int) -> None:
+    assert MODEL is not None
+    m = memory(2 * MODEL.motion.arm.stiffness.size + MODEL.motion.kind.size, len(MODEL.roles), 2)
+    m.S[:] = np.random.default_rng(seed).standard_normal(m.S.shape)
+    P = m.S @ m.S.T
+    for rotor, error, moved in zip(ROTORS, MODEL.rotor_error, by_rotors(MODEL, m).T, strict=True):
+        seen = [*BODY, rotor]
+        information = np.linalg.inv(P[np.ix_(seen, seen)])  # another route: by the precision of what is left
+        np.testing.assert_allclose(moved, -np.linalg.solve(information[:-1, :-1], information[:-1, -1]) * error,
+                                   rtol=1e-6, atol=1e-9 * abs(error))
+
+
+def test_rotors_that_are_taken_as_known_have_no_bias() -> None:
+    assert MODEL is not None
+    m = memory(2 * MODEL.motion.arm.stiffness.size + MODEL.motion.kind.size, len(MODEL.roles), 2)
+    m.S[:] = np.eye(len(m.S))
+    m.S[ROTORS] = 0.0
+    assert not by_rotors(MODEL, m).any()
+
+
+def test_the_bias_is_of_the_links_alone_however_large_hub_and_rotor_are() -> None:
+    heavy = IdentifierParameters(arm=ArmParameters(hub_inertia=(1.0, 1.0), rotor_inertia=(5.0, 3.0)))
+    model, links_alone = build(heavy), manipulator(ArmParameters())
+    assert model is not None
+    M = mass_matrix(links_alone, np.zeros(4), np.zeros(links_alone.stiffness.size))
+    fast = [1.0 / (row @ np.linalg.solve(M, row)) for row in links_alone.joint]
+    np.testing.assert_allclose(model.rotor_error, ROTOR_ERROR * np.array(fast), rtol=1e-12)
+
+
+def test_a_light_body_on_an_arm_of_more_shape_functions_and_much_friction_is_in_its_interval() -> None:
+    told = ArmParameters(damping_ratio=0.003)
+    arm = replace(told, modes=told.modes + 2, joint_coulomb_friction=(0.95, 0.95), rotor_inertia=(0.23, 0.28))
+    mass, capture = 6.12, CaptureEvent(3_193_000_000, EventKind.CAPTURE)
+    plant = PlantParameters(arm=arm, payload_mass=mass, payload_com=(-0.12, 0.08), payload_inertia=0.36, snr_db=50.0,
+                            initial_angles=(-1.477, -0.881))
+    torques = excitation.sequence(
+        ExcitationParameters(shape='prbs', amplitude=(11.44, 5.72), period=(0.894, 0.553), seed=37), 6200)
+    records = (item if isinstance(item, CaptureEvent) else item._replace(velocity=item.velocity[:0])
+               for item in simulator.records(simulator.simulate(plant, torques, (capture,)), (capture,)))
+    late = [estimate.payload for estimate in pipeline.run(IdentifierParameters(arm=told, model_rate=0.1), records)
+            if estimate.payload is not None and estimate.stamp_ns > 4_200_000_000]
+    assert all(found.status is Status.TRACKING for found in late)
+    assert all(found.lower < mass < found.upper for found in late)
+    assert late[-1].upper - late[-1].lower < 0.1 * mass
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2 ** 32 - 1), quiet=st.floats(0.0, 0.7e-3), loud=st.floats(3e-3, 1.0))
+def test_rates_tell_the_friction_unless_their_noise_hides_where_it_reverses(
+        seed: int, quiet: float, loud: float) -> None:
+    moving = np.sin(0.01 * np.arange(60))[:, None]  # 10 rad/s^2 at 1 kHz
+    rates = moving + np.random.default_rng(seed).standard_normal((60, 2)) * [quiet, loud]
+    assert too_noisy(rates, 1e-3).tolist() == [False, True]
+    assert not too_noisy(rates, 5e-3).any()  # vibrations would be taken for noise
+    rates[1:] = np.nan
+    assert not too_noisy(rates, 1e-3).any()  # one sample tells no noise
+
+
+def test_noise_hides_the_share_of_friction_as_reckoned() -> None:
+    rng = np.random.default_rng(1)
+    for std in (0.3, 1.0, 2.0):  # of the noise, over the rate where friction reverses
+        share = np.tanh(std * rng.standard_normal(100_000))  # at a measured rate of zero
+        assert np.var(share) == pytest.approx(1.0 - 1.0 / np.sqrt(1.0 + np.pi / 2.0 * std ** 2), abs=0.06)
