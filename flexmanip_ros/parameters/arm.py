@@ -219,7 +219,7 @@ class ExcitationParameters:
     bit_time: float = parameter(0.05, 'shortest pulse of the PRBS', unit='s', low=1e-4, high=60.0)
     seed: int = parameter(1, 'seed of the multisine phases and of the PRBS', low=0)
     allowed_angle: float = parameter(
-        0.0, 'both amplitudes are scaled by one factor so that the chords of the empty arm turn exactly this far '
+        0.0, 'both amplitudes are scaled by one factor so that the chords of the empty arm turn this far '
         'within design_time; 0: no scaling', unit='rad', low=0.0, high=3.0)
     design_time: float = parameter(
         6.0, 'length of the run for which allowed_angle and the expected payload accuracy hold', unit='s',
