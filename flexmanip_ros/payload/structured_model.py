@@ -319,9 +319,9 @@ shape functions would make that inertia less, so a rotor that is learned stands 
 On 53 random arms with two sines more than the estimator this error was 0.14 rms at joint 1, 0.07 at joint 2."""
 FEWEST = 9
 """Least number of samples whose fourth differences tell the noise of a signal."""
-LONGEST_PERIOD = 2.5e-3
-"""Longest sample time [s] at which fourth differences of a joint's rate tell its noise. Vibrations add 0.1 to 0.7
-mrad/s at 2 ms, 2 to 10 mrad/s at 5 ms (default arm with rotors of 0.2 and 0.5 kg m^2)."""
+LONGEST_PERIOD = 1.5e-3
+"""Longest sample time [s] at which fourth differences of a joint's rate tell its noise. Vibrations add up to 0.1 mrad/s
+at 1 ms, 0.7 at 2 ms, 10 at 5 ms (default arm with rotors of 0.2 and 0.5 kg m^2)."""
 VISCOUS_STD = 0.02
 """Prior deviation of a viscous friction, as the rate [1/s] at which it alone would slow down that inertia."""
 COULOMB_STD = 0.005
