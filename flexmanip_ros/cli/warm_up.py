@@ -80,8 +80,8 @@ def simulator_and_identifier() -> None:
     validation.predict_ahead(model, u, y, 2)
 
 
-def steps_of_the_fit() -> None:
-    """Compile what the payload's filter calls now and then."""
+def steps_of_the_filter() -> None:
+    """Compile what the payload's filter calls, but its prediction."""
     config = IdentifierParameters()
     model = build(config)
     assert model is not None
@@ -114,7 +114,7 @@ def payload() -> None:
 
 
 PARTS: dict[str, tuple[Callable[[], None], ...]] = {
-    'payload': (payload,), 'simulator and identifier': (steps_of_the_fit, simulator_and_identifier)}
+    'payload': (payload,), 'simulator and identifier': (steps_of_the_filter, simulator_and_identifier)}
 
 
 def main(argv: list[str] | None = None) -> int:

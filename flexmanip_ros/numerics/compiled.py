@@ -36,8 +36,8 @@ def inlined(function: Function) -> Function:
     """Compile a kernel into those that call it; Python may call it as well.
 
     Passing a Manipulator takes some 300 words on the stack and as many instructions at every call: half the
-    time of the small kernels. Every caller compiles the function again, so a function with few callers and a long
-    run time stays a ``kernel``.
+    time of the small kernels. Every caller compiles the function again, so one that takes seconds to compile is
+    ``separate``.
     """
     return _compiled(function, forceinline=True)
 

@@ -15,6 +15,7 @@ from flexmanip_ros.arm.equations_of_motion import STICTION_RATE
 from flexmanip_ros.arm.late_torque import efforts_needed
 from flexmanip_ros.arm.linearization import mass_matrix
 from flexmanip_ros.arm.manipulator import Manipulator, fastest_mode, manipulator, modal, workspace
+from flexmanip_ros.identification.prediction_check import white_noise
 from flexmanip_ros.numerics.square_root import allocate_bounds
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
@@ -405,12 +406,6 @@ def _inertias_at_joints(arm: Manipulator) -> Array:
     return np.array([1.0 / float(row @ np.linalg.solve(M, row)) for row in arm.joint])
 
 
-def white_noise(Y: Array) -> Array:
-    """Return the variance (c,) of the white noise of signals Y (N, c), by their fourth differences."""
-    white: Array = (1.4826 * np.median(np.abs(np.diff(Y, n=4, axis=0)), axis=0)) ** 2 / 70
-    return white
-
-
 def too_noisy(rates: Array, dt: float) -> NDArray[np.bool_]:
     """Return of which joints (L,) the measured rates (N, L) tell less of the Coulomb friction than those of the model.
 
@@ -429,10 +424,12 @@ def too_noisy(rates: Array, dt: float) -> NDArray[np.bool_]:
 
 def noise(model: Model, Y: Array) -> Array:
     """Return a first guess of every sensor's noise, as ``FilterState.noise``, from its first samples Y (N, m)."""
+    differences = np.diff(Y, n=4, axis=0)
+    white = (1.4826 * np.median(np.abs(differences), axis=0)) ** 2 / 70
     rows = np.zeros((len(model.roles), 11))
     rows[:, mem.LEVEL] = np.inf  # no spectrum yet
     rows[:, mem.FLOOR] = [FLOORS[role.quantity] ** 2 for role in model.roles]
-    rows[:, mem.WHITE] = np.maximum(white_noise(Y), rows[:, mem.FLOOR])
+    rows[:, mem.WHITE] = np.maximum(white, rows[:, mem.FLOOR])
     guess_noise(model, rows)
     return rows
 
