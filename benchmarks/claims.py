@@ -92,7 +92,7 @@ def detection_delay(rows: list[dict[str, Any]]) -> Claims:
     for samples, share in zip(moving['samples_after'], moving['payload_inside'], strict=True):
         yield covers(f'{samples} ms after the instant that was found: payload inside its interval', share,
                      moving['runs'])
-    yield Claim('at rest, found within 100 ms of torque', rest['within_100_ms'], 0.95)
+    yield Claim('known arm at rest, found within 100 ms of torque', rest['within_100_ms'], 0.95)
     yield Claim(f'false alarms in {empty["hours"]} h', empty['alarms'], high=0)
 
 

@@ -171,6 +171,8 @@ def _watch(
     if taken < 0:  # the fit of the empty arm begins again, and may learn more of it
         last = part.since(part.until - 1)
         fresh = structured.restart(state.identifier, filtered, after, last)
+        if m.counts[mem.RESTS] == mem.SLIDES:  # the horizon of an arm at rest
+            return replace(state, filter=fresh, glr=glr), None
         glr = _quiet(glr)
         glr.level[kernel.PEAK] = 0.0  # what the model missed before
         return replace(state, filter=fresh, glr=glr), None

@@ -22,12 +22,14 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
 # Elements of ``counts``.
 (HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, MOVED, SEEN, BEFORE,
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
- IN_SPECTRUM, SPECTRA, LINEARIZED, EFFORTS) = range(24)
+ IN_SPECTRUM, SPECTRA, LINEARIZED, EFFORTS, RESTS) = range(25)
 # Elements of ``score``.
 (SHIFT, DOUBT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES, SANDWICH,
  WHITENED, MISFIT, EMPTY_MISFIT, LOG_DETERMINANT, LIKELIHOOD) = range(15)
 # Values of ``counts[EFFORTS]``: whether the white part of the reported efforts is noise or acts on the arm.
 NOISY, COMPARED, EXACT, CONFIRMED = range(4)
+# Values of ``counts[RESTS]``: whether the arm is at rest, and its horizon slides until it moves.
+MOVES_ABOUT, RESTING, SLIDES, BEGINS_TO_MOVE = range(4)
 
 
 class FilterState(NamedTuple):
@@ -45,7 +47,7 @@ class FilterState(NamedTuple):
     """(m, 3, TONES) of its fourth differences: both states of Goertzel's filter, mean power over that of white noise
     of unit variance."""
     counts: NDArray[np.int64]
-    """(24,) counters and flags (1: yes).
+    """(25,) counters and flags (1: yes).
 
     Filter: HELD: the arm holds something; LEARNED: it was seen empty before; SEEN: samples measured, at most 2000;
     SINCE_EVENT: those since the last event; IN_A_ROW: those since the last one that was missing; SINCE_NOISE: samples
@@ -57,7 +59,9 @@ class FilterState(NamedTuple):
     reads the same samples, as it has not converged; TRIED: iterations over the same samples so far; REFITS: fits begun
     again since the event; LINEARIZED: the iteration carries a linearized Kalman filter; EFFORTS: NOISY: their white
     part is taken for noise; COMPARED: the iteration takes it for true; EXACT: it fits better so; CONFIRMED: it does
-    not."""
+    not; RESTS: RESTING: the samples since the event tell nothing yet of the payload, so no fit reads them and the
+    horizon slides along, IN_BATCH counts the samples since it slid; SLIDES: it is due; BEGINS_TO_MOVE: the last sample
+    tells."""
     score: Array
     """(15,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
     squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
@@ -115,7 +119,7 @@ def memory(nx: int, m: int, links: int) -> FilterState:
     """Allocate for nx states, m sensors and the joints of ``links`` links."""
     return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)),
-        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(24, dtype=np.int64), score=np.zeros(15),
+        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(25, dtype=np.int64), score=np.zeros(15),
         moved=np.zeros((nx, 2)), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
         normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, 2 * nx + 1)),
         N=np.zeros((nx, nx)), g=np.zeros(nx), batch=np.zeros(nx), B=np.zeros((nx, nx)),

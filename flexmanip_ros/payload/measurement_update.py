@@ -22,6 +22,8 @@ from flexmanip_ros.payload.filter_state import (
     MOVED,
     MOVES,
     POWER,
+    RESTING,
+    RESTS,
     SEEN,
     SINCE_EVENT,
     SLOW,
@@ -319,6 +321,8 @@ def judge_moves(sensors: MeasurementModel, m: FilterState) -> None:
     variance has hardly fallen waits for a later batch. While the horizon is open the step of the last iteration (SHIFT)
     says this instead, as the fit replaces the filter.
     """
+    if m.counts[RESTS] == RESTING:
+        return
     if m.counts[STORED] < HORIZON:
         m.counts[IN_BATCH] = 0
         return

@@ -48,6 +48,8 @@ class StructuredState(NamedTuple):
     """Row of the sample log that it takes next."""
     horizon: Horizon | None = None
     """Where the moving horizon begins."""
+    next: Arrival | None = None
+    """Where it will begin when it slides, while the arm is at rest."""
     last_ns: int = 0
     time_ns: int = 0
     """Instant of the state [ns]: when the last row was sampled, or the event after it."""
@@ -69,6 +71,18 @@ class StructuredState(NamedTuple):
     """How often the empty arm's fit was begun again."""
     white: Array = np.empty(0)
     """(m, 2) variance of each measurement's white noise at the last restart, and its bound by the spectrum."""
+
+
+class Arrival(NamedTuple):
+    """Where the horizon of an arm at rest will begin next, and its arrival cost."""
+
+    horizon: Horizon
+    x: Array
+    """(nx,) mean."""
+    S: Array
+    """(nx, nx) square root of the covariance."""
+    noise: Array
+    """(m, 11) what was known of each sensor's noise."""
 
 
 class Horizon(NamedTuple):
@@ -93,7 +107,9 @@ def first_needed(state: StructuredState) -> int:
     """Return the first row of the sample log that will be read again."""
     if state.begin is not None:
         return state.begin
-    if state.memory is None or state.horizon is None or state.memory.counts[mem.STORED] >= mem.HORIZON:
+    if state.memory is None or state.horizon is None:
+        return state.cursor
+    if state.memory.counts[mem.STORED] >= mem.HORIZON and state.memory.counts[mem.RESTS] != mem.RESTING:
         return state.cursor
     return state.horizon.row
 
@@ -263,6 +279,7 @@ def _begin_horizon(model: Model, m: mem.FilterState) -> None:
     keep_possible(model.motion, m, 0.0)  # over a whole horizon a damping ratio below zero explodes
     m.x0[:], m.S0[:] = m.x, m.S
     m.counts[mem.STORED] = 0
+    m.counts[mem.RESTS] = mem.MOVES_ABOUT
     _refit(m)
 
 
@@ -352,7 +369,7 @@ def _bridge(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
     change = _unforeseen(rows.u[0] - state.efforts[-1], state.slope, state.missing)
     columns = structured_model.unknown_torque(state.model, m, change, state.missing, state.sensors.period)
     m.S[:] = structured_model.widen(m.S, columns)
-    if m.counts[mem.STORED] < mem.HORIZON:  # the horizon has no process noise
+    if m.counts[mem.STORED] < mem.HORIZON or m.counts[mem.RESTS] == mem.RESTING:  # the horizon has no process noise
         _begin_horizon(state.model, m)
     return state._replace(memory=m, missing=0,
                           horizon=Horizon(state.cursor, state.time_ns, state.efforts, state.rates))
@@ -419,17 +436,23 @@ def reopen(
 
 def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
     """Take rows without a gap among them."""
-    assert state.model is not None
-    assert state.memory is not None
-    assert state.sensors is not None
-    m = mem.copy(state.memory, horizon=False)
-    table, first = input_table(state, rows)
-    failed = filtered(state.model.motion, state.sensors, m, table, first) - first
-    taken = rows.between(rows.first, min(rows.first + failed + 1, rows.until))
-    after = after_rows(state, m, taken, table[:first + len(taken)])
-    if failed == len(rows):
-        return after
-    return advance(config, restart(config, state, after, taken.since(taken.until - 1)), rows.since(taken.until))
+    while len(rows):
+        assert state.model is not None
+        assert state.memory is not None
+        assert state.sensors is not None
+        m = mem.copy(state.memory, horizon=False)
+        part = rows.between(rows.first, min(rows.first + mem.HORIZON, rows.until))
+        table, first = input_table(state, part)
+        failed = filtered(state.model.motion, state.sensors, m, table, first) - first
+        taken = part.between(part.first, min(part.first + failed + 1, part.until))
+        after = after_rows(state, m, taken, table[:first + len(taken)])
+        rows = rows.since(taken.until)
+        if failed < len(part):
+            after = restart(config, state, after, taken.since(taken.until - 1))
+            if after.memory is None:
+                return advance(config, after, rows)
+        state = after
+    return state
 
 
 def after_rows(state: StructuredState, m: mem.FilterState, taken: Rows, table: Array) -> StructuredState:
@@ -487,7 +510,7 @@ def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
 
 def restart(config: IdentifierParameters, before: StructuredState, state: StructuredState, last: Rows,
             ) -> StructuredState:
-    """Begin again after the last row, at which numbers left the finite range or a fit failed.
+    """Begin again after the last row: numbers left the finite range, a fit failed, or the horizon of rest goes on.
 
     before: the state before these rows.
 
@@ -501,6 +524,10 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
     assert state.memory is not None
     assert state.efforts is not None
     model, m = state.model, state.memory
+    if m.counts[mem.RESTS] == mem.BEGINS_TO_MOVE:
+        return _begin_to_move(state)
+    if m.counts[mem.RESTS] == mem.SLIDES:
+        return _slide(state)
     refits = int(m.counts[mem.REFITS])
     unfit = refits > before.memory.counts[mem.REFITS]
     if unfit and refits <= STARTS and m.counts[mem.HELD] and model.body > 1 and m.counts[mem.STORED] < mem.HORIZON:
@@ -540,6 +567,42 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
         grasped = CaptureEvent(state.last_ns, EventKind.CAPTURE)
         fresh = fresh._replace(early=((state.cursor, grasped),))
     return fresh
+
+
+def _slide(state: StructuredState) -> StructuredState:
+    """Let the horizon of an arm at rest begin where the arm was when it slid before.
+
+    So it has always begun before the motion that tells of the payload, and the fit reads all of that.
+    """
+    assert state.memory is not None
+    assert state.horizon is not None
+    assert state.efforts is not None
+    m = mem.copy(state.memory)
+    begin = state.horizon
+    if state.next is not None and state.next.horizon.row > begin.row:  # else it has just come to rest
+        begin = state.next.horizon
+        m.x0[:], m.S0[:] = state.next.x, state.next.S
+    m.counts[mem.IN_BATCH], m.counts[mem.RESTS] = 0, mem.RESTING
+    here = Horizon(state.cursor, state.time_ns, state.efforts, state.rates)
+    return state._replace(memory=m, horizon=begin, next=Arrival(
+        here, m.x.copy(), structured_model.triangular(m.S), m.noise.copy()))
+
+
+def _begin_to_move(state: StructuredState) -> StructuredState:
+    """Open the horizon of an arm that was at rest; the filter goes on as it is until the fit replaces its state."""
+    assert state.model is not None
+    assert state.memory is not None
+    assert state.horizon is not None
+    m = mem.copy(state.memory)
+    x, S = m.x.copy(), m.S.copy()
+    m.x[:], m.S[:] = m.x0, m.S0
+    _set_arrival_cost(state.model, m)
+    m.x[:], m.S[:] = x, S
+    m.counts[[mem.STORED, mem.SINCE_EVENT]] = state.cursor - state.horizon.row
+    if state.next is not None:
+        for column in (mem.EFFECTIVE, mem.POWER, mem.SLOW):  # what did not fit was taken for noise
+            m.noise[:, column] = state.next.noise[:, column]
+    return state._replace(memory=m, next=None)
 
 
 def is_off(state: StructuredState) -> bool:
