@@ -26,8 +26,8 @@ from flexmanip_ros.types import CaptureEvent, EventKind, Status
 ARM = ArmParameters(damping_ratio=0.003)
 CONFIG = TriggerParameters(mode='auto', arm=ARM, outputs=trials.BENDS)
 KNOWN = replace(CONFIG, payload=replace(CONFIG.payload, learn=()))
-"""Nothing is learned of this arm. Another one that has never moved has taught nothing of its friction and rotors, and its
-first motion is no event."""
+"""Nothing is learned of this arm. Another one that has never moved has taught nothing of its friction and rotors, and
+its first motion is no event."""
 NOISE = (1e-4, 2e-4, 2e-5, 2e-5, 1e-3, 1e-3, 7e-4, 9e-4)
 MARKS = (250, 1000, 2900)
 SQUARES = excitation.sequence(ExcitationParameters(), 10_000)
