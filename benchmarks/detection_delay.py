@@ -1,4 +1,4 @@
-"""Claim: 20 kg is found within 50 ms with probability 0.95, at rest within 100 ms of torque; its interval holds it.
+"""Claim: 20 kg is found within 50 ms in 95 %, by a known arm at rest within 100 ms of torque; its interval holds it.
 
 What is found is dated to some milliseconds. The interval is looked at 0.25, 1 and 2.9 s later all the same.
 No false alarm.

@@ -107,11 +107,14 @@ def first_needed(state: StructuredState) -> int:
     """Return the first row of the sample log that will be read again."""
     if state.begin is not None:
         return state.begin
-    if state.memory is None or state.horizon is None:
-        return state.cursor
-    if state.memory.counts[mem.STORED] >= mem.HORIZON and state.memory.counts[mem.RESTS] != mem.RESTING:
+    if state.memory is None or state.horizon is None or not _has_horizon(state.memory):
         return state.cursor
     return state.horizon.row
+
+
+def _has_horizon(m: mem.FilterState) -> bool:
+    """Whether the rows of the horizon will be read again: it is open, or slides along with an arm at rest."""
+    return bool(m.counts[mem.STORED] < mem.HORIZON or m.counts[mem.RESTS] == mem.RESTING)
 
 
 def advance(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
@@ -369,7 +372,7 @@ def _bridge(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
     change = _unforeseen(rows.u[0] - state.efforts[-1], state.slope, state.missing)
     columns = structured_model.unknown_torque(state.model, m, change, state.missing, state.sensors.period)
     m.S[:] = structured_model.widen(m.S, columns)
-    if m.counts[mem.STORED] < mem.HORIZON or m.counts[mem.RESTS] == mem.RESTING:  # the horizon has no process noise
+    if _has_horizon(m):  # it has no process noise
         _begin_horizon(state.model, m)
     return state._replace(memory=m, missing=0,
                           horizon=Horizon(state.cursor, state.time_ns, state.efforts, state.rates))
@@ -441,6 +444,7 @@ def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> St
         assert state.memory is not None
         assert state.sensors is not None
         m = mem.copy(state.memory, horizon=False)
+        # an arm at rest returns after every slide, and the table of what is left is made again
         part = rows.between(rows.first, min(rows.first + mem.HORIZON, rows.until))
         table, first = input_table(state, part)
         failed = filtered(state.model.motion, state.sensors, m, table, first) - first
@@ -510,7 +514,9 @@ def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
 
 def restart(config: IdentifierParameters, before: StructuredState, state: StructuredState, last: Rows,
             ) -> StructuredState:
-    """Begin again after the last row: numbers left the finite range, a fit failed, or the horizon of rest goes on.
+    """Begin again after the last row, at which numbers left the finite range or a fit failed.
+
+    Or let the horizon of an arm at rest slide or open there.
 
     before: the state before these rows.
 

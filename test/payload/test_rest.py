@@ -45,13 +45,12 @@ def settings(**parameters):
 
 
 @pytest.mark.parametrize('rest_s', [2.0, 10.0])
-@pytest.mark.parametrize('seed', [0, 2])
+@pytest.mark.parametrize('seed', [0, 2])  # after 10 s two of eight end in another minimum: docs/lab/payload.md
 def test_an_arm_that_rested_learns_its_friction_and_rotors_from_two_hundred_samples_a_second(rest_s, seed):
     capture = CaptureEvent(round((rest_s + 3.0) * 1e9), EventKind.CAPTURE)
     trajectory = after_rest(rest_s, 200.0, 6.0, (capture,), seed, **OWN)
-    config, found = IdentifierParameters(arm=ARM, model_rate=0.1), None
-    for estimate in pipeline.run(config, simulator.records(trajectory, (capture,))):
-        found = estimate.payload
+    config = IdentifierParameters(arm=ARM, model_rate=0.1)
+    found = [estimate.payload for estimate in pipeline.run(config, simulator.records(trajectory, (capture,)))][-1]
     assert found is not None
     assert found.status is Status.TRACKING
     assert found.mass == pytest.approx(20.0, rel=0.01)
