@@ -354,6 +354,19 @@ def payload_speed(rows: list[dict[str, Any]]) -> Claims:
         yield Claim(f'kappa {row["kappa"]}: filter over a step of the plant', row['ratio_filter_to_plant'], high=3.0)
 
 
+def payload_precise_sensors(rows: list[dict[str, Any]]) -> Claims:
+    """The more precise the sensors, the better the payload is known, up to 60 dB (encoders of 1e-5 rad)."""
+    for row in rows:
+        name, tracking = f'{row["snr_db"]:.0f} dB', row['tracking_at_the_end']
+        yield Claim(f'{name}: runs TRACKING at the end', tracking / row['runs'], 0.9)  # as of `payload_random_arms`
+        yield covers(f'{name}: these inside their interval', row['inside_at_the_end'] / max(tracking, 1), tracking)
+        yield Claim(f'{name}: TRACKING and outside', row['wrong_and_tracking_percent'], high=5.0, unit='%')
+        yield Claim(f'{name}: error, median', row['median_error_percent'], high=0.7, unit='%')  # as of chosen arms
+    for noisy, precise in itertools.pairwise(rows):
+        yield Claim(f'half width at {precise["snr_db"]:.0f} dB over that at {noisy["snr_db"]:.0f} dB, medians',
+                    precise['median_half_width_percent'] / noisy['median_half_width_percent'], high=1.0)
+
+
 def payload_real_arms(rows: list[dict[str, Any]]) -> Claims:
     """Told the ideal arm, `structured` knows what an arm as it is holds: mass within 0.7 %, in its interval."""
     for row in rows:
@@ -490,9 +503,9 @@ CLAIMS: dict[str, Callable[[Any], Claims]] = {
         identification_missions, identification_moving_arm, identification_paper_settings, identification_soak,
         identification_speed, identification_status, identification_suggested, identification_ten_minutes,
         io_bag_reading, payload_block, payload_bounds, payload_coverage, payload_elements, payload_jitter,
-        payload_linear, payload_minute, payload_mismatched, payload_random_arms, payload_real_arms, payload_speed,
-        plant_convergence, plant_hour, plant_live, plant_segment_chain, plant_speed, replay_speed,
-        ros_fuzz, ros_latency, ros_loss, ros_signals, setup_time, study_scaling)}
+        payload_linear, payload_minute, payload_mismatched, payload_precise_sensors, payload_random_arms,
+        payload_real_arms, payload_speed, plant_convergence, plant_hour, plant_live, plant_segment_chain, plant_speed,
+        replay_speed, ros_fuzz, ros_latency, ros_loss, ros_signals, setup_time, study_scaling)}
 
 
 def claims_of(name: str, result: Any) -> list[Claim]:

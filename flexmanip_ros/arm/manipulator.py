@@ -73,6 +73,13 @@ def fastest_mode(arm: ArmParameters) -> float:
         arm.bending_stiffness, arm.linear_density, arm.link_length, strict=True))
 
 
+def pinned_frequencies(arm: ArmParameters) -> tuple[float, ...]:
+    """First frequency of each link alone, pinned at both ends [Hz]."""
+    return tuple(
+        float(np.pi / (2 * L ** 2) * np.sqrt(EI / rho))
+        for L, EI, rho in zip(arm.link_length, arm.bending_stiffness, arm.linear_density, strict=True))
+
+
 @lru_cache(maxsize=64)
 def shape_functions(sines: int, static: bool) -> ShapeFunctions:
     """Return the shapes of a pinned link, in the order of their frequencies."""

@@ -87,7 +87,8 @@ def steps_of_the_filter() -> None:
     assert model is not None
     memory = filter_state.memory(model.payload + model.motion.kind.size, len(model.roles),
                                  model.motion.effort.size)
-    fit = model.motion, sensors(config, model, 1e-3, diffusion(config, model, memory)), memory
+    seen = sensors(config, model, 1e-3, diffusion(config, model, memory), np.zeros(len(config.arm.link_length)))
+    fit = model.motion, seen, memory
     compile_for(moving_horizon.keep_possible, model.motion, memory, 0.0)
     for step in (gauss_newton.close_horizon, gauss_newton.finish_iteration, gauss_newton.reject_step,
                  moving_horizon.strays):

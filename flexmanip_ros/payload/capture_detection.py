@@ -140,8 +140,8 @@ def _start(config: TriggerParameters, state: DetectionState, row: Rows) -> Detec
         trace=np.zeros((w, m, kernel.CAUSES)), factors=np.zeros((w, kernel.TESTED, kernel.TESTED)),
         scores=np.zeros((w, kernel.TESTED)), past=np.zeros((w, m)), innovations=np.zeros((w, m)),
         clock=np.zeros(6, dtype=np.int64),
-        level=np.array([0.0, 0.0, threshold(config, dt)]), history=np.zeros((2, 2 * w)),
-        torques=row.u[-1].copy(), drive=np.zeros(3), flow=np.zeros((n2, n2)),
+        level=np.array([0.0, 0.0, threshold(config, dt), 0.0]), history=np.zeros((2, 2 * w)),
+        torques=row.u[-1].copy(), flow=np.zeros((n2, n2)),
         state=np.zeros((2, n2, kernel.DIRECTIONS)))
     return replace(state, glr=glr, dt=dt)
 

@@ -52,18 +52,13 @@ CALM = 3.0
 """Factor by which the statistic must exceed its own recent peaks, which errors of the model cause. At a capture it
 reaches 10 to 1000 times these peaks within 0.1 s. With a factor of 2 three of 48 runs had a false alarm, with 3
 none."""
-CAUSED = 0.25
-"""Share of the largest energy of the torque below which a peak is not ascribed to the torque: chance has peaks as
-well."""
 MOST_HALVINGS = 20
 """Largest number of halvings of a sample time in the matrix exponential: no real arm needs more."""
 
 # elements of ``clock``
 NEWEST, FILLED, SINCE_TRACES, QUIET, HISTORY, ALARMED = range(6)
 # elements of ``level``
-STATISTIC, PEAK, THRESHOLD = range(3)
-# elements of ``drive``: energy of the torque's changes; the largest of late; the one that belongs to the recent peak
-ENERGY, LARGEST, AT_PEAK = range(3)
+STATISTIC, PEAK, THRESHOLD, ENERGY = range(4)
 
 
 class GlrState(NamedTuple):
@@ -82,14 +77,12 @@ class GlrState(NamedTuple):
     clock: NDArray[np.int64]
     """(6,) counters."""
     level: Array
-    """(3,) statistic, recent peak, threshold."""
+    """(4,) statistic, recent peak, threshold, energy of the torques' changes within the window [N^2 m^2]."""
     history: Array
     """(2, 2 w) statistics of the last 2 w samples and energies of the torque's changes; a peak counts once it is
     older."""
     torques: Array
     """(L,) the last torques [N m]."""
-    drive: Array
-    """(3,) energies of the torque's changes [N^2 m^2]."""
     flow: Array
     """(n2, n2) scratch: state transition of a sample."""
     state: Array
@@ -260,39 +253,27 @@ def update_glr(m: FilterState, glr: GlrState, scratch: Array) -> None:
 @inner
 def note_torques(glr: GlrState, torques: Array) -> None:
     """Add the change of the torques before a sample to its energy, which fades over the window."""
-    glr.drive[ENERGY] -= glr.drive[ENERGY] / glr.trace.shape[0]
+    glr.level[ENERGY] -= glr.level[ENERGY] / glr.trace.shape[0]
     for i in range(torques.size):
         change = torques[i] - glr.torques[i]
-        glr.drive[ENERGY] += change * change
+        glr.level[ENERGY] += change * change
         glr.torques[i] = torques[i]
 
 
 @inner
 def limit(glr: GlrState) -> float:
-    """Return the limit of the statistic: the threshold, or ``CALM`` times its recent peak, whichever is larger.
-
-    A change of the torque excites modes that the model leaves out. Their part in the innovations is proportional to
-    that change, and the statistic is quadratic in it. So the recent peak is scaled with the energy of the torque's
-    changes.
-    """
-    drive = glr.drive
-    larger = drive[ENERGY] / max(drive[AT_PEAK], CAUSED * drive[LARGEST], 1e-300)
-    most: float = max(glr.level[THRESHOLD], CALM * glr.level[PEAK] * max(larger, 1.0))
+    """Return the limit of the statistic: the threshold, or ``CALM`` times its recent peak, whichever is larger."""
+    most: float = max(glr.level[THRESHOLD], CALM * glr.level[PEAK])
     return most
 
 
 @inner
 def remember(glr: GlrState, fade: float) -> None:
-    """Make a statistic that is older than the window the recent peak if it is the largest over its energy."""
-    clock, history, drive = glr.clock, glr.history, glr.drive
+    """Make a statistic that is older than the window the recent peak if it is the largest."""
+    clock, history = glr.clock, glr.history
     clock[HISTORY] = (clock[HISTORY] + 1) % history.shape[1]
-    old, energy = history[0, clock[HISTORY]], history[1, clock[HISTORY]]
-    history[0, clock[HISTORY]], history[1, clock[HISTORY]] = glr.level[STATISTIC], drive[ENERGY]
-    glr.level[PEAK] *= fade
-    drive[LARGEST] = max(drive[LARGEST] * fade, drive[ENERGY])
-    least = CAUSED * drive[LARGEST]
-    if old * max(drive[AT_PEAK], least) > glr.level[PEAK] * max(energy, least):
-        glr.level[PEAK], drive[AT_PEAK] = old, energy
+    glr.level[PEAK] = max(fade * glr.level[PEAK], history[0, clock[HISTORY]])
+    history[0, clock[HISTORY]], history[1, clock[HISTORY]] = glr.level[STATISTIC], glr.level[ENERGY]
 
 
 @inner
@@ -322,7 +303,7 @@ def torques_begin(glr: GlrState) -> bool:
     model's.
     """
     oldest = (glr.clock[HISTORY] + 1) % glr.history.shape[1]
-    return bool(glr.drive[ENERGY] > BEGIN * glr.history[1, oldest])
+    return bool(glr.level[ENERGY] > BEGIN * glr.history[1, oldest])
 
 
 @inner
@@ -392,7 +373,7 @@ UNWATCHED = GlrState(
     trace=np.zeros((0, 0, 0)), factors=np.zeros((0, 0, 0)), scores=np.zeros((0, 0)), past=np.zeros((0, 0)),
     innovations=np.zeros((0, 0)),
     clock=np.zeros(0, dtype=np.int64), level=np.zeros(0), history=np.zeros((0, 0)), torques=np.zeros(0),
-    drive=np.zeros(0), flow=np.zeros((0, 0)), state=np.zeros((0, 0, 0)))
+    flow=np.zeros((0, 0)), state=np.zeros((0, 0, 0)))
 """Stands for a test that is not run."""
 
 

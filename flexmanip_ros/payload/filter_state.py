@@ -109,6 +109,9 @@ class FilterState(NamedTuple):
     in the filter, and in the linearized one."""
     effort_noise: Array
     """(L,) variance of the white part of each reported effort [N^2 m^2]."""
+    ringing: Array
+    """(3, 2, L) energy of the changes of each torque [N^2 m^2], which fades, and its last effort [N m]: in the filter,
+    at the last event, and in the iteration; see ``note_change``."""
     innovation: Array
     """(m, 2) the latest, and its variance before the update."""
     power: Array
@@ -123,7 +126,8 @@ def memory(nx: int, m: int, links: int) -> FilterState:
         moved=np.zeros((nx, 2)), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
         normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, 2 * nx + 1)),
         N=np.zeros((nx, nx)), g=np.zeros(nx), batch=np.zeros(nx), B=np.zeros((nx, nx)),
-        torque_noise=np.zeros((2, links)), effort_noise=np.zeros(links), innovation=np.zeros((m, 2)), power=np.ones(m))
+        torque_noise=np.zeros((2, links)), effort_noise=np.zeros(links),
+        ringing=np.zeros((3, 2, links)), innovation=np.zeros((m, 2)), power=np.ones(m))
 
 
 def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
@@ -132,7 +136,7 @@ def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
     horizon False: what belongs to a complete moving horizon is shared; then only an event writes it.
     """
     (x, S, noise, recent, spectrum, counts, score, moved, x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g,
-     batch, B, torque_noise, effort_noise, innovation, power) = state
+     batch, B, torque_noise, effort_noise, ringing, innovation, power) = state
     if horizon or counts[STORED] < HORIZON:
         x0, S0, xi = x0.copy(), S0.copy(), xi.copy()
         accepted, normal, gradient = accepted.copy(), normal.copy(), gradient.copy()
@@ -140,4 +144,4 @@ def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
     return FilterState(
         x.copy(), S.copy(), noise.copy(), recent.copy(), spectrum.copy(), counts.copy(), score.copy(), moved.copy(),
         x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g, batch, B, torque_noise.copy(),
-        effort_noise.copy(), innovation.copy(), power.copy())
+        effort_noise.copy(), ringing.copy(), innovation.copy(), power.copy())

@@ -84,6 +84,10 @@ class MeasurementModel(NamedTuple):
     """(m,) which state is its offset; -1: none."""
     delay: NDArray[np.int64]
     """(m,) which state is its delay; -1: none."""
+    omitted: Array
+    """(m, L) variance that the omitted modes add at a step of 1 N m of each torque, in units of the sensor."""
+    fade: float
+    """Factor of that variance from one sample to the next."""
     reach: int
     """Efforts that a torque depends on."""
     block: int
@@ -158,6 +162,24 @@ def observe(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Ar
     return predicted
 
 
+@inner
+def note_change(sensors: MeasurementModel, ringing: Array, efforts: Array) -> None:
+    """Add the squares of the changes of the efforts (L,) to their energy, ringing[0]; the efforts become ringing[1]."""
+    for j in range(ringing.shape[1]):
+        change = efforts[j] - ringing[1, j]
+        ringing[0, j] = sensors.fade * ringing[0, j] + change * change
+        ringing[1, j] = efforts[j]
+
+
+@inner
+def omitted_variance(sensors: MeasurementModel, i: int, ringing: Array) -> float:
+    """Return the variance of sensor i that comes from modes that the shape functions leave out (``omitted_modes``)."""
+    variance: float = 0.0
+    for j in range(ringing.shape[1]):
+        variance += sensors.omitted[i, j] * ringing[0, j]
+    return variance
+
+
 @separate
 def measure(sensors: MeasurementModel, m: FilterState, y: Array, qdd: Array, opened: NDArray[np.int64]) -> None:
     """Update the filter with one sample; gather the power of its innovations and their information on the payload.
@@ -168,14 +190,14 @@ def measure(sensors: MeasurementModel, m: FilterState, y: Array, qdd: Array, ope
     n = sensors.H.shape[1]
     payload = 2 * n
     for i in range(y.size):
-        r = m.noise[i, EFFECTIVE]
+        r = m.noise[i, EFFECTIVE] + omitted_variance(sensors, i, m.ringing[0])
         e = y[i] - observe(sensors, i, n, x, S, f, qdd)
         spread = dot(f, f)
         variance = spread + r
         square = e * e / variance
         m.innovation[i, 0], m.innovation[i, 1] = e, variance
         m.power[i] += (min(square, 25.0) - m.power[i]) / min(m.counts[SINCE_EVENT] + 100, 1000)
-        residual = min(max(e / np.sqrt(variance), -5.0), 5.0) * np.sqrt(r)
+        residual = min(max(e / np.sqrt(variance), -5.0), 5.0) * np.sqrt(m.noise[i, EFFECTIVE])
         m.noise[i, BLOCK_SUM] += residual
         m.noise[i, BLOCK_POWER] += residual * residual
         if square > OUTLIER * OUTLIER:

@@ -76,7 +76,9 @@ from flexmanip_ros.payload.measurement_update import (
     learn_noise,
     measure,
     misfit,
+    note_change,
     observe,
+    omitted_variance,
     white_variance,
 )
 from flexmanip_ros.payload.process_model import (
@@ -185,11 +187,13 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
     steps = predict(motion, m.xr, m.Sr, columns, rows, sensors.period, sample[0])
     if steps == 0:
         return 0
+    note_change(sensors, m.ringing[2], sample[1:1 + motion.effort.size])
     measured = sample[first] == sample[first]
     if measured:
         m.counts[MEASURED] += 1
     for i in range(m.noise.shape[0] if measured else 0):
-        r = m.noise[i, EFFECTIVE]
+        own = m.noise[i, EFFECTIVE]
+        r = own + omitted_variance(sensors, i, m.ringing[2])
         e = sample[first + i] - observe(sensors, i, n, m.xr, m.Sr, f, motion.k[0])
         weight = 1.0 / r
         m.score[COST] += e * e * weight
@@ -198,7 +202,7 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
             m.g[a] += scaled * e
             for b in range(a + 1):
                 m.N[a, b] += scaled * f[b]
-        m.noise[i, FIT] += update_linearized(m, f, e, r) if linearized else e * e
+        m.noise[i, FIT] += (update_linearized(m, f, e, r) if linearized else e * e) * own / r
     m.counts[ITERATED] += 1
     if linearized:
         gather_torque_noise(motion, m, m.torque_noise[1], m.counts[EFFORTS] in (NOISY, CONFIRMED))
@@ -524,6 +528,7 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
     if not predict(motion, m.x, m.S, m.counts[USED], rows, sensors.period, duration):
         return False
     came = y[0] == y[0]
+    note_change(sensors, m.ringing[0], table[k, 1:1 + motion.effort.size])
     if came:
         measure(sensors, m, y, motion.k[0], motion.opened)
         if not abs(m.x[2 * sensors.H.shape[1]]) < 1e9:

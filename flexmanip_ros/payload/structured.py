@@ -83,6 +83,8 @@ class Arrival(NamedTuple):
     """(nx, nx) square root of the covariance."""
     noise: Array
     """(m, 11) what was known of each sensor's noise."""
+    ringing: Array
+    """(2, L) energy of the changes of the torques, and their efforts; see ``note_change``."""
 
 
 class Horizon(NamedTuple):
@@ -281,6 +283,7 @@ def _begin_horizon(model: Model, m: mem.FilterState) -> None:
     """Begin a new moving horizon here: the present state is its arrival cost."""
     keep_possible(model.motion, m, 0.0)  # over a whole horizon a damping ratio below zero explodes
     m.x0[:], m.S0[:] = m.x, m.S
+    m.ringing[1] = m.ringing[0]
     m.counts[mem.STORED] = 0
     m.counts[mem.RESTS] = mem.MOVES_ABOUT
     _refit(m)
@@ -321,9 +324,10 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     m.S[:] = structured_model.triangular(m.S)
     _set_arrival_cost(model, m)
     m.counts[mem.REFITS] = state.refits
-    seen = sensors(config, model, dt, structured_model.diffusion(config, model, m))
+    seen = sensors(fewer, model, dt, structured_model.diffusion(config, model, m), np.mean(rows.angles, axis=0))
     events = state.early
     time_ns, efforts = int(rows.time_ns[0]), latest(seen, rows.u[:1], state.efforts)
+    m.ringing[:, 1] = efforts[-1]
     rates = np.full(efforts.shape[1], np.nan)
     unused = structured_model.too_noisy(rows.rates, dt) if rows.rates.shape[1] else np.zeros(rates.size, dtype=np.bool_)
     state = state._replace(
@@ -587,11 +591,11 @@ def _slide(state: StructuredState) -> StructuredState:
     begin = state.horizon
     if state.next is not None and state.next.horizon.row > begin.row:  # else it has just come to rest
         begin = state.next.horizon
-        m.x0[:], m.S0[:] = state.next.x, state.next.S
+        m.x0[:], m.S0[:], m.ringing[1] = state.next.x, state.next.S, state.next.ringing
     m.counts[mem.IN_BATCH], m.counts[mem.RESTS] = 0, mem.RESTING
     here = Horizon(state.cursor, state.time_ns, state.efforts, state.rates)
     return state._replace(memory=m, horizon=begin, next=Arrival(
-        here, m.x.copy(), structured_model.triangular(m.S), m.noise.copy()))
+        here, m.x.copy(), structured_model.triangular(m.S), m.noise.copy(), m.ringing[0].copy()))
 
 
 def _begin_to_move(state: StructuredState) -> StructuredState:
@@ -600,10 +604,10 @@ def _begin_to_move(state: StructuredState) -> StructuredState:
     assert state.memory is not None
     assert state.horizon is not None
     m = mem.copy(state.memory)
-    x, S = m.x.copy(), m.S.copy()
-    m.x[:], m.S[:] = m.x0, m.S0
+    x, S, ringing = m.x.copy(), m.S.copy(), m.ringing[0].copy()
+    m.x[:], m.S[:], m.ringing[0] = m.x0, m.S0, m.ringing[1]
     _set_arrival_cost(state.model, m)
-    m.x[:], m.S[:] = x, S
+    m.x[:], m.S[:], m.ringing[0] = x, S, ringing
     m.counts[[mem.STORED, mem.SINCE_EVENT]] = state.cursor - state.horizon.row
     if state.next is not None:
         for column in (mem.EFFECTIVE, mem.POWER, mem.SLOW):  # what did not fit was taken for noise

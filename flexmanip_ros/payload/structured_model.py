@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from flexmanip_ros.arm.capture import tip_jacobian
 from flexmanip_ros.arm.equations_of_motion import STICTION_RATE
 from flexmanip_ros.arm.late_torque import efforts_needed
-from flexmanip_ros.arm.linearization import mass_matrix
-from flexmanip_ros.arm.manipulator import Manipulator, fastest_mode, manipulator, modal, workspace
+from flexmanip_ros.arm.linearization import mass_matrix, omitted_modes
+from flexmanip_ros.arm.manipulator import Manipulator, fastest_mode, manipulator, modal, pinned_frequencies, workspace
 from flexmanip_ros.identification.prediction_check import white_noise
 from flexmanip_ros.numerics.square_root import allocate_bounds
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
@@ -187,13 +187,6 @@ def build(config: IdentifierParameters) -> Model | None:
                  ROTOR_ERROR * _inertias_at_joints(links_alone))
 
 
-def pinned_frequencies(arm: ArmParameters) -> tuple[float, ...]:
-    """First frequency of each link alone, pinned at both ends [Hz]."""
-    return tuple(
-        float(np.pi / (2 * L ** 2) * np.sqrt(EI / rho))
-        for L, EI, rho in zip(arm.link_length, arm.bending_stiffness, arm.linear_density, strict=True))
-
-
 LEARNED = {
     'stiffness': Kind.STIFFNESS, 'damping': Kind.DAMPING, 'viscous_friction': Kind.VISCOUS,
     'coulomb_friction': Kind.COULOMB, 'rotor_inertia': Kind.ROTOR, 'torque_gain': Kind.TORQUE_GAIN,
@@ -255,17 +248,20 @@ def motion(config: IdentifierParameters) -> ProcessModel:
     return made._replace(prior=priors(config, made), given=_given(config.arm, made))
 
 
-def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Array) -> MeasurementModel:
-    """Return how each measurement follows from the state; dt: sample time [s]."""
+def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Array, angles: Array) -> MeasurementModel:
+    """Return how each measurement follows from the state; dt: sample time [s], angles: (L,) first ones [rad]."""
     output = model.motion.arm.output
     links, count = len(config.arm.link_length), len(model.roles)
     H = np.empty((count, output.shape[1]))
     rate = np.zeros(count, dtype=np.bool_)
+    beyond = omitted_modes(config.arm, np.array(config.payload.working_point or chords(config.arm, angles)))
+    omitted = np.empty((count, links))
     gain, offset, delay = (np.full(count, -1) for _ in range(3))
     for i, role in enumerate(model.roles):
         bends = role.quantity in (Quantity.BEND, Quantity.BEND_RATE)
         H[i] = output[role.link + links * bends]
         rate[i] = role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE)
+        omitted[i] = beyond.variance[int(rate[i]), role.link + links * bends]
         if bends:
             gain[i] = _state(model.motion, Kind.BEND_GAIN, role.link)
             if not rate[i]:
@@ -274,6 +270,7 @@ def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Ar
     nx = diffusion.size
     block = max(2, round(0.1 / (model.slowest * dt)))
     return MeasurementModel(H=H, period=dt, rate=rate, gain=gain, offset=offset, delay=delay,
+                            omitted=omitted, fade=math.exp(-dt / beyond.duration),
                             reach=torque_reach(model, dt), block=block, kicks_every=max(1, block // 4),
                             noise_every=max(1, round(0.01 * config.payload.memory_time / dt)), diffusion=diffusion,
                             noise=np.zeros((nx, nx)), kicks=np.zeros((nx, links)), f=np.zeros(nx),

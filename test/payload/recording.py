@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.signal
 
 from flexmanip_ros.parameters import (
     ArmParameters,
@@ -10,6 +11,7 @@ from flexmanip_ros.parameters import (
     IdentifierParameters,
     PlantParameters,
 )
+from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured
 from flexmanip_ros.samples.sample_log import Rows, log_of
 from flexmanip_ros.simulation import excitation, simulator
@@ -77,3 +79,16 @@ def altered(rows: Rows, **columns: np.ndarray) -> Rows:
     """The same rows with other columns."""
     whole = {name: getattr(rows, name) for name in ('u', 'y', 'angles', 'stamp_ns', 'gap')}
     return rows_of(**{**whole, **columns})
+
+
+def noise_of_rows(state: structured.StructuredState, efforts: np.ndarray) -> np.ndarray:
+    """The variance of each measurement (N, m) in the rows of the horizon, with that of the omitted modes.
+
+    efforts: (N, L) of these rows; the changes are filtered all at once.
+    """
+    m, sensors = state.memory, state.sensors
+    energy, last = m.ringing[1]
+    squares = np.diff(np.vstack([last, efforts]), axis=0) ** 2
+    squares[0] += sensors.fade * energy
+    fading = scipy.signal.lfilter([1.0], [1.0, -sensors.fade], squares, axis=0)
+    return m.noise[:, mem.EFFECTIVE] + fading @ sensors.omitted.T

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recording import record, run
+from recording import noise_of_rows, record, run
 
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
@@ -27,13 +27,14 @@ def scores(before: structured.StructuredState, state: structured.StructuredState
     table, _ = structured.input_table(before, samples.between(before.cursor, state.cursor))
     used, first = int(m.counts[mem.USED]), 1 + 3 * motion.effort.size
     x, S = m.x0 + m.S0 @ m.accepted, m.S0.copy()
+    r = noise_of_rows(state, table[sensors.reach - 1:, 1:1 + motion.effort.size])
     found, f = np.zeros((int(m.counts[mem.BEFORE]), m.x.size)), np.zeros(used)
     for k in range(len(found)):
         row = k + sensors.reach - 1
         assert predict(motion, x, S, used, table[row + 1 - sensors.reach:row + 1], sensors.period, table[row, 0])
-        for i, noise in enumerate(m.noise):
+        for i in range(len(m.noise)):
             e = table[row, first + i] - observe(sensors, i, sensors.H.shape[1], x, S, f, motion.k[0])
-            found[k, :used] += f * e / noise[mem.EFFECTIVE]
+            found[k, :used] += f * e / r[k, i]
     return found
 
 

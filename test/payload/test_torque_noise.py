@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recording import altered, event, record, run
+from recording import altered, event, noise_of_rows, record, run
 
 from flexmanip_ros.arm.equations_of_motion import STICTION_RATE
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
@@ -53,15 +53,16 @@ def kalman(before: structured.StructuredState, state: structured.StructuredState
     x, P = m.x0 + m.S0 @ m.accepted, m.S0 @ m.S0.T
     d = m.x0 - x
     variance, f = np.zeros(links), np.zeros(nx)
+    r = noise_of_rows(state, table[sensors.reach - 1:, 1:1 + links])
     for k in range(int(m.counts[mem.BEFORE])):
         row = k + sensors.reach - 1
         F = np.diag(np.where(known, 0.0, 1.0))
         rows = table[row + 1 - sensors.reach:row + 1]
         assert predict(motion, x, F, nx, rows, sensors.period, table[row, 0])
         d, P = F @ d, F @ P @ F.T
-        for i, noise in enumerate(m.noise):
+        for i in range(len(m.noise)):
             e = table[row, 1 + 3 * links + i] - observe(sensors, i, n, x, np.eye(nx), f, motion.k[0])
-            v = f @ P @ f + noise[mem.EFFECTIVE]
+            v = f @ P @ f + r[k, i]
             d, P = d + P @ f * (e - f @ d) / v, P - np.outer(P @ f, f @ P) / v
         variance += (motion.coulomb * MODELLED_SHARE / np.cosh(motion.work.net[1] / (WAVES * STICTION_RATE))) ** 2
         variance += m.effort_noise

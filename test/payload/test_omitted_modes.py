@@ -1,0 +1,68 @@
+"""Claims: the modes that the shape functions leave out are noise that follows the steps of the torques."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recording import BENDS
+
+from flexmanip_ros import pipeline
+from flexmanip_ros.arm.linearization import MORE_SINES, omitted_modes
+from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, IdentifierParameters, PlantParameters
+from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.types import CaptureEvent, EventKind, Status
+
+ARM = ArmParameters(damping_ratio=0.003)
+ANGLES = (math.radians(60.0), math.radians(45.0))
+
+
+@pytest.mark.parametrize('joint', [0, 1])
+def test_their_variance_has_the_energy_of_what_the_nonlinear_arm_shows_after_a_step(joint: int) -> None:
+    """Two simulated arms, one with more sines; a torque so small that both are linear, sampled at 4 kHz."""
+    torque, rate = 1e-3, 4000.0
+    efforts = np.zeros((int(0.1 * rate), 2))
+    efforts[:, joint] = torque
+    found = []
+    for modes in (ARM.modes, ARM.modes + MORE_SINES):
+        plant = PlantParameters(arm=replace(ARM, modes=modes), rate=rate, initial_angles=ANGLES, noise='none')
+        found.append(simulator.simulate(plant, efforts, ()).position)
+    energy = np.sum(((found[1] - found[0]) / torque) ** 2, axis=0) / rate
+    omitted = omitted_modes(ARM, np.array(ANGLES))
+    own = joint, 2 + joint  # the angle of this joint, the bend of its link
+    np.testing.assert_allclose(omitted.variance[0, own, joint] * omitted.duration, energy[list(own)], rtol=0.02)
+    assert 0.005 < omitted.duration < 0.02
+
+
+def test_an_arm_of_sines_leaves_nothing_out() -> None:
+    omitted = omitted_modes(replace(ARM, shape_functions='sines'), np.array(ANGLES))
+    assert not omitted.variance.any()
+
+
+def test_a_link_alone_and_a_floating_base_have_theirs_too() -> None:
+    single = omitted_modes(ArmParameters(
+        link_length=(0.41,), linear_density=(0.5,), bending_stiffness=(2.0,), hub_inertia=(0.002,)), np.zeros(1))
+    assert single.variance.shape == (2, 2, 1)
+    assert np.all(single.variance > 0.0)
+    pinned = omitted_modes(ARM, np.array(ANGLES))
+    heavy = omitted_modes(replace(ARM, base_mass=1e9, base_inertia=1e9), np.array(ANGLES))
+    np.testing.assert_allclose(heavy.variance, pinned.variance, rtol=1e-3)
+
+
+@pytest.mark.parametrize(('own', 'snr_db'), [
+    ({}, 50.0), ({}, 60.0), ({'joint_coulomb_friction': (1.0, 0.5)}, 60.0),
+    ({'torque_gain': (1.04, 1.04), 'bend_gain': (0.98, 0.98), 'bend_offset': (5e-4, 5e-4)}, 60.0)],
+    ids=['16 bits', '18 bits', 'Coulomb friction', 'gains and offset'])
+def test_precise_encoders_tell_the_payload_better_although_they_show_these_modes(own: dict, snr_db: float) -> None:
+    """At 60 dB their noise is 1e-5 rad; the modes that are left out ring by 5e-4 rad after each step of the torques."""
+    plant = PlantParameters(arm=replace(ARM, modes=5, **own), payload_mass=20.0, snr_db=snr_db)
+    capture = CaptureEvent(3_000_000_000, EventKind.CAPTURE)
+    trajectory = simulator.simulate(plant, excitation.sequence(ExcitationParameters(), 5000), (capture,))
+    config = IdentifierParameters(arm=ARM, outputs=BENDS, model_rate=0.1)
+    found = [estimate.payload for estimate in pipeline.run(config, simulator.records(trajectory, (capture,)))][-1]
+    assert found is not None
+    assert found.status is Status.TRACKING
+    assert found.mass == pytest.approx(20.0, rel=0.003)
+    assert found.lower < 20.0 < found.upper
