@@ -2,7 +2,7 @@
 
 Arms with friction, rotors, gains and offsets (``parts.real_arms``), whose sensors have 40, 50 and 60 dB. At 60 dB the
 modes that the estimator's shape functions leave out exceed the noise by a factor of fifty after each step of the
-torques. Capture after 3 s, estimate after 6 s.
+torques. Capture after 3 s, estimate after 6 s. Draws docs/images/omitted_modes.png.
 
 Use: python benchmarks/payload_precise_sensors.py [--runs 4]
 """
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,8 @@ from parts import payload_trials as trials
 from parts.real_arms import CAPTURE, plant_of, simulate, told
 
 from flexmanip_ros import pipeline
+from flexmanip_ros.payload import structured
+from flexmanip_ros.samples import sampling
 from flexmanip_ros.simulation import simulator
 from flexmanip_ros.types import Status
 
@@ -49,6 +52,29 @@ def judged(trial: Trial) -> dict[str, Any]:
             'half_width_percent': round(50.0 * min(last.upper - last.lower, 1e6) / truth, 3)}
 
 
+def plot() -> None:
+    """Draw docs/images/omitted_modes.png: an innovation over two steps of the torques, and what is expected of it."""
+    import matplotlib.pyplot as plt
+
+    plant = replace(plant_of('ideal', 1), snr_db=SNR_DB[-1])
+    config = told(plant)
+    clock, log, state, seen = sampling.Clock(), sampling.EMPTY, structured.init(config), []
+    for record in simulator.records(simulate(plant), ()):
+        clock, log, _ = sampling.push(config, clock, log, record)
+        state = structured.advance(config, state, log.rows(state.cursor, log.end))
+        if state.memory is not None:
+            e, variance = state.memory.innovation[2]  # after both bends the first angle
+            seen.append((record.stamp_ns * 1e-9, *(1e3 * np.array([e, np.sqrt(variance)]))))
+    t, e, std = np.array(seen).T
+    shown = (t > 2.4) & (t < 2.9)
+    figure, axes = plt.subplots(figsize=(8.0, 3.2), layout='constrained')
+    axes.fill_between(t[shown], -2.0 * std[shown], 2.0 * std[shown], color='0.85', label='two deviations')
+    axes.plot(t[shown], e[shown], lw=0.8, label='innovation of joint 1')
+    axes.set(xlabel='time [s]', ylabel='mrad', xlim=(2.4, 2.9))
+    axes.legend(loc='upper right', frameon=False)
+    figure.savefig(Path(__file__).resolve().parents[1] / 'docs' / 'images' / 'omitted_modes.png', dpi=110)
+
+
 def main() -> None:
     """Measure, print and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -73,6 +99,7 @@ def main() -> None:
             'median_half_width_percent': round(float(np.median([row['half_width_percent'] for row in here])), 3)})
         print(rows[-1])
     trials.write('payload_precise_sensors', rows)
+    plot()
 
 
 if __name__ == '__main__':

@@ -126,30 +126,33 @@ def discretize(Ac: Array, Bc: Array, dt: float) -> tuple[Array, Array]:
 
 
 class OmittedModes(NamedTuple):
-    """Response to a step of 1 N m of each torque of the modes that the shape functions leave out, as noise."""
+    """Response to a step of 1 N m of each torque of the modes that the shape functions leave out."""
 
     variance: Array
     """(2, 2 L, L) at the step, of deflections (joint angles, bends) [rad^2 or m^2] and of their rates."""
     duration: float
     """Time constant of its exponential decay [s]."""
+    frequency: float
+    """Mean angular frequency [rad/s]."""
 
 
 def omitted_modes(arm: ArmParameters, theta: Array) -> OmittedModes:
     """Return what modal truncation adds to the outputs after a step of a torque, at chord angles theta (L,) [rad].
 
-    A torque step excites all modes. With ``MORE_SINES`` the step response of an output differs by e(t). It has the
-    energy and the mean instant of a variance P exp(-t / T): T = int t e^2 dt / int e^2 dt, the mean over all
-    deflections, and P = int e^2 dt / T. Zero with sines alone: who chooses the arm of the paper has that one.
+    A torque step excites all modes. With ``MORE_SINES`` the step response of an output differs by e(t). A variance
+    V exp(-t / T) of a vibration with angular frequency w has its energy, mean instant and rate, means over all outputs:
+    T = int t e^2 dt / int e^2 dt, V = int e^2 dt / T, w^2 = int e'^2 dt / int e^2 dt. Zero with sines alone: who
+    chooses the arm of the paper has that one.
     """
     L = len(arm.link_length)
     if arm.shape_functions != 'component_modes':
-        return OmittedModes(np.zeros((2, 2 * L, L)), 1.0)
+        return OmittedModes(np.zeros((2, 2 * L, L)), 1.0, 0.0)
     dt = 1.0 / (INSTANTS * min(pinned_frequencies(arm)))
     square = (step_response(replace(arm, modes=arm.modes + MORE_SINES), theta, dt) - step_response(arm, theta, dt)) ** 2
     energy, instants = square.sum(axis=0) * dt, dt * np.arange(1, INSTANTS + 1)
-    by_output = square[:, 0].sum(axis=2)
-    duration = float(np.mean(instants @ by_output / by_output.sum(axis=0)))
-    return OmittedModes(energy / duration, duration)
+    by_output = energy.sum(axis=2)
+    duration = float(np.mean(dt * (instants @ square[:, 0].sum(axis=2)) / by_output[0]))
+    return OmittedModes(energy / duration, duration, float(np.sqrt(np.mean(by_output[1] / by_output[0]))))
 
 
 def step_response(arm: ArmParameters, theta: Array, dt: float) -> Array:

@@ -110,8 +110,8 @@ class FilterState(NamedTuple):
     effort_noise: Array
     """(L,) variance of the white part of each reported effort [N^2 m^2]."""
     ringing: Array
-    """(3, 2, L) energy of the changes of each torque [N^2 m^2], which fades, and its last effort [N m]: in the filter,
-    at the last event, and in the iteration; see ``note_change``."""
+    """(3, 3, L) vibration that the changes of each torque excite in omitted modes, a phasor of two parts [N m], and its
+    last effort [N m]: in the filter, at the last event, and in the iteration; see ``note_change``."""
     innovation: Array
     """(m, 2) the latest, and its variance before the update."""
     power: Array
@@ -127,7 +127,7 @@ def memory(nx: int, m: int, links: int) -> FilterState:
         normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, 2 * nx + 1)),
         N=np.zeros((nx, nx)), g=np.zeros(nx), batch=np.zeros(nx), B=np.zeros((nx, nx)),
         torque_noise=np.zeros((2, links)), effort_noise=np.zeros(links),
-        ringing=np.zeros((3, 2, links)), innovation=np.zeros((m, 2)), power=np.ones(m))
+        ringing=np.zeros((3, 3, links)), innovation=np.zeros((m, 2)), power=np.ones(m))
 
 
 def copy(state: FilterState, *, horizon: bool = True) -> FilterState:

@@ -112,7 +112,8 @@ def begin_iteration(motion: ProcessModel, m: FilterState) -> None:
     m.counts[LINEARIZED] = has_torque_noise(motion, m)
     for i in range(motion.effort.size):
         m.torque_noise[1, i] = 0.0
-        m.ringing[2, 0, i], m.ringing[2, 1, i] = m.ringing[1, 0, i], m.ringing[1, 1, i]
+        for part in range(3):
+            m.ringing[2, part, i] = m.ringing[1, part, i]
     for i in range(nx):
         m.g[i] = 0.0
         m.batch[i] = 0.0

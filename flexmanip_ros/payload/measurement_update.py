@@ -86,8 +86,8 @@ class MeasurementModel(NamedTuple):
     """(m,) which state is its delay; -1: none."""
     omitted: Array
     """(m, L) variance that the omitted modes add at a step of 1 N m of each torque, in units of the sensor."""
-    fade: float
-    """Factor of that variance from one sample to the next."""
+    turn: Array
+    """(2,) real and imaginary part of exp((i w - 1 / 2 T) h): the phasor of these modes from one sample to the next."""
     reach: int
     """Efforts that a torque depends on."""
     block: int
@@ -164,11 +164,16 @@ def observe(sensors: MeasurementModel, i: int, n: int, x: Array, S: Array, f: Ar
 
 @inner
 def note_change(sensors: MeasurementModel, ringing: Array, efforts: Array) -> None:
-    """Add the squares of the changes of the efforts (L,) to their energy, ringing[0]; the efforts become ringing[1]."""
+    """Carry on the vibration of omitted modes (3, L), excited by the changes of the efforts (L,).
+
+    Each phasor z (rows 0 and 1) becomes exp((i w - 1 / 2 T) h) z + change: its energy |z|^2 fades with T, and changes
+    that undo each other within a period cancel. Row 2: the efforts.
+    """
     for j in range(ringing.shape[1]):
-        change = efforts[j] - ringing[1, j]
-        ringing[0, j] = sensors.fade * ringing[0, j] + change * change
-        ringing[1, j] = efforts[j]
+        real, imaginary = ringing[0, j], ringing[1, j]
+        ringing[0, j] = sensors.turn[0] * real - sensors.turn[1] * imaginary + efforts[j] - ringing[2, j]
+        ringing[1, j] = sensors.turn[1] * real + sensors.turn[0] * imaginary
+        ringing[2, j] = efforts[j]
 
 
 @inner
@@ -176,7 +181,7 @@ def omitted_variance(sensors: MeasurementModel, i: int, ringing: Array) -> float
     """Return the variance of sensor i that comes from modes that the shape functions leave out (``omitted_modes``)."""
     variance: float = 0.0
     for j in range(ringing.shape[1]):
-        variance += sensors.omitted[i, j] * ringing[0, j]
+        variance += sensors.omitted[i, j] * (ringing[0, j] * ringing[0, j] + ringing[1, j] * ringing[1, j])
     return variance
 
 

@@ -84,7 +84,7 @@ class Arrival(NamedTuple):
     noise: Array
     """(m, 11) what was known of each sensor's noise."""
     ringing: Array
-    """(2, L) energy of the changes of the torques, and their efforts; see ``note_change``."""
+    """(3, L) vibration of omitted modes, and the last efforts; see ``note_change``."""
 
 
 class Horizon(NamedTuple):
@@ -327,7 +327,7 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     seen = sensors(fewer, model, dt, structured_model.diffusion(config, model, m), np.mean(rows.angles, axis=0))
     events = state.early
     time_ns, efforts = int(rows.time_ns[0]), latest(seen, rows.u[:1], state.efforts)
-    m.ringing[:, 1] = efforts[-1]
+    m.ringing[:, 2] = efforts[-1]
     rates = np.full(efforts.shape[1], np.nan)
     unused = structured_model.too_noisy(rows.rates, dt) if rows.rates.shape[1] else np.zeros(rates.size, dtype=np.bool_)
     state = state._replace(

@@ -254,7 +254,11 @@ def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Ar
     links, count = len(config.arm.link_length), len(model.roles)
     H = np.empty((count, output.shape[1]))
     rate = np.zeros(count, dtype=np.bool_)
-    beyond = omitted_modes(config.arm, np.array(config.payload.working_point or chords(config.arm, angles)))
+    # a damping ratio of zero is one that was not given
+    damping = config.arm.damping_ratio or min(config.payload.damping_std, MOST_DAMPING)
+    beyond = omitted_modes(replace(config.arm, damping_ratio=damping),
+                           np.array(config.payload.working_point or chords(config.arm, angles)))
+    turn = np.exp((1j * beyond.frequency - 0.5 / beyond.duration) * dt)
     omitted = np.empty((count, links))
     gain, offset, delay = (np.full(count, -1) for _ in range(3))
     for i, role in enumerate(model.roles):
@@ -270,7 +274,7 @@ def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Ar
     nx = diffusion.size
     block = max(2, round(0.1 / (model.slowest * dt)))
     return MeasurementModel(H=H, period=dt, rate=rate, gain=gain, offset=offset, delay=delay,
-                            omitted=omitted, fade=math.exp(-dt / beyond.duration),
+                            omitted=omitted, turn=np.array([turn.real, turn.imag]),
                             reach=torque_reach(model, dt), block=block, kicks_every=max(1, block // 4),
                             noise_every=max(1, round(0.01 * config.payload.memory_time / dt)), diffusion=diffusion,
                             noise=np.zeros((nx, nx)), kicks=np.zeros((nx, links)), f=np.zeros(nx),
@@ -328,6 +332,8 @@ GAIN_STD = 0.03
 """Prior deviation of the logarithm of the gains of torques and bends, which are calibrated to a few percent."""
 LATE_STD = 2e-3
 """Prior deviation of delays and lags [s]: a few samples of a bus, the lag of a drive."""
+MOST_DAMPING = 0.99
+"""Largest damping ratio with which the modes that are left out are computed, the largest one of ``arm``."""
 MOST_EFFORTS = 1000
 """Largest number of efforts that a torque depends on; before them the effort is taken as constant."""
 OFFSET_STD = 1e-3

@@ -87,8 +87,9 @@ def noise_of_rows(state: structured.StructuredState, efforts: np.ndarray) -> np.
     efforts: (N, L) of these rows; the changes are filtered all at once.
     """
     m, sensors = state.memory, state.sensors
-    energy, last = m.ringing[1]
-    squares = np.diff(np.vstack([last, efforts]), axis=0) ** 2
-    squares[0] += sensors.fade * energy
-    fading = scipy.signal.lfilter([1.0], [1.0, -sensors.fade], squares, axis=0)
-    return m.noise[:, mem.EFFECTIVE] + fading @ sensors.omitted.T
+    real, imaginary, last = m.ringing[1]
+    turn = sensors.turn[0] + 1j * sensors.turn[1]
+    changes = np.diff(np.vstack([last, efforts]), axis=0) + 0j
+    changes[0] += turn * (real + 1j * imaginary)
+    phasor = scipy.signal.lfilter([1.0], [1.0, -turn], changes, axis=0)
+    return m.noise[:, mem.EFFECTIVE] + np.abs(phasor) ** 2 @ sensors.omitted.T
