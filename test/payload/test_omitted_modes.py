@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.signal
 from recording import BENDS
 
 from flexmanip_ros import pipeline
@@ -66,3 +67,19 @@ def test_precise_encoders_tell_the_payload_better_although_they_show_these_modes
     assert found.status is Status.TRACKING
     assert found.mass == pytest.approx(20.0, rel=0.003)
     assert found.lower < 20.0 < found.upper
+
+
+def test_the_jitter_of_a_torque_adds_what_the_nonlinear_arm_shows() -> None:
+    """Changes of a torque undo each other: as independent steps they would add 1.6 times as much."""
+    std, rate = 1e-3, 1000.0
+    efforts = np.zeros((1000, 2))
+    efforts[:, 1] = np.random.default_rng(5).normal(0.0, std, len(efforts))
+    found = []
+    for modes in (ARM.modes, ARM.modes + MORE_SINES):
+        plant = PlantParameters(arm=replace(ARM, modes=modes), rate=rate, initial_angles=ANGLES, noise='none')
+        found.append(simulator.simulate(plant, efforts, ()).position[:, 1])
+    omitted = omitted_modes(ARM, np.array(ANGLES))
+    turn = np.exp((1j * omitted.frequency - 0.5 / omitted.duration) / rate)
+    phasor = scipy.signal.lfilter([1.0], [1.0, -turn], np.diff(efforts[:, 1], prepend=0.0))
+    expected = np.sqrt(omitted.variance[0, 1, 1] * np.mean(np.abs(phasor) ** 2))
+    assert np.std(found[1] - found[0]) == pytest.approx(expected, rel=0.25)
