@@ -42,14 +42,9 @@ class Trial(NamedTuple):
 def judged(trial: Trial) -> dict[str, Any]:
     """Identify one run."""
     plant = replace(plant_of(trial.case, trial.seed), snr_db=trial.snr_db)
-    truth = plant.payload_mass
     found = [estimate.payload for estimate in pipeline.run(told(plant), simulator.records(simulate(plant), (CAPTURE,)))
              if estimate.payload is not None and estimate.stamp_ns > CAPTURE.stamp_ns + JUDGED_NS]
-    last, (tracking, wrong) = found[-1], trials.trusted_and_outside(found, truth)
-    return {'case': trial.case, 'snr_db': trial.snr_db, 'seed': trial.seed, 'tracking': tracking, 'wrong': wrong,
-            'status': last.status.value, 'inside': last.lower <= truth <= last.upper,
-            'error_percent': round(100.0 * (last.mass / truth - 1.0), 3),
-            'half_width_percent': round(50.0 * min(last.upper - last.lower, 1e6) / truth, 3)}
+    return {**trial._asdict(), **trials.judged(found, plant.payload_mass)}
 
 
 def plot() -> None:

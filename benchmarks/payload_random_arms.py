@@ -118,16 +118,10 @@ def records(case: Case) -> Iterator[JointRecord | CaptureEvent]:
 def judged(run: int) -> dict[str, Any]:
     """Return what a run says: shares of its estimates, and the last one."""
     case = draw(run)
-    truth = case.plant.payload_mass
     found: list[Payload] = [
         estimate.payload for estimate in pipeline.run(configuration(case), records(case))
         if estimate.payload is not None and estimate.stamp_ns > case.capture.stamp_ns + round(JUDGED_S * 1e9)]
-    tracking, wrong = trials.trusted_and_outside(found, truth)
-    last = found[-1]
-    return {'run': run, 'tracking': tracking, 'wrong': wrong,
-            'status': last.status.value, 'inside': last.lower <= truth <= last.upper,
-            'error_percent': round(100.0 * (last.mass / truth - 1.0), 3),
-            'half_width_percent': round(50.0 * min(last.upper - last.lower, 1e6) / truth, 3)}
+    return {'run': run, **trials.judged(found, case.plant.payload_mass)}
 
 
 def main() -> None:

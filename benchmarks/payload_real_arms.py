@@ -29,15 +29,10 @@ def one(drawn: tuple[str, int]) -> tuple[PlantParameters, Payload, float]:
     Estimates count from 0.1 s after the capture on.
     """
     plant = plant_of(*drawn)
-    found, wrong, late = None, 0, 0
-    for estimate in pipeline.run(told(plant), simulator.records(simulate(plant), (CAPTURE,))):
-        found = estimate.payload
-        if found is not None and estimate.stamp_ns > CAPTURE.stamp_ns + 100_000_000:
-            late += 1
-            inside = found.lower <= plant.payload_mass <= found.upper
-            wrong += found.status is Status.TRACKING and not inside
-    assert found is not None
-    return plant, found, wrong / max(late, 1)
+    found = [estimate.payload for estimate in pipeline.run(told(plant), simulator.records(simulate(plant), (CAPTURE,)))
+             if estimate.payload is not None and estimate.stamp_ns > CAPTURE.stamp_ns + 100_000_000]
+    _, wrong = trials.trusted_and_outside(found, plant.payload_mass)
+    return plant, found[-1], wrong
 
 
 def main() -> None:

@@ -64,6 +64,15 @@ def trusted_and_outside(found: Sequence[Payload], truth: float) -> tuple[float, 
     return float(np.mean(trusted)), float(np.mean(trusted & ~inside))
 
 
+def judged(found: Sequence[Payload], truth: float) -> dict[str, Any]:
+    """Return what the payloads of one run say of the true mass [kg]: shares of all of them, and the last one."""
+    last, (tracking, wrong) = found[-1], trusted_and_outside(found, truth)
+    return {'tracking': tracking, 'wrong': wrong,
+            'status': last.status.value, 'inside': last.lower <= truth <= last.upper,
+            'error_percent': round(100.0 * (last.mass / truth - 1.0), 3),
+            'half_width_percent': round(50.0 * min(last.upper - last.lower, 1e6) / truth, 3)}
+
+
 def errors(trials: Sequence[Trial]) -> np.ndarray:
     """Relative errors in percent, (trials, marks)."""
     return np.array([[100 * (one.mass / trial.truth - 1) for one in trial.found] for trial in trials])
