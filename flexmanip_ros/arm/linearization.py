@@ -165,11 +165,13 @@ def step_response(arm: ArmParameters, theta: Array, dt: float) -> Array:
     K[L:, L:], D[L:, L:] = b.Kc, b.Dc
     A, B = discretize(*first_order(np.block([[b.Ma, b.Mb], [b.Mb.T, b.Mc]]), K, D, np.vstack([b.B_theta, b.B_eta])), dt)
     output = manipulator(arm).output[:, :n]
-    x, found = np.zeros_like(B), np.empty((INSTANTS, 2, len(output), L))
-    for row in found:
-        x = A @ x + B
-        row[0], row[1] = output @ x[:n], output @ x[n:]
-    return found
+    x = np.empty((INSTANTS, *B.shape))
+    x[0], known = B, 1
+    while known < INSTANTS:  # from k to k + m samples after the step: x(k + m) = A^m x(k) + x(m)
+        more = min(known, INSTANTS - known)
+        x[known:known + more] = A @ x[:more] + x[known - 1]
+        A, known = A @ A, known + more
+    return np.stack([output @ x[:, :n], output @ x[:, n:]], axis=1)
 
 
 def frequencies(Ac: Array) -> Array:
