@@ -155,7 +155,6 @@ def _watch(
     assert filtered.memory is not None
     assert filtered.sensors is not None
     assert glr is not None
-    assert state.since is not None
     m = mem.copy(filtered.memory)
     glr = kernel.GlrState._make(part.copy() for part in glr)
     table, first = structured.input_table(filtered, rows)

@@ -25,7 +25,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
  IN_SPECTRUM, SPECTRA, LINEARIZED, EFFORTS, RESTS) = range(25)
 # Elements of ``score``.
 (SHIFT, DOUBT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES, SANDWICH,
- WHITENED, MISFIT, EMPTY_MISFIT, LOG_DETERMINANT, LIKELIHOOD) = range(15)
+ WHITENED, MISFIT, EXCESS, LOG_DETERMINANT, LIKELIHOOD) = range(15)
 # Values of ``counts[EFFORTS]``: whether the white part of the reported efforts is noise or acts on the arm.
 NOISY, COMPARED, EXACT, CONFIRMED = range(4)
 # Values of ``counts[RESTS]``: whether the arm is at rest, and its horizon slides until it moves.
@@ -72,8 +72,8 @@ class FilterState(NamedTuple):
     Marquardt; MOVES: mean of the squared moves of payload and arm parameters, over the variance that the filter says,
     see ``judge_moves``; SANDWICH: factor, at least 1, by which the variances of the last fit of the empty arm are too
     small, see ``sandwich``; WHITENED: sum of the squared normalised innovations of the linearized filter in
-    this iteration; MISFIT: that of the last accepted iteration, without a linearized filter its COST;
-    EMPTY_MISFIT: innovation power over white noise before the last capture; LOG_DETERMINANT: sum of the logarithms of
+    this iteration; MISFIT: power of the residuals of the last accepted iteration over that of the noise; EXCESS: by how
+    many deviations of chance it exceeds one, see ``judge_residuals``; LOG_DETERMINANT: sum of the logarithms of
     the variances of the innovations of the linearized filter over those of the noise, in this iteration; LIKELIHOOD: -2
     times the logarithm of the likelihood of the last accepted iteration."""
     moved: Array

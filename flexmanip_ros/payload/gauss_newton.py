@@ -13,6 +13,7 @@ from flexmanip_ros.numerics.square_root import absorb_noise, backward, dot, fact
 from flexmanip_ros.payload.filter_state import (
     AGAIN,
     BEFORE,
+    BLOCKS,
     COMPARED,
     CONFIRMED,
     COST,
@@ -22,6 +23,7 @@ from flexmanip_ros.payload.filter_state import (
     EFFORTS,
     ENOUGH,
     EXACT,
+    EXCESS,
     EXCESS_BIAS,
     FIT,
     HELD,
@@ -48,7 +50,14 @@ from flexmanip_ros.payload.filter_state import (
     WHITENED,
     FilterState,
 )
-from flexmanip_ros.payload.measurement_update import BATCH, OVERLAP, MeasurementModel, white_variance
+from flexmanip_ros.payload.measurement_update import (
+    BATCH,
+    BLOCK_MEMORY,
+    OVERLAP,
+    MeasurementModel,
+    most_white,
+    white_variance,
+)
 from flexmanip_ros.payload.process_model import (
     COULOMB,
     INERTIA,
@@ -69,8 +78,6 @@ AT_REST = 0.5
 """A fit has converged when its last step moved the payload by less than this share of its standard deviation."""
 CONVERGED = 0.02
 """Decrease of the cost for each sample below which a step counts as converged, and the horizon may grow."""
-FITS = 1.5
-"""Cost over that of white noise up to which a step counts as converged, too."""
 TRUSTED = 2.0
 """Standard deviations by which a step of the moving-horizon estimation moves the filter's state at most."""
 LEVENBERG = 1.0
@@ -84,6 +91,10 @@ FADING, FADED = 8.0, 1e-3
 """Factor by which a rejected step raises the damping and an accepted one lowers it (Marquardt 1963); share of the first
 damping below which it is set to zero, where it hardly shortens a step. Were it zero after the first accepted step,
 every second step of a fit in a valley that bends would be rejected."""
+TELLS = 50
+"""Samples after which the cost tells whether a fit is one: that of white noise then varies by 0.1 of itself."""
+BY_CHANCE = 5.0
+"""Deviations of chance by which the residuals of a fit exceed the noise where the model is not the simplest one."""
 REJECTIONS = 8
 """Number of times that a step that raises the cost is shortened."""
 FRICTION = 3.0
@@ -129,13 +140,45 @@ def begin_iteration(motion: ProcessModel, m: FilterState) -> None:
             m.B[i, c] = 0.0
     for i in range(m.noise.shape[0]):
         m.noise[i, FIT] = 0.0
-        if m.counts[HELD] == 0:
-            # the first guess, from few samples, may be below the white noise that three deviations allow by now
-            least = 1.0 - 3.0 * np.sqrt(2.0 * OVERLAP / max(m.counts[SEEN], 1))
-            m.noise[i, EFFECTIVE] = max(m.noise[i, EFFECTIVE], least * white_variance(m.noise[i], LEVEL))
+    expect_noise(m)
     m.counts[ITERATED] = 0
     m.counts[MEASURED] = 0
     m.counts[ITERATING] = 1
+
+
+@inner
+def expect_noise(m: FilterState) -> None:
+    """Assume of each sensor the most that its white noise may vary, until its innovations have shown their variance.
+
+    An iteration over the same samples keeps the variances, as costs are compared. Before ``TELLS`` samples the first
+    guess is no worse than the estimate. A cost with larger variances is less, so the last one is raised with them.
+    """
+    if m.counts[BLOCKS] > 0 or m.counts[AGAIN] == 1 or m.counts[REJECTED] > 0 or m.counts[SEEN] < TELLS:
+        return
+    grown = 1.0
+    for i in range(m.noise.shape[0]):
+        most = most_white(m.noise[i], m.counts[SEEN])
+        grown = max(grown, m.noise[i, EFFECTIVE] / most)
+        m.noise[i, EFFECTIVE] = most
+    m.score[COST_BEFORE] *= grown
+
+
+@inner
+def judge_residuals(m: FilterState) -> None:
+    """Compare the power of the residuals of an iteration with that of the noise, and the excess with chance.
+
+    The noise is the sensors' white noise, or what the innovations were before the event. The mean of N squares varies
+    by sqrt(2 / N), and so does the estimate of the white noise, see ``OVERLAP``.
+    """
+    count, sensors, total = max(m.counts[MEASURED], 1), m.noise.shape[0], 0.0
+    for i in range(sensors):
+        variance = white_variance(m.noise[i], LEVEL)
+        if m.counts[BLOCKS] > 0:
+            variance = max(variance, m.noise[i, EFFECTIVE])
+        total += m.noise[i, FIT] / variance
+    chance = np.sqrt((2.0 / count + 2.0 * OVERLAP / max(m.counts[SEEN], 1)) / sensors)
+    m.score[MISFIT] = total / (sensors * count)
+    m.score[EXCESS] = (m.score[MISFIT] - 1.0) / chance
 
 
 @separate
@@ -147,7 +190,6 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
         m.gradient[i] = m.g[i] - m.xi[i]
         for c in range(i + 1):
             m.normal[i, c] = m.N[i, c]
-    fits = m.score[COST] < FITS * (nx + m.noise.shape[0] * m.counts[MEASURED])
     enough = CONVERGED * m.counts[ITERATED]
     # two steps may undo each other for ever where the valley bends
     still = (m.counts[BEFORE] == m.counts[ITERATED] and m.score[LAMBDA] <= first_damping(m)
@@ -156,14 +198,14 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
     m.score[COST_BEFORE] = m.score[COST]
     rejected = are_efforts_noisy(m)
     if not rejected:
-        m.score[MISFIT] = m.score[WHITENED] if m.counts[LINEARIZED] == 1 else m.score[COST]
+        judge_residuals(m)
     m.score[LAMBDA] = m.score[LAMBDA] / FADING if m.score[LAMBDA] > FADED * first_damping(m) else 0.0
     m.counts[REJECTED] = 0
     m.counts[ITERATING] = 0
     if not damped_step(motion, sensors, m):
         return False
     gained = dot(m.g, m.gradient)
-    m.counts[AGAIN] = 0 if fits or still or gained < enough else 1
+    m.counts[AGAIN] = 0 if m.score[EXCESS] < BY_CHANCE or still or gained < enough else 1
     m.counts[TRIED] = m.counts[TRIED] + 1 if m.counts[AGAIN] else 0
     if rejected:  # the filter has gone on with noisy efforts
         m.counts[AGAIN] = 0
@@ -184,8 +226,7 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
             for c in range(nx):
                 m.S[i, c] = m.Sr[i, c] if c < used else 0.0
         # its linearization holds near the minimum, and where its innovations are those of the noise
-        explains = m.score[WHITENED] < FITS * (nx + m.noise.shape[0] * m.counts[MEASURED])
-        if m.counts[LINEARIZED] == 1 and (part == 1.0 or explains):
+        if m.counts[LINEARIZED] == 1 and (part == 1.0 or m.score[EXCESS] < BY_CHANCE):
             for i in range(nx):
                 m.x[i] = m.xr[i] + m.Sr[i, 2 * used]
                 for c in range(used):
@@ -343,6 +384,8 @@ def close_horizon(motion: ProcessModel, sensors: MeasurementModel, m: FilterStat
         return
     if not again:
         m.counts[STORED] = HORIZON
+        # the powers of the innovations are those of the fit, and as many blocks have been averaged
+        m.counts[BLOCKS] = max(1, min(m.counts[BEFORE] // sensors.block, BLOCK_MEMORY))
         if m.counts[EFFORTS] == COMPARED:  # not to its end
             m.counts[EFFORTS] = NOISY
         if m.counts[HELD] == 0:

@@ -322,6 +322,16 @@ def white_variance(sensor: Array, most: int) -> float:
     return variance
 
 
+@inner
+def most_white(sensor: Array, count: int) -> float:
+    """Return the most that a sensor's white noise may vary, by ``count`` samples: three deviations above the estimate.
+
+    sensor: (11,) its row. See ``OVERLAP`` for the deviation.
+    """
+    most: float = (1.0 + 3.0 * np.sqrt(2.0 * OVERLAP / count)) * white_variance(sensor, LEVEL)
+    return most
+
+
 @inlined
 def misfit(noise: Array, rate: NDArray[np.bool_], most: int) -> float:
     """Innovation power over white noise, sensors weighted by their information on the payload; nan: there is none yet.

@@ -24,9 +24,9 @@ from flexmanip_ros.payload.filter_state import (
     COST_BEFORE,
     EFFECTIVE,
     EFFORTS,
-    EMPTY_MISFIT,
     ENOUGH,
     EXACT,
+    EXCESS,
     FIT,
     HELD,
     HORIZON,
@@ -60,8 +60,9 @@ from flexmanip_ros.payload.filter_state import (
 )
 from flexmanip_ros.payload.gauss_newton import (
     AT_REST,
-    FITS,
+    BY_CHANCE,
     LINEAR,
+    TELLS,
     begin_iteration,
     close_horizon,
     finish_iteration,
@@ -111,15 +112,8 @@ seems to tell 3 % within a second of rest; a step of the torques tells 10 % with
 LOST = 1e12
 """Cost for each measurement beyond which a trajectory is given up: a million standard deviations of the noise. The best
 encoders tell a million positions apart, so no arm is further from any estimate of it."""
-TELLS = 50
-"""Samples after which the cost tells whether a fit is one: that of white noise then varies by 0.1 of itself."""
 UNFIT = 2.0
 """Cost over that of white noise beyond which a fit is rejected."""
-BY_CHANCE, UNTOLD = 5.0, 0.05
-"""The first fit after a capture is of a point mass. A body is fitted next where the point costs more than white noise
-by so many standard deviations (of chi square with n degrees of freedom: the root of 2 n), and by the share to which the
-white noise is known. Up to 30 dB a point in place of a body costs less than ``UNFIT``, and its mass is wrong. Where the
-empty arm itself showed more than noise, so will any object, and ``UNFIT`` decides: a body would fit what rings."""
 TRIALS = 10
 """Iterations over the same samples after which a fit is given up: those that converge take three to nine."""
 STARTS = 2
@@ -127,14 +121,13 @@ STARTS = 2
 MOST_REFITS = 4
 """Largest number of times that a fit is begun again after an event: with the parameters of another arm none ever
 fits."""
-STRAY, STRAY_EVERY = 3.0, 500
-"""Innovation power over white noise, of every sensor, at which the filter is begun again; samples between two
-checks."""
+STRAY = 3.0
+"""Innovation power over white noise, of every sensor, at which the filter is begun again."""
 MOST_BIAS = 4.0
 """Standard deviations, with the error of its inertia among them, that an empty arm may seem to hold. Beyond them the
 arm is not the one that was described or learned, and what it catches is estimated wrong. Chance exceeds them 1 time in
-16 000. In ten looks, as many as five seconds at 1 kHz have, that is 1 in 1600. With 3 (1 in 370) six more of 120 random
-arms were INCONSISTENT; five of them knew the payload."""
+16 000. In 26 looks, as many as five seconds of the default arm have, that is 1 in 600. With 3 (1 in 370) six more of
+120 random arms were INCONSISTENT; five of them knew the payload."""
 SLACK = 1.0
 """Increase of the cost up to which a step is accepted: one is a change of the estimate by one standard deviation."""
 CHANCE = 3.0
@@ -349,8 +342,7 @@ def rests(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bo
     if motion.kind[-1] <= INERTIA or count < 2 * slide_length(sensors) or count & (count - 1) != 0:
         return False
     known = dot(m.S0[mass], m.S0[mass]) < (1.0 - TOLD) * motion.prior[0] * motion.prior[0]
-    costs = m.score[MISFIT] > FITS * (m.xi.size + m.noise.shape[0] * m.counts[BEFORE])
-    unfit = m.counts[AGAIN] == 1 or (m.counts[BEFORE] > 0 and costs)
+    unfit = m.counts[AGAIN] == 1 or (m.counts[BEFORE] > 0 and m.score[EXCESS] > BY_CHANCE)
     if known or unfit or m.counts[SINCE_EVENT] > count or tells(motion, m):
         return False
     m.counts[RESTS] = RESTING
@@ -428,12 +420,8 @@ def misfits(motion: ProcessModel, m: FilterState) -> bool:
     early = m.counts[TRIED] < TRIALS if m.counts[AGAIN] == 1 else m.counts[ITERATED] < TELLS
     if m.counts[REFITS] >= most or early:
         return False
-    expected = m.xi.size + m.noise.shape[0] * m.counts[MEASURED]
-    largest = UNFIT
-    chance = 1.0 + UNTOLD + BY_CHANCE * np.sqrt(2.0 / expected)
-    if m.counts[HELD] == 1 and m.counts[REFITS] == 0 and m.score[EMPTY_MISFIT] < chance:
-        largest = min(UNFIT, chance)
-    failed = bool(m.counts[AGAIN] == 1 or m.score[MISFIT] > largest * expected)
+    failed = bool(m.counts[AGAIN] == 1 or m.score[MISFIT] > UNFIT
+                  or (m.counts[REFITS] == 0 and m.score[EXCESS] > BY_CHANCE))
     m.counts[REFITS] += failed
     return failed
 
@@ -443,8 +431,7 @@ def fails(m: FilterState) -> bool:
     """Whether the fit failed at the end of the horizon: it costs far more than white noise, or lacks some samples."""
     if m.counts[REFITS] >= MOST_REFITS:
         return False
-    expected = m.xi.size + m.noise.shape[0] * m.counts[BEFORE]
-    failed = bool(m.score[MISFIT] > UNFIT * expected or m.counts[BEFORE] < m.counts[STORED])
+    failed = bool(m.score[MISFIT] > UNFIT or m.counts[BEFORE] < m.counts[STORED])
     m.counts[REFITS] += failed
     return failed
 
@@ -468,7 +455,7 @@ def strays(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> b
     """
     if m.counts[REFITS] >= MOST_REFITS or (m.counts[HELD] == 1 and m.counts[LEARNED] == 0):
         return False
-    if m.counts[STORED] < HORIZON or m.counts[SINCE_EVENT] % STRAY_EVERY != 0:
+    if m.counts[STORED] < HORIZON or m.counts[SINCE_EVENT] % (BATCH * sensors.block) != 0:
         return False
     least = STRAY
     for i in range(m.noise.shape[0]):

@@ -161,7 +161,7 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
 
 def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
     """Return the payload with its interval; never a NaN."""
-    return judge(config, state.model, state.sensors, state.memory, state.restarts)
+    return judge(config, state.model, state.sensors, state.memory, state.restarts, state.peak)
 
 
 def _change(config: IdentifierParameters, model: Model, sensors: MeasurementModel, m: mem.FilterState,
@@ -175,7 +175,6 @@ def _change(config: IdentifierParameters, model: Model, sensors: MeasurementMode
     columns = structured_model.jump(config, model, m, math.hypot(event.std_s, config.payload.event_time_std))
     opened = np.zeros((m.x.size, model.body))
     if kind is EventKind.CAPTURE:
-        m.score[mem.EMPTY_MISFIT], _ = innovation_power(sensors, m)
         if not held:
             _forget_payload(model, m)  # the arm was empty: its payload was the bias of the model
         opened[payload, 0] = structured_model.body_std(config, model)[0]  # a point first
@@ -189,8 +188,7 @@ def _change(config: IdentifierParameters, model: Model, sensors: MeasurementMode
         m.counts[mem.HELD] = 0
     m.S[:] = structured_model.widen(m.S, np.hstack([columns, opened]))
     if m.counts[mem.STORED] < mem.HORIZON and m.counts[mem.SEEN] >= UNTAUGHT:  # guessed from the first samples
-        structured_model.guess_noise(model, m.noise)
-    structured_model.shake(model, m)
+        structured_model.guess_noise(m, int(m.counts[mem.SEEN]))
     m.noise[:, mem.AT_EVENT] = m.noise[:, mem.EFFECTIVE]
     _set_arrival_cost(model, m)
 
@@ -271,7 +269,7 @@ def _fit_empty_arm_again(config: IdentifierParameters, model: Model, m: mem.Filt
     m.x[p] = learned
     m.S[p][known] = 0.0
     m.S[:] = structured_model.triangular(m.S)
-    structured_model.guess_noise(model, m.noise)
+    structured_model.guess_noise(m, int(m.counts[mem.SEEN]))
     _set_arrival_cost(model, m)
     start = m.x0.copy()
     m.x0[p] = given
@@ -315,7 +313,7 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     structured_model.freeze(fewer, model, np.mean(rows.angles, axis=0))
     if state.white.size:
         m.noise[:, [mem.WHITE, mem.LEVEL]] = state.white
-        structured_model.guess_noise(model, m.noise)
+    structured_model.guess_noise(m, FIRST_LOOK)
     # the simplest arm first; then all that may be learned, with late signals and without in turn, from another start
     if state.refits > 1:
         structured_model.expect_rotors_and_friction(model, m)

@@ -19,7 +19,7 @@ from flexmanip_ros.identification.prediction_check import white_noise
 from flexmanip_ros.numerics.square_root import allocate_bounds
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
-from flexmanip_ros.payload.measurement_update import MeasurementModel
+from flexmanip_ros.payload.measurement_update import MeasurementModel, most_white
 from flexmanip_ros.payload.moving_horizon import MEASURED_SHARE, MODELLED_SHARE
 from flexmanip_ros.payload.process_model import (
     STEP_ANGLE,
@@ -348,8 +348,6 @@ BEND_STD = 0.01
 """Prior deviation of the bending before the first sample, over the length of the link."""
 OTHER_JUMP = 0.01
 """Share of the rate jump at a capture that an impulse at the tip does not explain, as the shape functions are few."""
-RATE_NOISE = 10.0
-"""Variance of rates over their white noise, as long as none is measured: rates show the modes that are left out."""
 FLOORS = {Quantity.ANGLE: 1e-6, Quantity.ANGLE_RATE: 1e-5, Quantity.BEND: 1e-7, Quantity.BEND_RATE: 1e-6}
 """Least standard deviations of a sensor [rad, rad/s, m, m/s], as no signal is exact."""
 
@@ -426,23 +424,21 @@ def too_noisy(rates: Array, dt: float) -> NDArray[np.bool_]:
 
 
 def noise(model: Model, Y: Array) -> Array:
-    """Return a first guess of every sensor's noise, as ``FilterState.noise``, from its first samples Y (N, m)."""
+    """Return what the first samples Y (N, m) tell of the white noise of every sensor, as ``FilterState.noise``."""
     differences = np.diff(Y, n=4, axis=0)
     white = (1.4826 * np.median(np.abs(differences), axis=0)) ** 2 / 70
     rows = np.zeros((len(model.roles), 11))
     rows[:, mem.LEVEL] = np.inf  # no spectrum yet
     rows[:, mem.FLOOR] = [FLOORS[role.quantity] ** 2 for role in model.roles]
     rows[:, mem.WHITE] = np.maximum(white, rows[:, mem.FLOOR])
-    guess_noise(model, rows)
     return rows
 
 
-def guess_noise(model: Model, rows: Array) -> None:
-    """Set the variance of every sensor to twice its white noise, of rates to ``RATE_NOISE`` times it."""
-    rates = [role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE) for role in model.roles]
-    guess = np.maximum(rows[:, mem.WHITE], rows[:, mem.FLOOR]) * np.where(rates, RATE_NOISE, 2.0)
-    for column in (mem.POWER, mem.SLOW, mem.EFFECTIVE, mem.AT_EVENT):
-        rows[:, column] = guess
+def guess_noise(m: mem.FilterState, count: int) -> None:
+    """Assume of every sensor the most that its white noise may vary, by ``count`` samples, as before any innovation."""
+    m.counts[mem.BLOCKS] = 0
+    for row in m.noise:
+        row[[mem.POWER, mem.SLOW, mem.EFFECTIVE, mem.AT_EVENT]] = most_white(row, count)
 
 
 def first(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Array) -> None:
@@ -583,13 +579,6 @@ def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, 
     columns = np.zeros((m.x.size, found.shape[1]))
     columns[:2 * n] = found
     return columns
-
-
-def shake(model: Model, m: mem.FilterState) -> None:
-    """Raise the noise of the rates at an event: it excites vibrations beyond the shape functions, which rates show."""
-    for i, role in enumerate(model.roles):
-        if role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE):
-            m.noise[i, mem.EFFECTIVE] = max(m.noise[i, mem.EFFECTIVE], RATE_NOISE * m.noise[i, mem.WHITE])
 
 
 def diffusion(config: IdentifierParameters, model: Model, m: mem.FilterState) -> Array:

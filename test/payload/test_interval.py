@@ -1,4 +1,4 @@
-"""The interval holds what is not estimated: the bias of a rotor by the shape functions that are left out."""
+"""The interval holds what is not estimated: a rotor biased by missing shape functions, the form of the friction."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flexmanip_ros.arm.linearization import mass_matrix
 from flexmanip_ros.arm.manipulator import manipulator
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.payload.filter_state import memory
-from flexmanip_ros.payload.interval import by_rotors
+from flexmanip_ros.payload.interval import SHARE_ERROR, by_rotors, friction_error
 from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.payload.structured_model import ROTOR_ERROR, build, too_noisy
 from flexmanip_ros.simulation import excitation, simulator
@@ -24,6 +24,7 @@ MODEL = build(IdentifierParameters())
 assert MODEL is not None
 BODY = np.arange(MODEL.payload, MODEL.payload + MODEL.body)
 ROTORS = MODEL.payload + np.flatnonzero(MODEL.motion.kind == Kind.ROTOR)
+FRICTION = MODEL.payload + np.flatnonzero(MODEL.motion.kind == Kind.COULOMB)
 
 
 @settings(max_examples=30)
@@ -55,6 +56,16 @@ def test_the_bias_is_of_the_links_alone_however_large_hub_and_rotor_are() -> Non
     M = mass_matrix(links_alone, np.zeros(4), np.zeros(links_alone.stiffness.size))
     fast = [1.0 / (row @ np.linalg.solve(M, row)) for row in links_alone.joint]
     np.testing.assert_allclose(model.rotor_error, ROTOR_ERROR * np.array(fast), rtol=1e-12)
+
+
+@pytest.mark.parametrize(('friction', 'torques', 'error'), [
+    ((1.0, 0.4), (10.0, 5.0), 0.1 * SHARE_ERROR), ((0.2, 0.5), (10.0, 5.0), 0.1 * SHARE_ERROR),
+    ((0.0, 0.0), (10.0, 5.0), 0.0), ((-0.1, 0.0), (10.0, 5.0), 0.0), ((0.3, 0.2), (0.0, 0.0), 0.0)])
+def test_the_form_of_the_friction_is_an_error_in_proportion_to_friction_over_torque(friction, torques, error) -> None:
+    assert MODEL is not None
+    m = memory(2 * MODEL.motion.arm.stiffness.size + MODEL.motion.kind.size, len(MODEL.roles), 2)
+    m.x[FRICTION] = friction
+    assert friction_error(MODEL, m, np.array(torques)) == pytest.approx(error)
 
 
 def test_a_light_body_on_an_arm_of_more_shape_functions_and_much_friction_is_in_its_interval() -> None:
