@@ -29,8 +29,9 @@ from flexmanip_ros.payload.filter_state import (
     USED,
     FilterState,
 )
+from flexmanip_ros.payload.gauss_newton import UNFIT
 from flexmanip_ros.payload.measurement_update import MeasurementModel
-from flexmanip_ros.payload.moving_horizon import UNFIT, slide_length, take, tells
+from flexmanip_ros.payload.moving_horizon import slide_length, take, tells
 from flexmanip_ros.payload.process_model import SERIES, STEP_ANGLE, ProcessModel, predict
 from flexmanip_ros.types import Array
 

@@ -72,10 +72,10 @@ class FilterState(NamedTuple):
     Marquardt; MOVES: mean of the squared moves of payload and arm parameters, over the variance that the filter says,
     see ``judge_moves``; SANDWICH: factor, at least 1, by which the variances of the last fit of the empty arm are too
     small, see ``sandwich``; WHITENED: sum of the squared normalised innovations of the linearized filter in
-    this iteration; MISFIT: power of the residuals of the last accepted iteration over that of the noise; EXCESS: by how
-    many deviations of chance it exceeds one, see ``judge_residuals``; LOG_DETERMINANT: sum of the logarithms of
-    the variances of the innovations of the linearized filter over those of the noise, in this iteration; LIKELIHOOD: -2
-    times the logarithm of the likelihood of the last accepted iteration."""
+    this iteration; MISFIT: power of the residuals of the last accepted iteration over the noise assumed; EXCESS: by how
+    many deviations of chance it exceeds the white noise, see ``judge_residuals``; LOG_DETERMINANT: sum of the
+    logarithms of the variances of the innovations of the linearized filter over those of the noise, in this iteration;
+    LIKELIHOOD: -2 times the logarithm of the likelihood of the last accepted iteration."""
     moved: Array
     """(nx, 2) mean and variance of payload and arm parameters when their moves were last judged, with the process noise
     since then in the variance; see ``judge_moves``."""

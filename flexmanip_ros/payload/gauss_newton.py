@@ -39,6 +39,7 @@ from flexmanip_ros.payload.filter_state import (
     MISFIT,
     NOISY,
     POWER,
+    REFITS,
     REJECTED,
     SANDWICH,
     SEEN,
@@ -78,6 +79,8 @@ AT_REST = 0.5
 """A fit has converged when its last step moved the payload by less than this share of its standard deviation."""
 CONVERGED = 0.02
 """Decrease of the cost for each sample below which a step counts as converged, and the horizon may grow."""
+FITS = 1.5
+"""Cost over that of the noise assumed up to which a step counts as converged, too: the next one reads more."""
 TRUSTED = 2.0
 """Standard deviations by which a step of the moving-horizon estimation moves the filter's state at most."""
 LEVENBERG = 1.0
@@ -93,6 +96,8 @@ damping below which it is set to zero, where it hardly shortens a step. Were it 
 every second step of a fit in a valley that bends would be rejected."""
 TELLS = 50
 """Samples after which the cost tells whether a fit is one: that of white noise then varies by 0.1 of itself."""
+UNFIT = 2.0
+"""Power of the residuals over the noise assumed beyond which a fit is rejected."""
 BY_CHANCE = 5.0
 """Deviations of chance by which the residuals of a fit exceed the noise where the model is not the simplest one."""
 REJECTIONS = 8
@@ -165,20 +170,22 @@ def expect_noise(m: FilterState) -> None:
 
 @inner
 def judge_residuals(m: FilterState) -> None:
-    """Compare the power of the residuals of an iteration with that of the noise, and the excess with chance.
+    """Compare the power of the residuals of an iteration with the noise assumed, and with white noise.
 
-    The noise is the sensors' white noise, or what the innovations were before the event. The mean of N squares varies
-    by sqrt(2 / N), and so does the estimate of the white noise, see ``OVERLAP``.
+    MISFIT is their ratio to the noise that the fit assumes. EXCESS compares with the sensors' white noise, or with what
+    the innovations were before the event, in deviations of chance. The mean of N squares varies by sqrt(2 / N), and so
+    does the estimate of the white noise, see ``OVERLAP``.
     """
     count, sensors, total = max(m.counts[MEASURED], 1), m.noise.shape[0], 0.0
+    m.score[MISFIT] = 0.0
     for i in range(sensors):
         variance = white_variance(m.noise[i], LEVEL)
         if m.counts[BLOCKS] > 0:
             variance = max(variance, m.noise[i, EFFECTIVE])
         total += m.noise[i, FIT] / variance
+        m.score[MISFIT] += m.noise[i, FIT] / (m.noise[i, EFFECTIVE] * sensors * count)
     chance = np.sqrt((2.0 / count + 2.0 * OVERLAP / max(m.counts[SEEN], 1)) / sensors)
-    m.score[MISFIT] = total / (sensors * count)
-    m.score[EXCESS] = (m.score[MISFIT] - 1.0) / chance
+    m.score[EXCESS] = (total / (sensors * count) - 1.0) / chance
 
 
 @separate
@@ -190,6 +197,8 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
         m.gradient[i] = m.g[i] - m.xi[i]
         for c in range(i + 1):
             m.normal[i, c] = m.N[i, c]
+    # by the trajectory: a linearized filter explains residuals of one that is far from the minimum
+    fits = m.score[COST] < FITS * (nx + m.noise.shape[0] * m.counts[MEASURED])
     enough = CONVERGED * m.counts[ITERATED]
     # two steps may undo each other for ever where the valley bends
     still = (m.counts[BEFORE] == m.counts[ITERATED] and m.score[LAMBDA] <= first_damping(m)
@@ -205,7 +214,9 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
     if not damped_step(motion, sensors, m):
         return False
     gained = dot(m.g, m.gradient)
-    m.counts[AGAIN] = 0 if m.score[EXCESS] < BY_CHANCE or still or gained < enough else 1
+    # the simplest model is given up by chance, so not before it has converged
+    fits &= m.counts[REFITS] > 0 or m.score[EXCESS] < BY_CHANCE
+    m.counts[AGAIN] = 0 if fits or still or gained < enough else 1
     m.counts[TRIED] = m.counts[TRIED] + 1 if m.counts[AGAIN] else 0
     if rejected:  # the filter has gone on with noisy efforts
         m.counts[AGAIN] = 0
@@ -226,7 +237,7 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
             for c in range(nx):
                 m.S[i, c] = m.Sr[i, c] if c < used else 0.0
         # its linearization holds near the minimum, and where its innovations are those of the noise
-        if m.counts[LINEARIZED] == 1 and (part == 1.0 or m.score[EXCESS] < BY_CHANCE):
+        if m.counts[LINEARIZED] == 1 and (part == 1.0 or m.score[MISFIT] < FITS):
             for i in range(nx):
                 m.x[i] = m.xr[i] + m.Sr[i, 2 * used]
                 for c in range(used):

@@ -22,6 +22,7 @@ from flexmanip_ros.payload.filter_state import (
     SHIFT,
     STORED,
 )
+from flexmanip_ros.payload.gauss_newton import FITS
 from flexmanip_ros.payload.measurement_update import OVERLAP, MeasurementModel, misfit, white_variance
 from flexmanip_ros.payload.moving_horizon import MOST_BIAS
 from flexmanip_ros.payload.process_model import Kind
@@ -115,7 +116,8 @@ def is_behind(m: mem.FilterState) -> bool:
     """
     if m.counts[STORED] < FEW:
         return False
-    return bool(m.counts[mem.AGAIN] == 1 or 2 * m.counts[mem.BEFORE] <= m.counts[STORED])
+    unfit = m.counts[mem.AGAIN] == 1 and m.score[mem.MISFIT] > FITS
+    return bool(unfit or 2 * m.counts[mem.BEFORE] <= m.counts[STORED])
 
 
 def is_fitted_to_few(m: mem.FilterState) -> bool:

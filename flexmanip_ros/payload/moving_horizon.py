@@ -63,6 +63,7 @@ from flexmanip_ros.payload.gauss_newton import (
     BY_CHANCE,
     LINEAR,
     TELLS,
+    UNFIT,
     begin_iteration,
     close_horizon,
     finish_iteration,
@@ -112,8 +113,6 @@ seems to tell 3 % within a second of rest; a step of the torques tells 10 % with
 LOST = 1e12
 """Cost for each measurement beyond which a trajectory is given up: a million standard deviations of the noise. The best
 encoders tell a million positions apart, so no arm is further from any estimate of it."""
-UNFIT = 2.0
-"""Cost over that of white noise beyond which a fit is rejected."""
 TRIALS = 10
 """Iterations over the same samples after which a fit is given up: those that converge take three to nine."""
 STARTS = 2

@@ -21,6 +21,7 @@ def judged(rng: np.random.Generator) -> mem.FilterState:
     m.noise[:, mem.LEVEL] = np.inf
     differences = np.diff(rng.standard_normal((SAMPLES + 4, SENSORS)), n=4, axis=0)
     m.noise[:, mem.WHITE] = VARIANCE * np.mean(differences ** 2, axis=0) / 70
+    m.noise[:, mem.EFFECTIVE] = m.noise[:, mem.WHITE]
     m.noise[:, mem.FIT] = VARIANCE * np.sum(rng.standard_normal((SAMPLES, SENSORS)) ** 2, axis=0)
     gauss_newton.judge_residuals(m)
     return m
