@@ -51,7 +51,7 @@ BEGIN = 2.0
 100 squares of noise differ by less: their ratio has a deviation of 0.2."""
 CALM = 3.0
 """Factor by which the statistic must exceed its own recent peaks, which errors of the model cause. At a capture it
-reaches 10 to 1000 times these peaks within 0.1 s. With 3 one of 48 runs has a false alarm
+reaches 10 to 1000 times these peaks within 0.1 s. With 3 none of 48 runs has a false alarm
 (``detection_real_arms``); without these peaks three of eight with friction had."""
 MOST_HALVINGS = 20
 """Largest number of halvings of a sample time in the matrix exponential: no real arm needs more."""

@@ -412,7 +412,10 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, tab
 
 @inner
 def misfits(motion: ProcessModel, m: FilterState) -> bool:
-    """Whether another start is due: the fit costs far more than white noise, or came to no end in ``TRIALS``."""
+    """Whether another start is due: the residuals are far more than the noise, or the fit came to no end in ``TRIALS``.
+
+    Those of the simplest model of an arm, or of a point, need only exceed chance.
+    """
     most = MOST_REFITS - 1
     if m.counts[HELD] == 1:
         most = STARTS if motion.kind.size > INERTIA and motion.kind[INERTIA] == INERTIA else 0
