@@ -25,7 +25,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
  IN_SPECTRUM, SPECTRA, LINEARIZED, EFFORTS, RESTS) = range(25)
 # Elements of ``score``.
 (SHIFT, DOUBT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES, SANDWICH,
- WHITENED, MISFIT, EXCESS, LOG_DETERMINANT, LIKELIHOOD) = range(15)
+ MISFIT, EXCESS, LOG_DETERMINANT, LIKELIHOOD) = range(14)
 # Values of ``counts[EFFORTS]``: whether the white part of the reported efforts is noise or acts on the arm.
 NOISY, COMPARED, EXACT, CONFIRMED = range(4)
 # Values of ``counts[RESTS]``: whether the arm is at rest, and its horizon slides until it moves.
@@ -63,18 +63,18 @@ class FilterState(NamedTuple):
     horizon slides along, IN_BATCH counts the samples since it slid; SLIDES: it is due; BEGINS_TO_MOVE: the last sample
     tells."""
     score: Array
-    """(15,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
+    """(14,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
     squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
     EMPTY_ARM_BIAS: payload that the arm seemed to hold before the event, when it was empty, in the filter's standard
-    deviations; EXCESS_BIAS: the same over the deviation that its moves give, with the error of the inertia, and that
-    of an empty arm while it is fitted again; COST: of
-    the samples read in this iteration, COST_BEFORE: of the last accepted one; LAMBDA: damping of Levenberg and
+    deviations; EXCESS_BIAS: the same over the deviation that its moves give, with the error of the inertia, and that of
+    an empty arm while it is fitted again; COST: of the samples read in this iteration, COST_BEFORE: of the last
+    accepted one; LAMBDA: damping of Levenberg and
     Marquardt; MOVES: mean of the squared moves of payload and arm parameters, over the variance that the filter says,
     see ``judge_moves``; SANDWICH: factor, at least 1, by which the variances of the last fit of the empty arm are too
-    small, see ``sandwich``; WHITENED: sum of the squared normalised innovations of the linearized filter in
-    this iteration; MISFIT: power of the residuals of the last accepted iteration over the noise assumed; EXCESS: by how
-    many deviations of chance it exceeds the white noise, see ``judge_residuals``; LOG_DETERMINANT: sum of the
-    logarithms of the variances of the innovations of the linearized filter over those of the noise, in this iteration;
+    small, see ``sandwich``; MISFIT: power of the residuals of the last accepted iteration (of the innovations where
+    there is a linearized filter) over the noise assumed; EXCESS: by how many deviations of chance it exceeds the white
+    noise, see ``judge_residuals``; LOG_DETERMINANT: sum of the logarithms of the variances of the innovations of the
+    linearized filter over those of the noise, in this iteration;
     LIKELIHOOD: -2 times the logarithm of the likelihood of the last accepted iteration."""
     moved: Array
     """(nx, 2) mean and variance of payload and arm parameters when their moves were last judged, with the process noise
@@ -122,7 +122,7 @@ def memory(nx: int, m: int, links: int) -> FilterState:
     """Allocate for nx states, m sensors and the joints of ``links`` links."""
     return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)),
-        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(25, dtype=np.int64), score=np.zeros(15),
+        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(25, dtype=np.int64), score=np.zeros(14),
         moved=np.zeros((nx, 2)), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
         normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, 2 * nx + 1)),
         N=np.zeros((nx, nx)), g=np.zeros(nx), batch=np.zeros(nx), B=np.zeros((nx, nx)),

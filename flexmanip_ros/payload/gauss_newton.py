@@ -48,7 +48,6 @@ from flexmanip_ros.payload.filter_state import (
     STORED,
     TRIED,
     USED,
-    WHITENED,
     FilterState,
 )
 from flexmanip_ros.payload.measurement_update import (
@@ -123,7 +122,6 @@ def begin_iteration(motion: ProcessModel, m: FilterState) -> None:
     """Start a Gauss-Newton iteration at the event, linearized at the estimate of the last one."""
     nx, used = m.x.size, m.counts[USED]
     m.score[COST] = 0.0
-    m.score[WHITENED] = 0.0
     m.score[LOG_DETERMINANT] = 0.0
     m.counts[LINEARIZED] = has_torque_noise(motion, m)
     for i in range(motion.effort.size):

@@ -55,7 +55,6 @@ from flexmanip_ros.payload.filter_state import (
     TRIED,
     USED,
     WHITE,
-    WHITENED,
     FilterState,
 )
 from flexmanip_ros.payload.gauss_newton import (
@@ -235,7 +234,6 @@ def update_linearized(m: FilterState, f: Array, e: float, r: float) -> float:
         gain *= gamma
         for c in range(used):
             m.Sr[i, used + c] -= gain * own[c]
-    m.score[WHITENED] += e * e / variance
     m.score[LOG_DETERMINANT] += np.log(variance / r)
     return float(e * e / variance * r)
 
