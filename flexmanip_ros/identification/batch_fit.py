@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.identification.mode_drift import drift_of
+from flexmanip_ros.identification.mode_drift import drifting
 from flexmanip_ros.identification.moments import Realized, triangle
 from flexmanip_ros.identification.pbsid import pbsid
 from flexmanip_ros.identification.prediction_error import (
@@ -305,7 +305,10 @@ def _recursion(samples: Array, attempt: Attempt) -> Recursion:
     root, blocks = arrive(covariance_root(fit.information), fit.arrival), len(U) / BLOCK
     trend, trend_share = np.zeros(fit.directions.shape[1]), 0.0
     widening = _widening(U, Y, fit, structure)
-    drift = drift_of(U, Y, fit, structure, widening)
+    try:
+        drift = drifting(U, Y, fit, structure, widening)
+    except np.linalg.LinAlgError:  # the fit itself is sound
+        drift = None
     if drift is not None:  # the fit is that of the arm at an earlier time
         root = triangle(np.hstack([root, drift.ahead[:, None]]).T).T
         trend, trend_share = drift.rate / blocks, 1.0
@@ -336,7 +339,7 @@ def _gain_asked_for(U: Array, Y: Array, fit: Fit, structure: Structure, penalty:
     """Score test of K = 0 at the fit: whether a free K would raise the likelihood by more than its price."""
     full = structure._replace(free_gain=True)
     P = directions(fit.theta, full)
-    information, gradient, _, _, _ = derivatives(U, Y, fit.theta, full, fit.covariance, P)
+    information, gradient, _, _ = derivatives(U, Y, fit.theta, full, fit.covariance, P)
     if not np.all(np.isfinite(information)):
         return True
     root = covariance_root(information)
@@ -356,7 +359,7 @@ def _widening(U: Array, Y: Array, fit: Fit, structure: Structure) -> float:
     X: Array | None = None
     edges = np.linspace(0, len(U), PIECES + 1).astype(int)
     for a, b in itertools.pairwise(edges):
-        _, gradient, _, X, end = derivatives(
+        _, gradient, X, end = derivatives(
             U[a:b], Y[a:b], theta, structure, fit.covariance, fit.directions, X)
         sums.append(root.T @ gradient)
         theta = theta._replace(x=end)

@@ -17,11 +17,16 @@ LAG = TAPS // 2
 """Delay of the filter in kept sample times, from the instant of a filtered sample to the last sample it depends on."""
 
 
+Missing = NDArray[np.int64]
+"""See ``Rows.missing``."""
+
+
 class Decimator(NamedTuple):
-    """taps: (L,) filter; history: (L - 1, r + m) latest samples; seen: samples since the last gap."""
+    """taps: (L,) filter; history: (L - 1, r + m) and missing: (L - 1,) of the latest samples; seen: since a gap."""
 
     taps: Array
     history: Array
+    missing: Missing
     seen: int
 
 
@@ -31,7 +36,7 @@ def start(factor: int, width: int) -> Decimator:
     cutoff = 0.8 / factor  # of the Nyquist frequency
     taps = np.hamming(length) * np.sinc(cutoff * (np.arange(length) - (length - 1) / 2.0))
     taps /= taps.sum()
-    return Decimator(taps, np.zeros((length - 1, width)), 0)
+    return Decimator(taps, np.zeros((length - 1, width)), np.zeros(length - 1, dtype=np.int64), 0)
 
 
 def restart(decimator: Decimator) -> Decimator:
@@ -39,25 +44,30 @@ def restart(decimator: Decimator) -> Decimator:
     return decimator._replace(seen=0)
 
 
-def decimate(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimator, Array, list[int]]:
+def decimate(decimator: Decimator, samples: Array, missing: Missing, factor: int
+             ) -> tuple[Decimator, Array, list[int], Missing]:
     """Filter samples (k, r + m); return the kept ones (j, r + m), and for each the index of the sample it ends with.
 
-    A sample that is not finite restarts the filter and is passed on unfiltered, so the identifier sees the gap.
+    missing: (k,) of the samples; last result: (j,) of those that the kept ones describe, ``LAG`` earlier. A sample that
+    is not finite restarts the filter and is passed on unfiltered, so the identifier sees the gap.
     """
     kept: list[Array] = []
     at: list[int] = []
+    absent: list[Missing] = []
     good = np.all(np.isfinite(samples), axis=1)
     begin = 0
     for k in [*np.flatnonzero(~good).tolist(), len(samples)]:
-        decimator, some, due = _run(decimator, samples[begin:k], factor)
+        decimator, some, due, lost = _run(decimator, samples[begin:k], missing[begin:k], factor)
         kept.append(some)
+        absent.append(lost)
         at.extend(begin + i for i in due)
         if k < len(samples):
             decimator = restart(decimator)
             kept.append(samples[k:k + 1])
             at.append(k)
+            absent.append(missing[k:k + 1])
         begin = k + 1
-    return decimator, np.vstack(kept), at
+    return decimator, np.vstack(kept), at, np.concatenate(absent)
 
 
 def whole(samples: Array, factor: int) -> tuple[Array, NDArray[np.int64]]:
@@ -67,14 +77,15 @@ def whole(samples: Array, factor: int) -> tuple[Array, NDArray[np.int64]]:
     """
     if factor == 1:
         return samples, np.arange(len(samples))
-    _, kept, due = decimate(start(factor, samples.shape[1]), samples, factor)
+    _, kept, due, _ = decimate(start(factor, samples.shape[1]), samples, np.zeros(len(samples), np.int64), factor)
     return kept, np.array(due, dtype=np.int64) - LAG * factor
 
 
-def _run(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimator, Array, list[int]]:
+def _run(decimator: Decimator, samples: Array, missing: Missing, factor: int
+         ) -> tuple[Decimator, Array, list[int], Missing]:
     """Filter finite samples of one stretch without a gap."""
-    taps, history, seen = decimator
-    joint = np.vstack([history, samples])
+    taps, history, before, seen = decimator
+    joint, missing = np.vstack([history, samples]), np.concatenate([before, missing])
     order = len(taps) - 1
     # joint[order + i] is sample number seen + i + 1 since the gap; it is kept where the filter is full, every factor-th
     numbers = seen + 1 + np.arange(len(samples))
@@ -82,5 +93,5 @@ def _run(decimator: Decimator, samples: Array, factor: int) -> tuple[Decimator, 
     out = np.empty((len(due), samples.shape[1]))
     for row, i in enumerate(due):
         out[row] = taps @ joint[i:i + order + 1]
-    going_on = decimator._replace(history=joint[len(joint) - order:], seen=seen + len(samples))
-    return going_on, out, due.tolist()
+    going_on = Decimator(taps, joint[len(joint) - order:], missing[len(joint) - order:], seen + len(samples))
+    return going_on, out, due.tolist(), missing[due + LAG * factor]

@@ -3,16 +3,16 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from flexmanip_ros.numerics.compiled import library
 from flexmanip_ros.types import Array
 
-WEIGHT, WEIGHT2, PRIOR, ENERGY, LATELY, POWER, GAMMA, OPEN = 0, 1, 2, 3, 4, 5, 6, 7
+WEIGHT, WEIGHT2, PRIOR, ENERGY, LATELY, POWER, OPEN = 0, 1, 2, 3, 4, 5, 6
 """Indices into ``scalars``: sum of the weights, sum of the squared weights, remaining weight of the prior, remembered
-and recent variation of the signals (unit: squared peaks), innovation power, last conversion factor, and share with
-which the last sample counted (0: not at all)."""
-SCALARS = 8
+and recent variation of the signals (unit: squared peaks), innovation power, and share with which the last sample
+counted (0: not at all)."""
+SCALARS = 7
 FILLED, USED, SEEN, REJECTED, ODD = 0, 1, 2, 3, 4
 """Indices into ``counts``: samples in a row without a gap, regressions since the restart, samples since the reset,
 samples rejected, and outliers in a row."""
@@ -35,7 +35,7 @@ EXPECTED, SURPRISE = 1.5, 3.0
 """Innovation power up to which the model fits, and from which on the plant counts as changed."""
 
 
-@njit(cache=True)
+@library
 def accept(u: Array, y: Array, new: Array, scale: Array, mean: Array, counts: Array) -> bool:
     """Scale one sample into ``new`` (r + m,); return False and empty the window where a number is rejected.
 
@@ -68,7 +68,7 @@ def accept(u: Array, y: Array, new: Array, scale: Array, mean: Array, counts: Ar
     return True
 
 
-@njit(cache=True)
+@library
 def push(z: Array, new: Array) -> None:
     """Shift the past window z (p (r + m),) by one sample (r + m,)."""
     width = new.shape[0]
@@ -79,7 +79,7 @@ def push(z: Array, new: Array) -> None:
         z[past - width + i] = new[i]
 
 
-@njit(cache=True)
+@library
 def remember(new: Array, mean: Array, scalars: Array, counts: Array, p: int) -> None:
     """Update the recent variation of the signals; mean (2, r + m) holds slow means and running peaks.
 
@@ -101,7 +101,7 @@ def remember(new: Array, mean: Array, scalars: Array, counts: Array, p: int) -> 
     scalars[LATELY] += (energy - scalars[LATELY]) / p
 
 
-@njit(cache=True)
+@library
 def memory(scalars: Array, counts: Array, beta: float, mode: int) -> float:
     """Return the forgetting factor of this sample.
 
@@ -131,8 +131,8 @@ def memory(scalars: Array, counts: Array, beta: float, mode: int) -> float:
     return float(b)
 
 
-@njit(cache=True)
-def judge(residual: Array, variance: Array, scalars: Array, counts: Array, b: float, parameters: int) -> None:
+@library
+def judge(residual: Array, variance: Array, scalars: Array, counts: Array, parameters: int) -> None:
     """Update the innovation variance (m,) and power from one recursive residual (m,)."""
     m = residual.shape[0]
     rate = 1.0 / scalars[WEIGHT]
@@ -147,8 +147,6 @@ def judge(residual: Array, variance: Array, scalars: Array, counts: Array, b: fl
 
 Outcomes = NDArray[np.int8]
 
-__all__ = ['COUNTS', 'SCALARS', 'advance_factor', 'rotate']
-
 LEARNT_ROW, REJECTED_ROW, QUIET_ROW = 0, 1, 2
 """Outcome of a sample. A sample that only fills the past window counts as learnt."""
 
@@ -156,15 +154,13 @@ GROWTH = 1.25
 """Factor by which a regressor must exceed its peak before the prior of its coefficient is renewed."""
 
 
-@njit(cache=True)
-def rotate(R: Array, row: Array, start: int, stop: int, root: float) -> float:
+@library
+def rotate(R: Array, row: Array, start: int, stop: int, root: float) -> None:
     """Fold ``row`` into columns start..stop-1 of the upper triangle R, scaled by ``root`` first.
 
-    R: (q, q), row: (q,) is overwritten with what is left of it. Returns the product of the cosines:
-    for a least-squares column block, residual = prior error x product = posterior error / product.
+    R: (q, q), row: (q,) is overwritten with what is left of it.
     """
     q = R.shape[1]
-    product = 1.0
     for i in range(start, stop):
         b = row[i]
         if b == 0.0:
@@ -187,11 +183,9 @@ def rotate(R: Array, row: Array, start: int, stop: int, root: float) -> float:
             R[i, j] = cr * t + s * v
             row[j] = c * v - sr * t
         row[i] = 0.0
-        product *= c
-    return product
 
 
-@njit(cache=True)
+@library
 def state_prior(
     R: Array, row: Array, scratch: Array, peaks: Array, prior: Array, regressors: int, m: int,
     alpha: float, weight: float,
@@ -217,7 +211,7 @@ def state_prior(
             rotate(R, scratch, i, q, 1.0)
 
 
-@njit(cache=True)
+@library
 def advance_factor(
     U: Array, Y: Array, R: Array, z: Array, row: Array, scratch: Array, peaks: Array, prior: Array,
     scale: Array, mean: Array, variance: Array, scalars: Array, counts: Array,
@@ -258,10 +252,10 @@ def advance_factor(
             scalars[PRIOR] *= b
             state_prior(R, row, scratch, peaks, prior, regressors, m, alpha, scalars[PRIOR])
             root = math.sqrt(b)
-            scalars[GAMMA] = rotate(R, row, 0, regressors, root)
+            rotate(R, row, 0, regressors, root)
             scalars[WEIGHT] = b * scalars[WEIGHT] + 1.0
             scalars[WEIGHT2] = b * b * scalars[WEIGHT2] + 1.0
-            judge(row[q - m:], variance, scalars, counts, b, regressors)
+            judge(row[q - m:], variance, scalars, counts, regressors)
             rotate(R, row, regressors, q, root)
             counts[USED] += 1
         push(z, new)

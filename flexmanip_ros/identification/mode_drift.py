@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numba import njit
 
 from flexmanip_ros.identification.prediction_error import (
     Fit,
@@ -14,10 +13,11 @@ from flexmanip_ros.identification.prediction_error import (
     following,
     innovation,
 )
+from flexmanip_ros.numerics.compiled import library
 from flexmanip_ros.types import Array
 
 
-@njit(cache=True, nogil=True)
+@library
 def sway(U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, turns: Array, x: Array, X: Array,
          E: Array, S: Array) -> None:
     """Simulate x+ = A x + B u, y = C x + D u, and the derivatives by drifts of A along ``turns`` (g, n, n).
@@ -84,14 +84,6 @@ def turns(A: Array, least: float = 0.0) -> Array:
     chosen = np.flatnonzero((values.imag > 0.0) & (np.angle(values) >= least))
     return np.array([2.0 * np.real(1j * values[i] * np.outer(vectors[:, i], left[i])) for i in chosen]
                     ).reshape(-1, *A.shape)
-
-
-def drift_of(U: Array, Y: Array, fit: Fit, structure: Structure, widening: float = 1.0) -> Drift | None:
-    """Return the drift of a fit, see ``drifting``; None also where a matrix decomposition fails."""
-    try:
-        return drifting(U, Y, fit, structure, widening)
-    except np.linalg.LinAlgError:  # the fit itself is sound
-        return None
 
 
 def drifting(U: Array, Y: Array, fit: Fit, structure: Structure, widening: float = 1.0) -> Drift | None:

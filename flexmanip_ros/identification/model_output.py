@@ -9,7 +9,7 @@ import scipy
 from flexmanip_ros.identification import realization, uncertainty
 from flexmanip_ros.identification.batch_fit import Recursion
 from flexmanip_ros.identification.factor import POWER, WEIGHT, WEIGHT2
-from flexmanip_ros.identification.moments import Realized, realize, triangle
+from flexmanip_ros.identification.moments import Realized, realize_orders, triangle
 from flexmanip_ros.identification.pbsid import observability_controllability, open_loop_weight
 from flexmanip_ros.identification.uncertainty import Identified, Tangent
 from flexmanip_ros.parameters import IdentifierParameters
@@ -27,15 +27,19 @@ SIGNIFICANT = 25.0
 """Twice the logarithm of the likelihood ratio above which the variance from the limited order is not chance."""
 
 
+def at_unit_power(R: Array, width: int) -> tuple[Array, Array]:
+    """Return the factor R of the moments for signals of unit power, and the scales (width,) of the signals."""
+    power = np.linalg.norm(R[:, -width:], axis=0)
+    unit = np.divide(1.0, power, out=np.ones(width), where=power > 0.0)
+    return R * np.tile(unit, R.shape[1] // width), unit
+
+
 def from_factor(config: IdentifierParameters, R: Array, scale: Array) -> tuple[Realized | None, Array, Array]:
     """Compute the model from the factor R of the moments; return it with R and scale for signals of unit power."""
     r, m = len(config.inputs), len(config.outputs)
-    width = r + m
-    power = np.linalg.norm(R[:, -width:], axis=0)
-    unit = np.divide(1.0, power, out=np.ones(width), where=power > 0.0)
-    R = R * np.tile(unit, R.shape[1] // width)
-    realized = realize(
-        R, r, m, config.order, config.future_window, feedthrough=config.direct_feedthrough,
+    R, unit = at_unit_power(R, r + m)
+    realized, = realize_orders(
+        R, r, m, (config.order,), config.future_window, feedthrough=config.direct_feedthrough,
         weighted=config.weighted_observability, fixed=config.state_basis == 'fixed',
         riccati=config.kalman_gain == 'riccati')
     return realized, R, scale * unit
@@ -96,8 +100,8 @@ def from_fit(
     dA, dB, dK, dC, dD = (
         (part if part.size else np.zeros((len(spread), a * b))).reshape(-1, a, b)
         for part, (a, b) in zip(parts, shapes, strict=True))
-    along = Tangent(*_in_units(dA, dB[:, :, :r], dC, dD, dK, su, sy))
-    model = StateSpace(*_in_units(theta.A, theta.B[:, :r], theta.C, theta.D, recursion.gain, su, sy), dt=dt)
+    along = Tangent(*in_units(dA, dB[:, :, :r], dC, dD, dK, su, sy))
+    model = StateSpace(*in_units(theta.A, theta.B[:, :r], theta.C, theta.D, recursion.gain, su, sy), dt=dt)
     model, moved_along, W = based(model, along, config.stable_model)
     assert moved_along is not None
     constant = W @ theta.B[:, r:].sum(axis=1)  # the last column, if there is one
@@ -128,7 +132,7 @@ def publish(
     along = None
     if parameters * entries <= LARGEST_SPREAD:
         along = uncertainty.tangent(R, realized, r, innovation * np.sqrt(scalars[WEIGHT2] / scalars[WEIGHT]))
-        along = Tangent(*_in_units(*along, su, sy))
+        along = Tangent(*in_units(*along, su, sy))
     model, along, _ = based(model, along, config.stable_model)
     spread = along.flat() if along is not None else np.zeros((entries, 0))
     ratio = float(effective * np.log1p(realized.neglected).sum())
@@ -161,12 +165,12 @@ def raw_model(config: IdentifierParameters, realized: Realized, scale: Array, dt
     r = len(config.inputs)
     su = np.where(scale[:r] > 0.0, scale[:r], 1.0)
     sy = np.where(scale[r:] > 0.0, scale[r:], 1.0)
-    parts = _in_units(realized.A, realized.B, realized.C, realized.D, realized.K, su, sy)
+    parts = in_units(realized.A, realized.B, realized.C, realized.D, realized.K, su, sy)
     model = StateSpace(*parts, dt=dt)
     return model if all(np.all(np.isfinite(part)) for part in parts) else None, su, sy
 
 
-def _in_units(
+def in_units(
     A: Array, B: Array, C: Array, D: Array, K: Array, su: Array, sy: Array,
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Convert matrices (or stacks of them) for scaled signals su u, sy y to matrices for u, y."""

@@ -123,25 +123,17 @@ def riccati_gain(A: Array, C: Array, process: Array, measurement: Array, fallbac
     return gain if np.all(np.isfinite(gain)) else fallback
 
 
-def realize(
-    R: Array, r: int, m: int, n: int, f: int, *, feedthrough: bool, weighted: bool, fixed: bool = False,
-    riccati: bool = False,
-) -> Realized | None:
-    """Model of order n from the factor R (q, q) of [z; u; y]; None when the moments have a rank below n.
-
-    fixed: S = [I 0], so the state is the first n rows of (observability x controllability) z; otherwise S holds the
-    leading n left singular vectors of the whitened product of that matrix with the data. riccati: the gain K solves the
-    Riccati equation of the residuals, which makes the predictor stable; otherwise K is regressed like A and B.
-    """
-    return realize_orders(
-        R, r, m, (n,), f, feedthrough=feedthrough, weighted=weighted, fixed=fixed, riccati=riccati)[0]
-
-
 def realize_orders(
     R: Array, r: int, m: int, orders: Sequence[int], f: int, *, feedthrough: bool, weighted: bool,
     fixed: bool = False, riccati: bool = False,
 ) -> list[Realized | None]:
-    """Models of several orders from one factor, see ``realize``, with one regression and one decomposition for all."""
+    """Models of several orders n from the factor R (q, q) of [z; u; y]; None where the moments have a rank below n.
+
+    All share one regression and one decomposition. fixed: S = [I 0], so the state is the first n rows of (observability
+    x controllability) z; otherwise S holds the leading n left singular vectors of the whitened product of that matrix
+    with the data. riccati: the gain K solves the Riccati equation of the residuals, which makes the predictor stable;
+    otherwise K is regressed like A and B.
+    """
     width = r + m
     past = R.shape[0] - width
     d = past + r if feedthrough else past

@@ -3,11 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from flexmanip_ros.identification.factor import (
     FILLED,
-    GAMMA,
     GROWTH,
     OPEN,
     PRIOR,
@@ -20,13 +18,14 @@ from flexmanip_ros.identification.factor import (
     push,
     remember,
 )
+from flexmanip_ros.numerics.compiled import library
 from flexmanip_ros.types import Array
 
 LIMIT = 1e30
 """Largest covariance of a coefficient, in units of its prior one; at this limit nothing is forgotten."""
 
 
-@njit(cache=True)
+@library
 def potter(S: Array, theta: Array, phi: Array, target: Array, f: Array, beta: float, error: Array) -> float:
     """One square-root least-squares step (eqs. 31-32, 40-42), covariance S S' (d, d), theta (k, d).
 
@@ -64,7 +63,7 @@ def potter(S: Array, theta: Array, phi: Array, target: Array, f: Array, beta: fl
     return beta / a
 
 
-@njit(cache=True)
+@library
 def least_squares(
     S: Array, theta: Array, prior: Array, peaks: Array, phi: Array, target: Array, unit: Array, f: Array,
     error: Array, alpha: float, beta: float, weight: float,
@@ -90,7 +89,7 @@ def least_squares(
     return potter(S, theta, phi, target, f, beta, error)
 
 
-@njit(cache=True)
+@library
 def select(W: Array, h: Array, x: Array) -> None:
     """Form x = W h (eq. 35)."""
     for i in range(W.shape[0]):
@@ -99,7 +98,7 @@ def select(W: Array, h: Array, x: Array) -> None:
             x[i] += W[i, j] * h[j]
 
 
-@njit(cache=True)
+@library
 def track(W: Array, P: Array, h: Array, x: Array, beta: float) -> None:
     """Projection approximation subspace tracking of h (q,): W (n, q), P (n, n), x = W h on return."""
     n = W.shape[0]
@@ -120,7 +119,7 @@ def track(W: Array, P: Array, h: Array, x: Array, beta: float) -> None:
     select(W, h, x)
 
 
-@njit(cache=True)
+@library
 def observe(xi: Array, z: Array, h: Array, f: int, r: int, m: int, weighted: int) -> None:
     """Compute h = (observability x controllability) z (eqs. 33-35), f blocks of m, without forming the matrix."""
     width = r + m
@@ -139,7 +138,7 @@ def observe(xi: Array, z: Array, h: Array, f: int, r: int, m: int, weighted: int
             h[block * m + o] = total
 
 
-@njit(cache=True)
+@library
 def advance_paper(
     U: Array, Y: Array, S1: Array, xi: Array, prior1: Array, peaks1: Array,
     S2: Array, theta_x: Array, peaks2: Array, S3: Array, theta_y: Array, peaks3: Array, W: Array, P: Array,
@@ -187,13 +186,13 @@ def advance_paper(
             y = new[r:]
             scalars[PRIOR] *= b
             weight = scalars[PRIOR]
-            scalars[GAMMA] = math.sqrt(
+            converted = math.sqrt(
                 least_squares(S1, xi, prior1, peaks1, phi1, y, unit1, f1, e1, alpha[0], b, weight))
             scalars[WEIGHT] = b * scalars[WEIGHT] + 1.0
             scalars[WEIGHT2] = b * b * scalars[WEIGHT2] + 1.0
             for i in range(m):
-                e1[i] *= scalars[GAMMA]
-            judge(e1, variance, scalars, counts, b, d1)
+                e1[i] *= converted
+            judge(e1, variance, scalars, counts, d1)
             observe(xi, z, h, future, r, m, weighted)
             if tracked:
                 for i in range(h.shape[0]):  # tracking depends on the scale: scale to unit peak

@@ -94,9 +94,9 @@ class Varying(NamedTuple):
     every: one of so many filtered samples is kept; filtered: (4, ``width``) state of the filter; dt: sample time [s];
     angle: relative angle of the links after the last block [rad]; blocks: number taken; strikes: number of bad blocks
     in a row; lost: samples were missing, so filter and state restart; settling: kept samples until the restarted filter
-    has settled; gain: (n, m) published K; turn: angle through which the links swing with displacements of unit power
-    [rad, rms]; power: (h, h) covariance of the scaled displacements, and swing: see ``Block``, averages over the last
-    blocks; center: see ``signals_of``.
+    has settled; turn: angle through which the links swing with displacements of unit power [rad, rms]; power: (h, h)
+    covariance of the scaled displacements, and swing: see ``Block``, averages over the last blocks; center: see
+    ``signals_of``.
     """
 
     shift: float
@@ -117,7 +117,6 @@ class Varying(NamedTuple):
     strikes: int
     lost: bool
     settling: int
-    gain: Array
     turn: float
     power: Array
     swing: float

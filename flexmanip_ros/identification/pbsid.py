@@ -6,9 +6,9 @@ sample by sample, and the matrices are regressed on them.
 """
 
 import numpy as np
-from numba import njit
 
 from flexmanip_ros.errors import ModelError
+from flexmanip_ros.numerics.compiled import library
 from flexmanip_ros.types import Array, StateSpace
 
 
@@ -23,40 +23,19 @@ def past_windows(U: Array, Y: Array, p: int) -> Array:
     return np.hstack(columns) if columns else np.zeros((count, 0))
 
 
-@njit(cache=True)
-def predictions(Xi: Array, f: int, r: int, weighted: bool, G: Array) -> None:
-    """Fill G (f m, past) from Xi (m, past), shifted by 0..f - 1 samples; see ``observability_controllability``."""
+@library
+def unfold(Xi: Array, r: int, G: Array) -> None:
+    """Add to each block row i of G (f m, q) the rows j < i times the coefficients of output j in Xi (m, past)."""
     m, past = Xi.shape
     width = r + m
-    for i in range(f):
-        for o in range(m):
-            for q in range(i * width):
-                G[i * m + o, q] = 0.0
-            for q in range(i * width, past):
-                G[i * m + o, q] = Xi[o, q - i * width]
-        if weighted:
-            for j in range(i):
-                at = past - (i - j) * width + r
-                for o in range(m):
-                    for k in range(m):
-                        a = Xi[o, at + k]
-                        for q in range(past):
-                            G[i * m + o, q] += a * G[j * m + k, q]
-
-
-@njit(cache=True)
-def open_loop(Xi: Array, f: int, r: int, L: Array) -> None:
-    """Turn L (f m, f m), at first the identity, into the result of ``open_loop_weight``."""
-    m, past = Xi.shape
-    width = r + m
-    for i in range(f):
+    for i in range(G.shape[0] // m):
         for j in range(i):
             at = past - (i - j) * width + r
             for o in range(m):
                 for k in range(m):
                     a = Xi[o, at + k]
-                    for q in range((j + 1) * m):
-                        L[i * m + o, q] += a * L[j * m + k, q]
+                    for q in range(G.shape[1]):
+                        G[i * m + o, q] += a * G[j * m + k, q]
 
 
 def observability_controllability(Xi: Array, f: int, r: int, weighted: bool) -> Array:
@@ -65,15 +44,19 @@ def observability_controllability(Xi: Array, f: int, r: int, weighted: bool) -> 
     weighted False: future outputs count as zero (observability of the predictor, A - K C); True: they are replaced by
     their own predictions (observability of the system, A).
     """
-    G = np.empty((f * Xi.shape[0], Xi.shape[1]))
-    predictions(np.ascontiguousarray(Xi), f, r, weighted, G)
+    m, past = Xi.shape
+    G = np.zeros((f * m, past))
+    for i in range(f):
+        G[i * m:(i + 1) * m, i * (r + m):] = Xi[:, :max(past - i * (r + m), 0)]
+    if weighted:
+        unfold(np.ascontiguousarray(Xi), r, G)
     return G
 
 
 def open_loop_weight(Xi: Array, f: int, r: int) -> Array:
     """(f m, f m) lower triangular L with observability of the system = L x observability of the predictor."""
     L = np.eye(f * Xi.shape[0])
-    open_loop(np.ascontiguousarray(Xi), f, r, L)
+    unfold(np.ascontiguousarray(Xi), r, L)
     return L
 
 

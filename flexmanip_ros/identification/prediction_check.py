@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 import scipy  # its submodules are imported at first use
-from numba import njit
 from numpy.typing import NDArray
 
 from flexmanip_ros.identification.uncertainty import REAL, Identified, modes
 from flexmanip_ros.identification.validation import affine, simulate
+from flexmanip_ros.numerics.compiled import library
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import QUANTILE, Array, Mode, StateSpace, Status
 
@@ -117,7 +117,7 @@ def missed(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np
     return np.where(power > SILENT * white, np.mean(errors, axis=0), np.nan)
 
 
-@njit(cache=True, nogil=True)
+@library
 def swing(poles: Complex, turns: Complex, gains: Complex, U: Array, Z: Complex, S: Complex) -> None:
     """Simulate modes z+ = pole z + gain u from rest over U (N, r), and S, the derivative of z along d ln(pole) = turn.
 

@@ -4,11 +4,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.pbsid import pbsid
 from flexmanip_ros.identification.realization import to_continuous, to_discrete
+from flexmanip_ros.numerics.compiled import library
 from flexmanip_ros.types import Array, StateSpace
 
 GATHERED = 64
@@ -16,7 +16,7 @@ GATHERED = 64
 100 kB, which fits the second-level cache of a core."""
 
 
-@njit(cache=True, nogil=True)
+@library
 def innovation(u: Array, y: Array, C: Array, D: Array, x: Array, e: Array) -> None:
     """Fill e (m,) = y - C x - D u; inputs beyond the columns of D have no direct term."""
     for o in range(e.size):
@@ -28,7 +28,7 @@ def innovation(u: Array, y: Array, C: Array, D: Array, x: Array, e: Array) -> No
         e[o] = total
 
 
-@njit(cache=True, nogil=True)
+@library
 def following(u: Array, A: Array, B: Array, K: Array, x: Array, e: Array, after: Array) -> None:
     """Fill after (n,) = A x + B u + K e."""
     for i in range(x.size):
@@ -42,21 +42,21 @@ def following(u: Array, A: Array, B: Array, K: Array, x: Array, e: Array, after:
         after[i] = total
 
 
-@njit(cache=True, nogil=True)
+@library
 def linearize(
     U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, K: Array, x: Array, whiten: Array,
     free_system: int, free_gain: int, free_output: int, free_direct: int,
-    N: Array, g: Array, moments: Array, X: Array,
+    N: Array, g: Array, X: Array,
 ) -> None:
     """Run the predictor x+ = A x + B u + K e, e = y - C x - D u over (L, r), (L, m), and its derivatives.
 
-    A row of Y that is NaN was not measured: e = 0 there, and the row adds nothing to N, g and moments.
+    A row of Y that is NaN was not measured: e = 0 there, and the row adds nothing to N and g.
 
     Parameters in order: A, B row-major if free_system, K if free_gain, C if free_output, D if free_direct, then x at
     the start. whiten: (m, m), whiten' whiten = inverse innovation covariance. On return x is the state after the last
-    sample, N (d, d) += J' J and g (d,) += J' e with J the derivatives of the whitened predictions; moments (m, m)
-    += e e' and X (n, d) = dx/dparameters, started at [0 I] by the caller. J is gathered for ``GATHERED`` samples, so
-    J' J is one matrix product of the BLAS library.
+    sample, N (d, d) += J' J and g (d,) += J' e with J the derivatives of the whitened predictions, and X (n, d) =
+    dx/dparameters, started at [0 I] by the caller. J is gathered for ``GATHERED`` samples, so J' J is one product by
+    the BLAS library.
     """
     n, r, m, direct = A.shape[0], B.shape[1], C.shape[0], D.shape[1]
     d = N.shape[0]
@@ -86,7 +86,6 @@ def linearize(
             for q in range(m):
                 w = whiten[o, q]
                 residuals[filled + o] += w * e[q]
-                moments[o, q] += e[o] * e[q]
                 if free_output:
                     for i in range(n):
                         row[at_c + q * n + i] += w * x[i]
@@ -128,7 +127,7 @@ def linearize(
                 X[i, j] = moved[i, j]
 
 
-@njit(cache=True, nogil=True)
+@library
 def residual_moments(
     U: Array, Y: Array, A: Array, B: Array, C: Array, D: Array, K: Array, x: Array, moments: Array,
 ) -> None:
@@ -150,7 +149,7 @@ def residual_moments(
                 moments[o, i] += e[o] * e[i]
 
 
-@njit(cache=True, nogil=True)
+@library
 def condition(H: Array, root: Array, gradient: Array, step: Array) -> None:
     """Update in square-root form: root (k, k) <- root L^-T with L L' = I + H, step = (I + H)^-1 gradient.
 
@@ -312,14 +311,13 @@ def score(U: Array, Y: Array, theta: Theta) -> tuple[float, Array]:
 def derivatives(
     U: Array, Y: Array, theta: Theta, structure: Structure, covariance: Array, P: Array,
     before: Array | None = None,
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Information (k, k), gradient (k,), innovation moments (m, m), arrival (n, k) and end state (n,), see ``Fit``.
+) -> tuple[Array, Array, Array, Array]:
+    """Information (k, k), gradient (k,), arrival (n, k) and end state (n,), see ``Fit``.
 
     before: (n, k) derivative of the state at the start of the stretch; None: [0 I], that state is itself a parameter.
     """
-    n, m = theta.A.shape[0], Y.shape[1]
-    d = P.shape[0]
-    N, g, moments = np.zeros((d, d)), np.zeros(d), np.zeros((m, m))
+    n, d = theta.A.shape[0], P.shape[0]
+    N, g = np.zeros((d, d)), np.zeros(d)
     X = np.zeros((n, d))
     X[:, d - n:] = np.eye(n)
     if before is not None:
@@ -328,8 +326,8 @@ def derivatives(
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     free = structure.names()
     linearize(U, Y, *theta.matrices(), end, whiten, int('A' in free), int('K' in free), int('C' in free),
-              int('D' in free), N, g, moments, X)
-    return P.T @ N @ P, P.T @ g, moments, X @ P, end
+              int('D' in free), N, g, X)
+    return P.T @ N @ P, P.T @ g, X @ P, end
 
 
 def forgets(theta: Theta, count: int) -> bool:
@@ -351,7 +349,7 @@ def descend(U: Array, Y: Array, theta: Theta, structure: Structure, iterations: 
     damping = DAMPING
     P = directions(theta, structure)
     for _ in range(iterations):
-        information, gradient, _, _, _ = derivatives(U, Y, theta, structure, covariance, P)
+        information, gradient, _, _ = derivatives(U, Y, theta, structure, covariance, P)
         if not np.all(np.isfinite(information)):
             return None
         size = np.sqrt(np.diag(information))
@@ -376,7 +374,7 @@ def descend(U: Array, Y: Array, theta: Theta, structure: Structure, iterations: 
     P = directions(theta, structure)
     count = measured(Y)
     free = covariance * count / max(count - P.shape[1] / Y.shape[1], 0.2 * count)
-    information, _, _, arrival, end = derivatives(U, Y, theta, structure, free, P)
+    information, _, arrival, end = derivatives(U, Y, theta, structure, free, P)
     if not np.all(np.isfinite(information)):
         return None
     return Fit(theta, P, information, arrival, end, free, cost)

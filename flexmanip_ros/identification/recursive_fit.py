@@ -222,10 +222,12 @@ def ask_block(config: IdentifierParameters, refined: Refined, rows: Rows) -> Ref
     return refined._replace(request=request, due=refined.end + later)
 
 
-def deliver(refined: Refined, result: FitResult) -> Refined:
-    """Return the refinement with the result of its request."""
+def delivered(refined: Refined, background: Background) -> Refined:
+    """Take the result of the fit under way, if there is one."""
     request = refined.request
-    assert request is not None
+    if request is None:
+        return refined
+    result: FitResult = background.result(request)
     refined = refined._replace(request=None)
     if result.failed:  # the subspace model is published, and a new stretch begins
         return start(refined.end)
@@ -253,12 +255,15 @@ def skip(refined: Refined) -> Refined:
     return refined._replace(begin=refined.begin + 1, end=refined.end + 1, seen=refined.seen + 1)
 
 
-def break_window(refined: Refined) -> Refined:
-    """Begin another stretch where samples are missing: the fits are kept, their state is unknown.
+def broken(refined: Refined, background: Background) -> Refined:
+    """Take the result under way and begin another stretch, where samples are missing.
 
-    A fit of fewer than ``LONGEST`` samples may be a poor one, and blocks alone may not mend it. So the new stretch is
-    fitted as a whole, too.
+    The fits are kept, their state is unknown. A fit of fewer than ``LONGEST`` samples may be a poor one, and blocks
+    alone may not mend it. So the new stretch is fitted as a whole, too.
     """
+    if refined.total == 0:
+        return refined
+    refined = delivered(refined, background)
     old = refined.recursion
     fresh = start(refined.end, refined.before, refined.varying_before)
     if refined.varying is not None:
@@ -313,18 +318,25 @@ def samples_of(rows: Rows) -> Array:
     return samples
 
 
-def _stretch(request: FitRequest, R: Array, scale: Array) -> Recursion | None:
-    """Fit the whole stretch, see ``batch_fit.fit_stretch``, from subspace models with one or two future windows."""
-    config = request.config
+def whole_fit(config: IdentifierParameters, samples: Array, R: Array, scale: Array, noise: str,
+              old: list[Recursion]) -> Recursion | None:
+    """Fit samples (N, r + m), see ``batch_fit.fit_stretch``, from subspace models with one or two future windows.
+
+    R, scale: see ``model_output.from_factor``; old: earlier fits, which are starts as well.
+    """
     starts = [model_output.from_factor(config, R, scale)]
     if config.order > len(config.outputs) and config.past_window > config.future_window:
         longer = replace(config, future_window=config.past_window)
         starts.append(model_output.from_factor(longer, R, scale))
-    found = fit_stretch(
-        samples_of(request.rows), [realized for realized, _, _ in starts if realized is not None],
-        [fit for fit in (request.old, request.older) if fit is not None],
-        starts[0][2], config.direct_feedthrough, 'sensor' if config.refinement == 'output_error' else 'any',
-        parameter_varying.has_constant(config))
+    return fit_stretch(samples, [realized for realized, _, _ in starts if realized is not None], old, starts[0][2],
+                       config.direct_feedthrough, noise, parameter_varying.has_constant(config))
+
+
+def _stretch(request: FitRequest, R: Array, scale: Array) -> Recursion | None:
+    """Fit the whole stretch."""
+    found = whole_fit(request.config, samples_of(request.rows), R, scale,
+                      'sensor' if request.config.refinement == 'output_error' else 'any',
+                      [fit for fit in (request.old, request.older) if fit is not None])
     if found is None or found.trend_share == 0.0:
         return found
     return found._replace(trend_lag=request.later / BLOCK + 1.0)  # the arm drifts on until the result is read
@@ -360,7 +372,7 @@ def _block(old: Recursion, samples: Array) -> Recursion | None:
     zeta, theta, further = np.zeros(k), old.theta, 0.0
     arrival, root = np.zeros((0, k)), kept
     for _ in range(2 if old.lost else 1):  # from an unknown state the first derivatives are poor
-        information, gradient, _, arrival, _ = derivatives(U, Y, theta, old.structure, noise, old.P)
+        information, gradient, arrival, _ = derivatives(U, Y, theta, old.structure, noise, old.P)
         H = kept.T @ information @ kept
         if not np.all(np.isfinite(H)):
             return None
@@ -469,15 +481,3 @@ def refine(config: IdentifierParameters, refined: Refined, rows: Rows, outcome: 
     if refined.request is not None and refined.request is not before:
         background.start(refined.request)
     return refined
-
-
-def broken(refined: Refined, background: Background) -> Refined:
-    """Take the result under way and begin another stretch, where samples are missing."""
-    return break_window(delivered(refined, background)) if refined.total > 0 else refined
-
-
-def delivered(refined: Refined, background: Background) -> Refined:
-    """Take the result of the fit under way."""
-    if refined.request is None:
-        return refined
-    return deliver(refined, background.result(refined.request))

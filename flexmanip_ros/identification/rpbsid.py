@@ -23,7 +23,7 @@ from flexmanip_ros.identification import (
     prediction_check,
     recursive_fit,
 )
-from flexmanip_ros.identification.factor import FILLED, POWER, PRIOR, USED, WEIGHT, WEIGHT2, Outcomes
+from flexmanip_ros.identification.factor import FILLED, POWER, PRIOR, REJECTED, SEEN, USED, WEIGHT, WEIGHT2, Outcomes
 from flexmanip_ros.identification.moments import solve_regressor
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.identification.varying_model import Configurations
@@ -185,11 +185,10 @@ def _decimate(config: IdentifierParameters, state: RpbsidState, decimator: decim
               log: SampleLog, rows: Rows) -> tuple[RpbsidState, Rows]:
     """Filter rows; return the new state and the rows that they add to the decimated log."""
     was_empty = decimator.seen < len(decimator.taps)  # the filter has given no sample since the gap
-    decimator, kept, at = decimation.decimate(decimator, rows.u_y, config.decimation)
+    decimator, kept, at, absent = decimation.decimate(decimator, rows.u_y, rows.missing, config.decimation)
     r = log.width.inputs
     first = log.end
     needed = min(first - prediction_check.MOST_ROWS, _first_read(state, first))
-    absent = rows.missing[at]
     gap = np.zeros(len(at), dtype=np.bool_)
     gap[:1] = was_empty and first > 0
     log = log.from_row(needed).append(
@@ -204,16 +203,15 @@ def _run(config: IdentifierParameters, state: RpbsidState, U: Array, Y: Array, m
     mode = MODES['excitation' if recursive and config.forgetting == 'innovation' else config.forgetting]
     outcome = np.zeros(len(U), dtype=np.int8)
     if config.estimator == 'paper':
-        common: tuple[Any, ...] = (
-            state.z, state.scale, state.mean, state.variance, state.scalars, state.counts)
-        options: tuple[Any, ...] = (
+        Y = Y.copy()
+        Y[missing > 0] = np.nan  # rejected like a sample that is not finite, but no outlier
+        advance: Any = paper_recursion.advance_paper
+        advance(
+            U, Y, *state.memory, state.z, state.scale, state.mean, state.variance, state.scalars, state.counts,
             config.past_window, config.future_window, int(config.direct_feedthrough),
             int(config.weighted_observability), int(config.state_basis == 'tracked'),
             np.array(config.regularization), np.array(config.forgetting_factor), mode)
-        memory: tuple[Any, ...] = state.memory
-        Y = Y.copy()
-        Y[missing > 0] = np.nan  # rejected like a sample that is not finite
-        paper_recursion.advance_paper(U, Y, *memory, *common, *options)
+        state.counts[[SEEN, REJECTED]] -= np.count_nonzero(missing)
         return outcome
     R, row, scratch, peaks, prior = state.memory
     factor.advance_factor(

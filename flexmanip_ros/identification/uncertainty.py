@@ -70,19 +70,6 @@ class Tangent(NamedTuple):
         return np.ascontiguousarray(np.concatenate(rows))
 
 
-def variance(identified: Identified, **gradients: Array) -> float:
-    """Variance of a scalar g of the model; A=, B=, C=, D=, K= are dg/dA, dg/dB, ... (same shapes)."""
-    model = identified.model
-    parts = []
-    for name in 'ABCDK':
-        shape = getattr(model, name).shape
-        parts.append(np.asarray(gradients.pop(name, np.zeros(shape)), dtype=float).reshape(-1))
-    if gradients:
-        raise TypeError(f'unknown matrices {sorted(gradients)}')
-    along = identified.spread.T @ np.concatenate(parts)
-    return float(along @ along) if along.size else float('nan')
-
-
 def tangent(R: Array, realized: Realized, r: int, deviation: Array) -> Tangent:
     """Propagate dXi = deviation' Omega regression^-T, where Omega has independent standard normal entries.
 

@@ -4,9 +4,9 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numba import njit
 
 from flexmanip_ros.identification.realization import markov
+from flexmanip_ros.numerics.compiled import library
 from flexmanip_ros.types import Array, StateSpace
 
 TIME_CONSTANTS = 10.0
@@ -38,7 +38,7 @@ def vaf(y: Array, yhat: Array) -> Array:
     return np.maximum(score, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@library
 def _run(A: Array, V: Array, X: Array) -> None:
     """Fill X (N + 1, n), whose first row is given, by x+ = A x + v with V (N, n)."""
     for k in range(V.shape[0]):

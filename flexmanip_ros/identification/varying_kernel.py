@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
 
+from flexmanip_ros.numerics.compiled import library
 from flexmanip_ros.types import Array
 
 TERMS = 6
@@ -15,7 +15,7 @@ LARGEST = 30.0
 the functions are infinite."""
 
 
-@njit(cache=True, nogil=True)
+@library
 def low_pass(rows: Array, Ad: Array, Bd: Array, Cd: Array, state: Array, every: int, out: Array, second: Array) -> None:
     """Run the columns of rows (N, w) through one filter of state (f, w); keep the last one of each ``every`` rows.
 
@@ -44,7 +44,7 @@ def low_pass(rows: Array, Ad: Array, Bd: Array, Cd: Array, state: Array, every: 
                 second[k, j] = curve
 
 
-@njit(cache=True, nogil=True)
+@library
 def simulate_block(U: Array, slope: Array, P: Array, bend: Array, V: Array, Y: Array, s: Array, dt: float, G: Array,
                    G1: Array, H: Array, H1: Array, D: Array, E: Array, Q: Array, x: Array, whiten: Array, N: Array,
                    g: Array, moments: Array, X: Array) -> None:

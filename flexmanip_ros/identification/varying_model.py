@@ -158,8 +158,7 @@ def _matrices(read: Configurations, c: float, role: Roles, ratio: float) -> tupl
     feed[rows] *= in_units
     d_feed[:, rows] *= in_units
     turned = unit[:, None] / unit
-    K = v.gain if v.gain.shape == (n, m) else np.zeros((n, m))
-    model = StateSpace(A * turned, B * unit[:, None] * v.scale_u, C, feed, K, read.dt)
+    model = StateSpace(A * turned, B * unit[:, None] * v.scale_u, C, feed, np.zeros((n, m)), read.dt)
     return model, Tangent(dA * turned, dB * unit[:, None] * v.scale_u, np.zeros((len(dA), m, n)), d_feed,
                           np.zeros((len(dA), n, m)))
 

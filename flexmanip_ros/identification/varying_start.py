@@ -166,7 +166,7 @@ def _from_recursion(old: Recursion, role: Roles, r: int, dt: float, c: float) ->
         shift=shift, scale_u=scale[:r].copy(), scale_y=scale[r:][list(role.displacements)].copy(), theta=theta,
         x=np.zeros(2 * h), root=root, noise=np.zeros((h, h)), share=np.zeros(h), chi2=1.0, corner=corner,
         every=every, filtered=np.zeros((4, width(h, r))), dt=dt, angle=0.0, blocks=0, strikes=0, lost=False,
-        settling=0, gain=np.zeros((0, 0)), turn=0.0, power=np.zeros((h, h)), swing=0.0,
+        settling=0, turn=0.0, power=np.zeros((h, h)), swing=0.0,
         center=np.zeros(h))
 
 

@@ -62,9 +62,9 @@ def merged(function: Function) -> Function:
 
 
 def library(function: Function) -> Function:
-    """Compile a function that kernels call and that calls BLAS through NumPy's linear algebra.
+    """Compile a function that makes arrays, or calls BLAS through NumPy's linear algebra.
 
-    Reference counting is on, because numba requires it there.
+    Reference counting is on, as both need it.
     """
     counted: dict[str, Any] = {'_nrt': True, 'forceinline': False}
     compiled: Function = njit(cache=True, nogil=True, **counted)(function)

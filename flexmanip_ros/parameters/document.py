@@ -1,4 +1,4 @@
-"""YAML files and a table for people, made from the declared parameters so that they cannot go stale."""
+"""YAML files and the text of --help, made from the declared parameters so that they cannot go stale."""
 
 import re
 import textwrap
@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from flexmanip_ros.parameters.arm import ExcitationParameters, PlantParameters
-from flexmanip_ros.parameters.field import LINKS, Leaf, leaves
+from flexmanip_ros.parameters.field import Leaf, leaves
 from flexmanip_ros.parameters.identifier import IdentifierParameters
 from flexmanip_ros.parameters.nodes import AdapterParameters, ControllerParameters, TriggerParameters, ViewParameters
 
@@ -70,16 +70,6 @@ def limits(leaf: Leaf) -> str:
     return f'>= {leaf.low:g}' if leaf.low is not None else '' if leaf.high is None else f'<= {leaf.high:g}'
 
 
-def kind(leaf: Leaf) -> str:
-    """Return the type as ROS names it."""
-    name = {bool: 'bool', int: 'integer', float: 'double', str: 'string'}[leaf.kind]
-    if not leaf.is_array:
-        return name
-    if leaf.per_link and leaf.size is not None:
-        return f'{name}[{leaf.size // LINKS} a link]'
-    return f'{name}[{leaf.size}]' if leaf.size is not None else f'{name}[]'
-
-
 def _comment(leaf: Leaf) -> str:
     extras = [part for part in (leaf.unit, limits(leaf)) if part]
     return leaf.words + (' (' + ', '.join(extras) + ')' if extras else '')
@@ -108,27 +98,6 @@ def yaml_text(node: str, values: Mapping[str, Any] | None = None, heading: str =
         # An empty list of numbers has no type in a ROS parameter file: it can only be left out.
         lines.append(f'{indent}# {name}: []' if text == '[]' else f'{indent}{name}: {text}')
     return '\n'.join(lines) + '\n'
-
-
-def table(cls: type) -> str:
-    """Return the parameters of a class as a Markdown table."""
-    rows = ['| parameter | type | default | unit | range | live | meaning |', '|---|---|---|---|---|---|---|']
-    for leaf in leaves(cls):
-        cells = (f'`{leaf.name}`', kind(leaf), f'`{written(leaf, leaf.default)}`', leaf.unit, limits(leaf),
-                 'yes' if leaf.live else '', leaf.words)
-        rows.append('| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |')
-    return '\n'.join(rows) + '\n'
-
-
-def markdown() -> str:
-    """Return the reference page of all parameters."""
-    parts = ['# Parameters', '',
-             'This page is written by `docs/write_parameters.py` (`make docs`) from the declarations in '
-             '`flexmanip_ros/parameters/`. A test fails when it is out of date.', '',
-             'A parameter marked `live` may be changed while the node runs.', '']
-    for node in NODES:
-        parts += [f'## {node}', '', table(NODES[node])]
-    return '\n'.join(parts)
 
 
 def help_text(cls: type) -> str:

@@ -131,14 +131,7 @@ def dotted(tree: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any
 
 def flatten(config: Any, prefix: str = '') -> dict[str, Any]:
     """Return the dotted names and values of a configuration; configure() takes them back."""
-    flat: dict[str, Any] = {}
-    for item in dataclasses.fields(config):
-        value = getattr(config, item.name)
-        if dataclasses.is_dataclass(value):
-            flat.update(flatten(value, f'{prefix}{item.name}.'))
-        else:
-            flat[prefix + item.name] = value
-    return flat
+    return dict(dotted(dataclasses.asdict(config), prefix))
 
 
 def check_all(config: Any) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.identification import decimation, validation
+from flexmanip_ros.identification.model_output import at_unit_power, in_units
 from flexmanip_ros.identification.moments import realize_orders, triangle
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.types import Array, StateSpace
@@ -231,18 +232,15 @@ def moments(search: Search, kept: list[Kept], past: int) -> list[Array]:
 
 def _models(R: Array, search: Search, orders: Sequence[int], shape: Shape) -> list[StateSpace | None]:
     """Return the model of each order, in the units of the stretches."""
-    width = search.r + search.m
-    power = np.linalg.norm(R[:, -width:], axis=0)
-    unit = np.divide(1.0, power, out=np.ones(width), where=power > 0.0)
+    R, unit = at_unit_power(R, search.r + search.m)
     try:
-        found = realize_orders(R * np.tile(unit, R.shape[1] // width), search.r, search.m, orders, shape.future,
+        found = realize_orders(R, search.r, search.m, orders, shape.future,
                                feedthrough=shape.direct, weighted=shape.weighted, riccati=True)
     except np.linalg.LinAlgError:
         return [None] * len(orders)
     su, sy = unit[:search.r], unit[search.r:]
     return [None if part is None else StateSpace(
-        part.A, part.B * su, part.C / sy[:, None], part.D * su / sy[:, None], part.K * sy, shape.factor * search.dt)
-        for part in found]
+        *in_units(part.A, part.B, part.C, part.D, part.K, su, sy), shape.factor * search.dt) for part in found]
 
 
 def powers(search: Search, model: StateSpace, kept: list[Kept], factor: int, past: int,

@@ -14,8 +14,8 @@ import numpy as np
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.errors import ModelError, ParameterError
-from flexmanip_ros.identification import decimation, model_output, parameter_varying, rpbsid, validation
-from flexmanip_ros.identification.batch_fit import BLOCK, fit_stretch
+from flexmanip_ros.identification import decimation, model_output, parameter_varying, recursive_fit, rpbsid, validation
+from flexmanip_ros.identification.batch_fit import BLOCK
 from flexmanip_ros.identification.prediction_check import MOST_TURN
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.identification.varying_model import Configurations
@@ -227,16 +227,10 @@ def _longest(config: IdentifierParameters, signals: Signals, a: int, b: int) -> 
 def _fit(config: IdentifierParameters, state: rpbsid.RpbsidState, samples: Array, noise: str, count: int, dt: float
          ) -> Identified | None:
     """Return the maximum-likelihood fit; None where it would take too long, or no model simulates the stretch."""
-    n, r, m = config.order, len(config.inputs), len(config.outputs)
-    size = n * (n + r + 2 * m + 1) + m * r
+    size, m = recursive_fit.size(config), len(config.outputs)
     if len(samples) * config.decimation < WHOLE * count or not 2 * size < len(samples) < WORK / (m * size ** 2):
         return None
-    starts = [model_output.from_factor(config, state.memory[0], state.scale)]
-    if n > m and config.past_window > config.future_window:
-        longer = replace(config, future_window=config.past_window)
-        starts.append(model_output.from_factor(longer, state.memory[0], state.scale))
-    fit = fit_stretch(samples, [realized for realized, _, _ in starts if realized is not None], [], starts[0][2],
-                      config.direct_feedthrough, noise, parameter_varying.has_constant(config))
+    fit = recursive_fit.whole_fit(config, samples, state.memory[0], state.scale, noise, [])
     if fit is None:
         return None
     d = state.memory[4].shape[1]

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from linear_arm import benchmark, configuration, random_system, record, run, shared_data, sorted_poles, start
 
-from flexmanip_ros.identification import rpbsid, validation
+from flexmanip_ros.identification import decimation, rpbsid, validation
+from flexmanip_ros.identification.factor import REJECTED, USED
 from flexmanip_ros.identification.prediction_check import MOST_ROWS
 from flexmanip_ros.identification.realization import stabilized, suggested_order, to_continuous, to_discrete
+from flexmanip_ros.samples.sample_log import log_of
 
 
 def test_stable_model_has_no_pole_outside_the_circle():
@@ -80,6 +82,31 @@ def test_a_decimated_log_is_bounded_and_marks_where_the_filter_began_anew():
     assert judged is not None
     assert len(judged) == 750  # 1.5 s
     assert rpbsid.latest(replace(config, decimation=1), start(replace(config, decimation=1)).state, 0, 0.001) is None
+
+
+@pytest.mark.parametrize('size', [1, 7, 400])
+def test_a_decimated_sample_is_missing_where_the_instant_that_it_describes_is(size: int):
+    missing, seen = np.zeros(400, dtype=np.int64), []
+    missing[200:212] = np.arange(1, 13)
+    state = decimation.start(4, 1)
+    for k in range(0, 400, size):
+        part = missing[k:k + size]
+        state, _, _, absent = decimation.decimate(state, np.zeros((len(part), 1)), part, 4)
+        seen.append(absent)
+    _, described = decimation.whole(np.zeros((400, 1)), 4)
+    assert np.array_equal(np.concatenate(seen), missing[described])
+
+
+def test_a_lost_sample_is_no_outlier():
+    rng = np.random.default_rng(8)
+    u, y = record(random_system(2, 1, 2, rng), 300, 0.01, rng)
+    lost = np.zeros(300, dtype=np.int64)
+    lost[[100, 150]] = 1
+    for estimator in ('paper', 'factor'):
+        config = configuration(1, 2, order=2, past_window=4, future_window=2, refinement='none', estimator=estimator)
+        state = rpbsid.advance(config, rpbsid.init(config), log_of(u, y, missing=lost).rows(0, 300))
+        assert state.counts[REJECTED] == 0
+        assert state.counts[USED] == 300 - 4 - 2 - 8  # two windows of four begin again
 
 
 def test_continuous_and_discrete_are_inverse():

@@ -8,8 +8,8 @@ from linear_arm import benchmark, configuration, random_system, record, run
 
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.model_output import based, from_factor
-from flexmanip_ros.identification.moments import realize
-from flexmanip_ros.identification.uncertainty import Tangent, modes, tangent, variance
+from flexmanip_ros.identification.moments import realize_orders
+from flexmanip_ros.identification.uncertainty import Tangent, modes, tangent
 from flexmanip_ros.types import StateSpace
 
 
@@ -33,7 +33,7 @@ def test_tangent_is_the_derivative_with_respect_to_the_regression(n, m, feedthro
         change = np.zeros_like(R)
         change[:d, -m:] = omega.reshape(m, d).T
         step = 1e-7 * np.abs(R[:d, -m:]).max()
-        both = [realize(R + sign * step * change, 2, m, n, 5, feedthrough=feedthrough, weighted=True)
+        both = [realize_orders(R + sign * step * change, 2, m, (n,), 5, feedthrough=feedthrough, weighted=True)[0]
                 for sign in (1.0, -1.0)]
         shift = [np.array([np.linalg.eigvals(b.A)[np.argmin(np.abs(np.linalg.eigvals(b.A) - pole))]
                            for pole in poles]) for b in both if b is not None]
@@ -66,18 +66,6 @@ def test_change_of_basis_carries_the_tangent():
     for name in 'ABC':
         numeric = (getattr(shifted[0], name) - getattr(shifted[1], name)) / (2 * step)
         assert np.allclose(numeric, getattr(along, name)[0], atol=1e-4 * (1 + np.abs(numeric).max())), name
-
-
-def test_variance_of_a_matrix_entry_is_the_diagonal_of_the_covariance():
-    rng = np.random.default_rng(12)
-    u, y = record(random_system(2, 1, 2, rng), 1000, 0.05, rng)
-    config = configuration(1, 2, order=2, past_window=4, future_window=2)
-    found = rpbsid.identified(config, run(config, u, y).state, 0.01)
-    assert found is not None
-    covariance = found.spread @ found.spread.T
-    gradient = np.zeros((2, 1))
-    gradient[1, 0] = 1.0
-    assert variance(found, B=gradient) == pytest.approx(covariance[5, 5])
 
 
 def test_intervals_cover_at_40_and_20_db_and_are_as_wide_as_the_bound():

@@ -7,7 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from flexmanip_ros.numerics.compiled import drop_stale
+import flexmanip_ros
+from flexmanip_ros.numerics.compiled import _sources, drop_stale
 
 
 def test_caches_older_than_a_kernel_are_dropped(tmp_path: Path) -> None:
@@ -37,6 +38,13 @@ def test_caches_older_than_constants_that_a_kernel_reads_are_dropped(tmp_path: P
     assert drop_stale(package) == 0
     os.utime(package / 'layout.py', (400, 400))
     assert drop_stale(package) == 1
+
+
+def test_every_file_with_a_compiled_function_is_watched() -> None:
+    package = Path(flexmanip_ros.__file__).parent
+    compiled = {path.parents[1] / f'{path.name.split(".")[0]}.py' for path in package.rglob('__pycache__/*.nbi')}
+    assert compiled
+    assert compiled <= _sources(package)
 
 
 SEPARATE = """
