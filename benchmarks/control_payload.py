@@ -68,9 +68,9 @@ def run(plant: PlantParameters, knows: str, added: np.ndarray) -> dict[str, Any]
             identifier, estimates = pipeline.step(wanted, identifier, record)
             for found in estimates:
                 if found.payload is not None:
-                    believed = PayloadEstimate.of(found.payload)
-                    if knows == 'mass':
-                        believed = believed._replace(com=(0.0, 0.0), inertia=0.0)
+                    believed = PayloadEstimate(*found.payload[:5])
+                    if knows == 'estimate':
+                        believed = believed._replace(com=found.payload.com[:2], inertia=found.payload.inertia[5])
                     state = controller.estimate(config, state, believed)
         measured = controller.Measured(record.position, record.velocity, added[k])
         state, torque = controller.step(config, state, measured)
@@ -96,7 +96,7 @@ def smooth(values: np.ndarray) -> np.ndarray:
 def main() -> None:
     """Run every case; print a table and write JSON."""
     none, waves = np.zeros((COUNT, 2)), ExcitationParameters()
-    waved = waveforms.scaled(waves, (30.0, 15.0), COUNT) * (np.arange(COUNT) < MOVE)[:, None]
+    waved = waveforms.scaled(waves, (30.0, 15.0), np.arange(COUNT)) * (np.arange(COUNT) < MOVE)[:, None]
     print('| payload kg | body | controller knows | scheduled kg | settling s | peak bend mm: capture | move | end |')
     print('|---|---|---|---|---|---|---|---|')
     rows = []

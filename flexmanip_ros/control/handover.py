@@ -9,7 +9,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from flexmanip_ros.parameters import AdapterParameters, ControllerParameters
-from flexmanip_ros.types import Payload
 
 LONGEST_AGE = 5.0
 """Time without an estimate [s] after which a consumer warns: by default 250 estimates are missing then."""
@@ -29,11 +28,6 @@ class PayloadEstimate(NamedTuple):
     """Centre of mass in the frame of the tip [m]; a point at the tip where nothing else is known."""
     inertia: float = 0.0
     """Inertia about the centre of mass [kg m^2]."""
-
-    @classmethod
-    def of(cls, payload: Payload) -> PayloadEstimate:
-        """Return what a controller needs of a payload."""
-        return cls(*payload[:5], payload.com[:2], payload.inertia[5])
 
     def having(self, body: Sequence[float]) -> PayloadEstimate | None:
         """Return the estimate with the body (20,) of ``~/payload_body``; None where that is of another time.

@@ -23,13 +23,13 @@ BEYOND = 10.0
 
 def torque(config: ExcitationParameters, k: int) -> Array:
     """Torque (L,) [N m] held from sample k on."""
-    peak, tables = amplitude(config), [waveforms.unit(config, i) for i in range(len(config.amplitude))]
-    return np.array([config.offset[i] + peak[i] * tables[i][k % tables[i].size] for i in range(len(peak))])
+    torques: Array = waveforms.scaled(config, amplitude(config), np.array([k]))[0]
+    return torques
 
 
 def sequence(config: ExcitationParameters, n: int) -> Array:
     """Torques (n, L) [N m] of samples 0 .. n - 1: the same numbers as ``torque``."""
-    return waveforms.scaled(config, amplitude(config), n)
+    return waveforms.scaled(config, amplitude(config), np.arange(n))
 
 
 def amplitude(config: ExcitationParameters) -> tuple[float, ...]:

@@ -109,12 +109,9 @@ class LinearModel:
         if key not in self._steps:
             if len(self._steps) > 8:
                 self._steps.clear()
-            self._steps[key] = discretize(*self.continuous(payload), self._dt)
+            M = self.mass_matrix(self.rest(), payload)
+            self._steps[key] = discretize(*linearization.first_order(M, self.K, self.D, self.B), self._dt)
         return self._steps[key]
-
-    def continuous(self, payload: Array) -> tuple[Array, Array]:
-        """Continuous (Ac (2n, 2n), Bc (2n, L)) of x = [dq; dq']."""
-        return linearization.first_order(self.mass_matrix(self.rest(), payload), self.K, self.D, self.B)
 
     def mass_matrix(self, x: Array, payload: Array) -> Array:
         """See ``NonlinearModel``; constant."""

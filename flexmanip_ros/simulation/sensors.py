@@ -1,5 +1,7 @@
 """Sensors of the simulated arm: what they measure, their dynamics and noise."""
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.special import ndtri
 
@@ -12,20 +14,16 @@ BLOCK = 512
 COLUMNS = 10
 
 
+@lru_cache(maxsize=2)
 def block(seed: int, number: int) -> Array:
-    """Standard normal numbers (BLOCK, 10) from sample BLOCK * number on: positions, rates, stamp, loss."""
+    """Standard normal numbers (BLOCK, 10) from sample BLOCK * number on: positions, rates, stamp, loss; read only."""
     bits = np.random.Philox(key=seed, counter=[0, 0, 0, number])
     return np.random.Generator(bits).standard_normal((BLOCK, COLUMNS))
 
 
-def normal(seed: int, first: int, count: int) -> Array:
-    """Standard normal numbers (count, 10) of samples first .. first + count - 1."""
-    if count == 0:
-        return np.zeros((0, COLUMNS))
-    numbers = range(first // BLOCK, (first + count - 1) // BLOCK + 1)
-    drawn = np.concatenate([block(seed, number) for number in numbers])
-    start = first - BLOCK * numbers[0]
-    return drawn[start:start + count]
+def normal(seed: int, count: int) -> Array:
+    """Standard normal numbers (count, 10) of samples 0 .. count - 1."""
+    return np.concatenate([block(seed, number) for number in range(count // BLOCK + 1)])[:count]
 
 
 def std_for_snr(position: Array, velocity: Array, snr_db: float) -> Array:

@@ -44,10 +44,6 @@ class PlantState(NamedTuple):
     """(4,) what the arm holds, see ``manipulator.payload_array``."""
     noise_std: Array
     """(4 L,) standard deviations of the noise on the positions, then on the rates."""
-    noise_block: Array
-    """(BLOCK, 10) standard normal numbers around the next sample."""
-    noise_number: int
-    """Number of the block in ``noise_block``."""
     gauges: Array
     """(2, L) low-pass state of the deflections and of their rates."""
     bends: Array
@@ -81,12 +77,12 @@ def init(config: PlantParameters, start_ns: int = 0, noise_std: Array | None = N
     """
     model = models.build(config)
     links = len(config.arm.link_length)
+    late = efforts_needed(config.arm.torque_delay, max(config.arm.torque_lag), 1.0 / config.rate)
     return PlantState(
         model=model, start_ns=start_ns, sample=0, x=model.rest(), payload=np.zeros(4),
         noise_std=_levels(config) if noise_std is None else np.array(noise_std, dtype=np.float64),
-        noise_block=sensors.block(config.seed, 0), noise_number=0, gauges=np.zeros((2, links)),
-        bends=np.zeros((sensors.bends_needed(config), 2 * links)),
-        efforts=np.zeros((_efforts_needed(config) - 1, links)),
+        gauges=np.zeros((2, links)), bends=np.zeros((sensors.bends_needed(config), 2 * links)),
+        efforts=np.zeros((late - 1, links)),
         commands=np.zeros((config.actuators.command_delay, links)),
         reported=np.zeros((config.arm.effort_delay, links)))
 
@@ -106,10 +102,7 @@ def step(
     """
     efforts = _checked(config, np.asarray(efforts, dtype=np.float64).reshape(1, -1))
     now = stamp(config, state)
-    number = state.sample // sensors.BLOCK
-    if number != state.noise_number:
-        state = state._replace(noise_block=sensors.block(config.seed, number), noise_number=number)
-    drawn = state.noise_block[state.sample % sensors.BLOCK][None]
+    drawn = sensors.block(config.seed, state.sample // sensors.BLOCK)[state.sample % sensors.BLOCK][None]
     state, position, velocity, effort = _advance(config, state, efforts)
     if not sensors.arrives(config, drawn)[0]:
         return state, None
@@ -152,17 +145,16 @@ def on_samples(config: PlantParameters, events: Sequence[CaptureEvent], start_ns
 
 def simulate(
     config: PlantParameters, efforts: Array, events: Sequence[CaptureEvent] = (), start_ns: int = 0,
-    noise_std: Array | None = None,
 ) -> Trajectory:
     """Run efforts.shape[0] samples under efforts (N, L) [N m], events applied at their stamps.
 
-    The same numbers as N steps. With ``noise: snr`` and no noise_std given, the levels are those of this
-    very trajectory (a live plant cannot know them and rehearses).
+    The same numbers as N steps. With ``noise: snr`` the levels are those of this very trajectory (a live plant cannot
+    know them and rehearses).
     """
     efforts = _checked(config, np.asarray(efforts, dtype=np.float64))
     count = efforts.shape[0]
-    own_levels = config.noise == 'snr' and noise_std is None
-    state = init(config, start_ns, np.zeros(4 * efforts.shape[1]) if own_levels else noise_std)
+    own_levels = config.noise == 'snr'
+    state = init(config, start_ns, np.zeros(4 * efforts.shape[1]) if own_levels else None)
     stamps = start_ns + np.round(np.arange(count) * 1e9 / config.rate).astype(np.int64)
     m = 2 * efforts.shape[1]
     rows = np.empty((count, 2 * m + m // 2))
@@ -178,7 +170,7 @@ def simulate(
             first = end
     position, velocity, effort = rows[:, :m].copy(), rows[:, m:2 * m].copy(), rows[:, 2 * m:].copy()
     levels = sensors.std_for_snr(position, velocity, config.snr_db) if own_levels else state.noise_std
-    drawn = sensors.normal(config.seed, 0, count)
+    drawn = sensors.normal(config.seed, count)
     sensors.read(config, position, velocity, levels, drawn)
     kept = sensors.arrives(config, drawn)
     stamps = stamps + sensors.jitter_ns(config, drawn)
@@ -230,10 +222,6 @@ def _advance(
     return after, position, velocity, reported[:count]
 
 
-def _efforts_needed(config: PlantParameters) -> int:
-    return efforts_needed(config.arm.torque_delay, max(config.arm.torque_lag), 1.0 / config.rate)
-
-
 def _take(config: PlantParameters, state: PlantState, body: Body) -> PlantState:
     x, model = state.x.copy(), state.model
     n = x.size // 2
@@ -252,7 +240,7 @@ def _levels(config: PlantParameters) -> Array:
     gauges_only = SensorParameters(strain_cutoff=config.sensors.strain_cutoff)
     quiet = replace(config, noise='none', sensors=gauges_only)
     waves = ExcitationParameters(rate=config.rate, amplitude=config.rehearsal_torque, arm=config.arm)
-    efforts = waveforms.scaled(waves, waves.amplitude, round(REHEARSAL_TIME * config.rate))
+    efforts = waveforms.scaled(waves, waves.amplitude, np.arange(round(REHEARSAL_TIME * config.rate)))
     half = round(round(len(efforts) / 2) * 1e9 / config.rate)
     run = simulate(quiet, efforts, (CaptureEvent(half, EventKind.CAPTURE),))
     return sensors.std_for_snr(run.position, run.velocity, config.snr_db)

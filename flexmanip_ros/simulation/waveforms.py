@@ -3,6 +3,7 @@
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexmanip_ros.parameters import ExcitationParameters
 from flexmanip_ros.types import Array
@@ -11,13 +12,10 @@ CREST_PASSES = 200
 """Passes of the crest-factor optimization; a further one changes the peak by less than 0.1 %."""
 
 
-def scaled(config: ExcitationParameters, peak: tuple[float, ...], n: int) -> Array:
-    """Torques (n, L) [N m] of samples 0 .. n - 1 with peak torques (L,) [N m] about the offset."""
-    columns = []
-    for i in range(len(peak)):
-        table = unit(config, i)
-        columns.append(config.offset[i] + peak[i] * table[np.arange(n) % table.size])
-    return np.stack(columns, axis=1)
+def scaled(config: ExcitationParameters, peak: tuple[float, ...], k: NDArray[np.int64]) -> Array:
+    """Torques (n, L) [N m] of samples number k (n,) with peak torques (L,) [N m] about the offset."""
+    tables = [unit(config, i) for i in range(len(peak))]
+    return np.stack([config.offset[i] + peak[i] * table[k % table.size] for i, table in enumerate(tables)], axis=1)
 
 
 def unit(config: ExcitationParameters, joint: int) -> Array:
