@@ -21,7 +21,7 @@ from identification_moving_arm import frequencies
 from identification_status import LATELY_S, misses, renamed
 
 from flexmanip_ros import pipeline
-from flexmanip_ros.arm.manipulator import payload_array
+from flexmanip_ros.arm.manipulator import chords, payload_array
 from flexmanip_ros.control import controller
 from flexmanip_ros.parameters import (
     ArmParameters,
@@ -30,7 +30,6 @@ from flexmanip_ros.parameters import (
     IdentifierParameters,
     PlantParameters,
 )
-from flexmanip_ros.payload.structured_model import chords
 from flexmanip_ros.simulation import excitation, sensors, simulator
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointBlock, Mode, Status
 

@@ -18,8 +18,8 @@ import numpy as np
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm.linearization import vibration_model
+from flexmanip_ros.arm.manipulator import chords
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
-from flexmanip_ros.payload.structured_model import chords
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 

@@ -20,11 +20,11 @@ from identification_moving_arm import CONFIGURATIONS, frequencies
 from identification_suggested import CASES
 
 from flexmanip_ros import pipeline
+from flexmanip_ros.arm.manipulator import chords
 from flexmanip_ros.identification import decimation
 from flexmanip_ros.identification.validation import affine, simulate
 from flexmanip_ros.io import bag
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
-from flexmanip_ros.payload.structured_model import chords
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.simulation import excitation, simulator

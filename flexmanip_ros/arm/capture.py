@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from flexmanip_ros.arm.equations_of_motion import assemble
-from flexmanip_ros.arm.manipulator import Manipulator, payload_array, workspace
+from flexmanip_ros.arm.manipulator import Manipulator, modal, payload_array, workspace
 from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.types import Array
 
@@ -59,14 +59,8 @@ def tip_jacobian(arm: Manipulator, payload: Array, q: Array) -> Array:
     if arm.floating:
         J[:2] -= work.P / work.F[2]
     J[2, links - 1] = 1.0
-    J[2, modal_of(arm, links - 1)] = arm.tip_slope[-1]
+    J[2, modal(links, arm.kappa, links - 1)] = arm.tip_slope[-1]
     return J
-
-
-def modal_of(arm: Manipulator, link: int) -> slice:
-    """Return where the modal coordinates of a link stand in q."""
-    links = arm.length.size
-    return slice(links + link * arm.kappa, links + (link + 1) * arm.kappa)
 
 
 def rates_after(M: Array, J: Array, qd: Array, body: Body, mass: float = np.inf, held: Array | None = None) -> Array:
@@ -100,4 +94,4 @@ def body_jacobian(tip: Array, turn: float, com: tuple[float, float]) -> Array:
 def tip_angle(arm: Manipulator, q: Array) -> float:
     """Angle of the tip's cross-section [rad]."""
     last = arm.length.size - 1
-    return float(q[last] + arm.tip_slope[last] @ q[modal_of(arm, last)])
+    return float(q[last] + arm.tip_slope[last] @ q[modal(last + 1, arm.kappa, last)])

@@ -131,7 +131,7 @@ def assemble_payload(arm: Manipulator, payload: Array, q: Array, qd: Array, M: A
     last = links - 1
     o = links + last * k
     turn, spin = q[last], qd[last]
-    g = work.frame[0]
+    g = work.turn
     for r in range(n):
         g[r] = 0.0
     g[last] = 1.0

@@ -64,7 +64,7 @@ def payload_jacobian(
     o = links + last * k
     m, hx, hy = payload[0], payload[1], payload[2]
     turn, spin, accelerated = q[last], qd[last], qdd[last]
-    g = work.frame[0]
+    g = work.turn
     for r in range(n):
         g[r] = 0.0
     g[last] = 1.0
@@ -117,10 +117,10 @@ def payload_jacobian(
 def add_body_forces(arm: Manipulator, q: Array, qdd: Array, dp: Array, work: Workspace) -> None:
     """Add to dp (n, 4), the derivative of the forces by the payload's parameters, the part of additional qdd (n,).
 
-    Call it right after ``force_jacobian``: it reads work.frame, work.J and work.P of that call.
+    Call it right after ``force_jacobian``: it reads work.turn, work.J and work.P of that call.
     """
     n = q.size
-    g, J, mass = work.frame[0], work.J[arm.length.size], work.F[2]
+    g, J, mass = work.turn, work.J[arm.length.size], work.F[2]
     turn, accelerated, x, y = 0.0, 0.0, 0.0, 0.0
     for r in range(n):
         accelerated += g[r] * qdd[r]

@@ -201,8 +201,8 @@ class Workspace(NamedTuple):
     Fq: Array
     """(2, n) derivative with respect to q of the force that a link passes on to the link before."""
     Fv: Array
-    frame: Array
-    """(4, n) scratch: derivatives in the frame of a link."""
+    turn: Array
+    """(n,) gradient of the angle of the tip's cross-section."""
     B: Array
     """(n, L) torque matrix."""
     net: Array
@@ -220,7 +220,7 @@ def workspace(arm: Manipulator) -> Workspace:
         block=np.zeros((k + 1, k + 1)), gradient=np.zeros((3, arm.mass.shape[1], k)), elastic=np.zeros(n),
         tangent=np.zeros((k, k)),
         A=np.zeros((links + 1, 2)), Aq=np.zeros((links + 1, 2, n)), Av=np.zeros((links + 1, 2, n)),
-        Fq=np.zeros((2, n)), Fv=np.zeros((2, n)), frame=np.zeros((4, n)), B=np.zeros((n, links)),
+        Fq=np.zeros((2, n)), Fv=np.zeros((2, n)), turn=np.zeros(n), B=np.zeros((n, links)),
         net=np.zeros((3, links)), held=np.zeros((2, n)))
 
 
@@ -282,9 +282,19 @@ def manipulator(arm: ArmParameters, kappa: int | None = None, points: int | None
     return made._replace(**contiguous)
 
 
-def modal(arm: ArmParameters, kappa: int, link: int) -> slice:
+def chords(arm: ArmParameters, angles: Array) -> Array:
+    """Return absolute chord angles (L,) [rad] of a straight arm whose measured angles are ``angles`` (L,).
+
+    An encoder reads root slopes on top: some milliradians that swing about zero with the vibration, so
+    they are left out at a working point (give averaged angles where that matters). ``structured`` keeps them.
+    """
+    if arm.angle_convention == 'chord':
+        return np.asarray(angles, dtype=np.float64)
+    return np.cumsum(angles, dtype=np.float64)
+
+
+def modal(links: int, kappa: int, link: int) -> slice:
     """Return where the modal coordinates of a link stand in q."""
-    links = len(arm.link_length)
     return slice(links + link * kappa, links + (link + 1) * kappa)
 
 
@@ -294,10 +304,10 @@ def joint_rows(arm: ArmParameters, root: Array, tip: Array, n: int) -> Array:
     rows = np.zeros((links, n))
     for i in range(links):
         rows[i, i] = 1.0
-        rows[i, modal(arm, k, i)] = root[i]
+        rows[i, modal(links, k, i)] = root[i]
         if i:
             rows[i, i - 1] = -1.0
-            rows[i, modal(arm, k, i - 1)] = -tip[i - 1]
+            rows[i, modal(links, k, i - 1)] = -tip[i - 1]
     if arm.base_mass:
         rows[0, -1] = -1.0
     return rows
@@ -311,10 +321,10 @@ def _rotary(arm: ArmParameters, shapes: ShapeFunctions, root: Array, tip: Array,
         end = arm.tip_inertia if i == links - 1 else arm.joint_inertia
         for J, slopes in ((arm.hub_inertia[i], root), (end, tip)):
             row = np.zeros(len(R))
-            row[i], row[modal(arm, k, i)] = 1.0, slopes[i]
+            row[i], row[modal(links, k, i)] = 1.0, slopes[i]
             R += J * np.outer(row, row)
         R += arm.rotor_inertia[i] * np.outer(joint[i], joint[i])
-        at = modal(arm, k, i)
+        at = modal(links, k, i)
         R[at, at] += arm.linear_density[i] * arm.link_length[i] * np.diag(shapes.inertia - 0.5)
     if arm.base_mass:
         R[-1, -1] += arm.base_inertia
@@ -328,7 +338,7 @@ def _damping(arm: ArmParameters, shapes: ShapeFunctions, stiffness: Array) -> Ar
     """
     D = np.zeros(stiffness.size)
     for i, (L, rho) in enumerate(zip(arm.link_length, arm.linear_density, strict=True)):
-        at = modal(arm, len(shapes.inertia), i)
+        at = modal(len(arm.link_length), len(shapes.inertia), i)
         M, K = rho * L * shapes.inertia, stiffness[at]
         omega = np.sqrt(K / M)
         D[at] = 2 * arm.damping_ratio * (K / omega[0] if arm.damping_model == 'stiffness' else M * omega)
@@ -353,5 +363,5 @@ def _output_matrix(arm: ArmParameters, shapes: ShapeFunctions, joint: Array) -> 
     C = np.zeros((2 * links, n))
     C[:links] = joint if arm.angle_convention == 'encoder' else np.eye(links, n)
     for i in range(links):
-        C[links + i, modal(arm, k, i)] = shapes.at(np.array([arm.sensor_position[i]]))[0][:, 0]
+        C[links + i, modal(links, k, i)] = shapes.at(np.array([arm.sensor_position[i]]))[0][:, 0]
     return C

@@ -31,7 +31,7 @@ from flexmanip_ros.payload import (
     process_model,
     structured,
 )
-from flexmanip_ros.payload.structured_model import build, diffusion, sensors
+from flexmanip_ros.payload.structured_model import build, sensors
 from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, StateSpace
@@ -87,7 +87,7 @@ def steps_of_the_filter() -> None:
     assert model is not None
     memory = filter_state.memory(model.payload + model.motion.kind.size, len(model.roles),
                                  model.motion.effort.size)
-    seen = sensors(config, model, 1e-3, diffusion(config, model, memory), np.zeros(len(config.arm.link_length)))
+    seen = sensors(config, model, 1e-3, np.zeros(len(config.arm.link_length)))
     fit = model.motion, seen, memory
     compile_for(moving_horizon.keep_possible, model.motion, memory, 0.0)
     for step in (gauss_newton.close_horizon, gauss_newton.finish_iteration, gauss_newton.reject_step,

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.linalg import solve, solve_discrete_are
 
 from flexmanip_ros.arm.linearization import discretize, first_order, floating_blocks, gravity_forces
-from flexmanip_ros.arm.manipulator import manipulator, payload_array
+from flexmanip_ros.arm.manipulator import chords, manipulator, payload_array
 from flexmanip_ros.control.handover import PayloadEstimate, Verdict, judge
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.parameters import ControllerParameters
@@ -44,11 +44,6 @@ def observation(config: ControllerParameters) -> Array:
     if arm.base_mass:  # angles are relative to the base
         output = output[:, :-1]
     return np.asarray(np.append(np.ones(len(arm.bend_gain)), arm.bend_gain)[:, None] * output)
-
-
-def reference(config: ControllerParameters, angles: Array) -> Array:
-    """Return the chord angles (L,) of a straight arm whose encoders read ``angles`` (L,)."""
-    return np.cumsum(angles) if config.arm.angle_convention == 'encoder' else np.array(angles, dtype=np.float64)
 
 
 def model(config: ControllerParameters, theta: Array, payload: float | Array) -> tuple[Array, Array]:
@@ -108,7 +103,7 @@ def hold(config: ControllerParameters, theta: Array, payload: Array) -> tuple[Ar
 def hold_goal(config: ControllerParameters, state: ControllerState) -> Array:
     """Return the torques (L,) [N m] that hold the arm at the end of its path."""
     assert state.way is not None, 'there is no path before the first sample'
-    return hold(config, reference(config, state.way.goal), state.payload)[0]
+    return hold(config, chords(config.arm, state.way.goal), state.payload)[0]
 
 
 class Design(NamedTuple):
@@ -310,14 +305,14 @@ def step(config: ControllerParameters, state: ControllerState, measured: Measure
          ) -> tuple[ControllerState, Array]:
     """Return the torques (L,) [N m] for a sample, within the limits."""
     links = len(config.arm.link_length)
-    theta = reference(config, measured.position[:links]) if state.x is None else state.x[:links]
+    theta = chords(config.arm, measured.position[:links]) if state.x is None else state.x[:links]
     holding, sag = hold(config, theta, state.payload)
     x = _filtered(config, state, measured, sag)
     state = _scheduled(config, state, configuration(config, x[:links]))
     way = _onward(config, state, measured.position[:links], holding)
     state = state._replace(way=way, goal=state.setpoint)
     wanted, acceleration = _wanted(config, state, way)
-    wanted[:links] -= reference(config, sag[:links])
+    wanted[:links] -= chords(config.arm, sag[:links])
     feedforward = state.between(state.old.F, state.now.F) @ acceleration + holding
     limit = _limit(config, state)
     torque: Array = np.clip(measured.added + feedforward - state.gain @ (x - wanted), -limit, limit)
@@ -339,7 +334,7 @@ def _filtered(config: ControllerParameters, state: ControllerState, measured: Me
     if state.x is None:
         first = np.zeros(len(state.now.A))
         links = len(measured.position) // 2
-        first[:links] = reference(config, (measured.position - sag)[:links])
+        first[:links] = chords(config.arm, (measured.position - sag)[:links])
         return first
     offset = np.zeros(len(state.C))
     offset[:len(sag)] = sag
@@ -361,7 +356,7 @@ def _onward(config: ControllerParameters, state: ControllerState, present: Array
     left = np.maximum(np.asarray(config.effort_limit) - np.abs(holding), SPARE * np.asarray(config.effort_limit))
     limits = np.concatenate([config.move_effort * left, [config.move_bend] * links])
     seconds = duration(
-        reference(config, state.setpoint - position), reference(config, rate), config.setpoint_rate,
+        chords(config.arm, state.setpoint - position), chords(config.arm, rate), config.setpoint_rate,
         np.vstack([design.F, bends]), limits)
     return plan(way, state.setpoint, seconds)
 
@@ -371,10 +366,10 @@ def _wanted(config: ControllerParameters, state: ControllerState, way: Path) -> 
     n = len(state.now.A) // 2
     if way.ended:
         wanted = np.zeros(2 * n)
-        goal = reference(config, way.goal)
+        goal = chords(config.arm, way.goal)
         wanted[:len(goal)] = goal
         return wanted, np.zeros(len(goal))
-    position, rate, acceleration, jerk = (reference(config, row) for row in way.now())
+    position, rate, acceleration, jerk = (chords(config.arm, row) for row in way.now())
     bends = state.between(state.old.E, state.now.E)
     return np.concatenate([position, bends @ acceleration, rate, bends @ jerk]), acceleration
 

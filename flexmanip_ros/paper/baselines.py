@@ -16,10 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.arm.manipulator import pinned_frequencies
+from flexmanip_ros.arm.manipulator import chords, pinned_frequencies
 from flexmanip_ros.numerics.compiled import kernel
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload.structured_model import chords
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, JointRecord, Payload, Status

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexmanip_ros.arm.linearization import Blocks, blocks, vibration_model
-from flexmanip_ros.arm.manipulator import count, manipulator
+from flexmanip_ros.arm.manipulator import chords, count, manipulator
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.factor import POWER_RATE
 from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
-from flexmanip_ros.payload.structured_model import Quantity, chords, signals
+from flexmanip_ros.payload.structured_model import Quantity, signals
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import QUANTILE, Array, Payload, Status
 

@@ -79,18 +79,11 @@ def advance(
             state = _resume(state, one)
             rows = rows.since(one.until)
         else:
-            state, event = _watch(config, state, rows.stretches()[0])
+            state, event = _watch(state, rows.stretches()[0])
             rows = rows.since(state.filter.cursor)
             if event is not None:
                 found.append(event)
     return state, tuple(found)
-
-
-def statistic(state: DetectionState) -> tuple[float, float]:
-    """Return the latest statistic and its threshold (0 and infinite before there are any)."""
-    if state.glr is None:
-        return 0.0, float('inf')
-    return float(state.glr.level[kernel.STATISTIC]), float(kernel.limit(state.glr))
 
 
 def threshold(config: TriggerParameters, dt: float) -> float:
@@ -146,23 +139,19 @@ def _start(config: TriggerParameters, state: DetectionState, row: Rows) -> Detec
     return replace(state, glr=glr, dt=dt)
 
 
-def _watch(
-    config: TriggerParameters, state: DetectionState, rows: Rows,
-) -> tuple[DetectionState, CaptureEvent | None]:
+def _watch(state: DetectionState, rows: Rows) -> tuple[DetectionState, CaptureEvent | None]:
     """Take rows without a gap until an alarm; return the event."""
     filtered, glr = state.filter, state.glr
-    assert filtered.model is not None
-    assert filtered.memory is not None
-    assert filtered.sensors is not None
     assert glr is not None
-    m = mem.copy(filtered.memory)
+    model, sensors, memory, *_ = filtered.running
+    m = mem.copy(memory)
     glr = kernel.GlrState._make(part.copy() for part in glr)
     table, first = structured.input_table(filtered, rows)
     confirm = round(CONFIRM / state.dt)
-    mass, moment = structured_model.body_std(state.identifier, filtered.model)[:2] / structured_model.PAYLOAD_STD
+    mass, moment = structured_model.body_std(state.identifier, model)[:2] / structured_model.PAYLOAD_STD
     prior = np.outer([SPEED, ACCELERATION, JERK], [mass, mass, moment])
     taken = kernel.advance(
-        filtered.model.motion, filtered.sensors, m, glr, prior, state.dt, float(np.exp(-state.dt / PEAK_MEMORY)),
+        model.motion, sensors, m, glr, prior, state.dt, float(np.exp(-state.dt / PEAK_MEMORY)),
         round(SETTLE / state.dt), confirm, table, first, np.zeros(kernel.TESTED), True)
     until = abs(taken)
     part = rows.between(rows.first, rows.first + until - first)
@@ -170,10 +159,9 @@ def _watch(
     if taken < 0:  # the fit of the empty arm begins again, and may learn more of it
         last = part.since(part.until - 1)
         fresh = structured.restart(state.identifier, filtered, after, last)
-        if m.counts[mem.RESTS] == mem.SLIDES:  # the horizon of an arm at rest
-            return replace(state, filter=fresh, glr=glr), None
-        glr = _quiet(glr)
-        glr.level[kernel.PEAK] = 0.0  # what the model missed before
+        if m.counts[mem.RESTS] != mem.SLIDES:  # else only the horizon of an arm at rest slid
+            glr = _quiet(glr)
+            glr.level[kernel.PEAK] = 0.0  # what the model missed before
         return replace(state, filter=fresh, glr=glr), None
     state = replace(state, filter=after, glr=glr)
     if glr.clock[kernel.ALARMED] <= confirm:
@@ -238,8 +226,10 @@ class Watch(NamedTuple):
 
     @property
     def statistic(self) -> tuple[float, float]:
-        """The latest test statistic of the detection and its threshold."""
-        return (0.0, math.inf) if self.state is None else statistic(self.state)
+        """The latest statistic and its threshold (0 and infinite before there are any)."""
+        if self.state is None or self.state.glr is None:
+            return 0.0, math.inf
+        return float(self.state.glr.level[kernel.STATISTIC]), float(kernel.limit(self.state.glr))
 
 
 def watching(trigger: TriggerParameters) -> Watch:

@@ -173,7 +173,7 @@ def _gathered(
         raise ModelError(f'there are {len(noise_std)} deviations', 'give one for each output and each further angle')
     measured = np.asarray(noise_std)[[*model.kept, *range(len(config.outputs), len(noise_std))]]
     n, columns = model.motion.arm.stiffness.size, S.shape[1]
-    seen = sensors(config, model, dt, np.zeros(x.size), np.zeros(efforts.shape[1]))
+    seen = sensors(config, model, dt, np.zeros(efforts.shape[1]))
     rows = np.full((seen.reach, 1 + efforts.shape[1]), dt)
     padded = np.vstack([np.tile(efforts[0], (seen.reach - 1, 1)), efforts])
     information, F = np.zeros((columns, columns)), np.zeros((len(measured), columns))

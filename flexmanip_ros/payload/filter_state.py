@@ -130,18 +130,15 @@ def memory(nx: int, m: int, links: int) -> FilterState:
         ringing=np.zeros((3, 3, links)), innovation=np.zeros((m, 2)), power=np.ones(m))
 
 
+OF_HORIZON = ('x0', 'S0', 'xi', 'accepted', 'normal', 'gradient', 'xr', 'Sr', 'N', 'g', 'batch', 'B')
+"""What belongs to the moving horizon."""
+
+
 def copy(state: FilterState, *, horizon: bool = True) -> FilterState:
     """Return the same values in arrays of their own.
 
     horizon False: what belongs to a complete moving horizon is shared; then only an event writes it.
     """
-    (x, S, noise, recent, spectrum, counts, score, moved, x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g,
-     batch, B, torque_noise, effort_noise, ringing, innovation, power) = state
-    if horizon or counts[STORED] < HORIZON:
-        x0, S0, xi = x0.copy(), S0.copy(), xi.copy()
-        accepted, normal, gradient = accepted.copy(), normal.copy(), gradient.copy()
-        xr, Sr, N, g, batch, B = xr.copy(), Sr.copy(), N.copy(), g.copy(), batch.copy(), B.copy()
-    return FilterState(
-        x.copy(), S.copy(), noise.copy(), recent.copy(), spectrum.copy(), counts.copy(), score.copy(), moved.copy(),
-        x0, S0, xi, accepted, normal, gradient, xr, Sr, N, g, batch, B, torque_noise.copy(),
-        effort_noise.copy(), ringing.copy(), innovation.copy(), power.copy())
+    shared = () if horizon or state.counts[STORED] < HORIZON else OF_HORIZON
+    return FilterState._make(part if name in shared else part.copy()
+                             for name, part in zip(FilterState._fields, state, strict=True))

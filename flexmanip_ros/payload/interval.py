@@ -63,7 +63,7 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         return Payload(0.0, math.inf, 0.0, math.inf, 1.0, begun)
     state = model.payload
     held = bool(m.counts[mem.HELD])
-    consistency, reckoned = innovation_power(sensors, m)
+    consistency, share = innovation_power(sensors, m)
     fitting = held and m.counts[STORED] < HORIZON
     g = moves(m)
     if fitting:  # the next step may be as long as the last one
@@ -81,8 +81,9 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         status = Status.DIVERGED
     body = m.x[state:state + model.body].copy()
     spread = (widening ** 2) * (m.S[state:state + model.body] @ m.S[state:state + model.body].T)
-    considered = inertia_error(config, model, max(float(body[0]), 0.0) if held else 0.0)
-    spread[0, 0] += (reckoned * considered) ** 2
+    # of the payload, by the error of all inertia at the tip [kg]
+    considered = config.payload.model_error * ((max(float(body[0]), 0.0) if held else 0.0) + model.motion.scale)
+    spread[0, 0] += (share * considered) ** 2
     prior = float(structured_model.body_std(config, model)[0])
     if not held:
         std = math.sqrt(spread[0, 0])
@@ -226,32 +227,24 @@ def friction_error(model: Model, m: mem.FilterState, peak: Array) -> float:
     return SHARE_ERROR * float(np.max(np.divide(F, torques, out=np.zeros(F.size), where=torques > F), initial=0.0))
 
 
-def inertia_error(config: IdentifierParameters, model: Model, mass: float) -> float:
-    """Return the deviation [kg] of a payload of a mass [kg] by the error ``model_error`` of all inertia at the tip."""
-    return config.payload.model_error * (mass + model.motion.scale)
-
-
 def innovation_power(sensors: MeasurementModel, m: mem.FilterState) -> tuple[float, float]:
-    """Return the innovation power over white noise, and ``misjudged``.
+    """Return the innovation power over white noise, and the share of ``model_error``; see ``figures``.
 
     Of the displacements it is the median before a sensor tells of the payload.
     """
-    power, reckoned = figures(m.noise, sensors.rate, m.counts, sensors.block)
+    power, share = figures(m.noise, sensors.rate, m.counts, sensors.block)
     if math.isnan(power):
         power = float(np.median([sensor[mem.POWER] / white_variance(sensor, LEVEL)
                                  for sensor in m.noise[~sensors.rate]]))
-    return power, reckoned
-
-
-Integers = NDArray[np.int64]
+    return power, share
 
 
 @kernel
-def misjudged(noise: Array, counts: Integers, block: int) -> float:
-    """Share of ``model_error`` that the interval carries, 0 to 1; block: samples in a block.
+def figures(noise: Array, rate: NDArray[np.bool_], counts: NDArray[np.int64], block: int) -> tuple[float, float]:
+    """Return the misfit, and the share of ``model_error`` that the interval carries, 0 to 1; block: samples in a block.
 
-    It grows linearly with the innovation power over white noise of the sensor with the most. It is 0 up to what chance
-    explains if the samples are independent, and 1 from what chance explains if only blocks are independent.
+    The share grows linearly with the innovation power over white noise of the sensor with the most. It is 0 up to what
+    chance explains if the samples are independent, and 1 from what chance explains if only blocks are independent.
     """
     # a mean of N squares scatters by sqrt(2 / N); 2.5 times that is exceeded by chance in 0.6 % of the blocks
     blocks, of_white = max(counts[BLOCKS], 1), 2.0 * OVERLAP / max(counts[SEEN], 1)
@@ -260,10 +253,4 @@ def misjudged(noise: Array, counts: Integers, block: int) -> float:
     excess = 0.0
     for i in range(noise.shape[0]):
         excess = max(excess, noise[i, EFFECTIVE] / white_variance(noise[i], LEVEL) - 1.0)
-    return min(max((excess - least) / (most - least), 0.0), 1.0)
-
-
-@kernel
-def figures(noise: Array, rate: NDArray[np.bool_], counts: Integers, block: int) -> tuple[float, float]:
-    """Return misfit and ``misjudged``, in one call."""
-    return misfit(noise, rate, LEVEL), misjudged(noise, counts, block)
+    return misfit(noise, rate, LEVEL), min(max((excess - least) / (most - least), 0.0), 1.0)

@@ -334,14 +334,8 @@ def accelerate(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
 @inner
 def constant_mass_jacobian(motion: ProcessModel, qdd: Array) -> None:
     """Do what ``force_jacobian`` does, for the mass matrix of the working point."""
-    for r in range(qdd.size):
-        for c in range(qdd.size):
-            motion.dq[r, c] = 0.0
-            motion.dqd[r, c] = 0.0
-        for p in range(4):
-            motion.dp[r, p] = 0.0
-            for c in range(qdd.size):
-                motion.dp[r, p] += motion.Mp[p, r, c] * qdd[c]
+    motion.dq[:], motion.dqd[:], motion.dp[:] = 0.0, 0.0, 0.0
+    add_payload_columns(motion, qdd)
 
 
 @inner

@@ -72,6 +72,32 @@ class StructuredState(NamedTuple):
     white: Array = np.empty(0)
     """(m, 2) variance of each measurement's white noise at the last restart, and its bound by the spectrum."""
 
+    @property
+    def running(self) -> Running:
+        """What there is once it has started."""
+        assert self.model is not None
+        assert self.sensors is not None
+        assert self.memory is not None
+        assert self.efforts is not None
+        assert self.horizon is not None
+        return Running(self.model, self.sensors, self.memory, self.efforts, self.horizon)
+
+    @property
+    def here(self) -> Horizon:
+        """A horizon that begins with the next row."""
+        assert self.efforts is not None
+        return Horizon(self.cursor, self.time_ns, self.efforts, self.rates)
+
+
+class Running(NamedTuple):
+    """The parts of ``StructuredState`` that there are once it has started."""
+
+    model: Model
+    sensors: MeasurementModel
+    memory: mem.FilterState
+    efforts: Array
+    horizon: Horizon
+
 
 class Arrival(NamedTuple):
     """Where the horizon of an arm at rest will begin next, and its arrival cost."""
@@ -133,10 +159,9 @@ def advance(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
         if state.memory is None:  # it restarted meanwhile
             state = advance(config, state, part)
             continue
-        if broken:
-            assert state.sensors is not None
-            # ``unknown_torque`` is linearized at one instant; over more than a block that is some percent off
-            state = (_bridge if 0 < state.missing <= state.sensors.block else _resume)(config, state, part)
+        if broken:  # ``unknown_torque`` is linearized at one instant; over more than a block that is some percent off
+            is_short = 0 < state.missing <= state.running.sensors.block
+            state = _bridge(state, part) if is_short else _resume(config, state, part)
         state = _run(config, state, part)
     return state
 
@@ -147,16 +172,15 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
         return state
     if state.memory is None:
         return state._replace(early=(*state.early, (state.cursor, event)))
-    m = mem.copy(state.memory)
-    assert state.efforts is not None
-    assert state.sensors is not None
+    model, sensors, memory, efforts, _ = state.running
+    m = mem.copy(memory)
     ahead = max(event.stamp_ns - state.time_ns, 0)
-    rows, rates = np.pad(state.efforts, ((0, 0), (1, 0))), np.full(state.rates.size, np.nan)
-    predict(state.model.motion, m.x, m.S, m.x.size, rows, state.sensors.period, min(ahead * 1e-9, LONGEST_S))
-    _change(config, state.model, state.sensors, m, event)
-    time_ns = state.time_ns + ahead
-    return state._replace(memory=m, last_ns=max(event.stamp_ns, state.last_ns), time_ns=time_ns, rates=rates,
-                          horizon=Horizon(state.cursor, time_ns, state.efforts, rates))
+    rows, rates = np.pad(efforts, ((0, 0), (1, 0))), np.full(state.rates.size, np.nan)
+    predict(model.motion, m.x, m.S, m.x.size, rows, sensors.period, min(ahead * 1e-9, LONGEST_S))
+    _change(config, model, m, event)
+    state = state._replace(memory=m, last_ns=max(event.stamp_ns, state.last_ns), time_ns=state.time_ns + ahead,
+                           rates=rates)
+    return state._replace(horizon=state.here)
 
 
 def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
@@ -164,8 +188,7 @@ def estimate(config: IdentifierParameters, state: StructuredState) -> Payload:
     return judge(config, state.model, state.sensors, state.memory, state.restarts, state.peak)
 
 
-def _change(config: IdentifierParameters, model: Model, sensors: MeasurementModel, m: mem.FilterState,
-            event: CaptureEvent) -> None:
+def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, event: CaptureEvent) -> None:
     """Make uncertain what an event changes: the rates, and what is held."""
     payload, kind = model.payload, event.kind
     held = bool(m.counts[mem.HELD])
@@ -322,7 +345,7 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     m.S[:] = structured_model.triangular(m.S)
     _set_arrival_cost(model, m)
     m.counts[mem.REFITS] = state.refits
-    seen = sensors(fewer, model, dt, structured_model.diffusion(config, model, m), np.mean(rows.angles, axis=0))
+    seen = sensors(fewer, model, dt, np.mean(rows.angles, axis=0))
     events = state.early
     time_ns, efforts = int(rows.time_ns[0]), latest(seen, rows.u[:1], state.efforts)
     m.ringing[:, 2] = efforts[-1]
@@ -330,8 +353,8 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     unused = structured_model.too_noisy(rows.rates, dt) if rows.rates.shape[1] else np.zeros(rates.size, dtype=np.bool_)
     state = state._replace(
         model=model, memory=m, sensors=seen, begin=None, early=(), cursor=rows.first, last_ns=int(rows.stamp_ns[0]),
-        time_ns=time_ns, efforts=efforts, rates=rates, unused=unused,
-        horizon=Horizon(rows.first, time_ns, efforts, rates))
+        time_ns=time_ns, efforts=efforts, rates=rates, unused=unused)
+    state = state._replace(horizon=state.here)
     for row, item in events:
         state = event(config, _part(config, state, rows, row), item)
     return _part(config, state, rows, rows.until)
@@ -344,14 +367,10 @@ def _part(config: IdentifierParameters, state: StructuredState, rows: Rows, unti
 
 def _resume(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
     """After a gap: start at the measurements of the first row."""
-    state = state._replace(missing=0)
-    assert state.model is not None
-    fresh = reopen(config, state, measurements(state.model, rows.between(rows.first, rows.first + 1))[0])
-    assert fresh.memory is not None
-    assert state.sensors is not None
-    time_ns, efforts = int(rows.time_ns[0]), latest(state.sensors, rows.u[:1])
-    return fresh._replace(last_ns=int(rows.stamp_ns[0]), time_ns=time_ns, efforts=efforts,
-                          horizon=Horizon(rows.first, time_ns, efforts, state.rates))
+    model, sensors, *_ = state.running
+    state = state._replace(missing=0, last_ns=int(rows.stamp_ns[0]), time_ns=int(rows.time_ns[0]),
+                           efforts=latest(sensors, rows.u[:1]))
+    return reopen(config, state, measurements(model, rows.between(rows.first, rows.first + 1))[0])
 
 
 def latest(sensors: MeasurementModel, efforts: Array, before: Array | None = None) -> Array:
@@ -364,20 +383,16 @@ def latest(sensors: MeasurementModel, efforts: Array, before: Array | None = Non
     return efforts[-missing:].copy()
 
 
-def _bridge(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
+def _bridge(state: StructuredState, rows: Rows) -> StructuredState:
     """Widen the covariance by what torques may have done that changed at an unknown time while samples were missing."""
-    assert state.model is not None
-    assert state.memory is not None
-    assert state.efforts is not None
-    assert state.sensors is not None
-    m = mem.copy(state.memory)
-    change = _unforeseen(rows.u[0] - state.efforts[-1], state.slope, state.missing)
-    columns = structured_model.unknown_torque(state.model, m, change, state.missing, state.sensors.period)
+    model, sensors, memory, efforts, _ = state.running
+    m = mem.copy(memory)
+    change = _unforeseen(rows.u[0] - efforts[-1], state.slope, state.missing)
+    columns = structured_model.unknown_torque(model, m, change, state.missing, sensors.period)
     m.S[:] = structured_model.widen(m.S, columns)
     if _has_horizon(m):  # it has no process noise
-        _begin_horizon(state.model, m)
-    return state._replace(memory=m, missing=0,
-                          horizon=Horizon(state.cursor, state.time_ns, state.efforts, state.rates))
+        _begin_horizon(model, m)
+    return state._replace(memory=m, missing=0, horizon=state.here)
 
 
 UNKNOWN_TORQUE = 0.1
@@ -425,31 +440,26 @@ def reopen(
     config: IdentifierParameters, state: StructuredState, y: Array | None = None,
 ) -> StructuredState:
     """Start the motion again from measurements y (m,), and keep what is known of arm, payload and noise."""
-    assert state.model is not None
-    assert state.memory is not None
-    m = mem.copy(state.memory)
-    n = state.model.motion.arm.stiffness.size
-    parameters, spread = m.x[2 * n:].copy(), m.S[2 * n:].copy()
-    structured_model.first(config, state.model, m, m.recent[:, 0] if y is None else y)
-    m.x[2 * n:] = parameters
-    m.S[2 * n:] = 0.0
-    m.S[:] = structured_model.widen(m.S, np.vstack([np.zeros((2 * n, spread.shape[1])), spread]))
-    _set_arrival_cost(state.model, m)
-    assert state.efforts is not None
-    return state._replace(memory=m, horizon=Horizon(state.cursor, state.time_ns, state.efforts, state.rates))
+    model, m = state.running.model, mem.copy(state.running.memory)
+    payload = model.payload
+    parameters, spread = m.x[payload:].copy(), m.S[payload:].copy()
+    structured_model.first(config, model, m, m.recent[:, 0] if y is None else y)
+    m.x[payload:] = parameters
+    m.S[payload:] = 0.0
+    m.S[:] = structured_model.widen(m.S, np.vstack([np.zeros((payload, spread.shape[1])), spread]))
+    _set_arrival_cost(model, m)
+    return state._replace(memory=m, horizon=state.here)
 
 
 def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
     """Take rows without a gap among them."""
     while len(rows):
-        assert state.model is not None
-        assert state.memory is not None
-        assert state.sensors is not None
-        m = mem.copy(state.memory, horizon=False)
+        model, sensors, memory, *_ = state.running
+        m = mem.copy(memory, horizon=False)
         # an arm at rest returns after every slide, and the table of what is left is made again
         part = rows.between(rows.first, min(rows.first + mem.HORIZON, rows.until))
         table, first = input_table(state, part)
-        failed = filtered(state.model.motion, state.sensors, m, table, first) - first
+        failed = filtered(model.motion, sensors, m, table, first) - first
         taken = part.between(part.first, min(part.first + failed + 1, part.until))
         after = after_rows(state, m, taken, table[:first + len(taken)])
         rows = rows.since(taken.until)
@@ -463,17 +473,15 @@ def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> St
 
 def after_rows(state: StructuredState, m: mem.FilterState, taken: Rows, table: Array) -> StructuredState:
     """Return the state once the filter, now with memory m, took these rows, the last of the table."""
-    assert state.sensors is not None
-    assert state.efforts is not None
     links = taken.u.shape[1]
-    efforts = latest(state.sensors, taken.u[-1:], table[:, 1:1 + links])
+    efforts = latest(state.running.sensors, taken.u[-1:], table[:, 1:1 + links])
     slope, peak = state.slope, np.abs(taken.u).max(axis=0)
     if state.peak.size:
         peak = np.maximum(peak, state.peak)
     measured = np.flatnonzero(taken.missing == 0)
     if len(measured):
         last = int(measured[-1])
-        slope = taken.u[last] - (taken.u[last - 1] if last else state.efforts[-1])
+        slope = taken.u[last] - (taken.u[last - 1] if last else state.running.efforts[-1])
     return state._replace(memory=m, cursor=taken.until, last_ns=int(taken.stamp_ns[-1]),
                           time_ns=int(taken.time_ns[-1]), efforts=efforts,
                           rates=table[-1, 1 + 2 * links:1 + 3 * links].copy(), slope=slope,
@@ -487,15 +495,11 @@ def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
     [rad/s] (NaN: unknown); measurements (NaN: missing). While the horizon is open the table reaches back to its first
     row; before that come the efforts that a late torque needs.
     """
-    assert state.model is not None
-    before_ns, efforts, rates, horizon = state.time_ns, state.efforts, state.rates, state.horizon
+    model, *_, horizon = state.running
     begin = first_needed(state)
-    if begin < rows.first:
-        assert horizon is not None
-        before_ns, efforts, rates = horizon.before_ns, horizon.efforts, horizon.rates
+    _, before_ns, efforts, rates = horizon if begin < rows.first else state.here
     reach = rows.since(begin)
-    assert efforts is not None
-    times, y = reach.time_ns, measurements(state.model, reach)
+    times, y = reach.time_ns, measurements(model, reach)
     before, links = len(efforts) - 1, efforts.shape[1]
     first = 1 + 3 * links
     whole = np.zeros((before + len(y), first + y.shape[1]))
@@ -527,17 +531,13 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
     within ``FIRST_LOOK`` samples, with its given parameters. An empty arm that only seems to hold something begins with
     what was learned.
     """
-    assert before.memory is not None
-    assert state.model is not None
-    assert state.memory is not None
-    assert state.efforts is not None
-    model, m = state.model, state.memory
+    model, _, m, *_ = state.running
     if m.counts[mem.RESTS] == mem.BEGINS_TO_MOVE:
         return _begin_to_move(state)
     if m.counts[mem.RESTS] == mem.SLIDES:
         return _slide(state)
     refits = int(m.counts[mem.REFITS])
-    unfit = refits > before.memory.counts[mem.REFITS]
+    unfit = refits > before.running.memory.counts[mem.REFITS]
     if unfit and refits <= STARTS and m.counts[mem.HELD] and model.body > 1 and m.counts[mem.STORED] < mem.HORIZON:
         m = mem.copy(m)
         _open_body(config, model, m)
@@ -546,7 +546,7 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
     if unfit and refits > 1 and not m.counts[mem.HELD] and is_off(state):  # the simplest arm is given up
         m = mem.copy(m)
         _fit_empty_arm_again(config, model, m, y)
-        return state._replace(memory=m, horizon=Horizon(state.cursor, state.time_ns, state.efforts, state.rates))
+        return state._replace(memory=m, horizon=state.here)
     at_once = m.counts[mem.SINCE_EVENT] < FIRST_LOOK  # what was learned moves as no arm does
     if m.counts[mem.HELD] and m.counts[mem.LEARNED] and np.isfinite(m.S0).all() and not at_once:
         m = mem.copy(m)
@@ -566,7 +566,7 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
         for column in (mem.EFFECTIVE, mem.POWER, mem.SLOW):  # what did not fit was taken for noise
             m.noise[:, column] = m.noise[:, mem.AT_EVENT]
         _set_arrival_cost(model, m)
-        return state._replace(memory=m, horizon=Horizon(state.cursor, state.time_ns, state.efforts, state.rates))
+        return state._replace(memory=m, horizon=state.here)
     fresh = init(config)._replace(restarts=state.restarts + (not unfit), cursor=state.cursor, refits=refits,
                                   efforts=state.efforts)
     if unfit and m.counts[mem.SEEN] >= UNTAUGHT:
@@ -582,31 +582,24 @@ def _slide(state: StructuredState) -> StructuredState:
 
     So it has always begun before the motion that tells of the payload, and the fit reads all of that.
     """
-    assert state.memory is not None
-    assert state.horizon is not None
-    assert state.efforts is not None
-    m = mem.copy(state.memory)
-    begin = state.horizon
+    m, begin = mem.copy(state.running.memory), state.running.horizon
     if state.next is not None and state.next.horizon.row > begin.row:  # else it has just come to rest
         begin = state.next.horizon
         m.x0[:], m.S0[:], m.ringing[1] = state.next.x, state.next.S, state.next.ringing
     m.counts[mem.IN_BATCH], m.counts[mem.RESTS] = 0, mem.RESTING
-    here = Horizon(state.cursor, state.time_ns, state.efforts, state.rates)
     return state._replace(memory=m, horizon=begin, next=Arrival(
-        here, m.x.copy(), structured_model.triangular(m.S), m.noise.copy(), m.ringing[0].copy()))
+        state.here, m.x.copy(), structured_model.triangular(m.S), m.noise.copy(), m.ringing[0].copy()))
 
 
 def _begin_to_move(state: StructuredState) -> StructuredState:
     """Open the horizon of an arm that was at rest; the filter goes on as it is until the fit replaces its state."""
-    assert state.model is not None
-    assert state.memory is not None
-    assert state.horizon is not None
-    m = mem.copy(state.memory)
+    model, _, memory, _, horizon = state.running
+    m = mem.copy(memory)
     x, S, ringing = m.x.copy(), m.S.copy(), m.ringing[0].copy()
     m.x[:], m.S[:], m.ringing[0] = m.x0, m.S0, m.ringing[1]
-    _set_arrival_cost(state.model, m)
+    _set_arrival_cost(model, m)
     m.x[:], m.S[:], m.ringing[0] = x, S, ringing
-    m.counts[[mem.STORED, mem.SINCE_EVENT]] = state.cursor - state.horizon.row
+    m.counts[[mem.STORED, mem.SINCE_EVENT]] = state.cursor - horizon.row
     if state.next is not None:
         for column in (mem.EFFECTIVE, mem.POWER, mem.SLOW):  # what did not fit was taken for noise
             m.noise[:, column] = state.next.noise[:, column]
@@ -615,12 +608,10 @@ def _begin_to_move(state: StructuredState) -> StructuredState:
 
 def is_off(state: StructuredState) -> bool:
     """Whether an empty arm whose horizon has closed fits the samples and yet seems to hold something."""
-    assert state.model is not None
-    assert state.sensors is not None
-    m = state.memory
-    if m is None or m.counts[mem.STORED] < mem.HORIZON or abs(excess_bias(state.model.motion, m)) <= MOST_BIAS:
+    model, sensors, m, *_ = state.running
+    if m.counts[mem.STORED] < mem.HORIZON or abs(excess_bias(model.motion, m)) <= MOST_BIAS:
         return False
-    return innovation_power(state.sensors, m)[0] < POWER_LIMIT
+    return innovation_power(sensors, m)[0] < POWER_LIMIT
 
 
 def measurements(model: Model, rows: Rows) -> Array:

@@ -14,7 +14,15 @@ from flexmanip_ros.arm.capture import tip_jacobian
 from flexmanip_ros.arm.equations_of_motion import STICTION_RATE
 from flexmanip_ros.arm.late_torque import efforts_needed
 from flexmanip_ros.arm.linearization import mass_matrix, omitted_modes
-from flexmanip_ros.arm.manipulator import Manipulator, fastest_mode, manipulator, modal, pinned_frequencies, workspace
+from flexmanip_ros.arm.manipulator import (
+    Manipulator,
+    chords,
+    fastest_mode,
+    manipulator,
+    modal,
+    pinned_frequencies,
+    workspace,
+)
 from flexmanip_ros.identification.prediction_check import white_noise
 from flexmanip_ros.numerics.square_root import allocate_bounds
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
@@ -30,17 +38,6 @@ from flexmanip_ros.payload.process_model import (
     spread_scratch,
 )
 from flexmanip_ros.types import Array
-
-
-def chords(arm: ArmParameters, angles: Array) -> Array:
-    """Return absolute chord angles (L,) [rad] of measured ones (L,).
-
-    An encoder reads root slopes on top: some milliradians that swing about zero with the vibration, so
-    they are left out at a working point (give averaged angles where that matters). ``structured`` keeps them.
-    """
-    if arm.angle_convention == 'chord':
-        return np.asarray(angles, dtype=np.float64)
-    return np.cumsum(angles, dtype=np.float64)
 
 
 class Quantity(IntEnum):
@@ -184,7 +181,7 @@ def build(config: IdentifierParameters) -> Model | None:
     without = (0.0,) * len(config.arm.link_length)
     links_alone = manipulator(replace(config.arm, hub_inertia=without, rotor_inertia=without))
     return Model(motion(config), roles, kept, extra, min(pinned_frequencies(config.arm)),
-                 ROTOR_ERROR * _inertias_at_joints(links_alone))
+                 ROTOR_ERROR * _inertias_at_joints(links_alone, straight(links_alone)))
 
 
 LEARNED = {
@@ -228,7 +225,7 @@ def motion(config: IdentifierParameters) -> ProcessModel:
     unit = manipulator(replace(config.arm, damping_ratio=0.5)).damping / 0.5
     arm = nominal._replace(**{name: getattr(nominal, name).copy() for name in (
         'stiffness', 'damping', 'viscous', 'coulomb', 'rotary')})
-    frozen = config.payload.dynamics == 'linear'
+    M, frozen = straight(nominal), config.payload.dynamics == 'linear'
     if frozen:  # no forces of higher order than the displacements
         arm = arm._replace(along=np.zeros_like(arm.along))
     lightest = config.arm.tip_mass + config.arm.linear_density[-1] * config.arm.link_length[-1] / 3
@@ -237,7 +234,7 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         link=np.array([link for _, link in kinds], dtype=np.int64), prior=np.zeros(size), given=np.zeros(size),
         frozen=frozen, M0=np.zeros((n, n)), Mp=np.zeros((4, n, n)), stiffness=nominal.stiffness, damping=unit,
         rotary=nominal.rotary, scale=lightest, considered=config.payload.model_error * lightest,
-        least=_least(nominal, lightest), least_rotor=-0.25 * _inertias_at_joints(nominal),
+        least=_least(nominal, M, lightest), least_rotor=-0.25 * _inertias_at_joints(nominal, M),
         substeps=STEP_ANGLE / fastest_mode(config.arm), payload=np.zeros(4), effort=np.zeros(links),
         gain=np.ones(links), late=np.zeros((links, 2)), slope=np.zeros((links, 2)), driven=np.zeros(links),
         coulomb=nominal.coulomb.copy(), share=np.full(links, np.nan), rate=np.full(links, np.nan),
@@ -245,10 +242,10 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         k=np.zeros((20, n)), dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)),
         G=np.zeros((n, 2 * size)), F=np.zeros((n, 2 * n)), X=np.zeros((2 * n, 2 * n)), Y=np.zeros((n, n)),
         scratch=spread_scratch(n, size, 2 * nx + 1))
-    return made._replace(prior=priors(config, made), given=_given(config.arm, made))
+    return made._replace(prior=priors(config, made, M), given=_given(config.arm, made))
 
 
-def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Array, angles: Array) -> MeasurementModel:
+def sensors(config: IdentifierParameters, model: Model, dt: float, angles: Array) -> MeasurementModel:
     """Return how each measurement follows from the state; dt: sample time [s], angles: (L,) first ones [rad]."""
     output = model.motion.arm.output
     links, count = len(config.arm.link_length), len(model.roles)
@@ -271,14 +268,14 @@ def sensors(config: IdentifierParameters, model: Model, dt: float, diffusion: Ar
             if not rate[i]:
                 offset[i] = _state(model.motion, Kind.BEND_OFFSET, role.link)
                 delay[i] = _state(model.motion, Kind.BEND_DELAY, 0)
-    nx = diffusion.size
+    nx = model.payload + model.motion.kind.size
     block = max(2, round(0.1 / (model.slowest * dt)))
     return MeasurementModel(H=H, period=dt, rate=rate, gain=gain, offset=offset, delay=delay,
                             omitted=omitted, turn=np.array([turn.real, turn.imag]),
                             reach=torque_reach(model, dt), block=block, kicks_every=max(1, block // 4),
-                            noise_every=max(1, round(0.01 * config.payload.memory_time / dt)), diffusion=diffusion,
-                            noise=np.zeros((nx, nx)), kicks=np.zeros((nx, links)), f=np.zeros(nx),
-                            wide=np.zeros(2 * nx + 1), L=np.zeros((nx, nx)), W=np.zeros((nx, 2 * nx)),
+                            noise_every=max(1, round(0.01 * config.payload.memory_time / dt)),
+                            diffusion=diffusion(config, model), noise=np.zeros((nx, nx)), kicks=np.zeros((nx, links)),
+                            f=np.zeros(nx), wide=np.zeros(2 * nx + 1), L=np.zeros((nx, nx)), W=np.zeros((nx, 2 * nx)),
                             W_kicks=np.zeros((nx, nx + links)))
 
 
@@ -294,13 +291,6 @@ def _state(motion: ProcessModel, kind: Kind, link: int) -> int:
     """Return the index of the state of this kind and link; -1: there is none."""
     found = np.flatnonzero((motion.kind == kind) & (motion.link == link))
     return 2 * motion.arm.stiffness.size + int(found[0]) if found.size else -1
-
-
-def inertias(arm: Manipulator) -> Array:
-    """Inertia (L,) of the straight empty arm beyond each joint, about it [kg m^2]."""
-    links = arm.length.size
-    M = mass_matrix(arm, np.zeros(4), np.zeros(arm.stiffness.size))
-    return np.array([M[i:links, i:links].sum() for i in range(links)])
 
 
 DRIFT_SHARE = 3e-3
@@ -352,9 +342,13 @@ FLOORS = {Quantity.ANGLE: 1e-6, Quantity.ANGLE_RATE: 1e-5, Quantity.BEND: 1e-7, 
 """Least standard deviations of a sensor [rad, rad/s, m, m/s], as no signal is exact."""
 
 
-def priors(config: IdentifierParameters, motion: ProcessModel) -> Array:
-    """Return the prior standard deviation (np,) of each entry of p; of the payload that of an empty arm."""
-    J, L = inertias(motion.arm), np.array(config.arm.link_length)
+def priors(config: IdentifierParameters, motion: ProcessModel, M: Array) -> Array:
+    """Return the prior standard deviation (np,) of each entry of p; of the payload that of an empty arm.
+
+    M: (n, n) mass matrix of the straight empty arm.
+    """
+    L = np.array(config.arm.link_length)
+    J = np.array([M[i:L.size, i:L.size].sum() for i in range(L.size)])  # inertia beyond each joint, about it
     alike = {Kind.MASS: EMPTY_STD * motion.scale, Kind.STIFFNESS: config.payload.stiffness_std,
              Kind.DAMPING: config.payload.damping_std, Kind.TORQUE_GAIN: GAIN_STD, Kind.BEND_GAIN: GAIN_STD,
              Kind.TORQUE_DELAY: LATE_STD, Kind.TORQUE_LAG: LATE_STD, Kind.BEND_DELAY: LATE_STD}
@@ -391,19 +385,23 @@ def body_mean(config: IdentifierParameters, model: Model) -> Array:
     return np.array([mass, 0.0, 0.0, inertia])
 
 
-def _least(arm: Manipulator, mass: float) -> Array:
+def straight(arm: Manipulator) -> Array:
+    """Return the mass matrix (n, n) of the straight empty arm."""
+    return mass_matrix(arm, np.zeros(4), np.zeros(arm.stiffness.size))
+
+
+def _least(arm: Manipulator, M: Array, mass: float) -> Array:
     """Return the least mass and inertia of a payload with which the mass matrix stays positive: half the arm's own."""
-    J = tip_jacobian(arm, np.zeros(4), np.zeros(arm.stiffness.size))[2]
-    turning = 1.0 / float(J @ np.linalg.solve(mass_matrix(arm, np.zeros(4), np.zeros(arm.stiffness.size)), J))
+    J = tip_jacobian(arm, np.zeros(4), np.zeros(len(M)))[2]
+    turning = 1.0 / float(J @ np.linalg.solve(M, J))
     return np.array([-0.5 * mass, -0.5 * turning])
 
 
-def _inertias_at_joints(arm: Manipulator) -> Array:
+def _inertias_at_joints(arm: Manipulator, M: Array) -> Array:
     """Return the inertia (L,) [kg m^2] that a fast torque meets at each joint, 1 / (b' M^-1 b) with b its row.
 
-    With a rotor inertia of minus this the mass matrix is singular.
+    With a rotor inertia of minus this the mass matrix M (n, n) is singular.
     """
-    M = mass_matrix(arm, np.zeros(4), np.zeros(arm.stiffness.size))
     return np.array([1.0 / float(row @ np.linalg.solve(M, row)) for row in arm.joint])
 
 
@@ -461,7 +459,7 @@ def first(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Arr
         std[n - 1], std[2 * n - 1] = CERTAIN, BASE_RATE_STD
     for link, (L, EI, rho) in enumerate(zip(config.arm.link_length, config.arm.bending_stiffness,
                                             config.arm.linear_density, strict=True)):
-        part = modal(config.arm, k, link)
+        part = modal(links, k, link)
         std[part] = BEND_STD * L / np.arange(1, k + 1) ** 2
         # a mode's rate is its bending times its frequency, which grows as j^2
         std[n + part.start:n + part.stop] = BEND_STD * L * (np.pi / L) ** 2 * np.sqrt(EI / rho)
@@ -581,16 +579,16 @@ def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, 
     return columns
 
 
-def diffusion(config: IdentifierParameters, model: Model, m: mem.FilterState) -> Array:
+def diffusion(config: IdentifierParameters, model: Model) -> Array:
     """Return the standard deviation (nx,) that process noise adds in the square root of a second: memory is finite."""
     arm = model.motion.arm
     n, links = arm.stiffness.size, arm.length.size
     T = config.payload.memory_time
-    gained = np.zeros(m.x.size)
+    gained = np.zeros(model.payload + model.motion.kind.size)
     # a rate is then forgotten over T: what it gains in T equals what T seconds of samples tell of it
     gained[n:n + links] = 1e-4 / T
     gained[n + links:2 * n] = 1e-5 / T * np.array(config.arm.link_length).max()
     gained[2 * n:] = DRIFT_SHARE / T * model.motion.prior
     body = body_std(config, model)[:model.body] / PAYLOAD_STD
-    gained[model.payload:model.payload + model.body] = (1e-4 if m.counts[mem.HELD] else 1e-3) / T * body
+    gained[model.payload:model.payload + model.body] = 1e-3 / T * body
     return gained

@@ -13,11 +13,12 @@ import numpy as np
 import scipy
 
 from flexmanip_ros import pipeline
+from flexmanip_ros.arm.manipulator import chords
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.prediction_check import white_noise
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import cramer_rao
-from flexmanip_ros.payload.structured_model import chords, unobservable_reason
+from flexmanip_ros.payload.structured_model import unobservable_reason
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.whole_recording import Smoothed
 from flexmanip_ros.types import QUANTILE, Array, Estimate, EventKind, Mode, Payload, Status

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexmanip_ros.arm.linearization import frequencies, vibration_model
-from flexmanip_ros.control.controller import design, model, observation, reference
+from flexmanip_ros.arm.manipulator import chords
+from flexmanip_ros.control.controller import design, model, observation
 from flexmanip_ros.parameters import ArmParameters, ControllerParameters
 
 BETWEEN = st.floats(-3.0, 3.0)
@@ -40,7 +41,7 @@ def test_a_straight_arm_reads_its_reference_on_the_encoders() -> None:
     made = config(3)
     angles = np.array([0.3, -0.2])
     x = np.zeros(12)
-    x[:2] = reference(made, angles)
+    x[:2] = chords(made.arm, angles)
     assert np.allclose(observation(made) @ x, [0.3, -0.2, 0.0, 0.0])
 
 

@@ -455,7 +455,7 @@ def test_a_rate_is_unknown_in_a_row_that_never_came() -> None:
     state = run(config(), record(0.1))
     rows = log_of(np.zeros((3, 2)), np.zeros((3, 4)), np.zeros((3, 2)), missing=np.array([0, 1, 0]),
                   rates=np.ones((3, 2))).rows(0, 3)
-    table, first = structured.input_table(state._replace(cursor=0, horizon=None, rates=np.full(2, 7.0)), rows)
+    table, first = structured.input_table(state._replace(cursor=0, rates=np.full(2, 7.0)), rows)
     np.testing.assert_equal(table[first:, 3:7], [[7, 7, 1, 1], [1, 1, np.nan, np.nan], [np.nan, np.nan, 1, 1]])
 
 

@@ -69,7 +69,7 @@ class Sums:
 
         added = np.zeros(n)  # what slows the last modes is no part of the arm: it keeps its own momentum and energy
         for i, (rho, length) in enumerate(zip(ARM.linear_density, ARM.link_length, strict=True)):
-            added[modal(ARM, count(ARM), i)] = rho * length * (shape_functions(ARM.modes, True).inertia - 0.5)
+            added[modal(2, count(ARM), i)] = rho * length * (shape_functions(ARM.modes, True).inertia - 0.5)
         velocity, spin = derivative(qd)
         velocity = velocity + drift - mass @ velocity / mass.sum()
         self.linear = mass @ velocity
