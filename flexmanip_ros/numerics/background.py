@@ -17,16 +17,6 @@ class Request(Protocol):
         """Compute the result."""
 
 
-class Background(Protocol):
-    """Where requests are solved."""
-
-    def start(self, request: Request) -> None:
-        """Take note that the result of this request will be wanted."""
-
-    def result(self, request: Request) -> Any:
-        """Return the result of a request, solved now if it has not been solved yet."""
-
-
 class Inline:
     """Solves each request when its result is wanted, on the caller's thread."""
 
@@ -115,6 +105,8 @@ class Deferred(Threads):
         return super().result(request)
 
 
+Background = Inline | Threads
+"""Where requests are solved: ``start`` says that the result of one will be wanted, ``result`` returns it."""
 T = TypeVar('T')
 
 
