@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from flexmanip_ros.arm.linearization import discretize, vibration_model
+from flexmanip_ros.arm.linearization import blocks, discretize, vibration_model
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.identification.uncertainty import modes
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
-from flexmanip_ros.payload.block_extraction import estimate, extract
+from flexmanip_ros.payload.block_extraction import estimate, masses
 from flexmanip_ros.samples.sample_log import log_of
 
 DT, COUNT, MASS = 1e-3, 3000, 20.0
@@ -52,7 +52,7 @@ def derived(arm: ArmParameters, A: np.ndarray, B: np.ndarray) -> np.ndarray:
     poles = np.linalg.eigvals(Ac)
     poles = poles[poles.imag > 0]
     poles = poles[np.argsort(poles.imag)]
-    mass = extract(arm, Ac, Bc, THETA, kappa=1)
+    mass = float(masses(arm, blocks(arm, THETA, kappa=1), Ac, Bc, False))
     return np.array([*(poles.imag / (2 * np.pi)), *(-poles.real / np.abs(poles)), mass])
 
 
@@ -102,7 +102,7 @@ def study(runs: int, snr_db: float, damping: float) -> dict[str, object]:
             inside.append([False] * 5)
             continue
         both = modes(found)
-        held = estimate(config, found, THETA)
+        held = estimate(config, found, THETA, np.empty(0))
         values = [both[0].frequency_hz, both[1].frequency_hz, both[0].damping_ratio, both[1].damping_ratio]
         std = [both[0].frequency_std_hz, both[1].frequency_std_hz,
                both[0].damping_ratio_std, both[1].damping_ratio_std]

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from flexmanip_ros.arm.linearization import discretize, vibration_model
+from flexmanip_ros.arm.linearization import blocks, discretize, vibration_model
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
-from flexmanip_ros.payload.block_extraction import extract
+from flexmanip_ros.payload.block_extraction import masses
 from flexmanip_ros.samples.sample_log import log_of
 
 DT = 1e-3
@@ -68,15 +68,15 @@ def payload_errors(
     state = rpbsid.advance(config, rpbsid.init(config), log.rows(0, capture))
     state = rpbsid.restart(config, state) if config.restart_on_event else state
     state = rpbsid.advance(config, state, log.rows(capture, begin))
-    errors = []
+    errors, empty = [], blocks(config.arm, np.radians(degrees), kappa=1)
     for k in range(begin, len(u), every):
         state = rpbsid.advance(config, state, log.rows(k, min(k + every, len(u))))
         found = rpbsid.identified(config, state, DT)
         try:
             assert found is not None
             Ac, Bc = to_continuous(found.model.A, found.model.B, DT)
-            errors.append(extract(config.arm, Ac, Bc, np.radians(degrees), 1) / payload - 1.0)
-        except ModelError:
+            errors.append(float(masses(config.arm, empty, Ac, Bc, False)) / payload - 1.0)
+        except (ModelError, np.linalg.LinAlgError):
             errors.append(float('nan'))
     return np.array(errors)
 

@@ -69,7 +69,7 @@ def main() -> None:
                 assert model is not None
                 for known, gathered in found.items():
                     config = replace(paper, payload=PayloadParameters(known_coupling=known))
-                    gathered.append(block_extraction.estimate(config, model, THETA))
+                    gathered.append(block_extraction.estimate(config, model, THETA, np.empty(0)))
             for known, gathered in found.items():
                 done[known].append(trials.Trial(payload, tuple(gathered)))
         for known, runs_of in done.items():

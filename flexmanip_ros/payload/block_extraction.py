@@ -109,62 +109,6 @@ def unknown(status: Status, consistency: float = 1.0) -> Payload:
     return Payload(0.0, math.inf, 0.0, math.inf, consistency, status)
 
 
-def payload(
-    identified: Identified, S: Array, rates: tuple[bool, ...], mass_of: Callable[[Array, Array], Array],
-    doubts_of: Callable[[Array, Array, float], list[tuple[float, float]]],
-) -> Payload:
-    """Return the payload; S, rates: what the outputs see; mass_of: payload of modal (Ac, Bc).
-
-    doubts_of: how far below (negative) and above the mass [kg] of modal (Ac, Bc) the payload may be for
-    reasons that are not noise. The interval reaches over them; where one is larger than the noise, the status
-    says INCONSISTENT.
-    """
-    model = identified.model
-    power = identified.innovation_power if math.isfinite(identified.innovation_power) else 1.0
-    if not (np.isfinite(model.A).all() and np.isfinite(model.B).all() and np.isfinite(model.C).all()):
-        return unknown(Status.DIVERGED)
-    try:
-        Ac, Bc = to_continuous(model.A, model.B, model.dt)
-        modal = to_modal(Ac, Bc, model.C, S, rates)
-        mass = float(mass_of(*modal))
-        directions = continuous_spread(identified)
-        around = mass_of(*_modal(Ac, Bc, model.C, [STEP * part for part in directions], S, rates))
-        gradient = (around - mass) / STEP
-        std = float(np.linalg.norm(gradient))
-        normal = draws(directions[0].shape[0])
-        drawn = mass_of(*_modal(
-            Ac, Bc, model.C, [np.tensordot(normal, part, axes=1) for part in directions], S, rates))
-        doubts = doubts_of(*modal, mass) if math.isfinite(mass) else []
-    except (np.linalg.LinAlgError, ModelError):
-        return unknown(Status.ILL_CONDITIONED, power)
-    reach = max((above - below for below, above in doubts), default=0.0)
-    if not all(map(math.isfinite, (mass, std, reach))) or directions[0].shape[0] == 0:
-        return unknown(Status.ILL_CONDITIONED, power)
-    # a fit that is worse than its noise has a wider interval by as much
-    widening = math.sqrt(max(1.0, power - CHANCE * math.sqrt(POWER_RATE / model.C.shape[0])))
-    drawn = np.where(np.isfinite(drawn), drawn, np.inf)
-    # The draws tell how far the interval is from that of first order, against first order on the same draws:
-    # on their own, a few hundred of them are as much as a tenth too wide or too narrow.
-    bent, straight = (np.quantile(masses, [0.025, 0.975], method='nearest')
-                      for masses in (drawn, mass + normal @ gradient))
-    lower = mass - widening * max(QUANTILE * std + float(straight[0] - bent[0]), 0.0)
-    upper = mass + widening * max(QUANTILE * std + float(bent[1] - straight[1]), 0.0)
-    status = identified.status
-    if status is Status.TRACKING and widening * std > abs(mass):
-        status = Status.POORLY_EXCITED
-    if status is Status.TRACKING and reach > upper - lower:
-        status = Status.INCONSISTENT
-    lower += sum(below for below, _ in doubts)
-    upper += sum(above for _, above in doubts)
-    if mass < 0.0:
-        # No payload is negative; an interval cut off at 0 would look the surer the further the model is off.
-        if status is Status.TRACKING:
-            status = Status.INCONSISTENT if upper < 0.0 else Status.POORLY_EXCITED
-        upper = max(upper, widening * QUANTILE * std, -mass if upper < 0.0 else 0.0)
-    std = math.hypot(widening * std, 0.5 * reach)
-    return Payload(max(mass, 0.0), std, max(lower, 0.0), max(upper, 0.0), power, status)
-
-
 def continuous_spread(identified: Identified) -> tuple[Array, Array, Array]:
     """Directions (s, ...) in which Ac, Bc and C vary, one standard deviation each.
 
@@ -204,65 +148,73 @@ def _modal(
     return to_modal(Ac + change[0], Bc + change[1], C + change[2], S, rates)
 
 
-def extract(
-    arm: ArmParameters, Ac: Array, Bc: Array, theta: Array, kappa: int, known_mb: bool = False,
-) -> float:
-    """Return the payload [kg] of a continuous model with the state [eta; eta'].
-
-    Ac: (2 L kappa, 2 L kappa), Bc: (2 L kappa, L), theta: (L,) chord angles [rad]; known_mb: take M_b from the
-    arm instead of from the model. Raises ModelError on other shapes or a singular model.
-    """
-    links = len(arm.link_length)
-    order = 2 * links * kappa
-    if Ac.shape != (order, order) or Bc.shape != (order, links):
-        raise ModelError(
-            f'block extraction got A {Ac.shape} and B {Bc.shape} for kappa = {kappa}',
-            f'give A ({order}, {order}) and B ({order}, {links}): the order must be 2 L kappa')
-    try:
-        mass = float(masses(arm, blocks(arm, theta, kappa=kappa), Ac, Bc, known_mb))
-    except np.linalg.LinAlgError as err:
-        raise ModelError('the identified model has a singular block', 'excite both joints, or lower the order'
-                         ) from err
-    if not np.isfinite(mass):
-        raise ModelError('the identified model gives no finite payload',
-                         'excite both joints, or lower the order')
-    return mass
-
-
-NOWHERE: Array = np.empty(0)
-"""A extend_range of which nothing is known."""
-
-
-def estimate(config: IdentifierParameters, identified: Identified, angles: Array, configuration_range: Array = NOWHERE
+def estimate(config: IdentifierParameters, identified: Identified, angles: Array, configuration_range: Array
              ) -> Payload:
     """Return the payload of an identified model with its 95 % interval; never a NaN.
 
-    angles: (L,) measured, by the arm's convention; configuration_range: from ``extend_range``. The interval is that
-    of models
-    drawn from the covariance of the identified one (``block_interval``), and reaches over what a model of
-    kappa modes at one configuration cannot know: further modes, and with a known M_b how the arm moved.
+    angles: (L,) measured, by the arm's convention; configuration_range: from ``extend_range``, or (0,). The interval is
+    that of models drawn from the covariance of the identified one. It reaches over what a model of kappa modes at one
+    configuration cannot know: further modes, and with a known M_b how the arm moved. Where one of these is larger than
+    the noise, the status says INCONSISTENT.
     """
-    links = len(config.arm.link_length)
-    kappa = identified.model.order // (2 * links)
-    seen = sensor_matrix(config, kappa) if kappa and identified.model.order == 2 * links * kappa else None
+    links, model, known = len(config.arm.link_length), identified.model, config.payload.known_coupling
+    kappa = model.order // (2 * links)
+    seen = sensor_matrix(config, kappa) if kappa and model.order == 2 * links * kappa else None
     if seen is None or angles.shape != (links,) or np.linalg.matrix_rank(seen[0]) < links * kappa:
         return unknown(Status.UNOBSERVABLE)
     theta = working_point(config, angles)
-    known = config.payload.known_coupling
     empty = blocks(config.arm, theta, kappa=kappa)
 
     def mass_of(Ac: Array, Bc: Array) -> Array:
         return masses(config.arm, empty, Ac, Bc, known)
 
-    def doubts_of(Ac: Array, Bc: Array, mass: float) -> list[tuple[float, float]]:
+    power = identified.innovation_power if math.isfinite(identified.innovation_power) else 1.0
+    if not (np.isfinite(model.A).all() and np.isfinite(model.B).all() and np.isfinite(model.C).all()):
+        return unknown(Status.DIVERGED)
+    try:
+        Ac, Bc = to_continuous(model.A, model.B, model.dt)
+        modal = to_modal(Ac, Bc, model.C, *seen)
+        mass = float(mass_of(*modal))
+        directions = continuous_spread(identified)
+        around = mass_of(*_modal(Ac, Bc, model.C, [STEP * part for part in directions], *seen))
+        gradient = (around - mass) / STEP
+        std = float(np.linalg.norm(gradient))
+        normal = draws(directions[0].shape[0])
+        drawn = mass_of(*_modal(Ac, Bc, model.C, [np.tensordot(normal, part, axes=1) for part in directions], *seen))
         excess = _excess(config, theta, kappa, mass_of, mass)
         moved = [0.0]
         for turn in np.arccos(configuration_range):  # the blocks depend on the angle between the links alone
             there = blocks(config.arm, np.array([0.0, turn]), kappa=kappa)
-            moved.append(float(masses(config.arm, there, Ac, Bc, known)) - mass)
-        return [(min(0.0, -2.0 * excess), max(0.0, -2.0 * excess)), (min(moved), max(moved))]
-
-    return payload(identified, *seen, mass_of, doubts_of)
+            moved.append(float(masses(config.arm, there, *modal, known)) - mass)
+    except (np.linalg.LinAlgError, ModelError):
+        return unknown(Status.ILL_CONDITIONED, power)
+    doubts = [(min(0.0, -2.0 * excess), max(0.0, -2.0 * excess)), (min(moved), max(moved))]
+    reach = max(above - below for below, above in doubts)
+    if not all(map(math.isfinite, (mass, std, reach))) or directions[0].shape[0] == 0:
+        return unknown(Status.ILL_CONDITIONED, power)
+    # a fit that is worse than its noise has a wider interval by as much
+    widening = math.sqrt(max(1.0, power - CHANCE * math.sqrt(POWER_RATE / model.C.shape[0])))
+    drawn = np.where(np.isfinite(drawn), drawn, np.inf)
+    # The draws tell how far the interval is from that of first order, against first order on the same draws:
+    # on their own, a few hundred of them are as much as a tenth too wide or too narrow.
+    bent, straight = (np.quantile(masses, [0.025, 0.975], method='nearest')
+                      for masses in (drawn, mass + normal @ gradient))
+    lower = mass - widening * max(QUANTILE * std + float(straight[0] - bent[0]), 0.0)
+    upper = mass + widening * max(QUANTILE * std + float(bent[1] - straight[1]), 0.0)
+    status = identified.status
+    if status is Status.TRACKING and widening * std > abs(mass):
+        status = Status.POORLY_EXCITED
+    if status is Status.TRACKING and reach > upper - lower:
+        status = Status.INCONSISTENT
+    lower += sum(below for below, _ in doubts)
+    upper += sum(above for _, above in doubts)
+    if mass < 0.0:
+        # No payload is negative; an interval cut off at 0 would look the surer the further the model is off.
+        if status is Status.TRACKING:
+            status = Status.INCONSISTENT if upper < 0.0 else Status.POORLY_EXCITED
+        upper = max(upper, widening * QUANTILE * std, -mass if upper < 0.0 else 0.0)
+    std = math.hypot(widening * std, 0.5 * reach)
+    return Payload(max(mass, 0.0), std, max(lower, 0.0), max(upper, 0.0), power, status)
 
 
 def extend_range(config: IdentifierParameters, before: Array, rows: Rows) -> Array:

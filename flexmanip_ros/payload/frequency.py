@@ -12,7 +12,7 @@ import numpy as np
 
 from flexmanip_ros.arm.linearization import blocks
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
-from flexmanip_ros.payload.block_extraction import NOWHERE, unknown, working_point
+from flexmanip_ros.payload.block_extraction import unknown, working_point
 from flexmanip_ros.types import Array, Mode, Payload, Status
 
 GRID = 400
@@ -37,8 +37,7 @@ def frequencies(arm: ArmParameters, theta: Array, payloads: Array, count: int) -
     return np.asarray(1.0 / np.sqrt(periods[:, :count]) / (2 * np.pi))
 
 
-def estimate(config: IdentifierParameters, modes: Sequence[Mode], angles: Array, configuration_range: Array = NOWHERE
-             ) -> Payload:
+def estimate(config: IdentifierParameters, modes: Sequence[Mode], angles: Array, configuration_range: Array) -> Payload:
     """Return the payload that fits the lowest two identified modes; never a NaN.
 
     angles: (L,) as measured [rad]; configuration_range: (2,) or (0,) smallest and largest cosine between the links
@@ -52,7 +51,7 @@ def estimate(config: IdentifierParameters, modes: Sequence[Mode], angles: Array,
     if not usable:
         return unknown(Status.WARMING_UP)
     found = _at(config.arm, working_point(config, angles), usable)
-    for turn in np.arccos(np.clip(configuration_range, -1.0, 1.0)):  # frequencies depend on the angle between the links
+    for turn in np.arccos(configuration_range):  # frequencies depend on the angle between the links
         other = _at(config.arm, np.array([0.0, turn]), usable)
         found = found._replace(lower=min(found.lower, other.lower), upper=max(found.upper, other.upper))
     return found

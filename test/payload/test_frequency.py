@@ -21,6 +21,7 @@ from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, Mode, Status
 
 ARM = ArmParameters(angle_convention='chord')
 ANGLES = np.radians([60.0, 45.0])
+NOWHERE = np.empty(0)  # the arm has not moved
 
 
 def modes(payload, std=1e-3, shift=(0.0, 0.0), arm=ARM):
@@ -30,7 +31,7 @@ def modes(payload, std=1e-3, shift=(0.0, 0.0), arm=ARM):
 
 @pytest.mark.parametrize('payload', [0.0, 2.0, 20.0, 100.0])
 def test_exact_frequencies_give_the_payload(payload):
-    found = frequency.estimate(config(ARM), modes(payload), ANGLES)
+    found = frequency.estimate(config(ARM), modes(payload), ANGLES, NOWHERE)
     assert found.mass == pytest.approx(payload, abs=2e-3 * (payload + 15.0))
     assert found.lower <= payload <= found.upper
     assert found.status is Status.TRACKING
@@ -40,26 +41,26 @@ def test_the_interval_covers_ninety_five_per_cent():
     rng = np.random.default_rng(1)
     inside = 0
     for _ in range(200):
-        found = frequency.estimate(config(ARM), modes(20.0, 2e-3, 2e-3 * rng.normal(size=2)), ANGLES)
+        found = frequency.estimate(config(ARM), modes(20.0, 2e-3, 2e-3 * rng.normal(size=2)), ANGLES, NOWHERE)
         inside += found.lower <= 20.0 <= found.upper
     assert 0.90 <= inside / 200 <= 1.0
 
 
 def test_a_vague_frequency_leaves_the_upper_end_open():
-    found = frequency.estimate(config(ARM), modes(200.0, 0.3), ANGLES)
+    found = frequency.estimate(config(ARM), modes(200.0, 0.3), ANGLES, NOWHERE)
     assert found.upper == np.inf
 
 
 
 def test_frequencies_of_another_arm_are_found_out():
-    found = frequency.estimate(config(ARM), modes(20.0, 1e-3, (0.0, 0.3)), ANGLES)
+    found = frequency.estimate(config(ARM), modes(20.0, 1e-3, (0.0, 0.3)), ANGLES, NOWHERE)
     assert found.status is Status.INCONSISTENT
 
 
 def test_no_modes_or_angles_give_a_status():
-    assert frequency.estimate(config(ARM), (), ANGLES).status is Status.WARMING_UP
-    assert frequency.estimate(config(ARM), modes(20.0), np.empty(0)).status is Status.UNOBSERVABLE
-    assert frequency.estimate(config(ARM), (Mode(5.0, 0.01),), ANGLES).status is Status.WARMING_UP
+    assert frequency.estimate(config(ARM), (), ANGLES, NOWHERE).status is Status.WARMING_UP
+    assert frequency.estimate(config(ARM), modes(20.0), np.empty(0), NOWHERE).status is Status.UNOBSERVABLE
+    assert frequency.estimate(config(ARM), (Mode(5.0, 0.01),), ANGLES, NOWHERE).status is Status.WARMING_UP
 
 
 def identified(payload: float, seed: int, model: str, **values: object) -> list[Estimate]:
