@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from parts import payload_trials as trials
+from parts.all_bounds import everything
 
 from flexmanip_ros.arm.capture import body_jacobian, tip_angle, tip_jacobian
 from flexmanip_ros.arm.linearization import mass_matrix
@@ -28,7 +29,7 @@ from flexmanip_ros.parameters import (
     PayloadParameters,
     PlantParameters,
 )
-from flexmanip_ros.payload import cramer_rao, structured
+from flexmanip_ros.payload import structured
 from flexmanip_ros.payload.arm_parameters import taught
 from flexmanip_ros.payload.process_model import set_parameters
 from flexmanip_ros.simulation import excitation, sensors, simulator
@@ -105,7 +106,7 @@ def main() -> None:
     quiet = simulator.simulate(replace(PLANT, noise='none'), efforts, (EVENT,))
     noise = sensors.std_for_snr(quiet.position, quiet.velocity, 40.0)
     counts = (0, CAPTURE, SPIN, END)
-    bounds = cramer_rao.everything(config, PLANT, efforts, CAPTURE, noise[[2, 3, 6, 7, 0, 1]], counts)
+    bounds = everything(config, PLANT, efforts, CAPTURE, noise[[2, 3, 6, 7, 0, 1]], counts)
     done = [run(seed, noise) for seed in range(runs)]
     tracking = [found for found, good in done if good]
     rows: list[dict[str, Any]] = []

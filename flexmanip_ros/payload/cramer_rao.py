@@ -1,29 +1,25 @@
 """Cramer-Rao bounds: the least standard deviation any unbiased payload estimate can have from given signals.
 
-Four kinds of knowledge. ``structure_known``: the linear vibration model at a working point is known but for the
+Three kinds of knowledge. ``structure_known``: the linear vibration model at a working point is known but for the
 payload and the first state. ``structure_unknown``: nothing of (A, B) and the first state is known; the payload is read
 from them by the block extraction, so the bound belongs to that formula (name it wherever it is quoted).
-``nonlinear``: the moving arm, its stiffness, damping and rates as uncertain as the parameters say.
-``everything``: the same from before the capture on, and bounds of all that is unknown of arm and object.
+``nonlinear``: the moving arm, its stiffness, damping and rates as uncertain as the parameters say. Bounds of all that
+is unknown of arm and object, from before the capture on, are in benchmarks/parts/all_bounds.py.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from flexmanip_ros.arm.capture import Body, body_jacobian, free_object, rates_after, tip_angle, tip_jacobian
-from flexmanip_ros.arm.linearization import blocks, discretize, mass_matrix, momentum, vibration_model
+from flexmanip_ros.arm.linearization import blocks, discretize, vibration_model
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.realization import to_continuous
-from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, PlantParameters
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import structured_model
-from flexmanip_ros.payload.arm_parameters import NAMES
 from flexmanip_ros.payload.block_extraction import masses
 from flexmanip_ros.payload.filter_state import FilterState, memory
-from flexmanip_ros.payload.interval import about_com
 from flexmanip_ros.payload.measurement_update import observe
-from flexmanip_ros.payload.process_model import Kind, predict, set_parameters, spread_scratch
+from flexmanip_ros.payload.process_model import predict
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.types import Array
 
@@ -95,60 +91,19 @@ def nonlinear(
     among the outputs. The first state is as open as the estimator holds it, stiffness and damping as
     ``config.payload`` says. Raises ModelError where the configured signals cannot give a payload.
     """
-    model, m = _start(config, theta)
+    model, m = start(config, theta)
     n, p = model.motion.arm.stiffness.size, model.payload
     m.x[n:n + len(theta)] = 0.0 if rates is None else rates
     m.x[p] = payload
     m.S[p:p + model.body, p:p + model.body] = np.diag(10.0 * structured_model.body_std(config, model)[:model.body])
     found = []
-    for k, information in _gathered(config, model, m.x, m.S, efforts[:max(counts)], noise_std, dt):
+    for k, information in gathered(config, model, m.x, m.S, efforts[:max(counts)], noise_std, dt):
         if k in counts:
-            found.append(_posterior(information, m.S[p]))
+            found.append(posterior(information, m.S[p]))
     return np.array(found)
 
 
-def everything(
-    config: IdentifierParameters, plant: PlantParameters, efforts: Array, capture: int, noise_std: Array,
-    counts: Sequence[int],
-) -> dict[str, Array]:
-    """Return a bound after each of ``counts`` samples of all that is unknown, by name, in SI units.
-
-    First what ``payload.learn`` names, as ``arm_parameters.taught`` names it, then payload_mass, payload_com_x,
-    payload_com_y, payload_inertia (about the centre of mass), and object_spin before the capture. The arm of
-    ``plant`` begins at rest and takes the plant's object before sample ``capture``, momentum conserved. What is
-    unknown has the estimator's priors (posterior Cramer-Rao bound, Van Trees). efforts: (N, L) reported; noise_std
-    as for ``nonlinear``. Raises ModelError where the configured signals cannot give a payload.
-    """
-    config = replace(config, arm=plant.arm)
-    model, m = _start(config, np.array(plant.initial_angles))
-    n, size = model.motion.arm.stiffness.size, m.x.size
-    body, caught = slice(model.payload, model.payload + model.body), free_object(plant)
-    model = model._replace(motion=model.motion._replace(scratch=spread_scratch(n, size - 2 * n, size + 3)))
-    x, w = m.x, np.array([*caught.velocity, caught.spin])
-    # rows of S: the state; rows of V: velocity and spin of the object, unknown too; columns: independent unknowns
-    S, V = np.zeros((size, size + 3)), np.zeros((3, size + 3))
-    S[:, :size] = m.S
-    S[body] = 0.0
-    V[:, size:] = np.diag([config.payload.capture_speed, config.payload.capture_speed, structured_model.SPIN])
-    quantities, found = _quantities(config, model, x, caught.payload), []
-    for k, information in _gathered(config, model, x, S, efforts[:max(counts)], noise_std, 1.0 / plant.rate):
-        if k in counts:
-            found.append([_posterior(information, g @ np.vstack([S, V])) for g in quantities.values()])
-        if k == capture:
-            x[body] = caught.payload[:model.body]
-            S[body, body] = np.diag(structured_model.body_std(config, model)[:model.body])
-            ahead, behind = (np.array([_caught(model, x + e * S[:, c], w + e * V[:, c]) for c in range(size + 3)])
-                             for e in (DIFFERENCE, -DIFFERENCE))
-            x[n:2 * n] = _caught(model, x, w)
-            S[n:2 * n] = (ahead - behind).T / (2.0 * DIFFERENCE)
-    return dict(zip(quantities, np.array(found).T, strict=True))
-
-
-DIFFERENCE = 1e-4
-"""Step of a difference, in prior standard deviations."""
-
-
-def _start(config: IdentifierParameters, theta: Array) -> tuple[Model, FilterState]:
+def start(config: IdentifierParameters, theta: Array) -> tuple[Model, FilterState]:
     """Return the model and the estimator's first state, at rest at chords theta (L,)."""
     model = build(config)
     if model is None:
@@ -161,7 +116,7 @@ def _start(config: IdentifierParameters, theta: Array) -> tuple[Model, FilterSta
     return model, m
 
 
-def _gathered(
+def gathered(
     config: IdentifierParameters, model: Model, x: Array, S: Array, efforts: Array, noise_std: Array, dt: float,
 ) -> Iterator[tuple[int, Array]]:
     """Yield k and the information (c, c) of the first k samples on the unknowns, 0 <= k <= N.
@@ -189,41 +144,9 @@ def _gathered(
     yield len(efforts), information
 
 
-def _posterior(information: Array, row: Array) -> float:
+def posterior(information: Array, row: Array) -> float:
     """Return the least deviation of what is ``row`` (c,) times unknowns of unit prior deviation."""
     return float(np.sqrt(row @ np.linalg.solve(np.eye(len(row)) + information, row)))
-
-
-def _caught(model: Model, x: Array, w: Array) -> Array:
-    """Return the rates (n,) just after the empty arm has caught the body in x (nx,), of velocity and spin w (3,)."""
-    motion = model.motion
-    n, empty = motion.arm.stiffness.size, np.zeros(4)
-    q, qd = x[:n], x[n:2 * n]
-    m, *rest = x[model.payload:model.payload + model.body]
-    hx, hy, about_tip = rest or (0.0, 0.0, 0.0)
-    body = Body(m, about_tip - (hx * hx + hy * hy) / m, (hx / m, hy / m), (w[0], w[1]), w[2])
-    set_parameters(motion, x)
-    mass = momentum(motion.arm, empty, q)[1] if motion.arm.floating else np.inf
-    J = body_jacobian(tip_jacobian(motion.arm, empty, q), tip_angle(motion.arm, q), body.com)
-    return rates_after(mass_matrix(motion.arm, empty, q), J, qd, body, mass)
-
-
-def _quantities(config: IdentifierParameters, model: Model, x: Array, body: Array) -> dict[str, Array]:
-    """Return the gradient (nx + 3,), by state and object velocity, of each quantity with a bound, by name."""
-    motion, first = model.motion, 2 * model.motion.arm.stiffness.size
-    unit, found = np.eye(x.size + 3), {}
-    for c, (kind, link) in enumerate(zip(map(Kind, motion.kind), motion.link.tolist(), strict=True)):
-        if kind in NAMES and model.motion.prior[c]:
-            scale = {Kind.STIFFNESS: config.arm.bending_stiffness, Kind.TORQUE_GAIN: config.arm.torque_gain,
-                     Kind.BEND_GAIN: config.arm.bend_gain}.get(kind, (1.0, 1.0))[link]
-            found[NAMES[kind].format(link + 1)] = scale * unit[first + c]
-    rows = unit[first:first + model.body]
-    if model.body > 1:
-        rows = about_com(body) @ rows
-    names = ('payload_mass', 'payload_com_x', 'payload_com_y', 'payload_inertia')
-    found.update(zip(names[:model.body], rows, strict=True))
-    found['object_spin'] = unit[-1]
-    return found
 
 
 def _kappa(states: Array, efforts: Array, noise_std: Array, counts: Sequence[int]) -> int:

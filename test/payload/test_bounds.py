@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +17,10 @@ from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, Payloa
 from flexmanip_ros.payload import cramer_rao, structured_model
 from flexmanip_ros.payload.filter_state import memory
 from flexmanip_ros.simulation import excitation, sensors, simulator
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks'))
+
+from parts.all_bounds import everything
 
 PAPER = ArmParameters(torque_convention='paper', angle_convention='chord', modes=1)
 THETA = np.radians([60.0, 45.0])
@@ -101,7 +107,7 @@ def test_bounds_of_arm_body_and_spin_are_those_of_differences_of_the_simulated_a
     """
     torque = 10.0 * excitation.sequence(ExcitationParameters(), COUNT)
     settings = config(ARM, payload=PayloadParameters(learn=LEARN))
-    found = cramer_rao.everything(settings, PLANT, torque, CAPTURE, NOISE, (COUNT,))
+    found = everything(settings, PLANT, torque, CAPTURE, NOISE, (COUNT,))
     model = structured_model.build(settings)
     first = memory(2 * model.motion.arm.stiffness.size + model.motion.kind.size, len(model.roles), 2)
     structured_model.first(settings, model, first, np.zeros(len(model.roles)))
