@@ -514,6 +514,14 @@ def triangular(S: Array) -> Array:
     return root
 
 
+def _mass(motion: ProcessModel, q: Array) -> Array:
+    """Return the mass matrix (n, n) at q, with what ``set_parameters`` wrote last; of a linear plant see ``freeze``."""
+    if not motion.frozen:
+        return mass_matrix(motion.arm, motion.payload, q)
+    rotors: Array = motion.arm.rotary - motion.rotary
+    return motion.M0 + np.tensordot(motion.payload, motion.Mp, 1) + rotors
+
+
 def jump(config: IdentifierParameters, model: Model, m: mem.FilterState, instant_std: float) -> Array:
     """Return columns (nx, c) by which an event widens the rates: an impulse at the tip (force, moment), and the rest.
 
@@ -526,11 +534,9 @@ def jump(config: IdentifierParameters, model: Model, m: mem.FilterState, instant
     n, links = motion.arm.stiffness.size, motion.arm.length.size
     set_parameters(motion, m.x)
     q = m.x[:n]
+    M = _mass(motion, q)
     if motion.frozen:
-        M = motion.M0 + np.tensordot(motion.payload, motion.Mp, 1)
         q = np.concatenate([q[:links], np.zeros(n - links)])
-    else:
-        M = mass_matrix(motion.arm, motion.payload, q)
     J = tip_jacobian(motion.arm, motion.payload, q)
     if model.body == 1:
         J = J[:2]
@@ -561,9 +567,7 @@ def unknown_torque(model: Model, m: mem.FilterState, change: Array, count: int, 
     predict(motion, m.x, m.S, 0, np.zeros((1, 1 + change.size)), dt, 0.0)
     flow = np.zeros((2 * n + change.size, 2 * n + change.size))
     flow[:n, n:2 * n], flow[n:2 * n, :2 * n] = np.eye(n), motion.F
-    M = motion.M0 + np.tensordot(motion.payload, motion.Mp, 1) if motion.frozen \
-        else mass_matrix(motion.arm, motion.payload, m.x[:n])
-    flow[n:2 * n, 2 * n:] = np.linalg.solve(M, motion.arm.torque * (motion.gain * change))
+    flow[n:2 * n, 2 * n:] = np.linalg.solve(_mass(motion, m.x[:n]), motion.arm.torque * (motion.gain * change))
     step = scipy.linalg.expm(flow * dt)
     p = np.arange(1, count + 1) / (count + 1)
     power, shape = np.linalg.eigh(np.minimum.outer(p, p) - np.outer(p, p))

@@ -219,6 +219,22 @@ def test_modes_that_the_model_has_a_little_wrong_do_not_move_the_payload(
     assert found.status is Status.TRACKING
 
 
+def test_at_its_working_point_a_linear_plant_with_learned_rotors_jumps_as_the_moving_arm_does():
+    """By an impulse at the tip, and by a torque that changed at an unknown time."""
+    found = []
+    for dynamics in ('linear', 'nonlinear'):
+        settings = config(payload=PayloadParameters(dynamics=dynamics, learn=('rotor_inertia',)))
+        model = structured_model.build(settings)
+        m = mem.memory(model.payload + model.motion.kind.size, len(model.roles), 2)
+        structured_model.first(settings, model, m, np.zeros(len(model.roles)))
+        structured_model.freeze(settings, model, np.zeros(2))
+        m.x[model.payload:][model.motion.kind == Kind.ROTOR] = 0.3
+        found.append([structured_model.jump(settings, model, m, 0.0),
+                      structured_model.unknown_torque(model, m, np.ones(2), 3, 1e-3)])
+    for linear, moving in zip(*found, strict=True):
+        np.testing.assert_allclose(linear, moving, rtol=1e-6, atol=1e-9 * np.abs(moving).max())
+
+
 OTHER_ARM = {'link_length': (2.0, 1.5), 'linear_density': (3.0, 2.0), 'bending_stiffness': (1500.0, 600.0),
              'joint_mass': 5.0, 'tip_mass': 3.0}
 
