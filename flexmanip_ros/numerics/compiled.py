@@ -163,7 +163,7 @@ CONSTANT = re.compile(r'\b[A-Z][A-Z_]+\b')
 
 
 def drop_stale(package: Path) -> int:
-    """Delete cached functions that are older than the newest source of any compiled function; return how many.
+    """Delete cached functions that are older than the newest file that one of them may depend on; return how many.
 
     numba checks the file of a function alone, not those of the functions it calls or of the constants it reads. After
     an update one kernel in two would be outdated, and its numbers wrong. Raises OSError where the folder is
