@@ -181,10 +181,14 @@ def drop_stale(package: Path) -> int:
 
 
 def _sources(package: Path) -> set[Path]:
-    """Return the files of compiled functions, those of which they import constants, and this one."""
+    """Return the files of compiled functions, those that they import whole or constants of, and this one."""
     texts = {path: path.read_text(encoding='utf-8') for path in package.rglob('*.py')}
     found = {path: text for path, text in texts.items() if COMPILED.search(text)}
-    imported = (module for text in found.values() for module, names in IMPORT.findall(text) if CONSTANT.search(names))
+    imported = set[str]()
+    for text in found.values():
+        for module, names in IMPORT.findall(text):
+            imported |= {f'{module}.{name}' for name in re.findall(r'\w+', names)}
+            imported |= {module} if CONSTANT.search(names) else set()
     modules = {package.parent / f'{module.replace(".", "/")}.py' for module in imported}
     return found.keys() | (modules & texts.keys()) | {Path(__file__)}
 

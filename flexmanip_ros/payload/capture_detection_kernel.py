@@ -14,21 +14,7 @@ from numpy.typing import NDArray
 from flexmanip_ros.arm.equations_of_motion import solve
 from flexmanip_ros.numerics.compiled import inner, kernel, separate
 from flexmanip_ros.numerics.square_root import factor_information, forward
-from flexmanip_ros.payload.filter_state import (
-    AGAIN,
-    BEFORE,
-    BEGINS_TO_MOVE,
-    EFFECTIVE,
-    HORIZON,
-    IN_BATCH,
-    REJECTED,
-    RESTING,
-    RESTS,
-    SLIDES,
-    STORED,
-    USED,
-    FilterState,
-)
+from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.gauss_newton import UNFIT
 from flexmanip_ros.payload.measurement_update import MeasurementModel
 from flexmanip_ros.payload.moving_horizon import slide_length, take, tells
@@ -130,7 +116,7 @@ def transition(motion: ProcessModel, flow: Array, state: Array, dt: float) -> No
 
 
 @separate
-def traces(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr: GlrState, prior: Array, dt: float
+def traces(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, glr: GlrState, prior: Array, dt: float
            ) -> None:
     """Compute the traces of an onset from the linearization; prior: (3, 3) deviations by order and component."""
     n, links, k = motion.arm.stiffness.size, motion.arm.length.size, motion.arm.kappa
@@ -196,14 +182,14 @@ def rescore(glr: GlrState) -> None:
 
 
 @inner
-def information(m: FilterState, glr: GlrState) -> None:
+def information(m: mem.FilterState, glr: GlrState) -> None:
     """Factor the information of every lag."""
     for lag in range(glr.trace.shape[0]):
         for a in range(TESTED):
             for b in range(a + 1):
                 value = 0.0
                 for i in range(glr.trace.shape[1]):
-                    value += glr.trace[lag, i, a] * glr.trace[lag, i, b] / m.noise[i, EFFECTIVE]
+                    value += glr.trace[lag, i, a] * glr.trace[lag, i, b] / m.noise[i, mem.EFFECTIVE]
                 glr.factors[lag, a, b] = value
     # sums over the lags, then factors: the sums would be lost if each were factored at once
     for lag in range(1, glr.trace.shape[0]):
@@ -218,7 +204,7 @@ def information(m: FilterState, glr: GlrState) -> None:
 
 
 @inner
-def update_glr(m: FilterState, glr: GlrState, scratch: Array) -> None:
+def update_glr(m: mem.FilterState, glr: GlrState, scratch: Array) -> None:
     """Take the latest innovations into the score of every onset, and find the largest statistic."""
     w = glr.trace.shape[0]
     clock = glr.clock
@@ -227,7 +213,7 @@ def update_glr(m: FilterState, glr: GlrState, scratch: Array) -> None:
     for a in range(TESTED):
         glr.scores[clock[NEWEST], a] = 0.0
     for i in range(glr.trace.shape[1]):
-        variance = max(m.innovation[i, 1], m.noise[i, EFFECTIVE])
+        variance = max(m.innovation[i, 1], m.noise[i, mem.EFFECTIVE])
         most = 5.0 * np.sqrt(variance)
         glr.past[clock[NEWEST], i] = min(max(m.innovation[i, 0], -most), most) / variance
         glr.innovations[clock[NEWEST], i] = m.innovation[i, 0]
@@ -278,7 +264,7 @@ def remember(glr: GlrState, fade: float) -> None:
 
 
 @inner
-def slides_or_begins(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
+def slides_or_begins(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) -> bool:
     """Whether the horizon of an arm at rest is to slide, or to open.
 
     It opens where the samples tell of the payload, or do not fit an arm at rest.
@@ -287,12 +273,12 @@ def slides_or_begins(motion: ProcessModel, sensors: MeasurementModel, m: FilterS
     for i in range(m.power.size):
         begins |= m.power[i] > UNFIT
     if begins:
-        m.counts[RESTS] = BEGINS_TO_MOVE
+        m.counts[mem.RESTS] = mem.BEGINS_TO_MOVE
         return True
-    m.counts[IN_BATCH] += 1
-    if m.counts[IN_BATCH] < slide_length(sensors):
+    m.counts[mem.IN_BATCH] += 1
+    if m.counts[mem.IN_BATCH] < slide_length(sensors):
         return False
-    m.counts[RESTS] = SLIDES
+    m.counts[mem.RESTS] = mem.SLIDES
     return True
 
 
@@ -308,16 +294,16 @@ def torques_begin(glr: GlrState) -> bool:
 
 
 @inner
-def settled(m: FilterState) -> bool:
+def settled(m: mem.FilterState) -> bool:
     """Whether the filter has taken over a moving-horizon estimation that fits most samples since the last event."""
-    rows = m.counts[STORED]
-    return bool(rows >= HORIZON or (m.counts[AGAIN] == 0 and m.counts[REJECTED] == 0
-                                    and 2 * m.counts[BEFORE] > rows))
+    rows = m.counts[mem.STORED]
+    return bool(rows >= mem.HORIZON or (m.counts[mem.AGAIN] == 0 and m.counts[mem.REJECTED] == 0
+                                    and 2 * m.counts[mem.BEFORE] > rows))
 
 
 @kernel
 def advance(
-    motion: ProcessModel, sensors: MeasurementModel, m: FilterState, glr: GlrState, prior: Array, dt: float,
+    motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, glr: GlrState, prior: Array, dt: float,
     fade: float, hold: int, confirm: int, table: Array, first: int, scratch: Array, watching: bool,
 ) -> int:
     """Run the filter, and if watching the test, over the rows of the table from ``first`` on; return the next row.
@@ -331,7 +317,7 @@ def advance(
     for k in range(first, table.shape[0]):
         if not take(motion, sensors, m, table, k):
             return -k - 1
-        rests = m.counts[RESTS] == RESTING
+        rests = m.counts[mem.RESTS] == mem.RESTING
         if not watching:
             if rests and slides_or_begins(motion, sensors, m):
                 return -k - 1
@@ -341,7 +327,7 @@ def advance(
         if clock[SINCE_TRACES] == 0:
             # linearizes there; literal numbers would compile it once more
             rows = table[k + 1 - sensors.reach:k + 1]
-            predict(motion, m.x, m.S, m.counts[USED], rows, sensors.period, 0.0)
+            predict(motion, m.x, m.S, m.counts[mem.USED], rows, sensors.period, 0.0)
             traces(motion, sensors, m, glr, prior, dt)
         clock[SINCE_TRACES] = (clock[SINCE_TRACES] + 1) % REFRESH
         update_glr(m, glr, scratch)
@@ -355,9 +341,9 @@ def advance(
             if clock[QUIET] > hold:
                 clock[ALARMED] = glr.level[STATISTIC] > limit(glr)
                 if clock[ALARMED] > 0 and rests and torques_begin(glr):
-                    m.counts[RESTS] = BEGINS_TO_MOVE
+                    m.counts[mem.RESTS] = mem.BEGINS_TO_MOVE
                     return -k - 1
-            elif m.counts[STORED] < HORIZON and glr.level[STATISTIC] > glr.level[THRESHOLD]:
+            elif m.counts[mem.STORED] < mem.HORIZON and glr.level[STATISTIC] > glr.level[THRESHOLD]:
                 # the model is still wrong and will be another one: wait again, without what it missed
                 clock[QUIET] = glr.trace.shape[0]
                 glr.level[PEAK] = 0.0
@@ -378,7 +364,7 @@ UNWATCHED = GlrState(
 """Stands for a test that is not run."""
 
 
-def filtered(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array, first: int) -> int:
+def filtered(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, table: Array, first: int) -> int:
     """Run the filter alone, see ``advance``; return the row after the last one taken, less than N where it failed."""
     none = np.zeros(0)
     taken = advance(motion, sensors, m, UNWATCHED, np.zeros((0, 0)), 0.0, 0.0, 0, 0, table, first, none, False)

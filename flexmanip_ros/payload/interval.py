@@ -9,22 +9,8 @@ from flexmanip_ros.numerics.compiled import kernel
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured_model
-from flexmanip_ros.payload.filter_state import (
-    BLOCKS,
-    DOUBT,
-    EFFECTIVE,
-    HORIZON,
-    LEVEL,
-    MOVED,
-    MOVES,
-    REFITS,
-    SEEN,
-    SHIFT,
-    STORED,
-)
-from flexmanip_ros.payload.gauss_newton import FITS
+from flexmanip_ros.payload.gauss_newton import FITS, MOST_BIAS
 from flexmanip_ros.payload.measurement_update import OVERLAP, MeasurementModel, misfit, white_variance
-from flexmanip_ros.payload.moving_horizon import MOST_BIAS
 from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.payload.structured_model import Model
 from flexmanip_ros.types import QUANTILE, Array, Payload, Status
@@ -64,16 +50,16 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     state = model.payload
     held = bool(m.counts[mem.HELD])
     consistency, share = innovation_power(sensors, m)
-    fitting = held and m.counts[STORED] < HORIZON
+    fitting = held and m.counts[mem.STORED] < mem.HORIZON
     g = moves(m)
     if fitting:  # the next step may be as long as the last one
-        g = max(g, 1.0 + float(m.score[SHIFT]) ** 2)
+        g = max(g, 1.0 + float(m.score[mem.SHIFT]) ** 2)
     restless = math.sqrt(g * max(1.0, consistency / POWER_LIMIT))
     widening = max(restless, abs(float(m.score[mem.EMPTY_ARM_BIAS])) / FREE_BIAS)
     status = Status.TRACKING
     if consistency > POWER_LIMIT or restless > WIDENING_LIMIT or abs(m.score[mem.EXCESS_BIAS]) > MOST_BIAS:
         status = Status.INCONSISTENT
-    failed = bool(m.counts[REFITS]) and status is Status.INCONSISTENT  # a fit before it fitted no better
+    failed = bool(m.counts[mem.REFITS]) and status is Status.INCONSISTENT  # a fit before it fitted no better
     too_few = m.counts[mem.SINCE_EVENT] < FEW or (status is Status.INCONSISTENT and is_fitted_to_few(m))
     if (too_few and not failed) or (fitting and status is Status.TRACKING and is_behind(m)):
         status = Status.WARMING_UP
@@ -93,7 +79,7 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     moved = by_rotors(model, m)
     spread += moved @ moved.T
     spread[0, 0] += (friction_error(model, m, peak) * (max(float(body[0]), 0.0) + model.motion.scale)) ** 2
-    if consistency > (POWER_LIMIT if m.counts[REFITS] else UNKNOWN_POWER):
+    if consistency > (POWER_LIMIT if m.counts[mem.REFITS] else UNKNOWN_POWER):
         return Payload(max(float(body[0]), 0.0), math.inf, 0.0, math.inf, consistency, status)
     known_point = model.body > 1 and not spread[1:, 1:].any()
     if model.body > 1 and not known_point:
@@ -102,7 +88,7 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     mass, std = max(float(body[0]), 0.0), math.sqrt(spread[0, 0])
     # a linearization is too sure of a payload that is hardly excited, or was not known where it was made
     least = 0.0 if fitting else structured_model.EMPTY_STD * model.motion.scale  # a gripper may close on nothing
-    if std > UNKNOWN_STD * max(mass, least) or (fitting and m.score[DOUBT] > UNKNOWN_STD):
+    if std > UNKNOWN_STD * max(mass, least) or (fitting and m.score[mem.DOUBT] > UNKNOWN_STD):
         std = max(std, prior)
         status = Status.POORLY_EXCITED if status is Status.TRACKING else status
     found = Payload(mass, std, max(0.0, mass - QUANTILE * std), mass + QUANTILE * std, consistency, status)
@@ -115,10 +101,10 @@ def is_behind(m: mem.FilterState) -> bool:
     So it is where an object was lost in a gap: the fit begins with a mass that was known exactly. A horizon that lost
     messages have begun again is not judged before ``FEW`` samples.
     """
-    if m.counts[STORED] < FEW:
+    if m.counts[mem.STORED] < FEW:
         return False
     unfit = m.counts[mem.AGAIN] == 1 and m.score[mem.MISFIT] > FITS
-    return bool(unfit or 2 * m.counts[mem.BEFORE] <= m.counts[STORED])
+    return bool(unfit or 2 * m.counts[mem.BEFORE] <= m.counts[mem.STORED])
 
 
 def is_fitted_to_few(m: mem.FilterState) -> bool:
@@ -127,7 +113,7 @@ def is_fitted_to_few(m: mem.FilterState) -> bool:
     The iterations end with 36, 51 and 71 samples, so at ``FEW`` samples the variances are those of a fit to 36. A fit
     that twice ``FEW`` samples have not brought further is judged as it is.
     """
-    is_first = m.counts[mem.SINCE_EVENT] <= m.counts[STORED] < 2 * FEW  # no loss has begun the horizon again
+    is_first = m.counts[mem.SINCE_EVENT] <= m.counts[mem.STORED] < 2 * FEW  # no loss has begun the horizon again
     return bool(is_first and m.counts[mem.BEFORE] < FEW)
 
 
@@ -136,7 +122,7 @@ def moves(m: mem.FilterState) -> float:
 
     See ``judge_moves``; 1 before the first move.
     """
-    return max(1.0, float(m.score[MOVES])) if m.counts[MOVED] else 1.0
+    return max(1.0, float(m.score[mem.MOVES])) if m.counts[mem.MOVED] else 1.0
 
 
 def point_or_body(body: Array, spread: Array, mean: Array, std: Array) -> tuple[Array, Array]:
@@ -234,7 +220,7 @@ def innovation_power(sensors: MeasurementModel, m: mem.FilterState) -> tuple[flo
     """
     power, share = figures(m.noise, sensors.rate, m.counts, sensors.block)
     if math.isnan(power):
-        power = float(np.median([sensor[mem.POWER] / white_variance(sensor, LEVEL)
+        power = float(np.median([sensor[mem.POWER] / white_variance(sensor, mem.LEVEL)
                                  for sensor in m.noise[~sensors.rate]]))
     return power, share
 
@@ -247,10 +233,10 @@ def figures(noise: Array, rate: NDArray[np.bool_], counts: NDArray[np.int64], bl
     chance explains if the samples are independent, and 1 from what chance explains if only blocks are independent.
     """
     # a mean of N squares scatters by sqrt(2 / N); 2.5 times that is exceeded by chance in 0.6 % of the blocks
-    blocks, of_white = max(counts[BLOCKS], 1), 2.0 * OVERLAP / max(counts[SEEN], 1)
+    blocks, of_white = max(counts[mem.BLOCKS], 1), 2.0 * OVERLAP / max(counts[mem.SEEN], 1)
     most = 2.5 * math.sqrt(2.0 / blocks + of_white)
     least = 2.5 * math.sqrt(2.0 / (blocks * block) + of_white)
     excess = 0.0
     for i in range(noise.shape[0]):
-        excess = max(excess, noise[i, EFFECTIVE] / white_variance(noise[i], LEVEL) - 1.0)
-    return misfit(noise, rate, LEVEL), min(max((excess - least) / (most - least), 0.0), 1.0)
+        excess = max(excess, noise[i, mem.EFFECTIVE] / white_variance(noise[i], mem.LEVEL) - 1.0)
+    return misfit(noise, rate, mem.LEVEL), min(max((excess - least) / (most - least), 0.0), 1.0)

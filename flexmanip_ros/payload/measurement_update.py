@@ -7,34 +7,7 @@ from numpy.typing import NDArray
 
 from flexmanip_ros.numerics.compiled import inlined, inner, separate
 from flexmanip_ros.numerics.square_root import absorb_measurement, dot, project
-from flexmanip_ros.payload.filter_state import (
-    BLOCK_POWER,
-    BLOCK_SUM,
-    BLOCKS,
-    EFFECTIVE,
-    FLOOR,
-    HORIZON,
-    IN_A_ROW,
-    IN_BATCH,
-    IN_BLOCK,
-    IN_SPECTRUM,
-    LEVEL,
-    MOVED,
-    MOVES,
-    POWER,
-    RESTING,
-    RESTS,
-    SEEN,
-    SINCE_EVENT,
-    SLOW,
-    SPECTRA,
-    STORED,
-    TONES,
-    USED,
-    WEIGHT,
-    WHITE,
-    FilterState,
-)
+from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.types import Array
 
 OUTLIER = 4.0
@@ -53,7 +26,7 @@ SPECTRUM = 128
 ``TONE``."""
 SPECTRUM_MEMORY = 16
 """Spectra over which the power at each frequency is averaged: 2048 samples, as for the fourth differences."""
-TONE = 0.16 + 0.01 * np.arange(TONES)
+TONE = 0.16 + 0.01 * np.arange(mem.TONES)
 """Frequencies of the spectrum over the sample rate. Slow motion and the trace of a torque step in fourth differences
 are below the first; the window keeps the mirror images above one half from the last."""
 TURN = 2.0 * np.cos(2.0 * np.pi * TONE)
@@ -65,7 +38,7 @@ SHARE = 1.0 / (np.sum(HANN ** 2) * (2.0 * np.sin(np.pi * TONE)) ** 8)
 OVERLAP = 2.63
 """Samples for each independent fourth difference: 1 + 2 sum of r^2, r = 56, 28, 8 and 1 / 70 their correlation at lags
 1 to 4. So the variance of white noise by N of them has the relative deviation sqrt(2 OVERLAP / N)."""
-MEDIAN_STD = 1.25 / np.sqrt(TONES)
+MEDIAN_STD = 1.25 / np.sqrt(mem.TONES)
 """Relative standard deviation of the median of the powers in one spectrum of white noise: sqrt(pi / 2) of a mean's."""
 
 
@@ -186,50 +159,50 @@ def omitted_variance(sensors: MeasurementModel, i: int, ringing: Array) -> float
 
 
 @separate
-def measure(sensors: MeasurementModel, m: FilterState, y: Array, qdd: Array, opened: NDArray[np.int64]) -> None:
+def measure(sensors: MeasurementModel, m: mem.FilterState, y: Array, qdd: Array, opened: NDArray[np.int64]) -> None:
     """Update the filter with one sample; gather the power of its innovations and their information on the payload.
 
     qdd: (n,) accelerations; opened: see ``ProcessModel``.
     """
-    x, S, f = m.x, m.S, sensors.f[:m.counts[USED]]
+    x, S, f = m.x, m.S, sensors.f[:m.counts[mem.USED]]
     n = sensors.H.shape[1]
     payload = 2 * n
     for i in range(y.size):
-        r = m.noise[i, EFFECTIVE] + omitted_variance(sensors, i, m.ringing[0])
+        r = m.noise[i, mem.EFFECTIVE] + omitted_variance(sensors, i, m.ringing[0])
         e = y[i] - observe(sensors, i, n, x, S, f, qdd)
         spread = dot(f, f)
         variance = spread + r
         square = e * e / variance
         m.innovation[i, 0], m.innovation[i, 1] = e, variance
-        m.power[i] += (min(square, 25.0) - m.power[i]) / min(m.counts[SINCE_EVENT] + 100, 1000)
-        residual = min(max(e / np.sqrt(variance), -5.0), 5.0) * np.sqrt(m.noise[i, EFFECTIVE])
-        m.noise[i, BLOCK_SUM] += residual
-        m.noise[i, BLOCK_POWER] += residual * residual
+        m.power[i] += (min(square, 25.0) - m.power[i]) / min(m.counts[mem.SINCE_EVENT] + 100, 1000)
+        residual = min(max(e / np.sqrt(variance), -5.0), 5.0) * np.sqrt(m.noise[i, mem.EFFECTIVE])
+        m.noise[i, mem.BLOCK_SUM] += residual
+        m.noise[i, mem.BLOCK_POWER] += residual * residual
         if square > OUTLIER * OUTLIER:
             r += e * e / (OUTLIER * OUTLIER) - variance
             variance = spread + r
         gain = dot(f, S[payload]) / variance
-        m.noise[i, WEIGHT] += gain * gain * variance
+        m.noise[i, mem.WEIGHT] += gain * gain * variance
         absorb_measurement(x, S, opened, f, e, r, variance)
         white_noise(m, i, y[i])
     count_spectrum(m)
-    m.counts[SEEN] = min(m.counts[SEEN] + 1, 2000)
-    m.counts[IN_A_ROW] += 1
+    m.counts[mem.SEEN] = min(m.counts[mem.SEEN] + 1, 2000)
+    m.counts[mem.IN_A_ROW] += 1
 
 
 @inner
-def white_noise(m: FilterState, i: int, y: float) -> None:
+def white_noise(m: mem.FilterState, i: int, y: float) -> None:
     """Update the variance of sensor i's white noise by a fourth difference, in which slow motion has no part."""
     recent = m.recent[i]
-    if m.counts[IN_A_ROW] >= 4:
+    if m.counts[mem.IN_A_ROW] >= 4:
         difference = y - 4.0 * recent[0] + 6.0 * recent[1] - 4.0 * recent[2] + recent[3]
         square = difference * difference / 70.0
-        if m.counts[SEEN] > 50:
-            most = 16.0 * m.noise[i, WHITE] + 1e-300
+        if m.counts[mem.SEEN] > 50:
+            most = 16.0 * m.noise[i, mem.WHITE] + 1e-300
             if square > most:
                 difference *= np.sqrt(most / square)
                 square = most
-        m.noise[i, WHITE] += (square - m.noise[i, WHITE]) / max(m.counts[SEEN] - 3, 1)
+        m.noise[i, mem.WHITE] += (square - m.noise[i, mem.WHITE]) / max(m.counts[mem.SEEN] - 3, 1)
         take_spectrum(m, i, difference)
     for p in range(3, 0, -1):
         recent[p] = recent[p - 1]
@@ -237,7 +210,7 @@ def white_noise(m: FilterState, i: int, y: float) -> None:
 
 
 @inner
-def take_spectrum(m: FilterState, i: int, difference: float) -> None:
+def take_spectrum(m: mem.FilterState, i: int, difference: float) -> None:
     """Take a fourth difference of sensor i into its spectrum; after the last, bound its white noise by the median.
 
     Fast undamped modes enter the fourth differences as noise does. In the spectrum they are lines with white noise
@@ -246,79 +219,80 @@ def take_spectrum(m: FilterState, i: int, difference: float) -> None:
     method.
     """
     first, second, power = m.spectrum[i, 0], m.spectrum[i, 1], m.spectrum[i, 2]
-    k = m.counts[IN_SPECTRUM]
+    k = m.counts[mem.IN_SPECTRUM]
     if k == 0:
-        for j in range(TONES):
+        for j in range(mem.TONES):
             first[j] = 0.0
             second[j] = 0.0
     windowed = HANN[k] * difference
-    for j in range(TONES):
+    for j in range(mem.TONES):
         now = windowed + TURN[j] * first[j] - second[j]
         second[j] = first[j]
         first[j] = now
     if k < SPECTRUM - 1:
         return
-    count = min(m.counts[SPECTRA] + 1, SPECTRUM_MEMORY)
-    for j in range(TONES):
+    count = min(m.counts[mem.SPECTRA] + 1, SPECTRUM_MEMORY)
+    for j in range(mem.TONES):
         now = SHARE[j] * (first[j] * first[j] + second[j] * second[j] - TURN[j] * first[j] * second[j])
         power[j] += (now - power[j]) / count
-    for j in range(TONES):  # sorted, in what the next spectrum clears
+    for j in range(mem.TONES):  # sorted, in what the next spectrum clears
         place = j
         while place > 0 and first[place - 1] > power[j]:
             first[place] = first[place - 1]
             place -= 1
         first[place] = power[j]
-    median = 0.5 * (first[TONES // 2 - 1] + first[TONES // 2])
+    median = 0.5 * (first[mem.TONES // 2 - 1] + first[mem.TONES // 2])
     # a mean of N powers is chi-square with 2 N degrees of freedom, whose median is below its mean (Wilson and Hilferty)
     level = median / (1.0 - 1.0 / (9.0 * count)) ** 3
-    m.noise[i, LEVEL] = level * np.exp(3.0 * MEDIAN_STD / np.sqrt(count))
+    m.noise[i, mem.LEVEL] = level * np.exp(3.0 * MEDIAN_STD / np.sqrt(count))
 
 
 @inner
-def count_spectrum(m: FilterState) -> None:
+def count_spectrum(m: mem.FilterState) -> None:
     """Count a sample of the spectra; begin them again after a sample that was missing."""
-    if m.counts[IN_A_ROW] < 4:
-        m.counts[IN_SPECTRUM] = 0
+    if m.counts[mem.IN_A_ROW] < 4:
+        m.counts[mem.IN_SPECTRUM] = 0
         return
-    m.counts[IN_SPECTRUM] += 1
-    if m.counts[IN_SPECTRUM] == SPECTRUM:
-        m.counts[IN_SPECTRUM] = 0
-        m.counts[SPECTRA] = min(m.counts[SPECTRA] + 1, SPECTRUM_MEMORY)
+    m.counts[mem.IN_SPECTRUM] += 1
+    if m.counts[mem.IN_SPECTRUM] == SPECTRUM:
+        m.counts[mem.IN_SPECTRUM] = 0
+        m.counts[mem.SPECTRA] = min(m.counts[mem.SPECTRA] + 1, SPECTRUM_MEMORY)
 
 
 @inner
-def learn_noise(sensors: MeasurementModel, m: FilterState) -> None:
+def learn_noise(sensors: MeasurementModel, m: mem.FilterState) -> None:
     """At the end of a block update the variance of each sensor, larger where the innovations are not white.
 
     While the horizon is open the moving-horizon estimation does so instead, as the filter may not have converged.
     """
-    m.counts[IN_BLOCK] += 1
-    if m.counts[STORED] < HORIZON:
-        m.counts[IN_BLOCK] = 0
+    m.counts[mem.IN_BLOCK] += 1
+    if m.counts[mem.STORED] < mem.HORIZON:
+        m.counts[mem.IN_BLOCK] = 0
         for i in range(m.noise.shape[0]):
-            m.noise[i, BLOCK_SUM] = 0.0
-            m.noise[i, BLOCK_POWER] = 0.0
-    if m.counts[IN_BLOCK] < sensors.block:
+            m.noise[i, mem.BLOCK_SUM] = 0.0
+            m.noise[i, mem.BLOCK_POWER] = 0.0
+    if m.counts[mem.IN_BLOCK] < sensors.block:
         return
-    m.counts[IN_BLOCK] = 0
-    m.counts[BLOCKS] = min(m.counts[BLOCKS] + 1, BLOCK_MEMORY)
-    blocks = m.counts[BLOCKS]
+    m.counts[mem.IN_BLOCK] = 0
+    m.counts[mem.BLOCKS] = min(m.counts[mem.BLOCKS] + 1, BLOCK_MEMORY)
+    blocks = m.counts[mem.BLOCKS]
     doubt = 3.0 * np.sqrt(2.0 / blocks)
     for i in range(m.noise.shape[0]):
         row = m.noise[i]
-        row[POWER] += (row[BLOCK_POWER] / sensors.block - row[POWER]) / blocks
-        row[SLOW] += (row[BLOCK_SUM] * row[BLOCK_SUM] / sensors.block - row[SLOW]) / blocks
-        row[BLOCK_SUM] = 0.0
-        row[BLOCK_POWER] = 0.0
+        row[mem.POWER] += (row[mem.BLOCK_POWER] / sensors.block - row[mem.POWER]) / blocks
+        row[mem.SLOW] += (row[mem.BLOCK_SUM] * row[mem.BLOCK_SUM] / sensors.block - row[mem.SLOW]) / blocks
+        row[mem.BLOCK_SUM] = 0.0
+        row[mem.BLOCK_POWER] = 0.0
         # white noise has SLOW = POWER; a slow part that is no chance makes samples worth less
         # trust comes back slowly: the first guess, or a shock, may have been right
-        row[EFFECTIVE] = max(row[POWER], row[SLOW] - doubt * row[POWER], row[FLOOR], 0.7 * row[EFFECTIVE])
+        row[mem.EFFECTIVE] = max(
+            row[mem.POWER], row[mem.SLOW] - doubt * row[mem.POWER], row[mem.FLOOR], 0.7 * row[mem.EFFECTIVE])
 
 
 @inner
 def white_variance(sensor: Array, most: int) -> float:
     """Return the variance of a sensor's white noise; sensor: (11,) its row, most: column above which it is not."""
-    variance: float = max(min(sensor[WHITE], sensor[most]), sensor[FLOOR])
+    variance: float = max(min(sensor[mem.WHITE], sensor[most]), sensor[mem.FLOOR])
     return variance
 
 
@@ -328,7 +302,7 @@ def most_white(sensor: Array, count: int) -> float:
 
     sensor: (11,) its row. See ``OVERLAP`` for the deviation.
     """
-    most: float = (1.0 + 3.0 * np.sqrt(2.0 * OVERLAP / count)) * white_variance(sensor, LEVEL)
+    most: float = (1.0 + 3.0 * np.sqrt(2.0 * OVERLAP / count)) * white_variance(sensor, mem.LEVEL)
     return most
 
 
@@ -343,13 +317,13 @@ def misfit(noise: Array, rate: NDArray[np.bool_], most: int) -> float:
     total = sum_of_weights = 0.0
     for i in range(noise.shape[0]):
         if not rate[i]:
-            total += noise[i, WEIGHT] * noise[i, POWER] / white_variance(noise[i], most)
-            sum_of_weights += noise[i, WEIGHT]
+            total += noise[i, mem.WEIGHT] * noise[i, mem.POWER] / white_variance(noise[i], most)
+            sum_of_weights += noise[i, mem.WEIGHT]
     return total / sum_of_weights if sum_of_weights > 0.0 else np.nan
 
 
 @inner
-def judge_moves(sensors: MeasurementModel, m: FilterState) -> None:
+def judge_moves(sensors: MeasurementModel, m: mem.FilterState) -> None:
     """Compare the moves of payload and arm parameters with the fall of their variances, at the end of each batch.
 
     Covariance matching (Mehra, 1972): over some samples the mean of a Kalman filter moves by d. If the model is right,
@@ -358,16 +332,16 @@ def judge_moves(sensors: MeasurementModel, m: FilterState) -> None:
     variance has hardly fallen waits for a later batch. While the horizon is open the step of the last iteration (SHIFT)
     says this instead, as the fit replaces the filter.
     """
-    if m.counts[RESTS] == RESTING:
+    if m.counts[mem.RESTS] == mem.RESTING:
         return
-    if m.counts[STORED] < HORIZON:
-        m.counts[IN_BATCH] = 0
+    if m.counts[mem.STORED] < mem.HORIZON:
+        m.counts[mem.IN_BATCH] = 0
         return
-    m.counts[IN_BATCH] += 1
-    begins = m.counts[IN_BATCH] == 1
-    if not begins and m.counts[IN_BATCH] <= BATCH * sensors.block:
+    m.counts[mem.IN_BATCH] += 1
+    begins = m.counts[mem.IN_BATCH] == 1
+    if not begins and m.counts[mem.IN_BATCH] <= BATCH * sensors.block:
         return
-    m.counts[IN_BATCH] = 1
+    m.counts[mem.IN_BATCH] = 1
     total, known = 0.0, 0
     for i in range(2 * sensors.H.shape[1], m.x.size):
         variance = dot(m.S[i], m.S[i])
@@ -381,5 +355,5 @@ def judge_moves(sensors: MeasurementModel, m: FilterState) -> None:
             m.moved[i, 0] = m.x[i]
             m.moved[i, 1] = variance
     if known > 0:
-        m.counts[MOVED] = min(m.counts[MOVED] + known, MOVES_MEMORY)
-        m.score[MOVES] += (total - known * m.score[MOVES]) / m.counts[MOVED]
+        m.counts[mem.MOVED] = min(m.counts[mem.MOVED] + known, MOVES_MEMORY)
+        m.score[mem.MOVES] += (total - known * m.score[mem.MOVES]) / m.counts[mem.MOVED]

@@ -16,51 +16,12 @@ import numpy as np
 from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, solve
 from flexmanip_ros.numerics.compiled import inner, merged, separate
 from flexmanip_ros.numerics.square_root import absorb_noise, dot, least_distance
-from flexmanip_ros.payload.filter_state import (
-    AGAIN,
-    BEFORE,
-    CONFIRMED,
-    COST,
-    COST_BEFORE,
-    EFFECTIVE,
-    EFFORTS,
-    ENOUGH,
-    EXACT,
-    EXCESS,
-    FIT,
-    HELD,
-    HORIZON,
-    IN_A_ROW,
-    IN_BATCH,
-    ITERATED,
-    ITERATING,
-    LAMBDA,
-    LEARNED,
-    LINEARIZED,
-    LOG_DETERMINANT,
-    MEASURED,
-    MISFIT,
-    MOVED,
-    MOVES,
-    NOISY,
-    NOW,
-    POWER,
-    REFITS,
-    RESTING,
-    RESTS,
-    SHIFT,
-    SINCE_EVENT,
-    SINCE_NOISE,
-    STORED,
-    TRIED,
-    USED,
-    WHITE,
-    FilterState,
-)
+from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.gauss_newton import (
     AT_REST,
     BY_CHANCE,
     LINEAR,
+    MOST_BIAS,
     TELLS,
     UNFIT,
     begin_iteration,
@@ -121,11 +82,6 @@ MOST_REFITS = 4
 fits."""
 STRAY = 3.0
 """Innovation power over white noise, of every sensor, at which the filter is begun again."""
-MOST_BIAS = 4.0
-"""Standard deviations, with the error of its inertia among them, that an empty arm may seem to hold. Beyond them the
-arm is not the one that was described or learned, and what it catches is estimated wrong. Chance exceeds them 1 time in
-16 000. In 26 looks, as many as five seconds of the default arm have, that is 1 in 600. With 3 (1 in 370) six more of
-120 random arms were INCONSISTENT; five of them knew the payload."""
 SLACK = 1.0
 """Increase of the cost up to which a step is accepted: one is a change of the estimate by one standard deviation."""
 CHANCE = 3.0
@@ -147,7 +103,7 @@ WAVES = 2.0
 
 
 @inner
-def gather_torque_noise(motion: ProcessModel, m: FilterState, variance: Array, noisy: bool) -> None:
+def gather_torque_noise(motion: ProcessModel, m: mem.FilterState, variance: Array, noisy: bool) -> None:
     """Add to variance (L,) that of each torque over a sample [N^2 m^2]; ``predict`` was just called.
 
     noisy: whether reported efforts have noise. The share of Coulomb friction has d^2 / cosh^2(rate /
@@ -163,16 +119,16 @@ def gather_torque_noise(motion: ProcessModel, m: FilterState, variance: Array, n
 
 
 @merged
-def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array) -> int:
+def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, table: Array) -> int:
     """Take one sample since the event into the iteration: N += f f' / r, g += f e / r.
 
     table: (N, 1 + 3 L + m), the rows before the event that a late torque needs, then the first sample after it. The
     cost is the sum of e^2 / r. Return the number of integration steps; 0: this trajectory is given up, the step was too
     long.
     """
-    k = m.counts[ITERATED] + sensors.reach - 1
+    k = m.counts[mem.ITERATED] + sensors.reach - 1
     sample = table[k]
-    n, nx, used, linearized = sensors.H.shape[1], m.x.size, m.counts[USED], m.counts[LINEARIZED] == 1
+    n, nx, used, linearized = sensors.H.shape[1], m.x.size, m.counts[mem.USED], m.counts[mem.LINEARIZED] == 1
     columns = 2 * used + 1 if linearized else used
     first, f = 1 + 3 * motion.effort.size, sensors.wide[:columns]
     rows = table[k + 1 - sensors.reach:k + 1]
@@ -182,25 +138,25 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
     note_change(sensors, m.ringing[2], sample[1:1 + motion.effort.size])
     measured = sample[first] == sample[first]
     if measured:
-        m.counts[MEASURED] += 1
+        m.counts[mem.MEASURED] += 1
     for i in range(m.noise.shape[0] if measured else 0):
-        own = m.noise[i, EFFECTIVE]
+        own = m.noise[i, mem.EFFECTIVE]
         r = own + omitted_variance(sensors, i, m.ringing[2])
         e = sample[first + i] - observe(sensors, i, n, m.xr, m.Sr, f, motion.k[0])
         weight = 1.0 / r
-        m.score[COST] += e * e * weight
+        m.score[mem.COST] += e * e * weight
         for a in range(used):
             scaled = weight * f[a]
             m.g[a] += scaled * e
             for b in range(a + 1):
                 m.N[a, b] += scaled * f[b]
-        m.noise[i, FIT] += (update_linearized(m, f, e, r) if linearized else e * e) * own / r
-    m.counts[ITERATED] += 1
+        m.noise[i, mem.FIT] += (update_linearized(m, f, e, r) if linearized else e * e) * own / r
+    m.counts[mem.ITERATED] += 1
     if linearized:
-        gather_torque_noise(motion, m, m.torque_noise[1], m.counts[EFFORTS] in (NOISY, CONFIRMED))
-        if m.counts[ITERATED] % sensors.kicks_every == 0:
+        gather_torque_noise(motion, m, m.torque_noise[1], m.counts[mem.EFFORTS] in (mem.NOISY, mem.CONFIRMED))
+        if m.counts[mem.ITERATED] % sensors.kicks_every == 0:
             diffuse_linearized(motion, sensors, m)
-    if measured and m.counts[HELD] == 0 and m.counts[MEASURED] % (BATCH * sensors.block) == 0:
+    if measured and m.counts[mem.HELD] == 0 and m.counts[mem.MEASURED] % (BATCH * sensors.block) == 0:
         for a in range(used):
             m.batch[a] = m.g[a] - m.batch[a]
         for a in range(used):
@@ -208,22 +164,22 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: FilterSta
                 m.B[a, b] += m.batch[a] * m.batch[b]
         for a in range(used):
             m.batch[a] = m.g[a]
-    if not m.score[COST] < LOST * (nx + m.noise.shape[0] * m.counts[ITERATED]):
+    if not m.score[mem.COST] < LOST * (nx + m.noise.shape[0] * m.counts[mem.ITERATED]):
         return 0
     # the cost only grows: a step may be rejected before its last sample
-    if m.counts[ITERATED] <= m.counts[BEFORE] and m.score[COST] > m.score[COST_BEFORE] + SLACK:
+    if m.counts[mem.ITERATED] <= m.counts[mem.BEFORE] and m.score[mem.COST] > m.score[mem.COST_BEFORE] + SLACK:
         return 0
     return int(steps)
 
 
 @inner
-def update_linearized(m: FilterState, f: Array, e: float, r: float) -> float:
+def update_linearized(m: mem.FilterState, f: Array, e: float, r: float) -> float:
     """Update the linearized filter with a measurement (Potter); return the squared innovation, scaled to variance r.
 
     Its state is the departure from the trajectory of the iteration. f: (2 USED + 1,) m.Sr' h, h the derivative of the
     measurement by the state; e: departure of the measurement from the trajectory; r: its variance.
     """
-    used = m.counts[USED]
+    used = m.counts[mem.USED]
     own = f[used:2 * used]
     e -= f[2 * used]
     variance = dot(own, own) + r
@@ -234,14 +190,14 @@ def update_linearized(m: FilterState, f: Array, e: float, r: float) -> float:
         gain *= gamma
         for c in range(used):
             m.Sr[i, used + c] -= gain * own[c]
-    m.score[LOG_DETERMINANT] += np.log(variance / r)
+    m.score[mem.LOG_DETERMINANT] += np.log(variance / r)
     return float(e * e / variance * r)
 
 
 @inner
-def diffuse_linearized(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> None:
+def diffuse_linearized(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) -> None:
     """Add the process noise of the torques over the last samples to the linearized filter."""
-    nx, used, root = m.x.size, m.counts[USED], sensors.L
+    nx, used, root = m.x.size, m.counts[mem.USED], sensors.L
     for i in range(nx):
         for c in range(nx):
             root[i, c] = m.Sr[i, used + c] if c < used else 0.0
@@ -270,20 +226,20 @@ def add_torque_noise(motion: ProcessModel, sensors: MeasurementModel, variance: 
 
 
 @inner
-def kick(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> None:
+def kick(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) -> None:
     """Add the process noise of the torques since it was last added to the filter; ``predict`` was just called."""
     add_torque_noise(motion, sensors, m.torque_noise[0])
     absorb_noise(m.S, sensors.kicks, sensors.W_kicks)
 
 
 @inner
-def find_effort_noise(sensors: MeasurementModel, m: FilterState, table: Array) -> None:
+def find_effort_noise(sensors: MeasurementModel, m: mem.FilterState, table: Array) -> None:
     """Estimate the variance of the white part of each reported effort since the event, by its fourth differences.
 
     Slow torques have no part in these. Steps of a torque do not move the median of their sizes, which is ``MEDIAN``
     deviations of Gaussian noise. It is found by bisection.
     """
-    first, end = sensors.reach + 3, sensors.reach - 1 + m.counts[STORED]
+    first, end = sensors.reach + 3, sensors.reach - 1 + m.counts[mem.STORED]
     for column in range(1, 1 + m.effort_noise.size):
         low, high, peak = 0.0, 0.0, 0.0
         for k in range(first, end):
@@ -310,13 +266,13 @@ def fourth_difference(table: Array, k: int, column: int) -> float:
 
 
 @inner
-def at_rest(m: FilterState) -> bool:
+def at_rest(m: mem.FilterState) -> bool:
     """Whether the last iteration over all samples so far hardly moved the payload."""
-    return bool(m.counts[BEFORE] >= ENOUGH and m.score[SHIFT] < AT_REST and m.counts[AGAIN] == 0)
+    return bool(m.counts[mem.BEFORE] >= mem.ENOUGH and m.score[mem.SHIFT] < AT_REST and m.counts[mem.AGAIN] == 0)
 
 
 @inner
-def tells(motion: ProcessModel, m: FilterState) -> bool:
+def tells(motion: ProcessModel, m: mem.FilterState) -> bool:
     """Whether the samples since the event tell of the payload: its variance fell by ``TOLD``."""
     mass = m.x.size - motion.kind.size
     return bool(dot(m.S[mass], m.S[mass]) < (1.0 - TOLD) * dot(m.S0[mass], m.S0[mass]))
@@ -329,146 +285,146 @@ def slide_length(sensors: MeasurementModel) -> int:
 
 
 @inner
-def rests(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
+def rests(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) -> bool:
     """Whether the samples since the event fit, and tell nothing of a payload that is not known.
 
     Then the horizon slides until one does. Asked after two slides, when their number is a power of two.
     Not of an arm of which nothing is learned: its samples need no fit that begins with its motion.
     """
-    count, mass = m.counts[STORED], m.x.size - motion.kind.size
+    count, mass = m.counts[mem.STORED], m.x.size - motion.kind.size
     if motion.kind[-1] <= INERTIA or count < 2 * slide_length(sensors) or count & (count - 1) != 0:
         return False
     known = dot(m.S0[mass], m.S0[mass]) < (1.0 - TOLD) * motion.prior[0] * motion.prior[0]
-    unfit = m.counts[AGAIN] == 1 or (m.counts[BEFORE] > 0 and m.score[EXCESS] > BY_CHANCE)
-    if known or unfit or m.counts[SINCE_EVENT] > count or tells(motion, m):
+    unfit = m.counts[mem.AGAIN] == 1 or (m.counts[mem.BEFORE] > 0 and m.score[mem.EXCESS] > BY_CHANCE)
+    if known or unfit or m.counts[mem.SINCE_EVENT] > count or tells(motion, m):
         return False
-    m.counts[RESTS] = RESTING
-    m.counts[STORED] = HORIZON
-    m.counts[IN_BATCH] = slide_length(sensors)
+    m.counts[mem.RESTS] = mem.RESTING
+    m.counts[mem.STORED] = mem.HORIZON
+    m.counts[mem.IN_BATCH] = slide_length(sensors)
     return True
 
 
 @merged
-def iterate(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array) -> bool:
+def iterate(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, table: Array) -> bool:
     """Let the Gauss-Newton iteration take a few samples (``ROWS``); when the horizon closes, until it converges."""
-    stored = m.counts[STORED]
-    if stored >= HORIZON:
+    stored = m.counts[mem.STORED]
+    if stored >= mem.HORIZON:
         return True
-    m.counts[STORED] = stored + 1
+    m.counts[mem.STORED] = stored + 1
     if stored + 1 < FIRST_ITERATION:
         return True
     if rests(motion, sensors, m):
         return True
-    converged, last = at_rest(m), stored + 1 == HORIZON
+    converged, last = at_rest(m), stored + 1 == mem.HORIZON
     if stored + 1 >= LATEST:
-        last |= not converged or phase_std(motion, m, sensors.period * m.counts[STORED]) < LINEAR
+        last |= not converged or phase_std(motion, m, sensors.period * m.counts[mem.STORED]) < LINEAR
     if last and converged:  # the filter goes on from there
         close_horizon(motion, sensors, m)
         return True
     rows = CLOSING if last else int(ROWS * max(sensors.period / ROWS_TIME, 1.0))
     work = WORK * rows * max(sensors.period / motion.substeps, 1.0)
     for _ in range(rows):
-        if m.counts[STORED] == HORIZON > stored + 1:  # it has closed
+        if m.counts[mem.STORED] == mem.HORIZON > stored + 1:  # it has closed
             return True
         if work <= 0.0:
             break
-        if m.counts[ITERATING] == 0:
-            before = m.counts[BEFORE]
+        if m.counts[mem.ITERATING] == 0:
+            before = m.counts[mem.BEFORE]
             if last:
                 # until the step is within one standard deviation (Newton decrement): the filter goes on from here
-                due = before < m.counts[STORED] or m.score[LAMBDA] > 0.0 or dot(m.g, m.gradient) >= 1.0
+                due = before < m.counts[mem.STORED] or m.score[mem.LAMBDA] > 0.0 or dot(m.g, m.gradient) >= 1.0
             else:
-                more = max(before // GROWTH, 1) if m.score[SHIFT] < AT_REST else 1
-                due = m.counts[AGAIN] == 1 or m.counts[STORED] >= before + more
+                more = max(before // GROWTH, 1) if m.score[mem.SHIFT] < AT_REST else 1
+                due = m.counts[mem.AGAIN] == 1 or m.counts[mem.STORED] >= before + more
             if not due:
                 break
-            if m.counts[EFFORTS] == NOISY and m.counts[STORED] >= TELLS:
+            if m.counts[mem.EFFORTS] == mem.NOISY and m.counts[mem.STORED] >= TELLS:
                 find_effort_noise(sensors, m, table)
             begin_iteration(motion, m)
-        until = m.counts[BEFORE]
-        if m.counts[AGAIN] == 0:
-            until = m.counts[STORED] if last else min(m.counts[STORED], until + until // 2 + FIRST_ITERATION)
+        until = m.counts[mem.BEFORE]
+        if m.counts[mem.AGAIN] == 0:
+            until = m.counts[mem.STORED] if last else min(m.counts[mem.STORED], until + until // 2 + FIRST_ITERATION)
         steps = iterate_sample(motion, sensors, m, table)
         work -= steps
         if steps == 0:
-            if m.counts[BEFORE] == 0 or not reject_step(motion, sensors, m):
+            if m.counts[mem.BEFORE] == 0 or not reject_step(motion, sensors, m):
                 return False
-        elif m.counts[ITERATED] >= until and (not finish_iteration(motion, sensors, m) or misfits(motion, m)):
+        elif m.counts[mem.ITERATED] >= until and (not finish_iteration(motion, sensors, m) or misfits(motion, m)):
             return False
     if last:
-        if m.counts[HELD] == 1 and m.score[SHIFT] >= AT_REST:  # linearized before it converged: too sure
-            wider = np.sqrt(1.0 + m.score[SHIFT] * m.score[SHIFT])
+        if m.counts[mem.HELD] == 1 and m.score[mem.SHIFT] >= AT_REST:  # linearized before it converged: too sure
+            wider = np.sqrt(1.0 + m.score[mem.SHIFT] * m.score[mem.SHIFT])
             for i in range(m.x.size):
                 for c in range(m.x.size):
                     m.S[i, c] *= wider
         if fails(m):
-            m.counts[STORED] = HORIZON
+            m.counts[mem.STORED] = mem.HORIZON
             return False
         close_horizon(motion, sensors, m)
     return True
 
 
 @inner
-def misfits(motion: ProcessModel, m: FilterState) -> bool:
+def misfits(motion: ProcessModel, m: mem.FilterState) -> bool:
     """Whether another start is due: the residuals are far more than the noise, or the fit came to no end in ``TRIALS``.
 
     Those of the simplest model of an arm, or of a point, need only exceed chance.
     """
     most = MOST_REFITS - 1
-    if m.counts[HELD] == 1:
+    if m.counts[mem.HELD] == 1:
         most = STARTS if motion.kind.size > INERTIA and motion.kind[INERTIA] == INERTIA else 0
-    early = m.counts[TRIED] < TRIALS if m.counts[AGAIN] == 1 else m.counts[ITERATED] < TELLS
-    if m.counts[REFITS] >= most or early:
+    early = m.counts[mem.TRIED] < TRIALS if m.counts[mem.AGAIN] == 1 else m.counts[mem.ITERATED] < TELLS
+    if m.counts[mem.REFITS] >= most or early:
         return False
-    failed = bool(m.counts[AGAIN] == 1 or m.score[MISFIT] > UNFIT
-                  or (m.counts[REFITS] == 0 and m.score[EXCESS] > BY_CHANCE))
-    m.counts[REFITS] += failed
+    failed = bool(m.counts[mem.AGAIN] == 1 or m.score[mem.MISFIT] > UNFIT
+                  or (m.counts[mem.REFITS] == 0 and m.score[mem.EXCESS] > BY_CHANCE))
+    m.counts[mem.REFITS] += failed
     return failed
 
 
 @inner
-def fails(m: FilterState) -> bool:
+def fails(m: mem.FilterState) -> bool:
     """Whether the fit failed at the end of the horizon: it costs far more than white noise, or lacks some samples."""
-    if m.counts[REFITS] >= MOST_REFITS:
+    if m.counts[mem.REFITS] >= MOST_REFITS:
         return False
-    failed = bool(m.score[MISFIT] > UNFIT or m.counts[BEFORE] < m.counts[STORED])
-    m.counts[REFITS] += failed
+    failed = bool(m.score[mem.MISFIT] > UNFIT or m.counts[mem.BEFORE] < m.counts[mem.STORED])
+    m.counts[mem.REFITS] += failed
     return failed
 
 
 @separate
-def excess_bias(motion: ProcessModel, m: FilterState) -> float:
+def excess_bias(motion: ProcessModel, m: mem.FilterState) -> float:
     """Return the mass that an empty arm seems to hold, in deviations by its moves and the error of its inertia."""
     mass = m.x.size - motion.kind.size
     variance = dot(m.S[mass], m.S[mass])
-    if m.counts[MOVED] > 0:
-        variance *= max(m.score[MOVES], 1.0)
+    if m.counts[mem.MOVED] > 0:
+        variance *= max(m.score[mem.MOVES], 1.0)
     return float(m.x[mass] / np.sqrt(max(variance + motion.considered * motion.considered, 1e-300)))
 
 
 @separate
-def strays(motion: ProcessModel, sensors: MeasurementModel, m: FilterState) -> bool:
+def strays(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) -> bool:
     """Whether the filter has diverged after a fit: the sensors show far more than their white noise.
 
     While the arm holds something, every sensor must show it, as a fit that is begun again costs time. Of an empty arm
     the mean must, weighted by what each sensor tells of the payload, or the arm seems to hold something.
     """
-    if m.counts[REFITS] >= MOST_REFITS or (m.counts[HELD] == 1 and m.counts[LEARNED] == 0):
+    if m.counts[mem.REFITS] >= MOST_REFITS or (m.counts[mem.HELD] == 1 and m.counts[mem.LEARNED] == 0):
         return False
-    if m.counts[STORED] < HORIZON or m.counts[SINCE_EVENT] % (BATCH * sensors.block) != 0:
+    if m.counts[mem.STORED] < mem.HORIZON or m.counts[mem.SINCE_EVENT] % (BATCH * sensors.block) != 0:
         return False
     least = STRAY
     for i in range(m.noise.shape[0]):
-        least = min(least, m.noise[i, POWER] / white_variance(m.noise[i], WHITE))
+        least = min(least, m.noise[i, mem.POWER] / white_variance(m.noise[i], mem.WHITE))
     left = least >= STRAY
-    if m.counts[HELD] == 0:
-        left = misfit(m.noise, sensors.rate, WHITE) >= UNFIT or abs(excess_bias(motion, m)) > MOST_BIAS
-    m.counts[REFITS] += left
+    if m.counts[mem.HELD] == 0:
+        left = misfit(m.noise, sensors.rate, mem.WHITE) >= UNFIT or abs(excess_bias(motion, m)) > MOST_BIAS
+    m.counts[mem.REFITS] += left
     return bool(left)
 
 
 @separate
-def keep_possible(motion: ProcessModel, m: FilterState, chance: float) -> None:
+def keep_possible(motion: ProcessModel, m: mem.FilterState, chance: float) -> None:
     """Move the state to the most likely one within the bounds of p (constrained filter of Simon and Chia, 2002).
 
     All states move with an entry of p that is put back: otherwise each step across a bound would leave a bias in those
@@ -484,15 +440,15 @@ def keep_possible(motion: ProcessModel, m: FilterState, chance: float) -> None:
 
 
 @separate
-def diffuse(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, duration: float) -> None:
+def diffuse(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, duration: float) -> None:
     """Add the process noise since it was last added, which keeps the memory finite once the horizon has closed.
 
     That of the torques is here that of a friction within chance. ``predict`` was just called.
     """
-    m.score[NOW] += duration
-    if m.counts[STORED] < HORIZON or m.counts[SINCE_NOISE] < sensors.noise_every:
+    m.score[mem.NOW] += duration
+    if m.counts[mem.STORED] < mem.HORIZON or m.counts[mem.SINCE_NOISE] < sensors.noise_every:
         return
-    root, nx = np.sqrt(m.score[NOW]), m.x.size
+    root, nx = np.sqrt(m.score[mem.NOW]), m.x.size
     for i in range(nx):
         for c in range(nx):
             sensors.noise[i, c] = 0.0
@@ -501,19 +457,19 @@ def diffuse(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, dur
         m.moved[i, 1] += sensors.noise[i, i] * sensors.noise[i, i]
     absorb_noise(m.S, sensors.noise, sensors.W)
     kick(motion, sensors, m)
-    m.counts[SINCE_NOISE] = 0
-    m.score[NOW] = 0.0
+    m.counts[mem.SINCE_NOISE] = 0
+    m.score[mem.NOW] = 0.0
 
 
 @merged
-def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table: Array, k: int) -> bool:
+def take(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, table: Array, k: int) -> bool:
     """Take the sample in row k of the table; False when numbers left the finite range.
 
     table: (N, 1 + 3 L + m), see ``capture_detection_kernel.advance``.
     """
     duration, y = table[k, 0], table[k, 1 + 3 * motion.effort.size:]
     rows = table[k + 1 - sensors.reach:k + 1]
-    if not predict(motion, m.x, m.S, m.counts[USED], rows, sensors.period, duration):
+    if not predict(motion, m.x, m.S, m.counts[mem.USED], rows, sensors.period, duration):
         return False
     came = y[0] == y[0]
     note_change(sensors, m.ringing[0], table[k, 1:1 + motion.effort.size])
@@ -521,16 +477,17 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: FilterState, table:
         measure(sensors, m, y, motion.k[0], motion.opened)
         if not abs(m.x[2 * sensors.H.shape[1]]) < 1e9:
             return False
-        m.counts[SINCE_EVENT] += 1
+        m.counts[mem.SINCE_EVENT] += 1
         learn_noise(sensors, m)
     else:
-        m.counts[IN_A_ROW] = 0
+        m.counts[mem.IN_A_ROW] = 0
         for i in range(y.size):
             m.innovation[i, 0] = 0.0
-    m.counts[SINCE_NOISE] += 1
-    gather_torque_noise(motion, m, m.torque_noise[0], m.counts[EFFORTS] != EXACT)
-    told = m.counts[HELD] == 1 or m.counts[STORED] >= TELLS  # before that an empty arm's friction may be anything
-    if told and m.counts[SINCE_NOISE] % sensors.kicks_every == 0 and has_torque_noise(motion, m):
+    m.counts[mem.SINCE_NOISE] += 1
+    gather_torque_noise(motion, m, m.torque_noise[0], m.counts[mem.EFFORTS] != mem.EXACT)
+    # before that an empty arm's friction may be anything
+    told = m.counts[mem.HELD] == 1 or m.counts[mem.STORED] >= TELLS
+    if told and m.counts[mem.SINCE_NOISE] % sensors.kicks_every == 0 and has_torque_noise(motion, m):
         kick(motion, sensors, m)
     if not iterate(motion, sensors, m, table):
         return False

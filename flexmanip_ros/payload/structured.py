@@ -17,9 +17,10 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured_model
 from flexmanip_ros.payload.capture_detection_kernel import filtered
+from flexmanip_ros.payload.gauss_newton import MOST_BIAS
 from flexmanip_ros.payload.interval import POWER_LIMIT, innovation_power, judge
 from flexmanip_ros.payload.measurement_update import MeasurementModel
-from flexmanip_ros.payload.moving_horizon import MOST_BIAS, STARTS, excess_bias, keep_possible
+from flexmanip_ros.payload.moving_horizon import STARTS, excess_bias, keep_possible
 from flexmanip_ros.payload.process_model import Kind, predict
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.samples.sample_log import Rows
@@ -226,7 +227,7 @@ def _forget_payload(model: Model, m: mem.FilterState) -> None:
             if m.counts[mem.SINCE_EVENT] > mem.ENOUGH:
                 m.score[mem.EMPTY_ARM_BIAS] = m.x[payload] / math.sqrt(square)
             if m.counts[mem.SINCE_EVENT] > mem.ENOUGH or m.counts[mem.REFITS]:  # a fit begun again is doubted sooner
-                # the bias for which a fit was begun again counts until that fit closes its horizon, which clears it
+                # the bias for which a fit was begun again counts until a horizon closes with a fit, see close_horizon
                 m.score[mem.EXCESS_BIAS] = max(m.score[mem.EXCESS_BIAS], excess_bias(model.motion, m), key=abs)
             gain = m.S @ f / square
             m.x[:] -= gain * m.x[payload]

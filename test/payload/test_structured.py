@@ -119,8 +119,12 @@ def test_a_fit_of_the_empty_arm_that_ended_ten_deviations_off_is_fitted_again():
     assert abs(again.memory.x[again.model.payload]) < 3.0 * found.std
 
 
-@pytest.mark.parametrize(('bias', 'status'), [(6.0, Status.INCONSISTENT), (0.0, Status.TRACKING)])
-def test_what_an_arm_catches_while_it_is_fitted_again_for_its_bias_is_not_trusted(bias, status):
+@pytest.mark.parametrize(('bias', 'seeming', 'soon', 'late'), [
+    (0.0, 0.0, Status.TRACKING, Status.TRACKING),
+    (6.0, 0.0, Status.INCONSISTENT, Status.TRACKING),
+    (6.0, 6.0, Status.INCONSISTENT, Status.INCONSISTENT)])
+def test_what_an_arm_catches_while_it_is_fitted_again_for_its_bias_is_not_trusted_before_all_fits(
+        bias, seeming, soon, late):
     capture = event(0.6)
     samples = record(2.5, (capture,))
     state = run(config(), samples.between(0, 600))
@@ -128,9 +132,15 @@ def test_what_an_arm_catches_while_it_is_fitted_again_for_its_bias_is_not_truste
     assert m.counts[mem.STORED] < mem.HORIZON
     m.counts[mem.REFITS] = 2
     m.score[mem.EXCESS_BIAS] = bias  # in deviations, by the fit before this one
+    payload = state.model.payload
+    m.x[payload] += seeming * np.linalg.norm(m.S[payload])  # and by this one
     caught = structured.event(config(), state._replace(memory=m), capture)
-    found = structured.estimate(config(), structured.advance(config(), caught, samples.since(600)))
-    assert found.status is status
+    caught = structured.advance(config(), caught, samples.between(600, 900))
+    assert caught.memory.counts[mem.STORED] < mem.HORIZON
+    assert structured.estimate(config(), caught).status is soon
+    caught = structured.advance(config(), caught, samples.since(900))
+    assert caught.memory.counts[mem.STORED] == mem.HORIZON
+    assert structured.estimate(config(), caught).status is late
 
 
 def test_an_arm_that_holds_an_object_nobody_told_of_is_never_trusted():

@@ -29,14 +29,20 @@ def test_caches_older_than_constants_that_a_kernel_reads_are_dropped(tmp_path: P
     package = tmp_path / 'arms'
     cache = package / '__pycache__'
     cache.mkdir(parents=True)
-    kernels = 'from arms.layout import (\n    WIDTH,\n)\nfrom arms.words import say\n@kernel'
-    texts = {'kernels.py': kernels, 'layout.py': '', 'words.py': '', '__pycache__/a.nbi': ''}
-    ages = {'kernels.py': 100, 'layout.py': 100, 'words.py': 300, '__pycache__/a.nbi': 200}
+    kernels = ('from arms.layout import (\n    WIDTH,\n)\nfrom arms import state as mem\n'
+               'from arms.words import say\n@kernel')
+    texts = {'kernels.py': kernels, 'layout.py': '', 'state.py': '', 'words.py': '', '__pycache__/a.nbi': ''}
+    ages = {'kernels.py': 100, 'layout.py': 100, 'state.py': 100, 'words.py': 300, '__pycache__/a.nbi': 200}
     for name, text in texts.items():
         (package / name).write_text(text)
         os.utime(package / name, (ages[name], ages[name]))
     assert drop_stale(package) == 0
     os.utime(package / 'layout.py', (400, 400))
+    assert drop_stale(package) == 1
+    (package / '__pycache__/a.nbi').write_text('')
+    os.utime(package / '__pycache__/a.nbi', (500, 500))
+    assert drop_stale(package) == 0
+    os.utime(package / 'state.py', (600, 600))
     assert drop_stale(package) == 1
 
 
