@@ -21,6 +21,8 @@ PAYLOAD = 'payload'
 PAYLOAD_BODY = 'payload_body'
 ARM_PARAMETERS = 'arm_parameters'
 STATUS = 'status'
+LATCHED = frozenset({MODEL, PAYLOAD_ESTIMATE, PAYLOAD, PAYLOAD_BODY, ARM_PARAMETERS, STATUS})
+"""The topics whose last message a late subscription still gets (transient local, depth 1)."""
 
 
 class Dimension(NamedTuple):

@@ -12,7 +12,6 @@ from flexmanip_ros.cli import console
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import help_text
-from flexmanip_ros.types import QUANTILE
 
 if TYPE_CHECKING:
     from flexmanip_ros.cli.replay import Result
@@ -124,6 +123,7 @@ def _main(given: argparse.Namespace) -> int:
 def describe(result: Result) -> list[str]:
     """Return the result as the lines to print."""
     from flexmanip_ros.studies.results import result_rows
+    from flexmanip_ros.types import QUANTILE
 
     rows = result_rows(result.summary, result.config, result.modes, result.events)
     for part in result.summary.smoothed or ():

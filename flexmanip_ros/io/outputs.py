@@ -18,14 +18,16 @@ import stat
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from flexmanip_ros.errors import BagError, FlexmanipError
-from flexmanip_ros.io.bag_writer import BagWriter
-from flexmanip_ros.messages import MODES, MODES_INTERVAL, PAYLOAD_MASS, outgoing
+from flexmanip_ros.messages import LATCHED, outgoing
 from flexmanip_ros.types import Array, Estimate
+
+if TYPE_CHECKING:
+    from flexmanip_ros.io.bag_writer import BagWriter
 
 PAYLOAD = ('mass', 'std', 'lower', 'upper', 'consistency')
 SCALARS = ('excitation', 'condition', 'innovation_power')
@@ -223,11 +225,12 @@ class Output:
             return
         writer = self._opened()
         for name, value in outgoing(estimate, self._frame_id):
-            latched = name not in (MODES, MODES_INTERVAL, PAYLOAD_MASS)
-            writer.write(f'/{NODE}/{name}', estimate.stamp_ns, value, latched=latched)
+            writer.write(f'/{NODE}/{name}', estimate.stamp_ns, value, latched=name in LATCHED)
 
     def _opened(self) -> BagWriter:
         if self._writer is None:
+            from flexmanip_ros.io.bag_writer import BagWriter  # a program that writes no recording needs no rosbags
+
             self._writer = BagWriter(self.path)
         return self._writer
 

@@ -6,12 +6,15 @@ dB, the sample rate 1 kHz. The torques are square waves. Errors are averaged ove
 lost: the arm is the reference arm of the parameters.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from flexmanip_ros.studies.scenario import Scenario
+if TYPE_CHECKING:
+    from flexmanip_ros.studies.scenario import Scenario
 
 ARM: Mapping[str, Any] = {
     'modes': 1, 'torque_convention': 'paper', 'angle_convention': 'chord', 'shortening': False,
@@ -91,6 +94,8 @@ BEST_MODEL = 'restart'
 
 def scenario(case: Case, method: Method) -> Scenario:
     """Return the scenario of a case for one method."""
+    from flexmanip_ros.studies.scenario import Scenario  # it imports numpy, which the arguments need not wait for
+
     arm = {f'arm.{name}': value for name, value in ARM.items()}
     angles = [math.radians(angle) for angle in case.angles_deg]
     return Scenario(

@@ -11,7 +11,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload.structured_model import Quantity, signals
 from flexmanip_ros.ros.conversions import time_message
-from flexmanip_ros.studies.results import ADVICE
+from flexmanip_ros.ros.diagnostics import ADVICE
 from flexmanip_ros.types import Array, JointRecord, Payload, Status
 
 POINTS = 13

@@ -36,7 +36,7 @@ READERS = 4
 """Number of subscriptions to joint_states in this process: identifier, trigger, excitation, recorder."""
 RECORDED: dict[str, type[Any]] = {
     '/joint_states': JointState, '/effort_controller/commands': Float64MultiArray, '/capture_event': Header,
-    '/capture_detected': Header, **{f'/rpbsid_identifier/{name}': kind for name, (kind, _) in TOPICS.items()},
+    '/capture_detected': Header, **{f'/rpbsid_identifier/{name}': kind for name, kind in TOPICS.items()},
     '/rpbsid_identifier/arm': MarkerArray, '/diagnostics': DiagnosticArray,
 }
 """Recorded topics. The last two are for viewers alone: a replay does not repeat them."""
@@ -87,7 +87,7 @@ class Recorder(Node):
         self._log_ns = max(time.time_ns(), self._log_ns)
         try:
             self.writer.write_raw(topic, self._log_ns, raw, f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}',
-                                  latched=kind is Header)
+                                  latched=kind is Header or name in messages.LATCHED)
         except BagError as error:
             self._fail(error)
 
@@ -164,13 +164,18 @@ class Composition:
                 and all(item.get_subscription_count() >= 1 for item in self.identifier.outputs.values()))
 
     def run(self, show: Callable[[str], None]) -> None:
-        """Activate every node, and run until the last sample is recorded; ``show`` gets a line once a second."""
+        """Activate every node, and run until the last sample is recorded; ``show`` gets a line once a second.
+
+        Raises what ended the simulation early.
+        """
         for node in self._managed:
             node.trigger_activate()
         timer = self.recorder.create_timer(1.0, lambda: show(self._progress()))
         count = round(self.config.duration * self.config.rate)
-        spin(self.executor, until=lambda: self.recorder.joint_states >= count)
+        spin(self.executor, until=lambda: self.recorder.joint_states >= count or self.plant.fault is not None)
         timer.cancel()
+        if self.plant.fault is not None:
+            raise self.plant.fault
 
     def _progress(self) -> str:
         """Return the recorded time of the run and the latest estimate."""
@@ -195,7 +200,7 @@ class Composition:
         """Stop the plant and the excitation, and let every node process the messages still under way."""
         self.plant.trigger_deactivate()
         self.excitation.trigger_deactivate()
-        sent, recorder, identifier = self.plant.samples, self.recorder, self.identifier
+        sent, recorder, identifier = self.plant.published, self.recorder, self.identifier
         self.wait(lambda: recorder.joint_states + recorder.losses.lost >= sent
                          and identifier.state.counters.received + identifier.losses.lost >= sent)
         identifier.trigger_deactivate()  # publishes the last model

@@ -18,7 +18,7 @@ import pytest
 from flexmanip_ros.cli import console
 
 PROGRAMS = ('identify_bag', 'simulate_bag', 'live_view', 'monte_carlo', 'reproduce_paper', 'write_urdf')
-SLOW = ('scipy', 'numba', 'rosbags', 'matplotlib', 'rich', 'rclpy')
+SLOW = ('numpy', 'scipy', 'numba', 'rosbags', 'matplotlib', 'rich', 'rclpy')
 LOADED = """
 import sys
 from flexmanip_ros.cli import {program}

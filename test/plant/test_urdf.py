@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +95,14 @@ def test_the_program_writes_what_the_library_makes(
     assert target.read_text() == urdf(ArmParameters(), 4)
     assert write_urdf.main(['--set', 'arm.modes=many']) == 2
     assert 'arm.modes' in capsys.readouterr().err
+
+
+def test_the_program_needs_no_library_of_recordings(tmp_path: Path) -> None:
+    code = "import sys; sys.modules['rosbags'] = None; from flexmanip_ros.cli import write_urdf; " \
+           "sys.exit(write_urdf.main(['--output', sys.argv[1]]))"
+    done = subprocess.run(
+        [sys.executable, '-c', code, tmp_path / 'arm.urdf'], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, '')
 
 
 @pytest.mark.parametrize('section', ['/**', 'rpbsid_identifier', 'plant_simulator'])

@@ -38,7 +38,7 @@ class Live:
     def __init__(self, ros: Ros, **values: Any) -> None:
         self.ros = ros
         self.said: dict[str, list[Any]] = {}
-        for name, (kind, _) in TOPICS.items():
+        for name, kind in TOPICS.items():
             heard = self.said[name] = []
             ros.helper.create_subscription(
                 kind, f'/rpbsid_identifier/{name}',

@@ -55,6 +55,7 @@ def test_a_payload_that_is_not_known_is_no_ball_and_no_number() -> None:
     found = by_name(ArmMarkers(IdentifierParameters()).message(RECORD, unknown))
     assert found['object0'].action == Marker.DELETE
     assert found['payload0'].text.startswith('payload not known: ')
+    assert words(unknown._replace(status=Status.WARMING_UP)).endswith('take some tenths of a second')  # it runs
     assert words(HELD._replace(status=Status.INCONSISTENT)).startswith('not reliable: 20.00 kg')
     assert words(None) == ''
 

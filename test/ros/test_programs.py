@@ -18,9 +18,13 @@ from urllib.error import URLError
 from urllib.request import urlopen
 
 import pytest
+from rosbags.interfaces import QosDurability
+from rosbags.rosbag2 import Reader
 
+from flexmanip_ros import messages
 from flexmanip_ros.errors import BagError
 from flexmanip_ros.io import bag
+from flexmanip_ros.ros.composition import DRAIN_TIMEOUT_S
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
 NODES = ('plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'live_view')
@@ -80,6 +84,7 @@ def test_help_says_what_it_is_with_its_parameters(
     ('rpbsid_identifier', ['--nonsense'], 'unrecognized arguments: --nonsense'),
     ('capture_trigger', ['--ros-args', '-p', 'qos_overrides./joint_states.subscription.reliability:=magic'],
      "qos_overrides of 'joint_states'"),
+    ('live_view', ['--ros-args', '-p', 'window:=7'], 'window'),
     ('demo', ['--capture-time', '7'], "'capture_time' is 7 s; it must come before the end"),
     ('demo', ['--duration', 'long'], 'invalid float value'),
 ])
@@ -143,6 +148,25 @@ def test_the_demonstration_is_seen_live_recorded_drawn_and_replayed_bit_for_bit(
     assert {b.stamp_ns - a.stamp_ns for a, b in pairwise(recorded)} == {2_000_000}
     assert event == CaptureEvent(recorded[0].stamp_ns + 1_000_000_000, EventKind.CAPTURE)
     assert (folder / 'overview.png').stat().st_size > 20_000
+
+
+def test_a_demonstration_with_lost_samples_ends_at_once_and_records_what_was_offered(tmp_path: Path) -> None:
+    began = time.monotonic()
+    code, out, err = run('demo', str(tmp_path), '--duration', '1', '--capture-time', '0.5', '--rate', '500',
+                         '--ros-args', '-p', 'plant_simulator:sensors.drop_probability:=0.2')
+    assert code == 0, out + err
+    assert time.monotonic() - began < DRAIN_TIMEOUT_S
+    with Reader(tmp_path / 'run_001' / 'bag') as reader:
+        latched = {item.topic.rpartition('/')[2]: item.ext.offered_qos_profiles[0].durability ==
+                   QosDurability.TRANSIENT_LOCAL for item in reader.connections}
+    assert {'model', 'payload', 'payload_estimate', 'status', 'modes'} <= latched.keys()
+    assert latched == {name: name == 'capture_event' or name in messages.LATCHED for name in latched}
+
+
+def test_a_demonstration_whose_plant_fails_ends_with_the_reason(tmp_path: Path) -> None:
+    code, _, err = run('demo', str(tmp_path), '--ros-args', '-p', 'excitation:amplitude:=[1.0e7, 1.0e7]')
+    assert code == 1
+    assert err.splitlines()[-1].startswith('demo: the simulation diverged')
 
 
 def test_an_interrupted_demonstration_leaves_a_readable_bag(tmp_path: Path) -> None:

@@ -34,10 +34,11 @@ NAME = 'live_view'
 class LiveView(FlexmanipNode[ViewParameters]):
     """Takes the messages that wait at a rate of ``ViewParameters.rate``, and sends their content to the open pages."""
 
+    server: Server | None = None
+    """The web server of the page, which exists while the node is active."""
+
     def __init__(self, **options: Any) -> None:
         super().__init__(NAME, ViewParameters, **options)
-        self.server: Server | None = None
-        """The web server of the page, which exists while the node is active."""
         self.losses = LossCounter()
         self._reader = JointStateReader()
 

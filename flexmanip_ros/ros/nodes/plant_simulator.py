@@ -47,10 +47,13 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         self.late_events = 0
         self.rejected_events = 0
         self.samples = 0
+        self.published = 0
+        """Number of samples that were published: those made, without those that ``sensors.drop_probability`` lost."""
         self.backlog = 0
         self._restarted_ns = 0
         self._pending: tuple[CaptureEvent, ...] = ()
-        self._fault = ''
+        self.fault: FlexmanipError | None = None
+        """What stopped the simulation; None while it runs."""
 
     def make_entities(self) -> None:
         """Create the publisher, the subscriptions, the service and the timer."""
@@ -89,7 +92,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         """Put the arm at its initial state from the next stamp on."""
         self._restarted_ns = self._stamp(self.samples)
         self.state = simulator.init(self.config, self._restarted_ns, self._noise_std)
-        self._pending, self._fault, self.efforts = (), '', np.zeros(len(self.config.arm.link_length))
+        self._pending, self.fault, self.efforts = (), None, np.zeros(len(self.config.arm.link_length))
 
     def _stamp(self, index: int) -> int:
         return self._grid.start_ns + round(index * 1e9 / self.config.rate)
@@ -98,7 +101,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         """Make the samples up to the latest instant, at most ``CATCH_UP``."""
         self.backlog = latest + 1 - self.samples
         for _ in range(min(self.backlog, CATCH_UP)):
-            if self._fault:
+            if self.fault is not None:
                 return
             with self.meter.timed():
                 self._step()
@@ -108,12 +111,13 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             self._apply_events(simulator.stamp(self.config, self.state))
             self.state, record = simulator.step(self.config, self.state, self.efforts)
         except FlexmanipError as error:
-            self._fault = str(error)
+            self.fault = error
             self.get_logger().error(f'the simulation stopped: {error}; call {NAME}/reset to start again')
             return
         self.samples += 1
         if record is not None:  # None: lost on its way (sensors.drop_probability)
             self.joint_states.publish(joint_state(record))
+            self.published += 1
 
     def _apply_events(self, stamp: int) -> None:
         """Take or let go of the object before the first sample that is not older than the event."""
@@ -165,7 +169,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             response.success, response.message = False, f'{NAME} is not active'
             return response
         if self._grid.is_running:
-            if self._fault:  # the samples since the fault are not made up for
+            if self.fault is not None:  # the samples since the fault are not made up for
                 self.samples = max(self.samples, self._grid.latest() + 1)
             self._restart()
         response.success, response.message = True, 'the arm is at its start, at rest and empty'
@@ -177,8 +181,8 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         values = report.values
         values.update(samples=self.samples, backlog=self.backlog, dropped_commands=self.dropped_commands,
                       late_events=self.late_events, rejected_events=self.rejected_events)
-        if self._fault:
-            report.worse(ERROR, self._fault)
+        if self.fault is not None:
+            report.worse(ERROR, str(self.fault))
         elif self.active and not self._grid.is_running:
             report.silent(CLOCK)
         elif self.active and values['rate_hz'] < 0.9 * self.config.rate:

@@ -60,14 +60,12 @@ from flexmanip_ros.samples.signals import joints
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Status
 
 NAME = 'rpbsid_identifier'
-TOPICS = {
-    messages.MODEL: (Float64MultiArray, qos.latched), messages.MODES: (Float64MultiArray, qos.output),
-    messages.MODES_INTERVAL: (Float64MultiArray, qos.output),
-    messages.PAYLOAD_MASS: (Float64, qos.output), messages.PAYLOAD_ESTIMATE: (Float64MultiArray, qos.latched),
-    messages.PAYLOAD: (InertiaStamped, qos.latched), messages.PAYLOAD_BODY: (Float64MultiArray, qos.latched),
-    messages.STATUS: (DiagnosticArray, qos.latched), messages.ARM_PARAMETERS: (Float64MultiArray, qos.latched),
+TOPICS: dict[str, type[Any]] = {
+    **dict.fromkeys((messages.MODEL, messages.MODES, messages.MODES_INTERVAL, messages.PAYLOAD_ESTIMATE,
+                     messages.PAYLOAD_BODY, messages.ARM_PARAMETERS), Float64MultiArray),
+    messages.PAYLOAD_MASS: Float64, messages.PAYLOAD: InertiaStamped, messages.STATUS: DiagnosticArray,
 }
-"""Message type and quality of service of each output topic."""
+"""Message type of each output topic."""
 ARM = 'arm'
 ARM_RATE = 25.0
 """Rate at which the markers of the arm are published [Hz]."""
@@ -161,7 +159,9 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def make_entities(self) -> None:
         """Create the publishers, the subscriptions and the reset service."""
-        self.outputs = {name: self.publisher(kind, f'~/{name}', profile()) for name, (kind, profile) in TOPICS.items()}
+        self.outputs = {
+            name: self.publisher(kind, f'~/{name}', qos.latched() if name in messages.LATCHED else qos.output())
+            for name, kind in TOPICS.items()}
         self._joint_states = self.waiting_joint_states(self.losses)
         self._alarm = self.alarm(self._take)
         self._alarm.after(LONGEST_WAIT_S)
