@@ -1,16 +1,27 @@
 """The layout of everything published, as plain values: the live node and a bag written offline share it.
 
-Nothing here imports ROS. ``ros/conversions`` and ``io/bag_writer`` each turn these values into their own
-message classes, so both carry the same numbers.
+Nothing here imports ROS. ``message`` builds the message of a value; ``ros/conversions`` and ``io/bag_writer`` each
+give it their own message classes, so both carry the same numbers.
 """
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from flexmanip_ros.types import QUANTILE, ArmParameter, Array, Estimate, Mode, Payload, StateSpace, Status
+from flexmanip_ros.types import (
+    QUANTILE,
+    ArmParameter,
+    Array,
+    CaptureEvent,
+    Estimate,
+    JointRecord,
+    Mode,
+    Payload,
+    StateSpace,
+    Status,
+)
 
 MODEL = 'model'
 MODES = 'modes'
@@ -176,6 +187,49 @@ def _status(name: str, status: Status, trusted: bool, stamp_ns: int, hardware_id
 
 
 Value = LabelledArray | Inertia | Diagnostics | float
+"""What the identifier publishes."""
+AnyValue = Value | JointRecord | CaptureEvent
+"""Every value that has a message."""
+SECOND = 1_000_000_000
+FIRST_NS, LAST_NS = -(1 << 31) * SECOND, (1 << 31) * SECOND - 1
+"""Smallest and largest time that a stamp can hold [ns] (its seconds have 32 bits)."""
+
+
+def stamp(nanoseconds: int) -> dict[str, int]:
+    """Return the fields of a Time; a time beyond the range of stamps becomes the nearest stamp."""
+    sec, nanosec = divmod(min(max(nanoseconds, FIRST_NS), LAST_NS), SECOND)
+    return {'sec': sec, 'nanosec': nanosec}
+
+
+def message(value: AnyValue, new: Callable[..., Any]) -> Any:
+    """Return a value as its ROS message. new: makes a message from the name of its type and its fields."""
+    def header(stamp_ns: int, frame_id: str = '') -> Any:
+        return new('std_msgs/msg/Header', stamp=new('builtin_interfaces/msg/Time', **stamp(stamp_ns)),
+                   frame_id=frame_id)
+
+    if isinstance(value, JointRecord):
+        arrays = {name: np.ascontiguousarray(getattr(value, name), dtype=np.float64)
+                  for name in ('position', 'velocity', 'effort')}
+        return new('sensor_msgs/msg/JointState', header=header(value.stamp_ns), name=list(value.names), **arrays)
+    if isinstance(value, CaptureEvent):
+        return header(value.stamp_ns, value.kind.value)
+    if isinstance(value, LabelledArray):
+        dimensions = [new('std_msgs/msg/MultiArrayDimension', **item._asdict()) for item in value.dimensions]
+        layout = new('std_msgs/msg/MultiArrayLayout', dim=dimensions, data_offset=0)
+        return new('std_msgs/msg/Float64MultiArray', layout=layout, data=np.asarray(value.data, dtype=np.float64))
+    if isinstance(value, Inertia):
+        com = new('geometry_msgs/msg/Vector3', **dict(zip('xyz', map(float, value.com), strict=True)))
+        moments = dict(zip(('ixx', 'ixy', 'ixz', 'iyy', 'iyz', 'izz'), map(float, value.inertia), strict=True))
+        body = new('geometry_msgs/msg/Inertia', m=float(value.mass), com=com, **moments)
+        return new('geometry_msgs/msg/InertiaStamped', header=header(value.stamp_ns, value.frame_id), inertia=body)
+    if isinstance(value, Diagnostics):
+        statuses = [
+            new('diagnostic_msgs/msg/DiagnosticStatus', level=item.level, name=item.name, message=item.message,
+                hardware_id=item.hardware_id,
+                values=[new('diagnostic_msgs/msg/KeyValue', key=key, value=text) for key, text in item.values])
+            for item in value.statuses]
+        return new('diagnostic_msgs/msg/DiagnosticArray', header=header(value.stamp_ns), status=statuses)
+    return new('std_msgs/msg/Float64', data=float(value))
 
 
 def outgoing(estimate: Estimate, frame_id: str) -> Iterator[tuple[str, Value]]:

@@ -19,7 +19,7 @@ from sensor_msgs.msg import JointState
 from flexmanip_ros.io import cdr
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, configure
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.conversions import joint_state, time_message
+from flexmanip_ros.ros.conversions import time_message, to_message
 from flexmanip_ros.ros.rclpy_workarounds import make_executor, spin, with_info
 from flexmanip_ros.simulation import excitation, simulator
 
@@ -71,7 +71,7 @@ class Player(Node):
         plant = configure(PlantParameters, {'rate': rate})
         torque = excitation.sequence(configure(ExcitationParameters, {'rate': rate}), round(seconds * rate))
         made = simulator.simulate(plant, torque, (), 0)
-        self.messages = [serialize_message(joint_state(item)) for item in simulator.records(made)]
+        self.messages = [serialize_message(to_message(item)) for item in simulator.records(made)]
         self.sent, self.rate = 0, rate
         self.began: float | None = None
         self.states = self.create_publisher(JointState, 'joint_states', qos.sensor_output())

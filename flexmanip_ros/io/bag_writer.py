@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
@@ -17,13 +15,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from flexmanip_ros.errors import BagError
 from flexmanip_ros.io.bag import STORAGE, DamagedError, salvaged
-from flexmanip_ros.messages import Diagnostics, Inertia, LabelledArray
-from flexmanip_ros.types import CaptureEvent, JointRecord
+from flexmanip_ros.messages import AnyValue, message
 
 FLUSH_PERIOD = 0.2
 """Time between two flushes [s]. The library itself flushes after one mebibyte, which is 4 s at 1 kHz."""
-
-Value = JointRecord | CaptureEvent | float | LabelledArray | Inertia | Diagnostics
 
 
 def _qos(latched: bool) -> Qos:
@@ -34,7 +29,7 @@ def _qos(latched: bool) -> Qos:
 
 
 class BagWriter:
-    """A recording under ``path``, a new directory. Use it in a ``with``; any thread may write.
+    """A recording under ``path``, a new directory. Use it in a ``with``, on one thread.
 
     The ``with`` closes it after an exception too, so that it can be read. Raises BagError when the path exists or the
     disk fails.
@@ -46,7 +41,6 @@ class BagWriter:
         self.path = Path(path)
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._connections: dict[str, Connection] = {}
-        self._lock = threading.Lock()
         self._flush_period = np.inf if flush_period is None else flush_period
         self._flushed = time.monotonic()
         try:
@@ -56,44 +50,28 @@ class BagWriter:
             raise BagError(f"bag '{path}' exists already", 'remove it or give another name') from err
         except OSError as err:
             raise BagError(f"bag '{path}' cannot be written: {err.strerror}", 'give another place') from err
-        self._open = True
 
-    def write(self, topic: str, log_ns: int, value: Value, *, latched: bool = False) -> None:
+    def write(self, topic: str, log_ns: int, value: AnyValue, *, latched: bool = False) -> None:
         """Append a value as its message. log_ns: time of recording [ns], which must not decrease."""
-        message = _message(self._types.types, value)
-        kind = message.__msgtype__
-        self.write_raw(topic, log_ns, bytes(self._types.serialize_cdr(message, kind)), kind, latched=latched)
+        made = message(value, lambda kind, **fields: self._types.types[kind](**fields))
+        kind = made.__msgtype__
+        self.write_raw(topic, log_ns, bytes(self._types.serialize_cdr(made, kind)), kind, latched=latched)
 
     def write_raw(self, topic: str, log_ns: int, data: bytes, kind: str, *, latched: bool = False) -> None:
         """Append a serialized message. kind: its type, such as std_msgs/msg/Header."""
-        with self._lock:
-            if not self._open:
-                raise BagError(f"bag '{self.path}' is closed", 'write before closing it')
-            try:
-                self._writer.write(self._connection(topic, kind, latched), log_ns, data)
-                if time.monotonic() - self._flushed > self._flush_period:
-                    self._flush()
-            except OSError as err:
-                raise BagError(f"bag '{self.path}' cannot be written: {err.strerror}",
-                               'free some space and write it again') from err
+        try:
+            if topic not in self._connections:
+                self._connections[topic] = self._writer.add_connection(
+                    topic, kind, typestore=self._types, offered_qos_profiles=[_qos(latched)])
+            self._writer.write(self._connections[topic], log_ns, data)
+            if time.monotonic() - self._flushed > self._flush_period:
+                self.flush()
+        except OSError as err:
+            raise BagError(f"bag '{self.path}' cannot be written: {err.strerror}",
+                           'free some space and write it again') from err
 
     def flush(self) -> None:
         """Flush now. A recorder calls this on a timer, as ``write`` flushes only when a message comes."""
-        with self._lock:
-            if self._open:
-                self._flush()
-
-    def _connection(self, topic: str, kind: str, latched: bool) -> Connection:
-        known = self._connections.get(topic)
-        if known is None:
-            known = self._connections[topic] = self._writer.add_connection(
-                topic, kind, typestore=self._types, offered_qos_profiles=[_qos(latched)])
-        if known.msgtype != kind:
-            raise BagError(f"topic '{topic}' of bag '{self.path}' carries {known.msgtype}",
-                           f'use another topic for {kind}')
-        return known
-
-    def _flush(self) -> None:
         store = self._writer.storage
         if isinstance(store, McapWriter):
             if store.chunk.msgs:
@@ -102,22 +80,17 @@ class BagWriter:
         self._flushed = time.monotonic()
 
     def close(self) -> None:
-        """Write index and metadata. Calling it again does nothing."""
-        with self._lock:
-            if not self._open:
-                return
-            self._open = False
-            try:
-                self._writer.close()
-            except OSError as err:
-                with contextlib.suppress(OSError):  # the rest of the buffer cannot be written either
-                    self._writer.abort()
-                problem = f"bag '{self.path}' cannot be finished: {err.strerror}"
-                if self._holds_messages():
-                    raise BagError(f'{problem}; its end is missing, earlier messages are on the disk',
-                                   "free some space, then run 'ros2 bag reindex'") from err
-                raise BagError(f'{problem}; no message is on the disk', 'free some space, remove it, run again'
-                               ) from err
+        """Write index and metadata."""
+        try:
+            self._writer.close()
+        except OSError as err:
+            with contextlib.suppress(OSError):  # the rest of the buffer cannot be written either
+                self._writer.abort()
+            problem = f"bag '{self.path}' cannot be finished: {err.strerror}"
+            if self._holds_messages():
+                raise BagError(f'{problem}; its end is missing, earlier messages are on the disk',
+                               "free some space, then run 'ros2 bag reindex'") from err
+            raise BagError(f'{problem}; no message is on the disk', 'free some space, remove it, run again') from err
 
     def _holds_messages(self) -> bool:
         """Return whether a message can be read of a recording that was not finished."""
@@ -130,36 +103,3 @@ class BagWriter:
 
     def __exit__(self, *error: object) -> None:
         self.close()
-
-
-def _message(classes: Any, value: Value) -> Any:
-    """Convert a value of this package to a message object of the recording library."""
-    def new(kind: str, *fields: Any) -> Any:
-        return classes[kind](*fields)
-
-    def header(stamp_ns: int, frame_id: str = '') -> Any:
-        return new('std_msgs/msg/Header', new('builtin_interfaces/msg/Time', *divmod(stamp_ns, 10**9)), frame_id)
-
-    if isinstance(value, JointRecord):
-        arrays = (np.ascontiguousarray(part, dtype=np.float64)
-                  for part in (value.position, value.velocity, value.effort))
-        return new('sensor_msgs/msg/JointState', header(value.stamp_ns), list(value.names), *arrays)
-    if isinstance(value, CaptureEvent):
-        return header(value.stamp_ns, value.kind.value)
-    if isinstance(value, LabelledArray):
-        dimensions = [new('std_msgs/msg/MultiArrayDimension', *item) for item in value.dimensions]
-        layout = new('std_msgs/msg/MultiArrayLayout', dimensions, 0)
-        return new('std_msgs/msg/Float64MultiArray', layout, np.asarray(value.data, dtype=np.float64))
-    if isinstance(value, Inertia):
-        com = new('geometry_msgs/msg/Vector3', *(float(part) for part in value.com))
-        inertia = new('geometry_msgs/msg/Inertia', float(value.mass), com, *(float(part) for part in value.inertia))
-        return new('geometry_msgs/msg/InertiaStamped', header(value.stamp_ns, value.frame_id), inertia)
-    if isinstance(value, Diagnostics):
-        statuses = [
-            new('diagnostic_msgs/msg/DiagnosticStatus', status.level, status.name, status.message, status.hardware_id,
-                [new('diagnostic_msgs/msg/KeyValue', key, text) for key, text in status.values])
-            for status in value.statuses]
-        return new('diagnostic_msgs/msg/DiagnosticArray', header(value.stamp_ns), statuses)
-    if isinstance(value, float):
-        return new('std_msgs/msg/Float64', value)
-    raise TypeError(f'no message for a {type(value).__name__}')

@@ -23,7 +23,7 @@ from flexmanip_ros.io import cdr
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.parameters import DemoParameters
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.conversions import from_message
+from flexmanip_ros.ros.conversions import type_name
 from flexmanip_ros.ros.diagnostics import LossCounter
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.nodes.excitation import Excitation
@@ -64,8 +64,8 @@ class Recorder(Node):
         self.failure: BagError | None = None
         self.first_ns: int | None = None
         self.last_ns = self.joint_states = self._log_ns = 0
-        self.published: dict[str, list[messages.Value]] = {name: [] for name in TOPICS}
-        """Values that the identifier published, by topic, in the order of arrival."""
+        self.published: dict[str, list[Any]] = {name: [] for name in TOPICS}
+        """Messages that the identifier published, by topic, in the order of arrival."""
         self.losses = LossCounter()
         deep = QoSProfile(depth=qos.SENSOR_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
         for topic, kind in RECORDED.items():
@@ -81,12 +81,12 @@ class Recorder(Node):
             self.first_ns = self.last_ns if self.first_ns is None else self.first_ns
             self.joint_states += 1
         elif name in self.published:
-            self.published[name].append(from_message(deserialize_message(raw, kind)))
+            self.published[name].append(deserialize_message(raw, kind))
         if self.failure is not None:
             return
         self._log_ns = max(time.time_ns(), self._log_ns)
         try:
-            self.writer.write_raw(topic, self._log_ns, raw, f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}',
+            self.writer.write_raw(topic, self._log_ns, raw, type_name(kind),
                                   latched=kind is Header or name in messages.LATCHED)
         except BagError as error:
             self._fail(error)

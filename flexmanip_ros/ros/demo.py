@@ -17,7 +17,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.request import urlopen
 
 import numpy as np
@@ -27,18 +27,19 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from rich.console import Console
 from rich.table import Table
+from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.arm.linearization import frequencies, vibration_model
 from flexmanip_ros.errors import FlexmanipError, ParameterError
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.plots import Truth, collect, overview_figure
-from flexmanip_ros.messages import LabelledArray, Value
 from flexmanip_ros.parameters import DemoParameters, PlantParameters, configure, flatten, leaves
 from flexmanip_ros.parameters.arm import settings
 from flexmanip_ros.parameters.document import NODES, written, yaml_text
 from flexmanip_ros.ros import rclpy_workarounds
 from flexmanip_ros.ros.composition import Composition, foreign_arm
+from flexmanip_ros.ros.conversions import to_message
 from flexmanip_ros.ros.node import BAD_INPUT, reject
 from flexmanip_ros.studies.results import status_text
 from flexmanip_ros.types import QUANTILE, CaptureEvent, Estimate, JointRecord
@@ -286,16 +287,16 @@ def _occupied() -> bool:
     return found
 
 
-def outgoing(estimates: Iterable[Estimate], frame_id: str) -> dict[str, list[Value]]:
-    """Return the values that are published for estimates, by topic, in order."""
-    published: dict[str, list[Value]] = {}
+def outgoing(estimates: Iterable[Estimate], frame_id: str) -> dict[str, list[Any]]:
+    """Return the messages that are published for estimates, by topic, in order."""
+    published: dict[str, list[Any]] = {}
     for estimate in estimates:
         for name, value in messages.outgoing(estimate, frame_id):
-            published.setdefault(name, []).append(value)
+            published.setdefault(name, []).append(to_message(value))
     return published
 
 
-def compare(live: Mapping[str, Sequence[Value]], replayed: Mapping[str, Sequence[Value]]) -> str:
+def compare(live: Mapping[str, Sequence[Any]], replayed: Mapping[str, Sequence[Any]]) -> str:
     """Return a sentence on the first difference in any bit between two sets of messages; empty when they are equal."""
     for name in sorted({*live, *replayed}):
         ours, theirs = live.get(name, ()), replayed.get(name, ())
@@ -307,11 +308,11 @@ def compare(live: Mapping[str, Sequence[Value]], replayed: Mapping[str, Sequence
     return ''
 
 
-def _bits(value: Value) -> bytes:
-    """Return a published value as bytes; two values give equal bytes only when every bit is equal."""
-    if isinstance(value, LabelledArray):
-        return repr(value.dimensions).encode() + np.asarray(value.data, dtype=np.float64).tobytes()
-    return repr(value).encode()
+def _bits(message: Any) -> bytes:
+    """Return a message as bytes; two messages give equal bytes only when every bit is equal."""
+    if isinstance(message, Float64MultiArray):
+        return repr(message.layout).encode() + bytes(message.data)
+    return repr(message).encode()
 
 
 def known_truth(config: DemoParameters, plant: PlantParameters, items: Sequence[JointRecord | CaptureEvent]) -> Truth:

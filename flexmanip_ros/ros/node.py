@@ -36,7 +36,7 @@ from flexmanip_ros.io import cdr
 from flexmanip_ros.messages import Diagnostics
 from flexmanip_ros.parameters.document import help_text
 from flexmanip_ros.ros import qos, rclpy_workarounds
-from flexmanip_ros.ros.conversions import diagnostic_array
+from flexmanip_ros.ros.conversions import to_message
 from flexmanip_ros.ros.diagnostics import (
     CLOCK,
     ERROR,
@@ -316,7 +316,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
             self._log_silence(report)
             self._heard_at = self._heard_at if report.waits_for else now
         entry = report.entry(self.get_fully_qualified_name(), self.get_namespace())
-        self._diagnostics.publish(diagnostic_array(Diagnostics(self.get_clock().now().nanoseconds, (entry,))))
+        self._diagnostics.publish(to_message(Diagnostics(self.get_clock().now().nanoseconds, (entry,))))
 
     def _log_silence(self, report: Report) -> None:
         """Log when the messages that the node needs cease or come."""

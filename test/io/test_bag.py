@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import resource
 import shutil
-import threading
 from contextlib import contextmanager
 
 import numpy as np
@@ -103,8 +102,8 @@ def test_a_place_that_cannot_be_written_is_said(tmp_path):
 
 
 def test_an_exception_while_recording_leaves_a_whole_bag(tmp_path):
-    with pytest.raises(TypeError), BagWriter(tmp_path / 'bag') as writer:
-        writer.write('/joint_states', START, joint_state_record(0)) or writer.write('/x', START, 'a text')
+    with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'bag') as writer:
+        writer.write('/joint_states', START, joint_state_record(0)) or 1 / 0
     assert len(list(bag.read(tmp_path / 'bag'))) == 1
 
 
@@ -143,20 +142,6 @@ def test_a_killed_recorder_loses_only_what_was_not_flushed(tmp_path):
     items, line = good_part(copy)
     assert len(items) == 30
     assert '30 messages' in line
-
-
-def test_several_threads_may_write(tmp_path):
-    with BagWriter(tmp_path / 'bag') as writer:
-        def fill(topic: str) -> None:
-            for k in range(100):
-                writer.write(topic, START + k, joint_state_record(k))
-        threads = [threading.Thread(target=fill, args=(f'/t{i}',)) for i in range(4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    with Reader(tmp_path / 'bag') as reader:
-        assert sum(1 for _ in reader.messages()) == 400
 
 
 def test_a_namespace_is_found_and_two_are_asked_about(tmp_path):

@@ -39,10 +39,7 @@ class Live:
         self.ros = ros
         self.said: dict[str, list[Any]] = {}
         for name, kind in TOPICS.items():
-            heard = self.said[name] = []
-            ros.helper.create_subscription(
-                kind, f'/rpbsid_identifier/{name}',
-                lambda message, heard=heard: heard.append(conversions.from_message(message)), 1000)
+            self.said[name] = ros.listen(kind, f'/rpbsid_identifier/{name}')
         self.diagnostics = ros.listen(DiagnosticArray, '/diagnostics', 10)
         self.node = ros.managed(RpbsidIdentifier(context=ros.context, overrides=overrides(**values)))
         self.joint_states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
@@ -55,7 +52,7 @@ class Live:
             part = records[first:first + 200]
             before = self.node.state.counters.received
             for record in part:
-                self.joint_states.publish(conversions.joint_state(record))
+                self.joint_states.publish(conversions.to_message(record))
             self.ros.wait(lambda before=before, part=part:
                           self.node.state.counters.received >= before + len(part), what='samples to be taken')
 

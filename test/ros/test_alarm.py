@@ -49,7 +49,7 @@ def test_diagnostics_come_once_a_second_while_samples_are_taken(ros: Ros) -> Non
     live = Live(ros, payload_method='none')
     samples, began = recording(), time.monotonic()
     for k, record in enumerate(samples * 6):
-        live.joint_states.publish(conversions.joint_state(record._replace(
+        live.joint_states.publish(conversions.to_message(record._replace(
             stamp_ns=samples[0].stamp_ns + 1_000_000 * k)))
         if k % 5 == 0:
             time.sleep(max(began + 1e-3 * k - time.monotonic(), 0.0))

@@ -77,7 +77,7 @@ def test_the_identifier_shows_the_latest_sample_and_what_it_holds_when_somebody_
     heard = ros.listen(MarkerArray, '/rpbsid_identifier/arm', 10)
     live = Live(ros)
     ros.wait(lambda: live.node.arm.get_subscription_count() == 1)
-    live.events.publish(conversions.header(CAPTURE))
+    live.events.publish(conversions.to_message(CAPTURE))
     samples = recording(700)
     live.send(*samples)
     ros.wait(lambda: heard and conversions.stamp_ns(heard[-1].markers[0].header.stamp) == samples[-1].stamp_ns,

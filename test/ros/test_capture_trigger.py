@@ -13,8 +13,7 @@ from std_srvs.srv import Trigger
 
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters
 from flexmanip_ros.ros import diagnostics, qos
-from flexmanip_ros.ros.conversions import joint_state as joint_state_message
-from flexmanip_ros.ros.conversions import stamp_ns
+from flexmanip_ros.ros.conversions import stamp_ns, to_message
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
 from flexmanip_ros.simulation import simulator
 from flexmanip_ros.simulation.excitation import sequence
@@ -102,7 +101,7 @@ def test_mode_auto_finds_a_capture_and_tells_it_where_the_plant_does_not_listen(
     count, capture = 2600, CaptureEvent(START_NS + 2_100_000_000, EventKind.CAPTURE)
     run = simulator.simulate(PlantParameters(), sequence(ExcitationParameters(), count), (capture,), START_NS)
     for k, record in enumerate(simulator.records(run)):
-        publisher.publish(joint_state_message(record))
+        publisher.publish(to_message(record))
         if k % 200 == 199:
             ros.wait(lambda k=k: node._watch.clock.counters.received == k + 1)
     ros.wait(lambda: detected, what='the detected capture')

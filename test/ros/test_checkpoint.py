@@ -21,7 +21,7 @@ def test_an_identifier_that_is_restarted_goes_on_as_if_it_had_only_missed_sample
     samples = recording(900)
     first = Live(ros, checkpoint_file=file)
     first.send(*samples[:300])
-    first.events.publish(conversions.header(CAPTURE))
+    first.events.publish(conversions.to_message(CAPTURE))
     ros.wait(lambda: first.node.state.payload.pending)
     first.send(*samples[300:500])
     ros.remove(first.node)
@@ -93,9 +93,9 @@ def test_a_state_of_other_parameters_or_damaged_or_old_is_not_used_and_the_node_
     assert old.node.state.counters.received == 60
     late = recording(1)[0]._replace(stamp_ns=recording(1)[0].stamp_ns + 3600 * 10**9)
     caught = CaptureEvent(late.stamp_ns - 10**9, EventKind.CAPTURE)  # it is latched, so it comes first
-    old.events.publish(conversions.header(caught))
+    old.events.publish(conversions.to_message(caught))
     ros.wait(lambda: old.node.state.stamp_of(EventKind.CAPTURE) is not None)
-    old.joint_states.publish(conversions.joint_state(late))
+    old.joint_states.publish(conversions.to_message(late))
     ros.wait(lambda: old.node.state.counters.received == 1, what='a fresh start')
     assert old.node.state.stamp_of(EventKind.CAPTURE) == caught.stamp_ns
     ros.remove(old.node)

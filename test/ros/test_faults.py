@@ -23,7 +23,7 @@ def believed(live: Live) -> Payload:
     """Return the latest payload; every payload ever said must be finite in mass."""
     payload = live.node.estimate.payload
     assert payload is not None
-    assert all(math.isfinite(mass) for mass in live.said[messages.PAYLOAD_MASS])
+    assert all(math.isfinite(mass.data) for mass in live.said[messages.PAYLOAD_MASS])
     return payload
 
 
@@ -34,7 +34,7 @@ def honest(payload: Payload, truth: float) -> bool:
 
 
 def announce(ros: Ros, live: Live) -> None:
-    live.events.publish(conversions.header(CAPTURE))
+    live.events.publish(conversions.to_message(CAPTURE))
     ros.wait(lambda: live.node.state.payload is None or live.node.state.payload.latest)
 
 
@@ -136,7 +136,7 @@ def test_a_flood_is_taken_or_counted_as_lost_to_the_last_message(ros: Ros) -> No
     samples = recording(4000)
     live.send(samples[0])  # what is lost before the first message that comes is not counted
     for sample in samples[1:]:  # as fast as the publisher can: several times the usual rate
-        live.joint_states.publish(conversions.joint_state(sample))
+        live.joint_states.publish(conversions.to_message(sample))
     counts = [-1]
 
     def is_quiet() -> bool:
@@ -169,10 +169,10 @@ def test_a_release_without_a_capture_and_two_captures_claim_nothing_wrong(ros: R
     samples = recording(900)
     live.send(*samples[:200])
     release = CaptureEvent(START_NS + 210_000_000, EventKind.RELEASE)
-    live.events.publish(conversions.header(release))
+    live.events.publish(conversions.to_message(release))
     ros.wait(lambda: live.node.state.payload.latest)
     for stamp in (CAPTURE.stamp_ns, CAPTURE.stamp_ns + 1_000_000):
-        live.events.publish(conversions.header(CAPTURE._replace(stamp_ns=stamp)))
+        live.events.publish(conversions.to_message(CAPTURE._replace(stamp_ns=stamp)))
     ros.wait(lambda: live.node.state.payload.repeated_events == 1)
     live.send(*samples[200:])
     assert honest(believed(live), TRUTH)
@@ -200,8 +200,8 @@ def test_two_publishers_on_two_clocks_are_named_and_the_resets_logged_once_in_tw
     samples = recording(700)
     for k in range(0, 700, 50):
         for sample in samples[k:k + 50]:
-            live.joint_states.publish(conversions.joint_state(sample))
-        other.publish(conversions.joint_state(samples[k]._replace(stamp_ns=k * 10**6)))
+            live.joint_states.publish(conversions.to_message(sample))
+        other.publish(conversions.to_message(samples[k]._replace(stamp_ns=k * 10**6)))
         ros.wait(lambda k=k: live.node.state.counters.received >= (k // 50 + 1) * 51)
     assert live.node.state.counters.resets > 5
     cause = '2 publishers are on /joint_states: only one may publish these joints, with the stamps of one clock'
@@ -217,9 +217,9 @@ def test_two_publishers_of_different_joints_are_no_fault(ros: Ros, log: Callable
     ros.wait(lambda: live.node.losses.publishers == 2)
     log('')
     for k, sample in enumerate(recording(600)):
-        live.joint_states.publish(conversions.joint_state(sample))
+        live.joint_states.publish(conversions.to_message(sample))
         if k % 10 == 0:
-            gripper.publish(conversions.joint_state(renamed(sample, 'f1', 'f2', 'f3', 'f4')))
+            gripper.publish(conversions.to_message(renamed(sample, 'f1', 'f2', 'f3', 'f4')))
         if k % 100 == 99:
             ros.wait(lambda k=k: live.node.state.counters.accepted == k + 1)
     ros.wait(lambda: live.node.faults.foreign == 60)

@@ -146,7 +146,7 @@ def test_the_identifier_logs_what_it_does_waits_for_and_finds(ros: Ros, log: Cal
     samples = recording(1500)
     live.send(*samples[:300])
     log('messages arrive: ')
-    live.events.publish(conversions.header(CAPTURE))
+    live.events.publish(conversions.to_message(CAPTURE))
     log('capture_event: capture at ')
     live.send(*samples[300:])
     log('status TRACKING: tracking; the estimates can be used')
@@ -161,7 +161,7 @@ def test_an_event_with_a_stamp_of_another_clock_is_warned_of(ros: Ros, log: Call
     live = Live(ros)
     live.send(*recording(300))
     log('status TRACKING')
-    live.events.publish(conversions.header(CAPTURE._replace(stamp_ns=0)))
+    live.events.publish(conversions.to_message(CAPTURE._replace(stamp_ns=0)))
     log('capture_event: capture at 0.000000, ')
     log(' s before the last sample: stamp an event with the time of its samples')
 
@@ -196,23 +196,24 @@ def test_the_status_message_alone_says_whether_payload_and_model_are_to_be_trust
     live = Live(ros)
     samples = recording(1500)
     live.send(*samples[:200])
-    live.events.publish(conversions.header(CAPTURE))
+    live.events.publish(conversions.to_message(CAPTURE))
     ros.wait(lambda: live.node.state.payload.pending)
     live.send(*samples[200:])
     live.finish()
     ros.wait(lambda: len(live.said[messages.STATUS]) >= len(live.said[messages.MODEL])
              + len(live.said[messages.PAYLOAD_ESTIMATE]))
+    statuses = [conversions.diagnostics(message) for message in live.said[messages.STATUS]]
     for name, topic in (('payload', messages.PAYLOAD_ESTIMATE), ('model', messages.MODEL)):
-        entries = [item for item in live.said[messages.STATUS] if item.statuses[0].name == name]
+        entries = [item for item in statuses if item.statuses[0].name == name]
         assert len(entries) == len(live.said[topic])
         (last,) = entries[-1].statuses
         status = dict(last.values)['status']
         assert status == 'TRACKING' if name == 'payload' else status in ('TRACKING', 'WARMING_UP')
         assert last.level == (0 if status == 'TRACKING' else 1)
-    payloads = {item.stamp_ns: dict(item.statuses[0].values) for item in live.said[messages.STATUS]
+    payloads = {item.stamp_ns: dict(item.statuses[0].values) for item in statuses
                 if item.statuses[0].name == 'payload'}
     for body in live.said[messages.PAYLOAD]:
-        assert float(payloads[body.stamp_ns]['mass_kg']) == body.mass
+        assert float(payloads[conversions.stamp_ns(body.header.stamp)]['mass_kg']) == body.inertia.m
     unknown = [values for values in payloads.values() if values['mass_kg'] == 'nan']
     assert unknown
     assert len(live.said[messages.PAYLOAD_MASS]) == len(payloads) - len(unknown)

@@ -16,8 +16,7 @@ from std_msgs.msg import Float64MultiArray, Header
 from std_srvs.srv import Trigger
 
 from flexmanip_ros import event_replay
-from flexmanip_ros.ros.conversions import header, time_message
-from flexmanip_ros.ros.conversions import joint_state as message_of
+from flexmanip_ros.ros.conversions import time_message, to_message
 from flexmanip_ros.types import Status
 
 pytestmark = pytest.mark.filterwarnings('ignore::RuntimeWarning')  # numbers out of range have a status
@@ -59,8 +58,8 @@ def test_after_all_of_it_the_identifier_claims_nothing_wrong_and_after_a_reset_t
         before = bench.node.state.counters.received
         for k, sample in enumerate(recording(1500)):
             if k == 300:
-                bench.send([('capture_event', header(CAPTURE))])
-            bench.send([('joint_states', message_of(sample))], wait=False)
+                bench.send([('capture_event', to_message(CAPTURE))])
+            bench.send([('joint_states', to_message(sample))], wait=False)
             if k % 100 == 99:  # it takes them at 50 Hz, before them what is left of the made-up ones
                 ros.wait(lambda due=before + k + 1: bench.node.state.counters.received >= due,
                          what='the identifier to take the samples')

@@ -26,7 +26,7 @@ from test_server import Events
 
 from flexmanip_ros import messages
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.conversions import diagnostic_array, header, joint_state
+from flexmanip_ros.ros.conversions import to_message
 from flexmanip_ros.ros.nodes.live_view import LiveView
 from flexmanip_ros.types import EventKind, JointRecord, Payload, Status
 
@@ -50,12 +50,12 @@ class Live:
         for first in range(0, len(records), 500):  # in portions that its queue holds
             part, before = records[first:first + 500], self.node._screen.samples
             for record in part:
-                self.joint_states.publish(joint_state(record))
+                self.joint_states.publish(to_message(record))
             self.ros.wait(lambda before=before, part=part: self.node._screen.samples >= before + len(part))
 
     def payload(self, stamp_ns: int, mass: float, status: Status = Status.TRACKING) -> None:
         value = Payload(mass, 0.01, mass - 0.02, mass + 0.02, 1.0, status)
-        self.statuses.publish(diagnostic_array(messages.payload_status(value, stamp_ns, '')))
+        self.statuses.publish(to_message(messages.payload_status(value, stamp_ns, '')))
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def read(page: Events, until: int) -> dict[str, Any]:
 def test_a_page_is_told_every_sample_payload_and_event(live: Live, page: Events) -> None:
     records = recording(700)
     live.samples(*records[:1])
-    live.events.publish(header(CAPTURE))
+    live.events.publish(to_message(CAPTURE))
     live.ros.wait(lambda: live.node._screen._known)
     for k in (100, 200):
         live.payload(START_NS + k * 1_000_000, 20.0 + k)
@@ -106,7 +106,7 @@ def test_a_page_is_told_every_sample_payload_and_event(live: Live, page: Events)
 
 
 def test_a_page_that_opens_later_is_told_of_the_capture_too(live: Live) -> None:
-    live.events.publish(header(CAPTURE))
+    live.events.publish(to_message(CAPTURE))
     live.samples(*recording(700)[:500])
     page = Events(live.server)
     told = read(page, 500)
@@ -199,10 +199,10 @@ def test_at_1_khz_it_takes_far_less_than_a_callback_for_each_sample_and_loses_no
         began, first = time.perf_counter(), sent
         while (now := time.perf_counter() - began) < seconds:
             for _ in range(sent - first, int(1e3 * now)):
-                states.publish(joint_state(records[sent % 700]._replace(stamp_ns=START_NS + sent * 1_000_000)))
+                states.publish(to_message(records[sent % 700]._replace(stamp_ns=START_NS + sent * 1_000_000)))
                 sent += 1
                 if sent % 18 == 0:
-                    statuses.publish(diagnostic_array(messages.payload_status(held, START_NS + sent * 1_000_000, '')))
+                    statuses.publish(to_message(messages.payload_status(held, START_NS + sent * 1_000_000, '')))
             time.sleep(5e-4)
         return sent
 
@@ -241,7 +241,7 @@ def test_a_person_sees_status_mass_and_silence(live: Live, tmp_path: Path) -> No
         browser.wait("document.getElementById('alarm').innerText === 'waiting for /joint_states'")
         records = recording(700)
         live.samples(*records[:1])
-        live.events.publish(header(CAPTURE))
+        live.events.publish(to_message(CAPTURE))
         live.ros.wait(lambda: live.node._screen._known)
         live.samples(*records[1:])
         live.payload(records[-1].stamp_ns, 20.0)

@@ -27,11 +27,11 @@ def test_live_over_a_lossy_network_the_payload_is_trusted_and_a_replay_gives_the
     relay = ros.add(lossy.Relay(case, 1, context=ros.context))
     sent = ros.publisher(JointState, 'sent/joint_states', qos.sensor_output())
     ros.wait(lambda: live.node.losses.publishers == 2, what='the relay at the identifier')
-    live.events.publish(conversions.header(CAPTURE))
+    live.events.publish(conversions.to_message(CAPTURE))
     samples = recording(2000)
     for first in range(0, len(samples), PORTION):
         for record in samples[first:first + PORTION]:
-            sent.publish(conversions.joint_state(record))
+            sent.publish(conversions.to_message(record))
         ros.wait(lambda first=first: relay.heard >= first + PORTION and not relay.held
                  and live.node.state.counters.received >= relay.passed, what='samples to be taken')
     live.finish()
@@ -39,7 +39,7 @@ def test_live_over_a_lossy_network_the_payload_is_trusted_and_a_replay_gives_the
     expected = replayed(live, [CAPTURE, *(record for record in samples if not losses.takes(record.stamp_ns))])
     ros.wait(lambda: all(len(live.said[name]) >= len(values) for name, values in expected.items()))
     assert compare({name: values for name, values in live.said.items() if values}, expected) == ''
-    found = [entry for message in live.said[messages.STATUS] if message.stamp_ns >= CAPTURE.stamp_ns + 10**9
-             for entry in message.statuses if entry.name == 'payload']
+    found = [entry for message in map(conversions.diagnostics, live.said[messages.STATUS])
+             if message.stamp_ns >= CAPTURE.stamp_ns + 10**9 for entry in message.statuses if entry.name == 'payload']
     assert len(found) > 25
     assert sum(dict(entry.values)['status'] == 'TRACKING' for entry in found) >= 0.95 * len(found)

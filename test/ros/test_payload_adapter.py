@@ -19,7 +19,7 @@ from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.messages import payload_status
 from flexmanip_ros.parameters import AdapterParameters, ControllerParameters, IdentifierParameters
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.conversions import diagnostic_array
+from flexmanip_ros.ros.conversions import to_message
 from flexmanip_ros.ros.nodes import payload_adapter
 from flexmanip_ros.ros.nodes.payload_adapter import PayloadAdapter, fill, rejection, service_class
 from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
@@ -250,10 +250,10 @@ def test_the_consumer_of_the_documentation_takes_a_payload_that_is_trusted_and_n
     exec(code, module)
     publisher = ros.helper.create_publisher(DiagnosticArray, 'rpbsid_identifier/status', qos.latched())
     held = Payload(20.0, 0.1, 19.8, 20.2, 1.0, Status.TRACKING)
-    publisher.publish(diagnostic_array(payload_status(held, 0, 'tip')))
+    publisher.publish(to_message(payload_status(held, 0, 'tip')))
     consumer = ros.add(module['Consumer'](context=ros.context))  # later than the payload
     ros.wait(lambda: consumer.mass == 20.0, what='the latched payload')
-    publisher.publish(diagnostic_array(payload_status(held._replace(status=Status.INCONSISTENT), 0, 'tip')))
+    publisher.publish(to_message(payload_status(held._replace(status=Status.INCONSISTENT), 0, 'tip')))
     ros.wait(lambda: consumer.mass is None, what='the doubt')
 
 

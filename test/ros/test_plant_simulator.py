@@ -15,7 +15,7 @@ from std_msgs.msg import Float64MultiArray, Header
 from std_srvs.srv import Trigger
 
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.conversions import header, joint_record, stamp_ns, time_message
+from flexmanip_ros.ros.conversions import joint_record, stamp_ns, time_message, to_message
 from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
 from flexmanip_ros.simulation import simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
@@ -132,7 +132,7 @@ def test_an_event_ahead_of_its_stamp_acts_exactly_there(ros: Ros) -> None:
     events = ros.publisher(Header, 'capture_event', qos.latched())
     ros.wait(lambda: len(heard) > 20)
     at = stamp_ns(heard[-1].header.stamp) + 60 * STEP_NS
-    events.publish(header(CaptureEvent(at, EventKind.CAPTURE)))
+    events.publish(to_message(CaptureEvent(at, EventKind.CAPTURE)))
     ros.wait(lambda: stamp_ns(heard[-1].header.stamp) > at + 20 * STEP_NS)
     assert node.late_events == 0
     state = simulator.init(node.config, stamp_ns(heard[0].header.stamp))
@@ -146,7 +146,7 @@ def test_an_event_ahead_of_its_stamp_acts_exactly_there(ros: Ros) -> None:
 def test_an_event_from_before_the_start_is_ignored(ros: Ros) -> None:
     node, heard = start(ros)
     events = ros.publisher(Header, 'capture_event', qos.latched())
-    events.publish(header(CaptureEvent(10**18, EventKind.CAPTURE)))
+    events.publish(to_message(CaptureEvent(10**18, EventKind.CAPTURE)))
     node.trigger_activate()
     late = ros.listen(Header, 'capture_event', qos.latched())
     ros.wait(lambda: late and len(heard) > 10)

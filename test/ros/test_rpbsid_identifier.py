@@ -32,7 +32,7 @@ def test_live_and_replay_give_the_same_bits(ros: Ros) -> None:
     live = Live(ros)
     samples = recording()
     live.send(*samples[:300])
-    live.events.publish(conversions.header(CAPTURE))
+    live.events.publish(conversions.to_message(CAPTURE))
     ros.wait(lambda: live.node.state.payload.pending, what='the event')
     live.send(*samples[300:])
     live.finish()
@@ -46,7 +46,7 @@ def test_an_event_that_comes_late_is_applied_at_its_own_stamp(ros: Ros) -> None:
     live = Live(ros)
     samples = recording()
     live.send(*samples[:500])
-    live.events.publish(conversions.header(CAPTURE))
+    live.events.publish(conversions.to_message(CAPTURE))
     ros.wait(lambda: live.node.state.payload.rewinds == 1)
     live.send(*samples[500:])
     in_time = list(pipeline.run(live.node.config, [CAPTURE, *samples]))[-1].payload
@@ -115,7 +115,7 @@ def test_a_late_joiner_gets_the_last_model_and_payload(ros: Ros) -> None:
                        (messages.PAYLOAD, InertiaStamped)):
         late = ros.listen(kind, f'/rpbsid_identifier/{name}', qos.latched())
         ros.wait(lambda late=late: late, what=f'the latched {name}')
-        assert late[0].layout == conversions.to_message(live.said[name][-1]).layout \
+        assert late[0].layout == live.said[name][-1].layout \
             if kind is Float64MultiArray else late[0].header.frame_id == 'link2_tip'
 
 
@@ -191,7 +191,7 @@ def test_what_comes_while_the_node_is_not_active_is_no_loss(ros: Ros) -> None:
     live.send(*samples[:100])
     live.finish()
     for record in samples[100:200]:
-        live.joint_states.publish(conversions.joint_state(record))
+        live.joint_states.publish(conversions.to_message(record))
     ros.wait(lambda: len(heard) == 200)
     live.node.trigger_activate()
     live.send(*samples[200:])

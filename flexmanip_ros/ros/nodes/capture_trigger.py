@@ -26,7 +26,7 @@ from flexmanip_ros.errors import SignalError
 from flexmanip_ros.parameters import TriggerParameters
 from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.conversions import JointStateReader, header
+from flexmanip_ros.ros.conversions import JointStateReader, to_message
 from flexmanip_ros.ros.diagnostics import RECENT_S, WARN, JointStateFaults, Recent, Report, number
 from flexmanip_ros.ros.node import FlexmanipNode, run
 from flexmanip_ros.samples.signals import joints
@@ -158,7 +158,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         self.announced += 1
 
     def _publish(self, publisher: Publisher, event: CaptureEvent, how: str) -> None:
-        publisher.publish(header(event))
+        publisher.publish(to_message(event))
         second = self._adds_an_object(event)
         self.latest = event
         self.get_logger().info(f'{event.kind.value} {how}at {event.stamp_ns * 1e-9:.6f}{second}')

@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.ros import qos
-from flexmanip_ros.ros.conversions import capture_event, joint_state
+from flexmanip_ros.ros.conversions import capture_event, to_message
 from flexmanip_ros.ros.diagnostics import CLOCK, ERROR, WARN, LossCounter, Report
 from flexmanip_ros.ros.node import FlexmanipNode, SampleGrid, run
 from flexmanip_ros.simulation import simulator
@@ -116,7 +116,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             return
         self.samples += 1
         if record is not None:  # None: lost on its way (sensors.drop_probability)
-            self.joint_states.publish(joint_state(record))
+            self.joint_states.publish(to_message(record))
             self.published += 1
 
     def _apply_events(self, stamp: int) -> None:
