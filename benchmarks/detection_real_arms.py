@@ -19,7 +19,7 @@ from parts.real_arms import CAPTURE, CASES, plant_of, simulate, told
 from flexmanip_ros import pipeline
 from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.simulation import simulator
-from flexmanip_ros.types import EventKind, Payload, Status
+from flexmanip_ros.types import EventKind, JointBlock, Payload, Status
 
 NEAR_MS = 20.0
 """An event this near the capture is it: the payload is then estimated as if it had been announced."""
@@ -41,7 +41,7 @@ def one(case: str, seed: int) -> Run:
     plant = plant_of(case, seed)
     config, findings = told(plant), capture_detection.Findings()
     items = capture_detection.with_detected(
-        capture_detection.watch(config), simulator.records(simulate(plant), ()), findings)
+        capture_detection.watch(config), map(JointBlock.of, simulator.records(simulate(plant), ())), findings)
     last = [estimate.payload for estimate in pipeline.run(config, items)][-1]
     assert last is not None
     captures = [(event.stamp_ns - CAPTURE.stamp_ns) * 1e-6 for event in findings.events

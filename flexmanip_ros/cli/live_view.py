@@ -5,21 +5,20 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from flexmanip_ros.cli import console
-from flexmanip_ros.errors import BagError, ParameterError
+from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import help_text
 from flexmanip_ros.parameters.nodes import PORT, ViewParameters
 
 if TYPE_CHECKING:
-    from flexmanip_ros import pipeline
-    from flexmanip_ros.view.screen import Source
+    from flexmanip_ros.cli.replay import Request
+    from flexmanip_ros.view.screen import Screen
 
 PROG = 'live_view'
 LARGEST_PORT = 65535
@@ -78,23 +77,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _play(options: argparse.Namespace) -> int:
-    from flexmanip_ros.io import bag
-    from flexmanip_ros.payload import capture_detection
-    from flexmanip_ros.view.screen import of_identifier, page
+    from flexmanip_ros.cli.replay import Request
+    from flexmanip_ros.io.bag import Topics
+    from flexmanip_ros.view.screen import Screen, of_identifier, page
     from flexmanip_ros.view.server import Server
 
     config = load(IdentifierParameters, 'rpbsid_identifier', options.params, options.set)
-    source = of_identifier(config, Path(options.bag).name)
-    topics = bag.Topics(options.joint_states)
+    screen = Screen(of_identifier(config, Path(options.bag).name))
     with console.progress('identifying', 'messages') as progress, console.announced():
-        items: Iterable[pipeline.Item] = bag.read_blocks(options.bag, topics, progress)
-        if config.payload_method != 'none' and not bag.event_topics(options.bag, topics):
-            with suppress(ParameterError):  # as in identify_bag, captures are looked for in signals that can show them
-                items = capture_detection.with_detected(capture_detection.watch(config), items)
-        found, fault = read(config, items, source)
+        fault = read(Request(options.bag, config, Topics(options.joint_states)), screen, progress)
     if fault is not None:
         console.print_error(PROG, fault)
-    server = Server(page(source, found, options.speed), options.port)
+    server = Server(page(screen.source, screen.frame(MOST_ROWS), options.speed), options.port)
     try:
         print(f'{server.invitation}; Ctrl-C ends', flush=True)
         threading.Event().wait()
@@ -105,38 +99,22 @@ def _play(options: argparse.Namespace) -> int:
     return console.SUCCESS
 
 
-def read(config: IdentifierParameters, items: Iterable[pipeline.Item], source: Source
-         ) -> tuple[dict[str, Any], BagError | None]:
-    """Identify a recording; return what the page shows of it, and what was wrong with it.
+def read(request: Request, screen: Screen, progress: console.Report) -> FlexmanipError | None:
+    """Identify a recording and show it on the screen, events as in identify_bag; return what was wrong with it.
 
     Of a damaged recording everything before the damage is shown. Raises SignalError when no message can be used, and
     BagError when there is none.
     """
     from flexmanip_ros import pipeline
-    from flexmanip_ros.types import CaptureEvent, JointBlock
-    from flexmanip_ros.view.screen import Screen
+    from flexmanip_ros.cli.replay import Messages
 
-    screen = Screen(source)
-    fault: BagError | None = None
-
-    def tapped() -> Iterator[pipeline.Item]:
-        nonlocal fault
-        try:
-            for item in items:
-                if isinstance(item, CaptureEvent):
-                    screen.event(item)
-                else:
-                    screen.joint_states(item if isinstance(item, JointBlock) else JointBlock.of(item))
-                yield item
-        except BagError as error:
-            if not screen.samples:
-                raise
-            fault = error
-
-    for _, estimate in pipeline.replay(config, tapped()):
+    messages = Messages(request, progress, screen)
+    for _, estimate in pipeline.replay(request.config, messages):
         if estimate is not None:
             screen.estimate(estimate)
-    return screen.frame(MOST_ROWS), fault
+    if messages.fault is not None and not screen.samples:
+        raise messages.fault
+    return messages.fault
 
 
 if __name__ == '__main__':

@@ -27,7 +27,7 @@ from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.samples.signals import joints
 from flexmanip_ros.studies import whole_recording
 from flexmanip_ros.studies.results import Summary, payload_bound, summarize
-from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Mode, Status
+from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, Mode, Status
 from flexmanip_ros.view.screen import Screen, embedded, of_identifier
 
 
@@ -94,7 +94,8 @@ def identify(request: Request, progress: Report | None = None) -> Result:
         if place is not None:
             check_place(place, *endings)
     progress = progress or Report()
-    messages = _Messages(request, progress)
+    screen = None if request.report is None else Screen(of_identifier(request.config, Path(request.bag).name))
+    messages = Messages(request, progress, screen)
     kept: list[Estimate] = []
     state, interrupted = pipeline.init(), False
     output = None if request.output is None else Output(request.output, request.config.payload_frame)
@@ -150,7 +151,7 @@ def identify(request: Request, progress: Report | None = None) -> Result:
                              'docs/moving_arm.md')
         write_rows(request.configurations, found.rows())
     remark = '; '.join((*messages.far_events(), *_remarks(state, messages.foreign)))
-    if request.report is not None and signals is not None:
+    if request.report is not None and signals is not None and screen is not None:
         from flexmanip_ros.io import plots, report
 
         progress.phase('drawing the report')
@@ -163,16 +164,19 @@ def identify(request: Request, progress: Report | None = None) -> Result:
             request.report, Path(request.bag).name, config, summary, plots.run(config, signals, kept, messages.events),
             last, scores, {**state.counters._asdict(), 'dropped': state.counters.dropped}, bound=bound,
             fault='; '.join(str(words) for words in (fault, remark) if words), events=messages.search(summary.status),
-            player=embedded(messages.screen, messages.events, kept), configurations=found)
+            player=embedded(screen, kept), configurations=found)
     return Result(
         summary, () if last is None else last.modes, config, tuple(filter(None, places(request).values())), fault,
         interrupted, messages.search(summary.status), remark)
 
 
-class _Messages:
-    """Iterates over the messages of a recording up to its fault; keeps the signals for scores and figures."""
+class Messages:
+    """Iterates over the messages of a recording up to its fault; keeps the signals for scores and figures.
 
-    def __init__(self, request: Request, progress: Report) -> None:
+    screen: takes the joint states, held-out ones included, and the events.
+    """
+
+    def __init__(self, request: Request, progress: Report, screen: Screen | None = None) -> None:
         self.fault: FlexmanipError | None = None
         self.foreign = 0
         """Messages that hold none of the configured joints."""
@@ -188,8 +192,7 @@ class _Messages:
         self._looked = False
         self._search = ''
         """Text on why events were not looked for in the signals; else empty."""
-        self.screen = Screen(of_identifier(request.config, Path(request.bag).name))
-        """The signals that the player in the report shows."""
+        self._screen = screen
         self._request = request
         self._progress = progress
         self._joints = set(joints(request.config))
@@ -198,15 +201,19 @@ class _Messages:
         request = self._request
         watch = self._watch()
         try:
-            items: Iterable[pipeline.Item] = self._noted(bag.read_blocks(request.bag, request.topics, self._progress))
+            items: Iterable[JointBlock | CaptureEvent] = self._noted(
+                bag.read_blocks(request.bag, request.topics, self._progress))
             if watch is not None:
                 items = capture_detection.with_detected(watch, items, self._findings)
             for item in items:
-                yield from self._event(item) if isinstance(item, CaptureEvent) else self._joint_states(item)
+                if not isinstance(item, CaptureEvent):
+                    yield from self._joint_states(item)
+                elif item.stamp_ns < self._limit_ns():
+                    yield from self._event(item)
         except BagError as error:
             self.fault = error
 
-    def _noted(self, items: Iterable[pipeline.Item]) -> Iterator[pipeline.Item]:
+    def _noted(self, items: Iterable[JointBlock | CaptureEvent]) -> Iterator[JointBlock | CaptureEvent]:
         for item in items:
             if isinstance(item, CaptureEvent):
                 self._recorded.append(item)
@@ -266,24 +273,23 @@ class _Messages:
         return '' if self.events else self._search
 
     def _event(self, event: CaptureEvent) -> Iterator[CaptureEvent]:
-        if event.stamp_ns < self._limit_ns():
-            self.events.append(event)
-            yield event
+        self.events.append(event)
+        if self._screen is not None:
+            self._screen.event(event)
+        yield event
 
-    def _joint_states(self, item: JointBlock | JointRecord) -> Iterator[pipeline.Item]:
-        block = item if isinstance(item, JointBlock) else JointBlock.of(item)
+    def _joint_states(self, block: JointBlock) -> Iterator[pipeline.Item]:
         self.foreign += len(block.stamp_ns) * self._joints.isdisjoint(block.names)
         if self.is_kept:
             self._blocks.append(block)
-        if self._request.report is not None:
-            self.screen.joint_states(block)
+        if self._screen is not None:
+            self._screen.joint_states(block)
         if self.first_ns is None:
             self.first_ns = int(block.stamp_ns[0])
-            given = [CaptureEvent(self.first_ns + round(at * 1e9), kind) for at, kind in (
-                (self._request.capture_time, EventKind.CAPTURE), (self._request.release_time, EventKind.RELEASE))
-                if at is not None]
-            self.events += given
-            yield from given
+            for at, kind in ((self._request.capture_time, EventKind.CAPTURE),
+                             (self._request.release_time, EventKind.RELEASE)):
+                if at is not None:
+                    yield from self._event(CaptureEvent(self.first_ns + round(at * 1e9), kind))
         used = block.stamp_ns < self._limit_ns()
         if used.any():
             yield block if used.all() else block.part(used)

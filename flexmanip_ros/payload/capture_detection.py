@@ -199,7 +199,7 @@ def _quiet(glr: kernel.GlrState) -> kernel.GlrState:
     return fresh
 
 
-Item = JointRecord | JointBlock | CaptureEvent
+Item = JointBlock | CaptureEvent
 PIECE = 256
 """Messages of a block that are tested together; where an event is found in them, they are tested one by one."""
 
@@ -275,12 +275,6 @@ def with_detected(start: Watch, items: Iterable[Item], findings: Findings | None
     for item in items:
         if isinstance(item, CaptureEvent):
             yield item
-        elif isinstance(item, JointRecord):
-            now, events = look(now, item)
-            findings.events += events
-            findings.watched += now.is_on
-            yield item
-            yield from events
         else:
             for first in range(0, len(item.stamp_ns), PIECE):
                 piece = item.part(slice(first, first + PIECE))

@@ -271,10 +271,8 @@ def page(source: Source, recording: dict[str, Any] | None = None, speed: float =
     return text
 
 
-def embedded(screen: Screen, events: Iterable[CaptureEvent], estimates: Iterable[Estimate]) -> str:
-    """Return a page with a recording inside, for a report. screen: already contains the joint states."""
-    for event in events:
-        screen.event(event)
+def embedded(screen: Screen, estimates: Iterable[Estimate]) -> str:
+    """Return a page with a recording inside, for a report. screen: already contains joint states and events."""
     for estimate in estimates:
         screen.estimate(estimate)
     return page(screen.source, screen.frame(EMBEDDED_ROWS), playing=False)

@@ -84,7 +84,7 @@ def test_an_arm_that_caught_nothing_is_said_to_be_empty(
 
 
 def test_what_is_found_while_the_residuals_do_not_fit_is_called_a_guess(unannounced: Path) -> None:
-    messages = replay._Messages(replay.Request(unannounced, IdentifierParameters()), Report())
+    messages = replay.Messages(replay.Request(unannounced, IdentifierParameters()), Report())
     messages.first_ns = START
     messages._findings.events.append(CAPTURE)
     assert messages.search('TRACKING') == 'found in the signals: capture at 1.200 s'
@@ -157,13 +157,13 @@ def test_blocks_reveal_the_events_of_single_messages_just_after_the_same_message
                          *(np.array([getattr(record, name) for record in part]) for name in fields))
               for part in (items[k:k + 700] for k in range(0, len(items), 700))]
 
-    def seen(given: list[JointRecord] | list[JointBlock]) -> list[object]:
+    def seen(given: list[JointBlock]) -> list[object]:
         out: list[object] = []
         for item in with_detected(watch(IdentifierParameters()), given):
             out += item.stamp_ns.tolist() if isinstance(item, JointBlock) else [item]
-        return [item.stamp_ns if isinstance(item, JointRecord) else item for item in out]
+        return out
 
-    single, together = seen(items), seen(blocks)
+    single, together = seen([JointBlock.of(item) for item in items]), seen(blocks)
     assert single == together
     assert sum(isinstance(item, CaptureEvent) for item in single) == 2
 

@@ -19,13 +19,15 @@ import pytest
 from browser import Browser
 
 from flexmanip_ros.cli import identify_bag, live_view
+from flexmanip_ros.cli.console import Report
+from flexmanip_ros.cli.replay import Request
 from flexmanip_ros.errors import BagError
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, JointRecord
-from flexmanip_ros.view.screen import of_identifier
+from flexmanip_ros.view.screen import Screen, of_identifier
 
 START = 1_700_000_000_000_000_000
 COUNT = 3000
@@ -99,19 +101,23 @@ def test_without_a_recording_it_says_that_ros_is_needed() -> None:
     assert done.stderr.count('\n') == 1
 
 
-def test_of_a_damaged_recording_everything_before_the_damage_is_shown(recording: Path) -> None:
-    def damaged() -> Iterator[JointBlock | CaptureEvent]:
-        for count, item in enumerate(bag.read_blocks(recording)):
+def test_of_a_damaged_recording_everything_before_the_damage_is_shown(
+        recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = bag.read_blocks
+
+    def damaged(*arguments: Any) -> Iterator[JointBlock | CaptureEvent]:
+        for count, item in enumerate(whole(*arguments)):
             if count == 2:
                 raise BagError('it ends here', 'record again')
             yield item
 
+    monkeypatch.setattr(bag, 'read_blocks', damaged)
     config = IdentifierParameters()
-    frame, fault = live_view.read(config, damaged(), of_identifier(config, 'damaged'))
-    assert 'it ends here' in str(fault)
-    assert frame['samples']
+    screen = Screen(of_identifier(config, 'damaged'))
+    assert 'it ends here' in str(live_view.read(Request(recording, config), screen, Report()))
+    assert screen.frame()['samples']
     with pytest.raises(BagError, match='does not exist'):
-        live_view.read(config, bag.read_blocks('nowhere'), of_identifier(config, 'nowhere'))
+        live_view.read(Request('nowhere', config), Screen(screen.source), Report())
 
 
 def test_a_browser_plays_it(playing: tuple[subprocess.Popen[str], str], tmp_path: Path) -> None:

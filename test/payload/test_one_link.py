@@ -23,7 +23,7 @@ from flexmanip_ros.parameters import (
 )
 from flexmanip_ros.payload.capture_detection import watch, with_detected
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, Status
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, Status
 
 LINK = ArmParameters(link_length=(0.41,), linear_density=(0.3,), bending_stiffness=(0.5,), tip_mass=0.01,
                      hub_inertia=(0.002,), damping_ratio=0.01)
@@ -78,7 +78,7 @@ def test_the_identified_model_alone_tells_it_within_10_percent(run: list, method
 
 
 def test_its_capture_is_found_in_the_signals(run: list) -> None:
-    messages = [item for item in run if not isinstance(item, CaptureEvent)]
+    messages = [JointBlock.of(item) for item in run if not isinstance(item, CaptureEvent)]
     found = [item for item in with_detected(watch(IdentifierParameters(arm=LINK)), messages)
              if isinstance(item, CaptureEvent)]
     assert [event.kind for event in found] == [EventKind.CAPTURE]

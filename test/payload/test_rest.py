@@ -19,7 +19,7 @@ from flexmanip_ros.parameters import (
 from flexmanip_ros.payload import capture_detection, structured
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import CaptureEvent, EventKind, Status
+from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, Status
 
 ARM = ArmParameters(damping_ratio=0.003)
 OWN = {'joint_viscous_friction': (0.8, 0.8), 'joint_coulomb_friction': (0.15, 0.15), 'rotor_inertia': (0.2, 0.2)}
@@ -63,7 +63,7 @@ def test_the_first_motion_of_an_arm_with_friction_and_rotors_is_no_capture(rest_
     trajectory = after_rest(rest_s, 1000.0, 3.4, (capture,), **OWN)
     config, findings = IdentifierParameters(arm=ARM), capture_detection.Findings()
     for _ in capture_detection.with_detected(
-            capture_detection.watch(config), simulator.records(trajectory, ()), findings):
+            capture_detection.watch(config), map(JointBlock.of, simulator.records(trajectory, ())), findings):
         pass
     (found,) = findings.events
     assert abs(found.stamp_ns - capture.stamp_ns) <= 20e6
