@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flexmanip_ros.cli import console
-from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.errors import FlexmanipError, ParameterError
 from flexmanip_ros.paper import experiments
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.cli import workers
-    from flexmanip_ros.io.outputs import OutputError, check_place, write_rows
+    from flexmanip_ros.io.outputs import check_place, write_rows
 
     if given.runs < 1:
         raise ParameterError(f'--runs is {given.runs}', 'give at least 1')
@@ -66,7 +66,7 @@ def _main(given: argparse.Namespace) -> int:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as err:
-        raise OutputError(f"folder '{folder}' cannot be made: {err.strerror}", 'give another --output') from err
+        raise FlexmanipError(f"folder '{folder}' cannot be made: {err.strerror}", 'give another --output') from err
     for name in (PAGE, ROWS, SUMMARY):
         check_place(folder / name)
     started = time.perf_counter()

@@ -34,10 +34,6 @@ SCALARS = ('excitation', 'condition', 'innovation_power')
 NODE = 'rpbsid_identifier'
 
 
-class OutputError(FlexmanipError):
-    """A file cannot be written."""
-
-
 def write_file(path: str | Path, fill: Callable[[Any], Any]) -> None:
     """Write a file whole or not at all; an older one stays until the new one is complete."""
     path = Path(path)
@@ -49,7 +45,7 @@ def write_file(path: str | Path, fill: Callable[[Any], Any]) -> None:
     except OSError as err:
         with suppress(OSError):  # a name may be too long for it
             partial.unlink()
-        raise OutputError(f"'{path}' cannot be written: {err.strerror}", 'give another place') from err
+        raise FlexmanipError(f"'{path}' cannot be written: {err.strerror}", 'give another place') from err
 
 
 def ending(path: str | Path) -> str:
@@ -58,7 +54,7 @@ def ending(path: str | Path) -> str:
 
 
 def check_place(path: str | Path, *endings: str) -> None:
-    """Raise OutputError when a file cannot be written there, or its name has none of the endings, if any are given.
+    """Raise FlexmanipError when a file cannot be written there, or its name has none of the endings, if any are given.
 
     Call it before a long run.
     """
@@ -68,19 +64,19 @@ def check_place(path: str | Path, *endings: str) -> None:
     except (FileNotFoundError, NotADirectoryError):
         is_directory = not str(path)
     except OSError as err:
-        raise OutputError(f"'{path}' cannot be written: {err.strerror}", 'give another place') from err
+        raise FlexmanipError(f"'{path}' cannot be written: {err.strerror}", 'give another place') from err
     if is_directory:
-        raise OutputError(f"'{path}' is a directory", 'give a file name')
+        raise FlexmanipError(f"'{path}' is a directory", 'give a file name')
     if not folder.is_dir():
-        raise OutputError(f"directory '{folder}' does not exist", 'make it first, or give another place')
+        raise FlexmanipError(f"directory '{folder}' does not exist", 'make it first, or give another place')
     if not os.access(folder, os.W_OK):
-        raise OutputError(f"directory '{folder}' cannot be written", 'give another place')
+        raise FlexmanipError(f"directory '{folder}' cannot be written", 'give another place')
     if endings and ending(path) not in endings:
-        raise OutputError(f"'{path}' does not end in {' or '.join(endings)}", 'give such a name')
+        raise FlexmanipError(f"'{path}' does not end in {' or '.join(endings)}", 'give such a name')
 
 
 def check_apart(outputs: Mapping[str, str | None], params: str | None, bag: str | None = None) -> None:
-    """Raise OutputError where a run would write over what it reads, or write two outputs to one place.
+    """Raise FlexmanipError where a run would write over what it reads, or write two outputs to one place.
 
     outputs: path of each option, None where it is not given; params: the parameter file that is read; bag: the
     recording that is read, in whose folder no output may be.
@@ -94,11 +90,11 @@ def check_apart(outputs: Mapping[str, str | None], params: str | None, bag: str 
             continue
         path = Path(given).resolve()
         if params is not None and path == Path(params).resolve():
-            raise OutputError(f"{option} would overwrite '{given}', which --params reads", 'give another name')
+            raise FlexmanipError(f"{option} would overwrite '{given}', which --params reads", 'give another name')
         if folder is not None and path.is_relative_to(folder):
-            raise OutputError(f"{option} '{given}' is in the recording '{bag}'", 'give a place outside of it')
+            raise FlexmanipError(f"{option} '{given}' is in the recording '{bag}'", 'give a place outside of it')
         if path in taken:
-            raise OutputError(f"{taken[path]} and {option} are both '{given}'", 'give two names')
+            raise FlexmanipError(f"{taken[path]} and {option} are both '{given}'", 'give two names')
         taken[path] = option
 
 
@@ -253,8 +249,8 @@ SUFFIXES = ('.csv', '.parquet')
 class Journal:
     """Rows of one study at ``path`` + '.journal'. Use it in a ``with``.
 
-    identity: names and values that differ between studies. Raises OutputError for the journal of another study, for a
-    damaged one, and for one that another process is writing.
+    identity: names and values that differ between studies. Raises FlexmanipError for the journal of another study, for
+    a damaged one, and for one that another process is writing.
     """
 
     def __init__(self, path: str | Path, identity: Mapping[str, Any]) -> None:
@@ -262,19 +258,19 @@ class Journal:
         self.journal = self.path.with_name(self.path.name + '.journal')
         self.rows: list[Row] = []
         if ending(self.path) not in SUFFIXES:
-            raise OutputError(f"'{path}' is neither .csv nor .parquet", 'end the name in one of them')
+            raise FlexmanipError(f"'{path}' is neither .csv nor .parquet", 'end the name in one of them')
         if ending(self.path) == '.parquet':
             _parquet()
         check_place(self.path)
         head = json.dumps({'study': identity}, sort_keys=True)
         is_new = not self.journal.exists()
         if is_new and self.path.exists():
-            raise OutputError(f"'{path}' exists already and has no journal to continue from",
-                              'remove it or give another name')
+            raise FlexmanipError(f"'{path}' exists already and has no journal to continue from",
+                                 'remove it or give another name')
         try:
             self._file = self.journal.open('a', encoding='utf-8')
         except OSError as err:
-            raise OutputError(f"'{self.journal}' cannot be written: {err.strerror}", 'give another place') from err
+            raise FlexmanipError(f"'{self.journal}' cannot be written: {err.strerror}", 'give another place') from err
         try:
             self._lock()
             if is_new or not self._resume(head):
@@ -287,8 +283,8 @@ class Journal:
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as err:
-            raise OutputError(f"'{self.journal}' is being written by another process",
-                              'wait for it, or give another --output') from err
+            raise FlexmanipError(f"'{self.journal}' is being written by another process",
+                                 'wait for it, or give another --output') from err
         except OSError:
             return  # this file system has no locks
 
@@ -297,17 +293,17 @@ class Journal:
         content = self.journal.read_bytes()
         whole = content[:content.rfind(b'\n') + 1]
         if not whole and not f'{head}\n'.encode().startswith(content):
-            raise OutputError(f"'{self.journal}' is no journal of a study", 'remove it, or give another --output')
+            raise FlexmanipError(f"'{self.journal}' is no journal of a study", 'remove it, or give another --output')
         lines = whole.decode('utf-8', errors='replace').splitlines()
         if lines and lines[0] != head:
-            raise OutputError(f"'{self.journal}' belongs to another study",
-                              'give another --output, or remove the journal to start again')
+            raise FlexmanipError(f"'{self.journal}' belongs to another study",
+                                 'give another --output, or remove the journal to start again')
         for place, line in enumerate(lines[1:], start=2):
             try:
                 self.rows.extend(_run(line))
             except ValueError as err:
-                raise OutputError(f"'{self.journal}' is damaged in line {place}: {err}",
-                                  'remove that line, its run is done again') from err
+                raise FlexmanipError(f"'{self.journal}' is damaged in line {place}: {err}",
+                                     'remove that line, its run is done again') from err
         if len(whole) < len(content):
             self._file.truncate(len(whole))
         return bool(lines)
@@ -325,8 +321,8 @@ class Journal:
             self._file.flush()
             os.fsync(self._file.fileno())
         except OSError as err:
-            raise OutputError(f"'{self.journal}' cannot be written: {err.strerror}",
-                              'free some space and start again; the study continues') from err
+            raise FlexmanipError(f"'{self.journal}' cannot be written: {err.strerror}",
+                                 'free some space and start again; the study continues') from err
 
     def finish(self, order: Iterable[str]) -> None:
         """Write the table, sorted by the columns in ``order``."""

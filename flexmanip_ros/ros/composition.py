@@ -46,10 +46,6 @@ DRAIN_TIMEOUT_S = 30.0
 FLUSH_PERIOD_S = 0.25
 
 
-class CompositionError(FlexmanipError):
-    """The nodes cannot be configured or connected, or another arm is on their topics."""
-
-
 class Recorder(Node):
     """Writes the messages of ``RECORDED`` into a bag; keeps what the identifier said, and counts lost joint states.
 
@@ -142,7 +138,7 @@ class Composition:
         """Configure every node. It builds states and compiles kernels, which is slow, before any clock runs."""
         for node in self._managed:
             if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
-                raise CompositionError(f'{node.get_name()} could not be configured', 'see its log above')
+                raise FlexmanipError(f'{node.get_name()} could not be configured', 'see its log above')
 
     def connect(self, others: int = 0) -> None:
         """Open the bag, wait until all publishers and subscriptions are matched, and check that there is no other arm.
@@ -151,11 +147,11 @@ class Composition:
         """
         self.recorder = self._add(Recorder(self._bag))
         if not self.wait(lambda: self._matched(others), DISCOVERY_TIMEOUT_S):
-            raise CompositionError(f'the nodes did not find each other within {DISCOVERY_TIMEOUT_S:.0f} s',
-                                   'unset ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS')
+            raise FlexmanipError(f'the nodes did not find each other within {DISCOVERY_TIMEOUT_S:.0f} s',
+                                 'unset ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS')
         if foreign_arm(self.recorder, own_writers=1, own_readers=2):
-            raise CompositionError('another arm or controller is on these topics',
-                                   'run again, or set ROS_DOMAIN_ID to a free number')
+            raise FlexmanipError('another arm or controller is on these topics',
+                                 'run again, or set ROS_DOMAIN_ID to a free number')
 
     def _matched(self, others: int) -> bool:
         commands, events = self.excitation.commands, self.trigger.events_publisher

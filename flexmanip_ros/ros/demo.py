@@ -47,10 +47,6 @@ from flexmanip_ros.types import QUANTILE, CaptureEvent, Estimate, JointRecord
 END_TIMEOUT_S = 15.0
 
 
-class ViewerError(FlexmanipError):
-    """The live page could not be started."""
-
-
 class Viewer(NamedTuple):
     """The process of the node ``live_view`` and the address of its page."""
 
@@ -70,7 +66,7 @@ class Viewer(NamedTuple):
 def viewer(arguments: Sequence[str]) -> Iterator[Viewer]:
     """Start ``live_view`` on the domain of this process with its ROS arguments; end it when the context is left.
 
-    Raises ViewerError when the node does not start, for example on a port that is in use; the node has logged why.
+    Raises FlexmanipError when the node does not start, for example on a port that is in use; the node has logged why.
     """
     domain = rclpy.get_default_context().get_domain_id()
     # The node has a session of its own: Ctrl-C at the terminal reaches the demonstration alone, which then ends it.
@@ -109,7 +105,7 @@ def _url(process: subprocess.Popen[bytes]) -> str:
     for word in line.decode().split():
         if word.startswith('http://'):
             return word
-    raise ViewerError('the live view did not start', 'see its log above, or leave --view away')
+    raise FlexmanipError('the live view did not start', 'see its log above, or leave --view away')
 
 
 NAME = 'demo'

@@ -38,10 +38,6 @@ POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inli
     "img-src data:"
 
 
-class ViewError(FlexmanipError):
-    """The page cannot be served."""
-
-
 class Feed:
     """Numbered events in order, which each page reads at its own pace."""
 
@@ -107,7 +103,7 @@ class Feed:
 
 
 class Server(socketserver.ThreadingTCPServer):
-    """Serves a page until it is closed. Raises ViewError when the port cannot be opened.
+    """Serves a page until it is closed. Raises FlexmanipError when the port cannot be opened.
 
     page: the HTML; state: returns numbers for ``/state``, called on a thread of the server. The base is not HTTPServer,
     which looks up the name of the machine when it starts.
@@ -129,10 +125,11 @@ class Server(socketserver.ThreadingTCPServer):
             super().__init__((HOST, port), _Handler)
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
-                raise ViewError(f'port {port} of this machine is in use',
-                                'end the program that has it, or give another port (0: any that is free)') from error
-            raise ViewError(f'port {port} cannot be opened: {error.strerror}',
-                            'give a port from 1024 up (0: any that is free)') from error
+                raise FlexmanipError(
+                    f'port {port} of this machine is in use',
+                    'end the program that has it, or give another port (0: any that is free)') from error
+            raise FlexmanipError(f'port {port} cannot be opened: {error.strerror}',
+                                 'give a port from 1024 up (0: any that is free)') from error
         self.port = int(self.server_address[1])
         self._thread = threading.Thread(target=self.serve_forever, args=(0.2,), name='http', daemon=True)
         self._thread.start()

@@ -10,8 +10,8 @@ import pytest
 
 from flexmanip_ros.cli import monte_carlo, replay, reproduce_paper, simulate_bag, write_urdf
 from flexmanip_ros.cli.identify_bag import main
+from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.io.bag_writer import BagWriter
-from flexmanip_ros.io.outputs import OutputError
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
@@ -222,7 +222,7 @@ def test_the_function_behind_the_program_writes_no_two_outputs_to_one_file(tmp_p
     path = _bag(tmp_path / 'bag', _records())
     request = replay.Request(path, IdentifierParameters(payload_method='none'), **{
         name: str(tmp_path / place) for name, place in places.items()})
-    with pytest.raises(OutputError, match=words):
+    with pytest.raises(FlexmanipError, match=words):
         replay.identify(request)
     assert not (tmp_path / 'both.csv').exists()
 

@@ -12,8 +12,9 @@ from typing import Any
 
 import pytest
 
+from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.view import server as module
-from flexmanip_ros.view.server import HOST, Server, ViewError
+from flexmanip_ros.view.server import HOST, Server
 
 
 @pytest.fixture
@@ -169,7 +170,7 @@ def test_there_may_be_so_many_pages_and_no_more(server: Server, monkeypatch: pyt
 
 
 def test_a_port_in_use_is_named_with_the_way_out(server: Server) -> None:
-    with pytest.raises(ViewError, match=rf'port {server.port} of this machine is in use.*another port'):
+    with pytest.raises(FlexmanipError, match=rf'port {server.port} of this machine is in use.*another port'):
         Server('', server.port)
 
 

@@ -55,7 +55,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
         return '' if self.server is None else self.server.invitation
 
     def activated(self) -> None:
-        """Serve the page. Raises ViewError when the port is not available."""
+        """Serve the page. Raises FlexmanipError when the port is not available."""
         self._screen = Screen(Source('Live', self.resolve_topic_name('joint_states'), self.config))
         self._counted = self._runs = self._reported = 0
         self._heard: float | None = None
