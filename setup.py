@@ -94,7 +94,6 @@ setup(
     extras_require={
         'ros': list(ROS),
         'test': ['pytest', 'pytest-timeout', 'hypothesis'],
-        'finite_element': ['scikit-fem'],
         'cluster': ['dask', 'distributed'],
         'parquet': ['pyarrow'],
     },

@@ -51,7 +51,7 @@ class Observer(Node):
         self.reported = 0.0
         """When the identifier's diagnostics came last, on the monotonic clock [s]."""
         self._samples = Batches(self, self.create_subscription(  # one by one they would cost a fifth of a core
-            JointState, 'joint_states', lambda _: None, qos.sensor_input(), raw=True))
+            JointState, 'joint_states', lambda _: None, qos.sensor_input(), raw=True), lambda number: None)
         self.create_subscription(
             InertiaStamped, '/rpbsid_identifier/payload', with_info(self.on_payload), qos.latched_input())
         self.create_subscription(DiagnosticArray, '/diagnostics', self.on_report, 10)

@@ -5,7 +5,6 @@ The programs import numpy, scipy, numba, rosbags and matplotlib only after their
 """
 
 import argparse
-import importlib.util
 import math
 import os
 import signal
@@ -17,7 +16,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from flexmanip_ros.errors import FlexmanipError, ModelError
+from flexmanip_ros.errors import FlexmanipError
 
 if TYPE_CHECKING:
     from multiprocessing.sharedctypes import Synchronized
@@ -208,20 +207,6 @@ def number(value: float | None, digits: int = 3) -> str:
 def aligned(rows: Iterable[Sequence[str]], formats: Sequence[str]) -> list[str]:
     """Return the lines of a table. formats: of each column, such as '12' (to the left) or '>9' (to the right)."""
     return [' '.join(f'{cell:{how}}' for cell, how in zip(row, formats, strict=True)) for row in rows]
-
-
-def require_matplotlib() -> None:
-    """Raise FlexmanipError before the work when a report is asked for and its figures cannot be drawn."""
-    if importlib.util.find_spec('matplotlib') is None:
-        raise FlexmanipError('a report needs matplotlib, which is not installed',
-                             "run 'pip install matplotlib', or leave --report away")
-
-
-def require_scikit_fem() -> None:
-    """Raise ModelError before the work when it ends with the finite element plant, which needs scikit-fem."""
-    if importlib.util.find_spec('skfem') is None:
-        raise ModelError('the finite element plant needs scikit-fem, which is not installed',
-                         "run 'pip install scikit-fem'")
 
 
 def run(prog: str, body: Callable[[], int]) -> int:

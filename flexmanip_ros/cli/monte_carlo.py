@@ -62,7 +62,6 @@ def _main(given: argparse.Namespace) -> int:
     todo, identity = _plan(given)
     if given.report is not None:
         check_place(given.report)
-        console.require_matplotlib()
     interrupted = False
     with Journal(given.output, identity) as journal:
         done = {row.get(workers.KEY) for row in journal.rows}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from flexmanip_ros import estimator, pipeline
-from flexmanip_ros.cli.console import Report, require_matplotlib
+from flexmanip_ros.cli.console import Report
 from flexmanip_ros.errors import BagError, FlexmanipError, MissingSignalError, ModelError, ParameterError, SignalError
 from flexmanip_ros.event_replay import FAR_EVENT_NS
 from flexmanip_ros.io import bag
@@ -89,7 +89,6 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     check_apart(places(request), None, str(request.bag))
     if request.report is not None:
         check_place(request.report, '.html', '.htm')
-        require_matplotlib()
     for place, endings in ((request.save_arm, ('.yaml', '.yml')), (request.configurations, ('.csv',))):
         if place is not None:
             check_place(place, *endings)

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
-from rosbags.rosbag2 import Reader
 
 from flexmanip_ros.errors import BagError
 from flexmanip_ros.io import cdr
@@ -268,6 +267,8 @@ class _Recording:
 
     def messages(self) -> Generator[tuple[str, bytes]]:
         """Yield topic and bytes of each message on the chosen topics: those that the library reads, then the others."""
+        from rosbags.rosbag2 import Reader  # not before a recording is read: it takes 20 ms
+
         try:
             reader = Reader(self.path)
             reader.open()

@@ -81,6 +81,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
 
     Subclasses override ``start`` (configure), ``activated``, ``deactivated`` and ``report``. Topics and services are
     created once and stay: a node that is not active ignores the messages it receives and publishes diagnostics alone.
+    The cleanup transition keeps the state too; the next configure transition builds a new one.
     """
 
     def __init__(self, name: str, cls: type[Config], *, overrides: list[Parameter] | None = None, **options: Any
@@ -178,10 +179,6 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
 
     on_shutdown = close = on_deactivate
 
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Keep topics, services and state; the next configure transition builds a new state."""
-        return TransitionCallbackReturn.SUCCESS
-
     def autostart(self) -> bool:
         """Configure and activate at once, as a plain ``ros2 run`` expects, unless ``autostart`` is false.
 
@@ -232,9 +229,9 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         self.subscription(JointState, 'joint_states', timed, qos.sensor_input(), raw=True, losses=losses)
 
     def waiting_joint_states(self, losses: LossCounter) -> rclpy_workarounds.Batches:
-        """Subscribe to the joint states, which wait, serialized, until they are taken. Note their numbers."""
+        """Subscribe to the joint states, which wait, serialized, until they are taken."""
         made = rclpy_workarounds.Batches(self, self.subscription(
-            JointState, 'joint_states', lambda raw: None, qos.sensor_input(), raw=True, losses=losses))
+            JointState, 'joint_states', lambda raw: None, qos.sensor_input(), raw=True, losses=losses), losses.note)
         self._unknown_to_rclpy.callback(made.give_back, self)
         return made
 

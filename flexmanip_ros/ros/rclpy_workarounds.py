@@ -150,10 +150,12 @@ class Batches:
     At 1000 messages a second, one Python callback per message takes 10 % of a core; taking the waiting messages a
     hundred times a second takes 3 %. rclpy has no subscription without a callback, so this one is removed from its
     node after its creation.
+
+    note: gets the sequence number of each message that is taken.
     """
 
-    def __init__(self, node: Node, subscription: Subscription) -> None:
-        self._subscription = subscription
+    def __init__(self, node: Node, subscription: Subscription, note: Callable[[int | None], None]) -> None:
+        self._subscription, self._note = subscription, note
         node._subscriptions.remove(subscription)
         node._wake_executor()  # an executor on another thread may have added the subscription
 
@@ -170,6 +172,7 @@ class Batches:
                 taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
                 if taken is None:
                     return
+                self._note(sequence_number(taken[1]))
                 yield taken
 
     def give_back(self, node: Node) -> None:

@@ -209,7 +209,7 @@ def test_every_program_imports_and_is_callable(distribution: Distribution) -> No
 
 def test_every_module_with_a_main_is_a_program(distribution: Distribution) -> None:
     modules = [path for door in ('ros', 'cli') for path in (ROOT / 'flexmanip_ros' / door).rglob('*.py')]
-    mains = {path.stem for path in modules if '\ndef main(' in path.read_text(encoding='utf-8')}
+    mains = {path.stem for path in modules if re.search(r'\n(def main\(|main = )', path.read_text(encoding='utf-8'))}
     assert mains - {'warm_up'} == set(programs(distribution))
 
 

@@ -15,6 +15,7 @@ services    capture_trigger/capture, capture_trigger/release   std_srvs/Trigger
 import math
 import sys
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -204,10 +205,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
             report.silent('joint_states')
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(CaptureTrigger, NAME, __doc__, TriggerParameters, argv)
-
+main = partial(run, CaptureTrigger, NAME, __doc__, TriggerParameters)
 
 if __name__ == '__main__':
     sys.exit(main())

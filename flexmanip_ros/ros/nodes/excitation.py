@@ -9,6 +9,7 @@ When the node is deactivated or stopped it sends zero torque once.
 """
 
 import sys
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -106,10 +107,7 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
             report.worse(WARN, f'{report.values["rate_hz"]:.0f} of {self.config.rate:.0f} commands a second')
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(Excitation, NAME, __doc__, ExcitationParameters, argv)
-
+main = partial(run, Excitation, NAME, __doc__, ExcitationParameters)
 
 if __name__ == '__main__':
     sys.exit(main())

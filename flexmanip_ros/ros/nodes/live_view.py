@@ -13,6 +13,7 @@ A recording: live_view BAG [--params FILE.yaml] [--set name=value] [--speed 2] [
 
 import sys
 import time
+from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -24,7 +25,6 @@ from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, capture_event, diagnostics
 from flexmanip_ros.ros.diagnostics import LossCounter, Report
 from flexmanip_ros.ros.node import FlexmanipNode, run
-from flexmanip_ros.ros.rclpy_workarounds import sequence_number
 from flexmanip_ros.view.screen import Screen, Source, encoded, page
 from flexmanip_ros.view.server import BEAT_S, Server
 
@@ -48,7 +48,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
         self.subscription(DiagnosticArray, f'{self.config.identifier}/status', self._on_status, qos.sensor_input())
         for topic in ('capture_event', 'capture_detected'):
             self.subscription(Header, topic, self._on_event, qos.latched_input())
-        self._timer = self.create_timer(1.0 / self.config.rate, self._update, clock=self._steady)
+        self.create_timer(1.0 / self.config.rate, self._update, clock=self._steady)
 
     def summary(self) -> str:
         """Say where the page is."""
@@ -101,10 +101,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
 
     def _take(self) -> None:
         """Hand the waiting messages to the screen; a node that is not active drops them."""
-        raws: list[bytes] = []
-        for raw, info in self._joint_states.take():
-            self.losses.note(sequence_number(info))
-            raws.append(raw)
+        raws = [raw for raw, _ in self._joint_states.take()]
         if not self.active:
             return
         for block in self._reader.blocks(raws):
@@ -139,10 +136,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
             report.silent('joint_states')
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(LiveView, NAME, __doc__, ViewParameters, argv)
-
+main = partial(run, LiveView, NAME, __doc__, ViewParameters)
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -14,6 +14,7 @@ A payload is sent once it has been trusted for `settle_time`, and again when its
 import importlib
 import sys
 import time
+from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import Inertia, InertiaStamped
@@ -234,10 +235,7 @@ def rejection(response: Any) -> str:
                 'no reason given')
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(PayloadAdapter, NAME, __doc__, AdapterParameters, argv)
-
+main = partial(run, PayloadAdapter, NAME, __doc__, AdapterParameters)
 
 if __name__ == '__main__':
     sys.exit(main())

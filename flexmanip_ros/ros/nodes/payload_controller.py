@@ -16,6 +16,7 @@ example of a consumer, not a safety controller.
 import sys
 import time
 from collections.abc import Collection, Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -279,10 +280,7 @@ def listed(values: Iterable[float]) -> str:
     return ' and '.join(f'{value:.4g}' for value in values)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(PayloadController, NAME, __doc__, ControllerParameters, argv)
-
+main = partial(run, PayloadController, NAME, __doc__, ControllerParameters)
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -12,6 +12,7 @@ A command of the wrong size or with a value that is not finite is dropped whole.
 
 import math
 import sys
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -194,10 +195,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             report.worse(WARN, f'{self.rejected_events} events rejected')
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(PlantSimulator, NAME, __doc__, PlantParameters, argv)
-
+main = partial(run, PlantSimulator, NAME, __doc__, PlantParameters)
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -55,7 +55,6 @@ from flexmanip_ros.ros.diagnostics import (
     status_line,
 )
 from flexmanip_ros.ros.node import FlexmanipNode, run
-from flexmanip_ros.ros.rclpy_workarounds import sequence_number
 from flexmanip_ros.samples.signals import joints
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Status
 
@@ -271,7 +270,6 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         """
         raws, arrived_ns = [], []
         for raw, info in islice(self._joint_states.take(), most) if self.context.ok() else ():
-            self.losses.note(sequence_number(info))
             raws.append(raw)
             arrived_ns.append(info['received_timestamp'])
         return raws, np.array(arrived_ns, dtype=np.int64)
@@ -420,10 +418,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             log.warning(UNANNOUNCED)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(RpbsidIdentifier, NAME, __doc__, IdentifierParameters, argv)
-
+main = partial(run, RpbsidIdentifier, NAME, __doc__, IdentifierParameters)
 
 if __name__ == '__main__':
     sys.exit(main())
