@@ -95,7 +95,6 @@ setup(
         'ros': list(ROS),
         'test': ['pytest', 'pytest-timeout', 'hypothesis'],
         'cluster': ['dask', 'distributed'],
-        'parquet': ['pyarrow'],
     },
     zip_safe=False,
     cmdclass={'install': InstallAndCompile, 'develop': DevelopAndCompile},

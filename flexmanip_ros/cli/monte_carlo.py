@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 PROG = 'monte_carlo'
 EXAMPLES = """examples:
   monte_carlo config/scenarios/capture.yaml --runs 100 --output capture.csv
-  monte_carlo recordings/ --params my_arm.yaml --output recordings.parquet
-  monte_carlo config/scenarios/capture.yaml --runs 100000 --scheduler tcp://head:8786 --output capture.parquet
+  monte_carlo recordings/ --params my_arm.yaml --output recordings.csv
+  monte_carlo config/scenarios/capture.yaml --runs 100000 --scheduler tcp://head:8786 --output capture.csv
 
 An interrupted study continues when the same command is given again; more --runs add to what is there.
 A run that fails gives a row with its error. The true payload of a recording is read from NAME.truth.json beside it.
@@ -41,7 +41,7 @@ def _parser() -> console.Parser:
     add('source', metavar='SCENARIO.yaml|FOLDER', help='scenario to repeat, or folder with recordings')
     add('--runs', type=int, default=100, metavar='N', help='run the seeds FIRST .. FIRST+N-1; default: 100')
     add('--first-seed', type=console.whole, default=0, metavar='FIRST', help='first seed; default: 0')
-    add('--output', default='study.csv', metavar='TABLE', help='table to write, .csv or .parquet; default: study.csv')
+    add('--output', default='study.csv', metavar='TABLE', help='table to write, .csv; default: study.csv')
     add('--report', metavar='REPORT.html', help='write a report: one HTML page with scores and figures')
     console.add_workers(made)
     add('--scheduler', metavar='ADDRESS', help='run on the Dask cluster with this scheduler instead')

@@ -2,7 +2,7 @@
 
 A table of estimates (.csv for people and spreadsheets, .npz with the matrices for numpy) is written at the end of a
 run; a recording grows with the run. A study has a journal: one JSON line per run, on disk before the next run is added.
-A study that was interrupted or killed continues from its journal. Its table (.csv or .parquet) is made from the journal
+A study that was interrupted or killed continues from its journal. Its table (.csv) is made from the journal
 at the end, and on an interrupt.
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import csv
 import fcntl
-import importlib
 import io
 import json
 import os
@@ -243,7 +242,6 @@ class Output:
 
 
 Row = dict[str, Any]
-SUFFIXES = ('.csv', '.parquet')
 
 
 class Journal:
@@ -257,11 +255,7 @@ class Journal:
         self.path = Path(path)
         self.journal = self.path.with_name(self.path.name + '.journal')
         self.rows: list[Row] = []
-        if ending(self.path) not in SUFFIXES:
-            raise FlexmanipError(f"'{path}' is neither .csv nor .parquet", 'end the name in one of them')
-        if ending(self.path) == '.parquet':
-            _parquet()
-        check_place(self.path)
+        check_place(self.path, '.csv')
         head = json.dumps({'study': identity}, sort_keys=True)
         is_new = not self.journal.exists()
         if is_new and self.path.exists():
@@ -328,13 +322,7 @@ class Journal:
         """Write the table, sorted by the columns in ``order``."""
         names = list(order)
         rows = sorted(self.rows, key=lambda row: tuple(_sortable(row.get(name)) for name in names))
-        if ending(self.path) == '.csv':
-            write_rows(self.path, rows)
-        else:
-            arrow, parquet = _parquet()
-            columns = dict.fromkeys(name for row in rows for name in row)
-            made = arrow.table({name: [row.get(name) for row in rows] for name in columns})
-            write_file(self.path, lambda file: parquet.write_table(made, file))
+        write_rows(self.path, rows)
 
     def __enter__(self) -> Journal:
         return self
@@ -353,11 +341,3 @@ def _run(line: str) -> list[Row]:
 
 def _sortable(value: Any) -> tuple[int, Any]:
     return (0, value) if isinstance(value, (int, float)) else (1, str(value))
-
-
-def _parquet() -> tuple[Any, Any]:
-    try:
-        return importlib.import_module('pyarrow'), importlib.import_module('pyarrow.parquet')
-    except ImportError as err:
-        raise FlexmanipError('a .parquet table needs pyarrow, which is not installed',
-                             "run 'pip install pyarrow', or end the name in .csv") from err

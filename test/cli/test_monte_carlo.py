@@ -46,15 +46,6 @@ def test_the_report_shows_scores_runs_and_failures(tmp_path):
     assert 'Failed: 1' in text
 
 
-def test_parquet_holds_the_same_rows(scenario_file, tmp_path):
-    parquet = pytest.importorskip('pyarrow.parquet')
-    out = tmp_path / 'out.parquet'
-    assert run(scenario_file, '--runs', 2, '--workers', 0, '--output', out) == 0
-    table = parquet.read_table(out).to_pydict()
-    assert table['seed'] == [0, 1]
-    assert all(isinstance(value, float) for value in table['plant.payload_mass'])
-
-
 def test_a_folder_of_recordings_is_a_study_and_a_broken_one_a_row(tmp_path):
     import numpy as np
 

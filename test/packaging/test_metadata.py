@@ -33,7 +33,7 @@ LIBRARIES = {
     'backports': ('python3-rosbags-pip', 'backports.zstd'),
     'compression': ('python3-rosbags-pip', 'backports.zstd'),  # from Python 3.14 on
 }
-OPTIONAL = {'dask', 'distributed', 'pyarrow', 'skfem'}
+OPTIONAL = {'dask', 'distributed', 'skfem'}
 """Extras, imported where they are used, with an error that names the extra."""
 
 
