@@ -1,8 +1,8 @@
 """From VARX parameters to observability x controllability (paper eqs. 26-35), and the batch identification by them.
 
-Batch predictor-based subspace identification is the reference for the recursion. It works on the data matrices (paper
-eqs. 22-37 with all samples at once) and shares no arithmetic with the factor of ``moments.py``: the states are computed
-sample by sample, and the matrices are regressed on them.
+The batch identification is a first guess of the fits, and the reference for the recursion. It works on the data
+matrices (paper eqs. 22-37 with all samples at once) and shares no arithmetic with the factor of ``moments.py``: the
+states are computed sample by sample, and the matrices are regressed on them.
 """
 
 import numpy as np

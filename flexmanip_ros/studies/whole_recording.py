@@ -20,7 +20,7 @@ from flexmanip_ros.identification.prediction_check import MOST_TURN
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.identification.varying_model import Configurations
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.samples.sample_log import Signals, log_of
+from flexmanip_ros.samples.sample_log import Rows, Signals, log_of
 from flexmanip_ros.samples.signals import relative_angle
 from flexmanip_ros.types import Array, Mode, StateSpace, Status
 
@@ -165,7 +165,7 @@ def _of_every_configuration(config: IdentifierParameters, signals: Signals, a: i
     relative = relative_angle(config, signals.angles[a:b])
     if not np.nanmax(relative) - np.nanmin(relative) > MOST_TURN:
         return None
-    found = _configurations(config, _after(config, signals, a, b, signals.angles[a:b]), dt)
+    found = _configurations(config, _after(config, _rows(signals, a, b, signals.angles[a:b])), dt)
     if found is None:
         return None
     course = []
@@ -177,11 +177,14 @@ def _of_every_configuration(config: IdentifierParameters, signals: Signals, a: i
                     course[-1][1], tuple(course))
 
 
-def _after(config: IdentifierParameters, signals: Signals, a: int, b: int, angles: Array | None = None
-           ) -> rpbsid.RpbsidState:
-    """Return the state of the identifier after rows a to b."""
+def _rows(signals: Signals, a: int, b: int, angles: Array | None = None) -> Rows:
     log = log_of(signals.u[a:b], signals.y[a:b], angles, signals.stamp_ns[a:b], signals.gap[a:b], signals.missing[a:b])
-    return rpbsid.advance(config, rpbsid.init(config)._replace(held=None), log.rows(0, b - a))
+    return log.rows(0, b - a)
+
+
+def _after(config: IdentifierParameters, rows: Rows) -> rpbsid.RpbsidState:
+    """Return the state of the identifier after these rows."""
+    return rpbsid.advance(config, rpbsid.init(config)._replace(held=None), rows)
 
 
 def _configurations(config: IdentifierParameters, state: rpbsid.RpbsidState, dt: float) -> Configurations | None:
@@ -196,8 +199,9 @@ def _stretch(config: IdentifierParameters, signals: Signals, a: int, b: int, dt:
                      refinement='none', state_basis='fixed' if config.state_basis == 'fixed' else 'singular')
     found, method = None, 'none'
     try:
-        state = _after(config, signals, a, b)
-        found, method = _fit(config, state, _longest(config, signals, a, b), noise, b - a, dt), 'maximum likelihood'
+        rows = _rows(signals, a, b)
+        state = _after(config, rows)
+        found, method = _fit(config, state, _longest(config, rows), noise, b - a, dt), 'maximum likelihood'
         if found is None:
             found, method = rpbsid.identified(config, state, dt), 'subspace'
     except np.linalg.LinAlgError:
@@ -208,19 +212,15 @@ def _stretch(config: IdentifierParameters, signals: Signals, a: int, b: int, dt:
     return Smoothed(start_s, end_s, b - a, method, found.status, modes(found))
 
 
-def _longest(config: IdentifierParameters, signals: Signals, a: int, b: int) -> Array:
-    """Return the longest part of rows a to b without a gap, as the identifier has it: inputs and outputs (N, r + m).
+def _longest(config: IdentifierParameters, rows: Rows) -> Array:
+    """Return the longest part of the rows without a gap, as the identifier has it: inputs and outputs (N, r + m).
 
     Outputs that were not measured are NaN, and no fit counts them.
     """
-    gaps = a + np.flatnonzero(signals.gap[a:b])
-    first, end = max(pairwise([a, *gaps[gaps > a].tolist(), b]), key=lambda part: part[1] - part[0])
-    r = signals.u.shape[1]
-    samples, rows = decimation.whole(np.hstack([signals.u[first:end], signals.y[first:end]]), config.decimation)
-    absent = signals.missing[first:end][rows] > config.decimation // 2  # as the identifier counts them
-    if absent.any():
-        samples = samples.copy()
-        samples[absent, r:] = np.nan
+    rows = max(rows.stretches(), key=len)
+    samples, at = decimation.whole(rows.u_y, config.decimation)
+    samples = samples.copy()
+    samples[rows.missing[at] > config.decimation // 2, rows.log.width.inputs:] = np.nan  # as the identifier counts them
     return samples
 
 
