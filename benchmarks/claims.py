@@ -272,6 +272,7 @@ def payload_elements(rows: list[dict[str, Any]]) -> Claims:
     for row in rows:
         marks = {1: row['samples_after_capture'].index(1000), 3: row['samples_after_capture'].index(2990)}
         yield Claim('share beyond 1 % after 1 s', row['share_beyond_1_percent'][marks[1]], high=0.1)
+        yield Claim('TRACKING and outside', row['tracking_and_outside_percent'][0], high=5.0, unit='%')
         # docs/lab/payload.md, "Arms that are not the model"
         for second, untold, median in ((1, 0.02, 0.12), (3, 0.0, 0.07)):
             k = marks[second]

@@ -54,12 +54,14 @@ def main() -> None:
     done = [one(seed) for seed in range(runs)]
     error = np.abs(trials.errors(done))
     tracking = [[found.status is Status.TRACKING for found in trial.found] for trial in done]
+    wrong = [trials.trusted_and_outside(trial.found, trial.truth)[1] for trial in done]
     row = {
         'runs': runs, 'samples_after_capture': MARKS, 'coverage': trials.numbers(trials.coverage(done), 3),
         'median_percent': trials.numbers(np.median(error, axis=0), 3),
         'share_beyond_1_percent': trials.numbers(np.mean(error > 1.0, axis=0), 3),
         'beyond_1_percent_and_tracking': trials.numbers(np.mean((error > 1.0) & tracking, axis=0), 3),
-        'share_tracking': trials.numbers(np.mean(tracking, axis=0), 3)}
+        'share_tracking': trials.numbers(np.mean(tracking, axis=0), 3),
+        'tracking_and_outside_percent': trials.numbers(100.0 * np.mean(wrong), 2)}
     for name, value in row.items():
         print(f'{name:30}', value)
     trials.write('payload_elements', [row])

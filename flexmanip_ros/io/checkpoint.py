@@ -26,7 +26,7 @@ from flexmanip_ros import pipeline
 from flexmanip_ros.errors import CheckpointError
 from flexmanip_ros.parameters import IdentifierParameters, flatten, leaves
 
-NAME, FORMAT = b'flexmanip_ros checkpoint ', b'32\n'
+NAME, FORMAT = b'flexmanip_ros checkpoint ', b'33\n'
 """First bytes of the file: its name and the number of the format. The number changes when the fields of a state change,
 and when a class moves to another module."""
 CHECKSUM = hashlib.sha256().digest_size

@@ -27,7 +27,8 @@ class PayloadParameters:
         'nonlinear', 'method structured: nonlinear, the mass matrix follows the configuration; linear, it stays at '
         'working_point', choices=('nonlinear', 'linear'))
     working_point: tuple[float, ...] = parameter(
-        (), 'chord angles of the working point of dynamics linear; []: the first measured ones', unit='rad')
+        (), 'chord angles of the working point of dynamics linear; []: about the first measured ones, and learned',
+        unit='rad')
     stiffness_std: float = parameter(
         0.03, 'prior relative standard deviation of the stiffnesses; the empty arm refines them', low=0.0, high=1.0)
     damping_std: float = parameter(

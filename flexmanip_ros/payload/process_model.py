@@ -55,35 +55,37 @@ class Kind(IntEnum):
     """And to its left, m c_y [kg m]."""
     INERTIA = 3
     """Its inertia about the tip [kg m^2]."""
-    STIFFNESS = 4
+    POINT = 4
+    """Angle between the links at which a linear plant stays, less that of ``freeze`` [rad]."""
+    STIFFNESS = 5
     """Logarithm of EI over its nominal value."""
-    DAMPING = 5
+    DAMPING = 6
     """Damping ratio."""
-    VISCOUS = 6
+    VISCOUS = 7
     """Viscous friction of a joint [N m s/rad]."""
-    COULOMB = 7
+    COULOMB = 8
     """Coulomb friction of a joint [N m]."""
-    ROTOR = 8
+    ROTOR = 9
     """Rotor inertia of a joint [kg m^2]."""
-    TORQUE_GAIN = 9
+    TORQUE_GAIN = 10
     """Logarithm of torque over reported effort."""
-    BEND_GAIN = 10
+    BEND_GAIN = 11
     """Logarithm of measured over true bend."""
-    BEND_OFFSET = 11
+    BEND_OFFSET = 12
     """Measured bend of a straight link [m]."""
-    MODE = 12
+    MODE = 13
     """Logarithm of the stiffness of a mode beyond the first over what its link's stiffness gives; number link k + j."""
-    TORQUE_DELAY = 13
+    TORQUE_DELAY = 14
     """Dead time from the reported efforts to the torques of all joints [s]."""
-    TORQUE_LAG = 14
+    TORQUE_LAG = 15
     """Time constant from the effort of a joint to its torque [s]."""
-    BEND_DELAY = 15
+    BEND_DELAY = 16
     """Age of all bends in a sample beyond that of the angles [s]."""
 
 
 # for the compiled functions, to which an enumeration is no constant
-(MASS, FIRST_X, FIRST_Y, INERTIA, STIFFNESS, DAMPING, VISCOUS, COULOMB, ROTOR, TORQUE_GAIN, BEND_GAIN, BEND_OFFSET,
- MODE, TORQUE_DELAY, TORQUE_LAG, BEND_DELAY) = (int(kind) for kind in Kind)
+(MASS, FIRST_X, FIRST_Y, INERTIA, POINT, STIFFNESS, DAMPING, VISCOUS, COULOMB, ROTOR, TORQUE_GAIN, BEND_GAIN,
+ BEND_OFFSET, MODE, TORQUE_DELAY, TORQUE_LAG, BEND_DELAY) = (int(kind) for kind in Kind)
 
 
 class ProcessModel(NamedTuple):
@@ -105,6 +107,10 @@ class ProcessModel(NamedTuple):
     """(n, n) mass matrix of the empty arm at the working point, used when frozen."""
     Mp: Array
     """(4, n, n) its derivatives by the payload's inertial parameters."""
+    Mt: Array
+    """(5, n, n) the derivatives of M0 and Mp by the angle between the links."""
+    point: Array
+    """(1,) value of ``Kind.POINT``."""
     stiffness: Array
     """(n,) nominal K."""
     damping: Array
@@ -181,6 +187,8 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
         o = links + i * k
         if kind <= INERTIA:
             payload[kind] = value
+        elif kind == POINT:
+            motion.point[0] = value
         elif kind == STIFFNESS:
             factor_EI = np.exp(value)
             for j in range(k):
@@ -319,6 +327,16 @@ def constant_mass(motion: ProcessModel) -> None:
             M[r, c] = motion.M0[r, c] + motion.arm.rotary[r, c] - motion.rotary[r, c]
             for p in range(4):
                 M[r, c] += motion.payload[p] * motion.Mp[p, r, c]
+            M[r, c] += motion.point[0] * turned_mass(motion, r, c)
+
+
+@inner
+def turned_mass(motion: ProcessModel, r: int, c: int) -> float:
+    """Return the derivative of element (r, c) of the mass matrix of a linear plant by the angle between the links."""
+    derivative: float = motion.Mt[0, r, c]
+    for p in range(4):
+        derivative += motion.payload[p] * motion.Mt[1 + p, r, c]
+    return derivative
 
 
 @inner
@@ -429,6 +447,10 @@ def balance_columns(motion: ProcessModel, q: Array, qd: Array, qdd: Array, first
         if kind <= INERTIA:
             for r in range(n):
                 G[r, at] = motion.dp[r, kind]
+        elif kind == POINT:
+            for r in range(n):
+                for t in range(n):
+                    G[r, at] += turned_mass(motion, r, t) * qdd[t]
         elif kind == STIFFNESS:
             for j in range(k):
                 G[o + j, at] = motion.work.elastic[o + j] if first == 0 else arm.stiffness[o + j] * q[o + j]

@@ -199,6 +199,9 @@ def learned(config: IdentifierParameters) -> tuple[tuple[Kind, int], ...]:
     bends = {role.link for role in known.outputs if role.quantity in (Quantity.BEND, Quantity.BEND_RATE)} \
         if known else set()
     entries = [(kind, 0) for kind in body]
+    is_told = config.payload.dynamics == 'nonlinear' or config.payload.working_point or config.arm.base_mass
+    if len(config.arm.link_length) == 2 and not is_told:
+        entries.append((Kind.POINT, 0))
     given = {name for name, neutral in (('torque_gain', 1.0), ('bend_gain', 1.0), ('bend_offset', 0.0),
                                         ('torque_delay', 0.0), ('torque_lag', 0.0), ('bend_delay', 0.0))
              if np.any(np.array(getattr(config.arm, name)) != neutral)}
@@ -232,16 +235,16 @@ def motion(config: IdentifierParameters) -> ProcessModel:
     made = ProcessModel(
         arm=arm, work=workspace(nominal), kind=np.array([kind for kind, _ in kinds], dtype=np.int64),
         link=np.array([link for _, link in kinds], dtype=np.int64), prior=np.zeros(size), given=np.zeros(size),
-        frozen=frozen, M0=np.zeros((n, n)), Mp=np.zeros((4, n, n)), stiffness=nominal.stiffness, damping=unit,
-        rotary=nominal.rotary, scale=lightest, considered=config.payload.model_error * lightest,
-        least=_least(nominal, M, lightest), least_rotor=-0.25 * _inertias_at_joints(nominal, M),
-        substeps=STEP_ANGLE / fastest_mode(config.arm), payload=np.zeros(4), effort=np.zeros(links),
-        gain=np.ones(links), late=np.zeros((links, 2)), slope=np.zeros((links, 2)), driven=np.zeros(links),
-        coulomb=nominal.coulomb.copy(), share=np.full(links, np.nan), rate=np.full(links, np.nan),
-        opened=np.array([size, *range(size)]), bounds=allocate_bounds(size, nx), p=np.zeros(size), a=np.zeros(n),
-        k=np.zeros((20, n)), dq=np.zeros((n, n)), dqd=np.zeros((n, n)), dp=np.zeros((n, 4)),
-        G=np.zeros((n, 2 * size)), F=np.zeros((n, 2 * n)), X=np.zeros((2 * n, 2 * n)), Y=np.zeros((n, n)),
-        scratch=spread_scratch(n, size, 2 * nx + 1))
+        frozen=frozen, M0=np.zeros((n, n)), Mp=np.zeros((4, n, n)), Mt=np.zeros((5, n, n)), point=np.zeros(1),
+        stiffness=nominal.stiffness, damping=unit, rotary=nominal.rotary, scale=lightest,
+        considered=config.payload.model_error * lightest, least=_least(nominal, M, lightest),
+        least_rotor=-0.25 * _inertias_at_joints(nominal, M), substeps=STEP_ANGLE / fastest_mode(config.arm),
+        payload=np.zeros(4), effort=np.zeros(links), gain=np.ones(links), late=np.zeros((links, 2)),
+        slope=np.zeros((links, 2)), driven=np.zeros(links), coulomb=nominal.coulomb.copy(),
+        share=np.full(links, np.nan), rate=np.full(links, np.nan), opened=np.array([size, *range(size)]),
+        bounds=allocate_bounds(size, nx), p=np.zeros(size), a=np.zeros(n), k=np.zeros((20, n)), dq=np.zeros((n, n)),
+        dqd=np.zeros((n, n)), dp=np.zeros((n, 4)), G=np.zeros((n, 2 * size)), F=np.zeros((n, 2 * n)),
+        X=np.zeros((2 * n, 2 * n)), Y=np.zeros((n, n)), scratch=spread_scratch(n, size, 2 * nx + 1))
     return made._replace(prior=priors(config, made, M), given=_given(config.arm, made))
 
 
@@ -318,6 +321,9 @@ VISCOUS_STD = 0.02
 """Prior deviation of a viscous friction, as the rate [1/s] at which it alone would slow down that inertia."""
 COULOMB_STD = 0.005
 """Prior deviation of a Coulomb friction, as the deceleration [rad/s^2] that it alone would give that inertia."""
+POINT_STD = 0.01
+"""Prior deviation of the angle between the links at which a linear plant stays, about that of the first samples [rad]:
+while these come an encoder already turns by some mrad with the bending of its link."""
 GAIN_STD = 0.03
 """Prior deviation of the logarithm of the gains of torques and bends, which are calibrated to a few percent."""
 LATE_STD = 2e-3
@@ -349,7 +355,7 @@ def priors(config: IdentifierParameters, motion: ProcessModel, M: Array) -> Arra
     """
     L = np.array(config.arm.link_length)
     J = np.array([M[i:L.size, i:L.size].sum() for i in range(L.size)])  # inertia beyond each joint, about it
-    alike = {Kind.MASS: EMPTY_STD * motion.scale, Kind.STIFFNESS: config.payload.stiffness_std,
+    alike = {Kind.MASS: EMPTY_STD * motion.scale, Kind.POINT: POINT_STD, Kind.STIFFNESS: config.payload.stiffness_std,
              Kind.DAMPING: config.payload.damping_std, Kind.TORQUE_GAIN: GAIN_STD, Kind.BEND_GAIN: GAIN_STD,
              Kind.TORQUE_DELAY: LATE_STD, Kind.TORQUE_LAG: LATE_STD, Kind.BEND_DELAY: LATE_STD}
     by_joint = {Kind.VISCOUS: VISCOUS_STD * J, Kind.COULOMB: COULOMB_STD * J, Kind.ROTOR: ROTOR_STD * J,
@@ -488,13 +494,22 @@ def take_as_known(model: Model, m: mem.FilterState, beyond: Kind = Kind.DAMPING)
 
 
 def freeze(config: IdentifierParameters, model: Model, angles: Array) -> None:
-    """Set the mass matrices of a linear plant at its unbent working point, given or at the measured angles (L,)."""
-    nominal = manipulator(config.arm)
+    """Set the mass matrices of a linear plant at its unbent working point, given or at the measured angles (L,).
+
+    An element of M is a + b cos(t) + c sin(t), t the angle between the links. So its derivative by t is half the
+    difference of its values at t + pi / 2 and t - pi / 2.
+    """
+    nominal, motion = manipulator(config.arm), model.motion
     rest = np.zeros(nominal.stiffness.size)
     rest[:len(angles)] = config.payload.working_point or chords(config.arm, angles)
-    model.motion.M0[:] = mass_matrix(nominal, np.zeros(4), rest)
-    for p, unit in enumerate(np.eye(4)):
-        model.motion.Mp[p] = mass_matrix(nominal, unit, rest) - model.motion.M0
+    turn = np.zeros(rest.size)
+    turn[len(angles) - 1] = np.pi / 2.0
+    unit = np.eye(4)
+    here, ahead, behind = ([mass_matrix(nominal, payload, q) for payload in (np.zeros(4), *unit)]
+                           for q in (rest, rest + turn, rest - turn))
+    motion.M0[:], motion.Mp[:] = here[0], np.array(here[1:]) - here[0]
+    motion.Mt[:] = 0.5 * (np.array(ahead) - np.array(behind))
+    motion.Mt[1:] -= motion.Mt[0]
 
 
 def widen(S: Array, columns: Array) -> Array:
@@ -519,7 +534,9 @@ def _mass(motion: ProcessModel, q: Array) -> Array:
     if not motion.frozen:
         return mass_matrix(motion.arm, motion.payload, q)
     rotors: Array = motion.arm.rotary - motion.rotary
-    return motion.M0 + np.tensordot(motion.payload, motion.Mp, 1) + rotors
+    turned = motion.Mt[0] + np.tensordot(motion.payload, motion.Mt[1:], 1)
+    frozen: Array = motion.M0 + np.tensordot(motion.payload, motion.Mp, 1) + motion.point[0] * turned + rotors
+    return frozen
 
 
 def jump(config: IdentifierParameters, model: Model, m: mem.FilterState, instant_std: float) -> Array:

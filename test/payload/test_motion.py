@@ -10,7 +10,7 @@ import scipy.linalg
 from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.payload import process_model
 from flexmanip_ros.payload.process_model import Kind
-from flexmanip_ros.payload.structured_model import motion
+from flexmanip_ros.payload.structured_model import build, freeze, motion
 
 SHORT = {
     'arm.link_length': [1.0, 0.8], 'arm.linear_density': [1.0, 0.8], 'arm.bending_stiffness': [120.0, 60.0],
@@ -23,6 +23,16 @@ def arm():
     found = motion(configure(IdentifierParameters, SHORT))
     found.effort[:] = TORQUE
     return found
+
+
+def placed(dynamics: str, angles: np.ndarray):
+    """The short arm, a linear plant at these chord angles."""
+    settings = configure(IdentifierParameters, {
+        **SHORT, 'payload.dynamics': dynamics, 'arm.angle_convention': 'chord'})
+    model = build(settings)
+    freeze(settings, model, angles)
+    model.motion.effort[:] = TORQUE
+    return model.motion
 
 
 def bent(arm, n: int) -> np.ndarray:
@@ -156,7 +166,10 @@ def test_the_spread_moves_as_the_matrix_exponential_says(arm, sticks):
     assert np.abs((moved - exact) / scale).max() < process_model.SPREAD_ERROR * np.abs(exact / scale).max()
 
 
-def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(arm):
+@pytest.mark.parametrize('dynamics', ['nonlinear', 'linear'])
+def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(dynamics):
+    arm = placed(dynamics, np.array([1.0, 0.6]))
+    assert (Kind.POINT in arm.kind) == (dynamics == 'linear')
     n = arm.arm.stiffness.size
     x = bent(arm, n)
     low, high = np.zeros(n), np.zeros(n)
@@ -172,6 +185,18 @@ def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(arm):
             arm.effort[:] = arm.gain * TORQUE / np.exp(0.03)
             process_model.accelerate(arm, x[:n].copy(), x[n:2 * n].copy(), acceleration)
         np.testing.assert_allclose((high - low) / 2e-5, G[:, c], rtol=1e-4, atol=1e-5 * np.abs(G[:, c]).max() + 1e-9)
+
+
+def test_a_linear_plant_whose_links_stay_at_another_angle_moves_as_one_that_was_told_so():
+    """With what it holds, to first order in the angle."""
+    found, turn = [], 1e-3
+    for angles, point in (((0.3, 0.9), 0.0), ((0.3, 0.9), turn), ((0.3, 0.9 + turn), 0.0)):
+        arm = placed('linear', np.array(angles))
+        x = bent(arm, arm.arm.stiffness.size)
+        x[2 * arm.arm.stiffness.size:][arm.kind == Kind.POINT] = point
+        found.append(linearize(arm, x))
+    before, turned, told = found
+    assert np.abs(turned - told).max() < 2.0 * turn * np.abs(told - before).max()
 
 
 @pytest.mark.parametrize('base', [
