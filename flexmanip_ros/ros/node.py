@@ -107,7 +107,8 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
                 'autostart', True, ParameterDescriptor(
                     description='configure and activate at start; false: wait for ros2 lifecycle set',
                     read_only=True)).value)
-            self.parameters: NodeParameters[Config] = NodeParameters(self, cls, self.configuration_changed)
+            self.parameters: NodeParameters[Config] = NodeParameters(
+                self, cls, self.configuration_changed, self.check_change)
         except BaseException:
             self.destroy_node()
             raise
@@ -138,6 +139,9 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
 
     def deactivated(self) -> None:
         """Cease to work; what was published before stays. ``active`` becomes false after this call."""
+
+    def check_change(self, config: Config) -> None:
+        """Raise ParameterError to reject parameters that are set while the node runs and that it cannot work with."""
 
     def configuration_changed(self, config: Config, names: Collection[str]) -> None:
         """Apply parameters of these names that were set while the node runs, to whatever values."""

@@ -30,16 +30,19 @@ _LARGEST_INT = 2**63 - 1
 class NodeParameters(Generic[Config]):
     """The parameters of one node, kept as a valid configuration at all times.
 
+    ``check_change`` is called with the configuration that a set of changes gives; it rejects them by a ParameterError.
     ``on_change`` is called after a set of changes was accepted, with the new configuration and the names that were set.
     """
 
     def __init__(
-        self, node: Node, cls: type[Config], on_change: Callable[[Config, Collection[str]], None] | None = None
+        self, node: Node, cls: type[Config], on_change: Callable[[Config, Collection[str]], None] | None = None,
+        check_change: Callable[[Config], None] | None = None,
     ) -> None:
         """Declare every parameter of ``cls``; raises ParameterError naming the one that is wrong."""
         self._cls = cls
         self._leaves = {leaf.name: leaf for leaf in leaves(cls)}
         self._on_change = on_change
+        self._check_change = check_change
         _reject_unknown(node, self._leaves)
         self.config: Config = configure(cls, {leaf.name: _declare(node, leaf) for leaf in leaves(cls)})
         node.add_on_set_parameters_callback(self._validate)
@@ -53,7 +56,9 @@ class NodeParameters(Generic[Config]):
 
     def _validate(self, changes: list[Parameter]) -> SetParametersResult:
         try:
-            self._candidate(changes)
+            candidate = self._candidate(changes)
+            if self._check_change is not None and self._changed(changes):
+                self._check_change(candidate)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

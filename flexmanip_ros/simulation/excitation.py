@@ -17,6 +17,8 @@ TIMES = (0.25, 1.0, 3.0)
 """Times after the capture at which the expected accuracy is given [s]."""
 CLOSE = 0.02
 """Tolerance of the fitted motion: it stays below the allowed angle by no more than this share."""
+NO_TORQUE = 1e-9
+"""Peak torque [N m] below which a torque counts as zero: the motion of the arm is lost in rounding."""
 BEYOND = 10.0
 """Logarithm of turn over allowed turn that stands for an arm that diverges."""
 
@@ -62,7 +64,7 @@ def fitted_amplitude(config: ExcitationParameters) -> tuple[float, ...]:
     """
     plain = replace(config, allowed_angle=0.0)
     plant = plant_of(config)
-    if config.shape == 'zero' or not any(config.amplitude):
+    if config.shape == 'zero' or max(config.amplitude) < NO_TORQUE:
         raise ParameterError("parameter 'allowed_angle' is set but the torque is zero",
                              'choose a shape and amplitudes whose ratio you want')
     target = (1.0 - CLOSE / 2) * config.allowed_angle

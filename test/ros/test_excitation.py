@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from joint_states import joint_state
 from rclpy.parameter import Parameter
@@ -71,3 +73,20 @@ def test_torques_keep_in_step_with_the_stamps_of_the_arm_whenever_they_come(ros:
     ros.wait(lambda: len(heard) == 100)
     for k, message in enumerate(heard):
         assert message.data.tolist() == torque(node.config, k + 1).tolist()
+
+
+@pytest.mark.parametrize(('name', 'value', 'said'), [
+    ('amplitude', [0.0, 0.0], 'the torque is zero'), ('offset', [500.0, 0.0], 'lower the offset'),
+    ('amplitude', [1e-320, 0.0], 'the torque is zero')])
+def test_a_torque_that_no_amplitude_fits_to_the_allowed_angle_is_rejected_and_the_node_goes_on(
+        ros: Ros, name: str, value: list[float], said: str) -> None:
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
+    node = ros.managed(Excitation(context=ros.context, overrides=overrides(
+        rate=200.0, arm__modes=1, allowed_angle=0.3, design_time=1.0)))
+    ros.wait(lambda: heard)
+    answers: list[Any] = []
+    ros.run(node, lambda: answers.extend(node.set_parameters([Parameter(name, value=value)])))
+    assert not answers[0].successful
+    assert said in answers[0].reason
+    before = len(heard)
+    ros.wait(lambda: len(heard) > before + 10)

@@ -50,6 +50,10 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
         if self.config.allowed_angle or self.config.shape in ('multisine', 'prbs', 'chirp'):
             self.get_logger().info(excitation.describe(self.config))
 
+    def check_change(self, config: ExcitationParameters) -> None:
+        """Reject amplitudes and offsets that ``allowed_angle`` does not allow; fit the others before they are used."""
+        excitation.amplitude(config)
+
     def summary(self) -> str:
         """Say which torque it is."""
         config = self.config
