@@ -153,15 +153,17 @@ class PlantParameters:
     substeps: int = parameter(
         0, 'number of integration steps in a sample; 0: as many as the fastest mode needs', low=0, high=1000)
     payload_mass: float = parameter(
-        20.0, 'mass of the object that a capture event attaches', unit='kg', low=0.0, live=True)
+        20.0, 'mass of the object that a capture event attaches', unit='kg', low=0.0, high=1e9, live=True)
     payload_inertia: float = parameter(
-        0.0, "rotary inertia of the object about its centre of mass", unit='kg m^2', low=0.0, live=True)
+        0.0, "rotary inertia of the object about its centre of mass", unit='kg m^2', low=0.0, high=1e12, live=True)
     payload_com: tuple[float, ...] = parameter(
         (0.0, 0.0), "centre of mass of the object seen from the tip: along the tip tangent, and to its left",
-        unit='m', size=2, live=True)
+        unit='m', low=-1e3, high=1e3, size=2, live=True)
     object_velocity: tuple[float, ...] = parameter(
-        (0.0, 0.0), 'velocity x, y of the object before the capture', unit='m/s', size=2, live=True)
-    object_spin: float = parameter(0.0, 'angular rate of the object before the capture', unit='rad/s', live=True)
+        (0.0, 0.0), 'velocity x, y of the object before the capture', unit='m/s', low=-1e6, high=1e6, size=2,
+        live=True)
+    object_spin: float = parameter(
+        0.0, 'angular rate of the object before the capture', unit='rad/s', low=-1e6, high=1e6, live=True)
     capture_impact: str = parameter(
         'momentum', 'momentum: momentum is conserved and rates jump; continuous: rates stay as they were (the paper)',
         choices=('momentum', 'continuous'))
@@ -207,9 +209,10 @@ class ExcitationParameters:
     shape: str = parameter(
         'square', 'form of the torque over time', choices=('square', 'multisine', 'prbs', 'chirp', 'zero'))
     amplitude: tuple[float, ...] = parameter(
-        (10.0, 5.0), 'peak torque of each joint', unit='N m', low=0.0, size=2, per_link=True, live=True)
+        (10.0, 5.0), 'peak torque of each joint', unit='N m', low=0.0, high=1e9, size=2, per_link=True, live=True)
     offset: tuple[float, ...] = parameter(
-        (0.0, 0.0), 'constant torque added to each joint', unit='N m', size=2, per_link=True, live=True)
+        (0.0, 0.0), 'constant torque added to each joint', unit='N m', low=-1e9, high=1e9, size=2, per_link=True,
+        live=True)
     period: tuple[float, ...] = parameter(
         (1.0, 0.5), 'period of each square wave', unit='s', low=1e-3, size=2, per_link=True)
     band: tuple[float, ...] = parameter(

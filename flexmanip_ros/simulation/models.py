@@ -104,13 +104,21 @@ class LinearModel:
         return run_linear(A, B, self.C, self.rest_output, x, efforts, position, velocity, self._scratch)
 
     def step_matrices(self, payload: Array) -> tuple[Array, Array]:
-        """Discrete (A (2n, 2n), B (2n, L)) with a payload, kept for the last few payloads."""
+        """Discrete (A (2n, 2n), B (2n, L)) with a payload, kept for the last few payloads.
+
+        Raises ModelError for a payload so far from the arm's own masses that its mass matrix is singular to rounding.
+        """
         key = payload.tobytes()
         if key not in self._steps:
             if len(self._steps) > 8:
                 self._steps.clear()
             M = self.mass_matrix(self.rest(), payload)
-            self._steps[key] = discretize(*linearization.first_order(M, self.K, self.D, self.B), self._dt)
+            try:
+                self._steps[key] = discretize(*linearization.first_order(M, self.K, self.D, self.B), self._dt)
+            except np.linalg.LinAlgError as error:
+                raise ModelError(
+                    f'the arm with a payload of {payload[0]:g} kg and {payload[3]:g} kg m^2 cannot be linearized',
+                    'lower payload_mass, payload_inertia or payload_com, or use the nonlinear model') from error
         return self._steps[key]
 
     def mass_matrix(self, x: Array, payload: Array) -> Array:

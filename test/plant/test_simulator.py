@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 from dataclasses import replace
 
 import mechanics
@@ -189,3 +191,29 @@ def test_a_length_density_or_stiffness_of_zero_is_refused_by_name(field: str) ->
         ArmParameters(modes=0)
     with pytest.raises(ParameterError, match='sensor_position'):
         ArmParameters(sensor_position=(0.5, 1.2))
+
+
+@pytest.mark.parametrize('model', ['nonlinear', 'linear'])
+def test_an_object_of_any_allowed_size_and_speed_gives_numbers_or_an_error_of_the_package(model: str) -> None:
+    start = simulator.init(replace(CLEAN, model=model))
+    for mass, inertia, com, velocity in itertools.product(
+            (0.0, 1e-300, 1e9), (0.0, 1e12), ((0.0, 0.0), (1e3, -1e3)), ((0.0, 0.0), (1e6, -1e6))):
+        config = replace(CLEAN, model=model, payload_mass=mass, payload_inertia=inertia, payload_com=com,
+                         object_velocity=velocity, object_spin=-1e6)
+        with contextlib.suppress(ModelError):
+            _, record = simulator.step(config, simulator.attach(config, start), np.ones(2))
+            assert record is not None
+            assert np.isfinite([*record.position, *record.velocity]).all()
+
+
+@pytest.mark.parametrize('change', [
+    {'payload_mass': 1e308}, {'payload_inertia': 1e308}, {'payload_com': (1e160, 0.0)},
+    {'object_velocity': (1e308, 0.0)}, {'object_spin': -1e308}])
+def test_an_object_whose_moments_overflow_is_rejected(change: dict[str, object]) -> None:
+    with pytest.raises(ParameterError, match=next(iter(change))):
+        replace(CLEAN, **change)
+
+
+def test_a_torque_whose_offset_and_amplitude_add_up_to_infinity_is_rejected() -> None:
+    with pytest.raises(ParameterError, match='amplitude'):
+        ExcitationParameters(amplitude=(1.7e308, 0.0), offset=(1.7e308, 0.0))

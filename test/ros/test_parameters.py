@@ -116,7 +116,7 @@ def test_a_set_of_changes_is_taken_as_a_whole_or_refused_with_the_reason(ros: Ro
     request = SetParametersAtomically.Request(parameters=[item.to_parameter_msg() for item in bad])
     result = ros.call(SetParametersAtomically, 'declaring/set_parameters_atomically', request).result
     assert not result.successful
-    assert "'amplitude' is -1.0 N m; give a value of at least 0 N m" in result.reason
+    assert "'amplitude' is -1.0 N m; give a value from 0 to 1e+09 N m" in result.reason
     assert parameters.config.offset == (0.5, 0.5)
     assert ros.call(GetParameters, 'declaring/get_parameters', GetParameters.Request(
         names=['offset'])).values[0].double_array_value.tolist() == [0.5, 0.5]
