@@ -100,7 +100,7 @@ def judge(config: ControllerParameters, estimate: PayloadEstimate) -> Verdict:
 
 
 class HandoverState(NamedTuple):
-    """Since when the estimate is trusted [s], which one the driver accepted, and when it last answered [s]."""
+    """Since when the estimate is trusted [s], which one the driver accepted, when it was last asked or answered [s]."""
 
     trusted_since: float | None = None
     sent: PayloadEstimate | None = None

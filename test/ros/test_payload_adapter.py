@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+import time
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +160,25 @@ def test_a_driver_that_does_not_answer_is_said_and_its_requests_are_not_kept(
     ros.wait(lambda: adapter._asked is not None)
     ros.run(ros.helper, next(iter(ros.helper.timers)).cancel)
     ros.wait(lambda: adapter._asked is None, what='the end of the wait without another estimate')
+    node.destroy_node()
+
+
+def test_a_driver_that_does_not_answer_is_not_asked_again_before_min_period(
+        ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(payload_adapter, 'ANSWER_S', 0.05)
+    node = Node('deaf', context=ros.context)  # never spun
+    node.create_service(SetParameters, 'driver/set_parameters', lambda request, response: response)
+    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
+        target_node='driver', settle_time=0.0, min_period=60.0)))
+    ros.wait(adapter._client.service_is_ready)
+    requests: list[Any] = []
+    call = adapter._client.call_async
+    monkeypatch.setattr(adapter._client, 'call_async', lambda request: requests.append(request) or call(request))
+    say(ros, 31.5, 0.1)
+    ros.wait(lambda: 'has not answered' in adapter.problem)
+    ended = time.monotonic()
+    ros.wait(lambda: adapter._arrivals.times[0] > ended, what='three more estimates')
+    assert len(requests) == 1
     node.destroy_node()
 
 

@@ -34,7 +34,7 @@ from flexmanip_ros.ros.node import FlexmanipNode, run
 
 NAME = 'payload_adapter'
 ANSWER_S = 5.0
-"""Longest wait for the answer of a driver [s], after which it is asked again."""
+"""Longest wait for the answer of a driver [s], after which it may be asked again."""
 INERTIA = ('ixx', 'iyy', 'izz', 'ixy', 'ixz', 'iyz')
 
 
@@ -111,13 +111,15 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
             return
         future = self._client.call_async(self._request(inertia))
         self._asked = future, now
+        self.state = self.state._replace(sent_at=now)
         future.add_done_callback(lambda future: self._answered(future, found))
 
     def _give_up(self, now: float) -> None:
         """Stop waiting for an answer that has not come within ``ANSWER_S``."""
         if self._asked is not None and now - self._asked[1] >= ANSWER_S:
             self.problem = f"service '{self._client.srv_name}' has not answered within {ANSWER_S:g} s"
-            self.log_throttled('silence', f'{self.problem}; it is asked again with the next estimate')
+            self.log_throttled('silence', f'{self.problem}; it is asked again with the next estimate, no sooner than '
+                               'min_period after the last request')
             self._forget_request()
 
     def _forget_request(self) -> None:
