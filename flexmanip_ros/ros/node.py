@@ -6,9 +6,10 @@ import sys
 import time
 import traceback
 import warnings
+from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from functools import wraps
+from functools import partial, wraps
 from typing import Any, Generic, TypeVar
 
 import rclpy
@@ -29,9 +30,11 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
 
 from flexmanip_ros.cli import console
 from flexmanip_ros.errors import FlexmanipError, ParameterError
+from flexmanip_ros.event_replay import MOST_EVENTS
 from flexmanip_ros.io import cdr
 from flexmanip_ros.messages import Diagnostics
 from flexmanip_ros.parameters.document import help_text
@@ -80,7 +83,8 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
     """A lifecycle node whose parameters are those of one configuration class.
 
     Subclasses override ``start`` (configure), ``activated``, ``deactivated`` and ``report``. Topics and services are
-    created once and stay: a node that is not active ignores the messages it receives and publishes diagnostics alone.
+    created once and stay: a node that is not active ignores the messages it receives (but see ``each_event``) and
+    publishes diagnostics alone.
     The cleanup transition keeps the state too; the next configure transition builds a new one.
     """
 
@@ -96,6 +100,8 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         self.events: dict[str, int] = {}
         """Counts of QoS events, by topic and kind: missed deadlines, incompatible publishers, ..."""
         self._entities_made = False
+        self._unheard: deque[Callable[[], None]] = deque(maxlen=MOST_EVENTS)
+        """What is to be done at the activation with the events that came before it."""
         self._unknown_to_rclpy = ExitStack()
         """Clean-up of the alarms and batches, which ``destroy_node`` of rclpy does not know."""
         self._logged_at: dict[str, float] = {}
@@ -171,6 +177,8 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         self.activated()
         self.active, self._waits_for, self._heard_at = True, '', None
         self.get_logger().info(f'ready: {self.summary()}' if self.summary() else 'ready')
+        while self._unheard:
+            self._unheard.popleft()()
 
     @_logged
     def on_deactivate(self) -> None:
@@ -231,6 +239,21 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
                     take(raw)
 
         self.subscription(JointState, 'joint_states', timed, qos.sensor_input(), raw=True, losses=losses)
+
+    def each_event(self, take: Callable[[str, Header], None]) -> None:
+        """Subscribe to both topics of events; ``take`` gets topic and message.
+
+        The middleware sends a latched event once, and what the arm holds is true after it too. So those that come while
+        the node is not active are taken at its activation.
+        """
+        def heard(topic: str, message: Header) -> None:
+            if self.active:
+                take(topic, message)
+            else:
+                self._unheard.append(partial(take, topic, message))
+
+        for topic in ('capture_event', 'capture_detected'):
+            self.subscription(Header, topic, partial(heard, topic), qos.latched_input())
 
     def waiting_joint_states(self, losses: LossCounter) -> rclpy_workarounds.Batches:
         """Subscribe to the joint states, which wait, serialized, until they are taken."""

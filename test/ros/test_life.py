@@ -9,14 +9,16 @@ from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from joint_states import joint_state
+from joint_states import START_NS, joint_state
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
 
 from flexmanip_ros.parameters import leaves
 from flexmanip_ros.ros import qos
+from flexmanip_ros.ros.conversions import to_message
 from flexmanip_ros.ros.nodes import rpbsid_identifier
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
 from flexmanip_ros.ros.nodes.excitation import Excitation
@@ -25,6 +27,7 @@ from flexmanip_ros.ros.nodes.payload_adapter import PayloadAdapter
 from flexmanip_ros.ros.nodes.payload_controller import PayloadController
 from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
 from flexmanip_ros.ros.nodes.rpbsid_identifier import RpbsidIdentifier
+from flexmanip_ros.types import CaptureEvent, EventKind
 
 TRANSITIONS = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP, Transition.TRANSITION_ACTIVATE,
                Transition.TRANSITION_DEACTIVATE)
@@ -87,6 +90,22 @@ def test_every_parameter_that_may_change_may_change_in_every_state(ros: Ros, cls
         ros.run(node, step)
     assert [answer.reason for answer in answers if not answer.successful] == []
     assert len(answers) == 5 * len(changes)
+
+
+@pytest.mark.parametrize('cls', [RpbsidIdentifier, LiveView])
+def test_a_latched_event_that_comes_between_configure_and_activate_is_known_once_active(ros: Ros, cls: Any) -> None:
+    """A lifecycle manager leaves time between the two, and the middleware sends a latched event only once."""
+    event = CaptureEvent(START_NS - 10**9, EventKind.CAPTURE)
+    events = ros.helper.create_publisher(Header, 'capture_event', qos.latched())
+    events.publish(to_message(event))
+    node = ros.add(cls(context=ros.context, overrides=overrides(**NODES[cls], autostart=False)))
+    ros.run(node, node.trigger_configure)
+    ros.wait(lambda: node._unheard, what='the event')
+    ros.run(node, node.trigger_activate)
+    events.publish(to_message(event._replace(kind=EventKind.RELEASE)))  # taken after the first
+    known = (lambda: node.state.early) if cls is RpbsidIdentifier else (lambda: tuple(node._screen._known))
+    ros.wait(lambda: len(known()) == 2)
+    assert [item.kind for item in known()] == [EventKind.CAPTURE, EventKind.RELEASE]
 
 
 def test_two_nodes_of_one_name_say_so(ros: Ros) -> None:

@@ -46,8 +46,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
         """Create the subscriptions, and the timer whose callback takes their messages."""
         self._joint_states = self.waiting_joint_states(self.losses)
         self.subscription(DiagnosticArray, f'{self.config.identifier}/status', self._on_status, qos.sensor_input())
-        for topic in ('capture_event', 'capture_detected'):
-            self.subscription(Header, topic, self._on_event, qos.latched_input())
+        self.each_event(self._on_event)
         self.create_timer(1.0 / self.config.rate, self._update, clock=self._steady)
 
     def summary(self) -> str:
@@ -114,9 +113,7 @@ class LiveView(FlexmanipNode[ViewParameters]):
         if self.active:
             self._screen.status(diagnostics(message))
 
-    def _on_event(self, message: Header) -> None:
-        if not self.active:
-            return
+    def _on_event(self, topic: str, message: Header) -> None:
         try:
             self._screen.event(capture_event(message))
         except SignalError as error:

@@ -164,8 +164,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self._joint_states = self.waiting_joint_states(self.losses)
         self._alarm = self.alarm(self._take)
         self._alarm.after(LONGEST_WAIT_S)
-        for topic in ('capture_event', 'capture_detected'):
-            self.subscription(Header, topic, partial(self._on_event, topic), qos.latched_input())
+        self.each_event(self._on_event)
         self.create_service(Trigger, '~/reset', self._on_reset)
         self._markers = ArmMarkers(self.config)
         if self._markers.drawn:
@@ -290,8 +289,6 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         return min(wait_s, longest_s)
 
     def _on_event(self, topic: str, message: Header) -> None:
-        if not self.active:
-            return
         self._take_samples()  # the samples before the event
         try:
             event = capture_event(message).heard_on(topic)
