@@ -18,7 +18,7 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import Executor
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -70,6 +70,10 @@ def _logged(work: Callable[[Any], None]) -> Callable[..., TransitionCallbackRetu
             work(node)
         except FlexmanipError as error:
             node.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        except NameValidationException as error:
+            words = ' '.join(str(error).rstrip(' ^\n').split())
+            node.get_logger().error(f'{words}; correct the parameter that has this name')
             return TransitionCallbackReturn.FAILURE
         except Exception:
             node.get_logger().error(traceback.format_exc())

@@ -102,6 +102,18 @@ def test_the_identifier_takes_a_suggested_file(ros: Ros, tmp_path: Path) -> None
     assert {name: getattr(node.config, name) for name in values} == values
 
 
+@pytest.mark.parametrize(('cls', 'values', 'name'), [
+    (PayloadAdapter, {'target_node': 'bad name'}, 'bad name/set_parameters'),
+    (LiveView, {'port': 0, 'identifier': 'a//b'}, '/a//b/status')])
+def test_a_parameter_that_makes_no_name_of_a_topic_or_service_is_one_line_and_no_traceback(
+        ros: Ros, log: Callable[[str], str], cls: Any, values: dict[str, Any], name: str) -> None:
+    log('')
+    node = ros.managed(cls(context=ros.context, overrides=overrides(**values)))
+    said = log(f"'{name}'; correct the parameter that has this name")
+    assert 'Traceback' not in said
+    assert not node.active
+
+
 @pytest.mark.parametrize('path', CONFIG, ids=lambda path: path.stem)
 def test_the_files_in_config_are_for_every_name(path: Path) -> None:
     assert re.findall(r'^(\S+):\n  ros__parameters:', path.read_text(encoding='utf-8'), re.MULTILINE) == ['/**']
