@@ -196,6 +196,23 @@ def test_without_simulated_time_it_says_that_it_waits_for_the_clock_until_it_com
     log('/clock is there')
 
 
+def test_no_sample_is_missing_where_the_clock_is_much_slower_than_the_rate(ros: Ros) -> None:
+    """`ros2 bag play --clock` publishes 40 times a second."""
+    node, heard = start(ros, use_sim_time=True)
+    clock = ros.publisher(Clock, '/clock', 10)
+    node.trigger_activate()
+    for steps in (0, 40, 80, 120):
+        now = 10**9 + steps * STEP_NS
+
+        def is_heard(now: int = now) -> bool:
+            clock.publish(Clock(clock=time_message(now)))
+            return bool(node.get_clock().now().nanoseconds == now)
+
+        ros.wait(is_heard)
+    ros.wait(lambda: heard and stamp_ns(heard[-1].header.stamp) >= 10**9 + 119 * STEP_NS, what='all samples')
+    assert set(np.diff(stamps(heard))) == {STEP_NS}
+
+
 def test_simulated_time_drives_the_samples_and_a_jump_back_begins_anew(ros: Ros) -> None:
     node, heard = start(ros, use_sim_time=True)
     clock = ros.publisher(Clock, '/clock', 10)
