@@ -180,6 +180,8 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         """Begin to work."""
         self.activated()
         self.active, self._waits_for, self._heard_at = True, '', None
+        self.meter.window()  # the first report is on a whole second of work
+        self._diagnostics_timer.reset()
         self.get_logger().info(f'ready: {self.summary()}' if self.summary() else 'ready')
         while self._unheard:
             self._unheard.popleft()()

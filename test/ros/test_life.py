@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +107,22 @@ def test_a_latched_event_that_comes_between_configure_and_activate_is_known_once
     known = (lambda: node.state.early) if cls is RpbsidIdentifier else (lambda: tuple(node._screen._known))
     ros.wait(lambda: len(known()) == 2)
     assert [item.kind for item in known()] == [EventKind.CAPTURE, EventKind.RELEASE]
+
+
+@pytest.mark.parametrize(('cls', 'values'), [
+    (PlantSimulator, {'rate': 200.0, 'noise': 'none', 'arm__modes': 1}), (Excitation, {'rate': 200.0})])
+def test_a_node_that_keeps_its_rate_does_not_warn_of_the_second_in_which_it_was_activated(
+        ros: Ros, cls: Any, values: dict[str, Any]) -> None:
+    heard = ros.listen(DiagnosticArray, '/diagnostics')
+    node = ros.add(cls(context=ros.context, overrides=overrides(**values, autostart=False)))
+    ros.run(node, node.trigger_configure)
+    ros.wait(lambda: heard)
+    limit = time.monotonic() + 0.5  # in the middle of a second
+    ros.wait(lambda: time.monotonic() > limit)
+    ros.run(node, node.trigger_activate)
+    ros.wait(lambda: {'active': 'True'} in [{v.key: v.value for v in m.status[0].values if v.key == 'active'}
+                                            for m in heard])
+    assert [message.status[0].message for message in heard if 'a second' in message.status[0].message] == []
 
 
 def test_two_nodes_of_one_name_say_so(ros: Ros) -> None:
