@@ -115,8 +115,8 @@ class AdapterParameters:
         0.3, 'time for which a payload must have been trusted before it is sent', unit='s', low=0.0, high=60.0,
         live=True)
     min_change: float = parameter(
-        0.05, 'a payload is sent again when it changed by this fraction of it, or by max_std', low=0.0, high=10.0,
-        live=True)
+        0.05, 'a payload is sent again when it changed by more than this fraction of it, and by more than max_std',
+        low=0.0, high=10.0, live=True)
     min_displacement: float = parameter(
         0.02, 'a payload is sent again when its centre of mass moved, or its radius of gyration changed, by this',
         unit='m', low=0.0, high=100.0, live=True)

@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
 from flexmanip_ros.control import handover
 from flexmanip_ros.control.handover import PayloadEstimate
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.parameters import AdapterParameters
+from flexmanip_ros.parameters import AdapterParameters, leaves
 
 CONFIG = AdapterParameters(target_node='driver', settle_time=0.5, min_period=1.0)
 GOOD = PayloadEstimate(20.0, 0.1, 19.8, 20.2, 1.0)
@@ -42,6 +43,14 @@ def test_another_place_of_its_centre_of_mass_or_another_inertia_is_told_again() 
     for changed in (GOOD._replace(com=(0.03, 0.0)), GOOD._replace(inertia=0.05)):
         assert told_times([(0.1 * k, GOOD if k < 8 else changed) for k in range(40)]) == pytest.approx([0.5, 1.5])
     assert told_times([(0.1 * k, GOOD if k < 8 else GOOD._replace(com=(0.01, 0.0))) for k in range(40)]) == [0.5]
+
+
+def test_another_mass_is_told_again_where_it_differs_by_min_change_and_by_max_std() -> None:
+    words = next(leaf.words for leaf in leaves(AdapterParameters) if leaf.name == 'min_change')
+    assert 'by more than this fraction of it, and by more than max_std' in words
+    unsure = replace(CONFIG, max_std=2.0)
+    for mass, config, told in ((20.9, CONFIG, False), (21.1, CONFIG, True), (21.1, unsure, False)):
+        assert handover.changed(config, GOOD, GOOD._replace(mass=mass)) is told
 
 
 @pytest.mark.parametrize('bad', [
