@@ -174,6 +174,12 @@ class Recent:
         self._counts = {at: count for at, count in self._counts.items() if at >= oldest}
         return sum(self._counts.values())
 
+    def report(self, report: Report, what: str, became: str) -> None:
+        """Add a warning where something happened lately. what: such as 'message'; became: such as 'lost'."""
+        count = self.count()
+        if count:
+            report.worse(WARN, f'{number(count, what)} {became} in the last {RECENT_S:.0f} s')
+
 
 class LossCounter:
     """Counts messages that were sent and never arrived, from the publishers' sequence numbers.
@@ -221,9 +227,7 @@ class LossCounter:
     def report(self, report: Report, name: str, what: str) -> None:
         """Add the total under a name, and a warning for losses in ``RECENT_S``. what: 'message' or 'command'."""
         report.values[name] = self.lost
-        recent = self.recent()
-        if recent:
-            report.worse(WARN, f'{number(recent, what)} lost in the last {RECENT_S:.0f} s')
+        self._losses.report(report, what, 'lost')
 
 
 class JointStateFaults:

@@ -54,10 +54,36 @@ def test_bad_samples_get_no_torque_and_are_counted(ros: Ros) -> None:
     unnamed.name = ['a', 'b', 'c', 'd']
     for message in (good, nan, nan_rate, short, unnamed, late):
         states.publish(message)
-    ros.wait(lambda: node.dropped == 5)
+    ros.wait(lambda: (node.dropped, node.foreign) == (4, 1))
     ros.wait(lambda: heard)
     assert node.sent == 1
     assert np.isfinite(heard[0].data).all()
+
+
+def test_the_joint_states_of_a_gripper_are_no_error_while_those_of_the_arm_come(
+        ros: Ros, log: Callable[[str], str]) -> None:
+    diagnostics = ros.listen(DiagnosticArray, '/diagnostics')
+    node = start(ros, readers=0)
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    log('')
+    count = itertools.count()
+
+    def some(*kinds: tuple[str, ...]) -> None:
+        for names in kinds:
+            states.publish(joint_state(next(count), names) if names else joint_state(next(count)))
+
+    timer = ros.helper.create_timer(0.01, lambda: some((), ('finger',)))
+    ros.wait(lambda: node.foreign > 0)
+    before = len(diagnosed(diagnostics, ''))
+    ros.wait(lambda: len(diagnosed(diagnostics, '')) > before + 1)
+    words = 'no joint state can be used: none has joint1, joint2, link1_bend, link2_bend'
+    assert 'dropped' not in log('') + diagnostics[-1].status[0].message
+    assert not diagnosed(diagnostics, words)
+    ros.run(ros.helper, timer.cancel)
+    ros.helper.create_timer(0.01, lambda: some(('finger',)))
+    log(words)
+    assert ros.wait(lambda: diagnosed(diagnostics, words), what='the error')[0][0] == b'\x02'
+    assert node.dropped == 0
 
 
 def test_a_trusted_latched_estimate_changes_the_schedule_and_a_wild_one_does_not(ros: Ros) -> None:

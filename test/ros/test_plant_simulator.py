@@ -14,7 +14,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
 from std_srvs.srv import Trigger
 
-from flexmanip_ros.ros import qos
+from flexmanip_ros.ros import diagnostics, qos
 from flexmanip_ros.ros.conversions import joint_record, stamp_ns, time_message, to_message
 from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
 from flexmanip_ros.simulation import simulator
@@ -110,7 +110,7 @@ def test_two_publishers_with_numbers_of_their_own_are_no_loss(ros: Ros) -> None:
 
 
 def test_dropped_commands_show_in_the_diagnostics(ros: Ros) -> None:
-    diagnostics = ros.listen(DiagnosticArray, '/diagnostics', 10)
+    heard = ros.listen(DiagnosticArray, '/diagnostics', 10)
     node, _ = start(ros)
     node.trigger_activate()
     ros.publisher(Float64MultiArray, 'effort_controller/commands').publish(Float64MultiArray(data=[1.0]))
@@ -119,9 +119,24 @@ def test_dropped_commands_show_in_the_diagnostics(ros: Ros) -> None:
         return any(
             status.name == '/plant_simulator: status' and status.level == b'\x01'
             and {'dropped_commands': '1'}.items() <= {v.key: v.value for v in status.values}.items()
-            for message in diagnostics for status in message.status)
+            for message in heard for status in message.status)
 
     ros.wait(warned, what='a warning with the count')
+
+
+def test_a_dropped_command_is_a_warning_for_a_minute(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(diagnostics, 'RECENT_S', 3.0)
+    heard = ros.listen(DiagnosticArray, '/diagnostics', 10)
+    node, _ = start(ros)
+    node.trigger_activate()
+    ros.publisher(Float64MultiArray, 'effort_controller/commands').publish(Float64MultiArray(data=[1.0]))
+
+    def said() -> list[str]:
+        return [message.status[0].message for message in heard if message.status[0].name == '/plant_simulator: status']
+
+    ros.wait(lambda: '1 command dropped in the last 3 s' in said(), what='the warning')
+    ros.wait(lambda: said()[-1] == 'ok', what='its end')
+    assert node.dropped_commands == 1
 
 
 def test_an_event_ahead_of_its_stamp_acts_exactly_there(ros: Ros) -> None:

@@ -28,7 +28,7 @@ from flexmanip_ros.errors import SignalError
 from flexmanip_ros.parameters import ControllerParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, doubles
-from flexmanip_ros.ros.diagnostics import ERROR, WARN, Report, Stamps
+from flexmanip_ros.ros.diagnostics import ERROR, WARN, Recent, Report, Stamps
 from flexmanip_ros.ros.node import FlexmanipNode, run
 from flexmanip_ros.types import Array, JointRecord
 
@@ -57,7 +57,11 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         self._estimate: PayloadEstimate | None = None
         self._arrivals = handover.Arrivals()
         self._body: tuple[float, ...] | None = None
-        self.dropped = 0
+        self.dropped = self.foreign = 0
+        """Number of messages that could not be used, and of joint states with none of the joints and bends."""
+        self._drops = Recent()
+        self._came: set[bool] = set()
+        """Of the joint states since the last report: whether they have any of the joints and bends."""
         self.not_finite = 0
         self.sent = 0
         self._added, self._added_at = np.zeros(len(self.config.joints)), -np.inf
@@ -113,10 +117,9 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
             return
         measured = self._measured(record)
         if measured is None:
-            wanted = ', '.join((*self.config.joints, *self.config.bends))
-            self._drop('joint_states', 'a joint state was dropped: it lacks position and velocity '
-                       f'(finite, below {LARGEST:g}) of {wanted}')
+            self._not_measured(record)
             return
+        self._came.add(True)
         if self._is_late(record.stamp_ns):
             return
         self._arrived = time.monotonic()
@@ -136,6 +139,17 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
             torque = np.zeros(len(torque))
         self._send(torque)
         self._watch_limits(torque)
+
+    def _not_measured(self, record: JointRecord) -> None:
+        """Drop a joint state that cannot be used; one of other joints, such as those of a gripper, is only counted."""
+        wanted = (*self.config.joints, *self.config.bends)
+        known = not set(wanted).isdisjoint(record.names)
+        self._came.add(known)
+        if not known:
+            self.foreign += 1
+            return
+        self._drop('joint_states', 'a joint state was dropped: it lacks position and velocity '
+                   f'(finite, below {LARGEST:g}) of {", ".join(wanted)}')
 
     def _watch_limits(self, torque: Array) -> None:
         """Warn when the torques are at their limits more often than not, counted over ``AT_LIMIT_S``."""
@@ -176,6 +190,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
 
     def _drop(self, reason: str, words: str) -> None:
         self.dropped += 1
+        self._drops.add(1)
         self.log_throttled(reason, words)
 
     def _measured(self, record: JointRecord) -> controller.Measured | None:
@@ -247,9 +262,13 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
 
     def report(self, report: Report) -> None:
         """Report the rate, the payload that the gains follow, and the verdict on the latest estimate."""
-        report.values['dropped'] = self.dropped
-        if self.dropped:
-            report.worse(WARN, f'{self.dropped} messages dropped')
+        report.values.update(dropped=self.dropped, foreign=self.foreign)
+        self._drops.report(report, 'message', 'dropped')
+        came, self._came = self._came, set()
+        if came == {False}:
+            words = f'no joint state can be used: none has {", ".join((*self.config.joints, *self.config.bends))}'
+            self.log_throttled('foreign', words)
+            report.worse(ERROR, words)
         if self.active and report.values['rate_hz'] == 0.0:
             report.silent('joint_states')
         self._report_rate(report)

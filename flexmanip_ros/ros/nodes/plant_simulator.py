@@ -24,7 +24,7 @@ from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import capture_event, to_message
-from flexmanip_ros.ros.diagnostics import CLOCK, ERROR, WARN, LossCounter, Report
+from flexmanip_ros.ros.diagnostics import CLOCK, ERROR, WARN, LossCounter, Recent, Report
 from flexmanip_ros.ros.node import FlexmanipNode, SampleGrid, run
 from flexmanip_ros.simulation import simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
@@ -44,6 +44,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         self.state: simulator.PlantState
         self.efforts = np.zeros(len(self.config.arm.link_length))
         self.dropped_commands = 0
+        self._drops = Recent()
         self.lost_commands = LossCounter()
         self.late_events = 0
         self.rejected_events = 0
@@ -142,6 +143,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
 
     def _drop(self, words: str) -> None:
         self.dropped_commands += 1
+        self._drops.add(1)
         self.log_throttled('command', words)
 
     def _on_event(self, message: Header) -> None:
@@ -191,8 +193,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
             report.silent(CLOCK)
         elif self.active and values['rate_hz'] < 0.9 * self.config.rate:
             report.worse(WARN, f'{values["rate_hz"]:.0f} of {self.config.rate:.0f} samples a second')
-        if self.dropped_commands:
-            report.worse(WARN, f'{self.dropped_commands} commands dropped')
+        self._drops.report(report, 'command', 'dropped')
         self.lost_commands.report(report, 'lost_commands', 'command')
         if self.rejected_events:
             report.worse(WARN, f'{self.rejected_events} events rejected')
