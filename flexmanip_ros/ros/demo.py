@@ -262,14 +262,14 @@ def new_folder(base: Path) -> Path:
 def _init(arguments: Sequence[str], console: Console) -> None:
     """Initialize rclpy on a domain without another arm: the user's own, or else a free one."""
     domain: int | None = None
-    for _ in range(10):
+    for attempt in range(10):
         rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO, domain_id=domain)
         if not _occupied():
             if domain is not None:
                 console.print(f'another arm is on the usual domain; this one is on ROS_DOMAIN_ID={domain}')
             return
         rclpy.shutdown()
-        domain = (os.getpid() + (domain or 0)) % 100 + 1
+        domain = (os.getpid() + attempt) % 100 + 1
     raise ParameterError('no free ROS domain was found', 'set ROS_DOMAIN_ID')
 
 

@@ -18,11 +18,12 @@ from urllib.error import URLError
 from urllib.request import urlopen
 
 import pytest
+from rich.console import Console
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import Reader
 
 from flexmanip_ros import messages
-from flexmanip_ros.errors import BagError
+from flexmanip_ros.errors import BagError, ParameterError
 from flexmanip_ros.io import bag
 from flexmanip_ros.ros.composition import DRAIN_TIMEOUT_S
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
@@ -181,6 +182,23 @@ def test_an_interrupted_demonstration_leaves_a_readable_bag(tmp_path: Path) -> N
     assert 'interrupted' in out
     assert 'Traceback' not in err
     assert sum(isinstance(item, JointRecord) for item in bag.read(tmp_path / 'run_001' / 'bag')) > 100
+
+
+@pytest.mark.parametrize('number', [1033, 1049, 1099, 7])
+def test_a_demonstration_looks_for_a_free_domain_on_nine_others(
+        monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    from flexmanip_ros.ros import demo
+
+    tried: list[int | None] = []
+    monkeypatch.setattr(demo.rclpy, 'init', lambda domain_id, **_: tried.append(domain_id))
+    monkeypatch.setattr(demo.rclpy, 'shutdown', lambda: None)
+    monkeypatch.setattr(demo, '_occupied', lambda: True)
+    monkeypatch.setattr(demo.os, 'getpid', lambda: number)
+    with pytest.raises(ParameterError, match='no free ROS domain'):
+        demo._init([], Console())
+    assert tried[0] is None
+    assert len(set(tried)) == 10
+    assert all(1 <= domain <= 100 for domain in tried[1:] if domain is not None)
 
 
 def test_runs_never_share_a_folder(tmp_path: Path) -> None:
