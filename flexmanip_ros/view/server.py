@@ -182,7 +182,7 @@ class _Handler(BaseHTTPRequestHandler):
         server, path = self.server, self.path.partition('?')[0]
         try:
             # Another site whose name resolves to this address could read the data.
-            if self.headers.get('Host', '').rpartition(':')[0] not in (HOST, 'localhost'):
+            if self.headers.get('Host', '').partition(':')[0] not in (HOST, 'localhost'):
                 self.send_error(HTTPStatus.FORBIDDEN, f'open {server.url}')
             elif path == '/':
                 self._answer('text/html; charset=utf-8', server.page)

@@ -94,7 +94,13 @@ def test_what_is_not_there_is_not_found(server: Server) -> None:
 
 def test_another_site_whose_name_leads_here_reads_nothing(server: Server) -> None:
     assert get(server, '/state', Host='evil.example:80')[0] == 403
+    assert get(server, '/state', Host='localhost.evil.example')[0] == 403
     assert get(server, '/state', Host=f'localhost:{server.port}')[0] == 200
+
+
+@pytest.mark.parametrize('host', [HOST, 'localhost'])
+def test_a_browser_that_leaves_out_the_port_as_it_does_at_port_80_is_answered(server: Server, host: str) -> None:
+    assert get(server, '/state', Host=host)[0] == 200
 
 
 def test_every_page_gets_every_event_in_order(server: Server) -> None:
