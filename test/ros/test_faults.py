@@ -8,12 +8,14 @@ from collections.abc import Callable
 
 import numpy as np
 from identifier_harness import CAPTURE, START_NS, Live, recording, replayed
-from ros_harness import Ros
+from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
 
 from flexmanip_ros import messages
 from flexmanip_ros.ros import conversions, qos
 from flexmanip_ros.ros.demo import compare
+from flexmanip_ros.ros.nodes.plant_simulator import PlantSimulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, Payload, Status
 
 TRUTH = 20.0
@@ -209,6 +211,30 @@ def test_two_publishers_on_two_clocks_are_named_and_the_resets_logged_once_in_tw
     log(f'the stamps of the joint states are irregular: {cause}')
     lines = log(cause).count('everything identified is forgotten: the stamps jumped')
     assert 1 <= lines <= 1 + (time.monotonic() - began) / 2.0
+
+
+def test_a_flood_of_events_that_are_late_or_of_another_clock_does_not_fill_the_log(
+        ros: Ros, log: Callable[[str], str]) -> None:
+    live = Live(ros, payload_method='none')
+    plant = ros.managed(PlantSimulator(context=ros.context, namespace='other', overrides=overrides(
+        rate=100.0, noise='none', arm__modes=1)))
+    ros.wait(lambda: plant.samples > 20)
+    live.send(*recording(100))
+
+    def taken() -> int:
+        events = live.node.state.payload
+        return int(events.late_events + events.repeated_events + events.rewinds)
+
+    log('')
+    late = ros.publisher(Header, '/other/capture_event', qos.latched())
+    began, words = time.monotonic(), ('stamp an event with the time of its samples', 'ms late and is applied now')
+    for k in range(100):
+        live.events.publish(conversions.to_message(CaptureEvent(k * 10**9, EventKind.CAPTURE)))
+        late.publish(conversions.to_message(CaptureEvent(plant._restarted_ns + k, EventKind.RELEASE)))
+        ros.wait(lambda k=k: taken() > k)
+        ros.wait(lambda k=k: plant.late_events > k)
+    said = [log(text).count(text) for text in words]
+    assert max(said) <= 1 + (time.monotonic() - began) / 2.0
 
 
 def test_two_publishers_of_different_joints_are_no_fault(ros: Ros, log: Callable[[str], str]) -> None:

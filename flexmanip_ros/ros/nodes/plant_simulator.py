@@ -161,9 +161,9 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         if self.samples and event.stamp_ns <= self._stamp(self.samples - 1):
             self.late_events += 1
             late_ms = (self._stamp(self.samples) - event.stamp_ns) * 1e-6
-            self.get_logger().warning(
-                f'{event.kind.value} came {late_ms:.1f} ms late and is applied now; raise lead_time or '
-                'service_delay of capture_trigger')
+            self.log_throttled(
+                'late event', f'{event.kind.value} came {late_ms:.1f} ms late and is applied now; raise lead_time or '
+                'service_delay of capture_trigger', is_error=False)
         self._pending = tuple(sorted((*self._pending, event), key=lambda item: item.stamp_ns))
 
     def _reject_event(self, words: str) -> None:

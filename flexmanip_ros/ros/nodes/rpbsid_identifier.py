@@ -299,8 +299,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         last_ns = self.state.clock.last_ns
         if last_ns is not None and abs(event.stamp_ns - last_ns) > FAR_EVENT_NS:
             where = 'before' if event.stamp_ns < last_ns else 'after'
-            self.get_logger().warning(f'{words}, {abs(event.stamp_ns - last_ns) * 1e-9:.0f} s {where} the last sample: '
-                                      'stamp an event with the time of its samples')
+            self.log_throttled('far event', f'{words}, {abs(event.stamp_ns - last_ns) * 1e-9:.0f} s {where} the last '
+                               'sample: stamp an event with the time of its samples', is_error=False)
         else:
             self.get_logger().info(words)
         if self._resumed:
