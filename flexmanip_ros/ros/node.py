@@ -58,6 +58,8 @@ BAD_INPUT = 2
 """Exit code of a program whose arguments or parameters are wrong."""
 THROTTLE_S = 2.0
 """Shortest time between two log lines of a repeated error [s]: the log stays readable and does not fill the disk."""
+NO_STAMP = 0
+"""Stamp [ns] that a publisher did not fill in, such as that of some grippers; no clock can be kept by it."""
 MISMATCHED = {'durability': ('volatile', 'transient_local'), 'reliability': ('best_effort', 'reliable')}
 """What a publisher offers, and the subscription wants, where the two do not match: the only such pair of a policy."""
 

@@ -75,6 +75,19 @@ def test_torques_keep_in_step_with_the_stamps_of_the_arm_whenever_they_come(ros:
         assert message.data.tolist() == torque(node.config, k + 1).tolist()
 
 
+def test_joint_states_without_a_stamp_as_those_of_a_gripper_do_not_disturb_the_torques(ros: Ros) -> None:
+    heard = ros.listen(Float64MultiArray, 'effort_controller/commands', qos.sensor_output())
+    node = ros.managed(Excitation(context=ros.context, overrides=overrides(
+        clock='joint_states', period=[0.02, 0.01])))
+    ros.wait(lambda: node.commands.get_subscription_count() == 1)
+    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    for k in range(50):
+        states.publish(JointState(name=['finger'], position=[0.1]))
+        states.publish(joint_state(k))
+    ros.wait(lambda: len(heard) >= 50)
+    assert [message.data.tolist() for message in heard] == [torque(node.config, k + 1).tolist() for k in range(50)]
+
+
 @pytest.mark.parametrize(('name', 'value', 'said'), [
     ('amplitude', [0.0, 0.0], 'the torque is zero'), ('offset', [500.0, 0.0], 'lower the offset'),
     ('amplitude', [1e-320, 0.0], 'the torque is zero')])

@@ -29,7 +29,7 @@ from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, to_message
 from flexmanip_ros.ros.diagnostics import RECENT_S, WARN, JointStateFaults, Recent, Report, number
-from flexmanip_ros.ros.node import FlexmanipNode, run
+from flexmanip_ros.ros.node import NO_STAMP, FlexmanipNode, run
 from flexmanip_ros.samples.signals import joints
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, events_at
 
@@ -105,14 +105,19 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         if stamp is None:
             return
         self._arrived = time.monotonic()
+        if stamp != NO_STAMP:
+            self._keep_time(stamp)
+        if self._watch is not None:
+            self._watch = self._detect(self._watch, raw)
+
+    def _keep_time(self, stamp: int) -> None:
+        """Announce the events that are due at a stamp [ns]."""
         if self._first_ns is None or self._is_new_recording(stamp):
             self._begin(stamp)
         self._before_ns, self._last_ns = self._last_ns, stamp
         while self._pending and stamp >= self._pending[0].stamp_ns - int(self.config.lead_time * 1e9):
             self._announce(self._pending[0])
             self._pending = self._pending[1:]
-        if self._watch is not None:
-            self._watch = self._detect(self._watch, raw)
 
     def _is_new_recording(self, stamp: int) -> bool:
         """Return whether the stamp went back to a new recording, not from a single wrong stamp to the right ones."""
@@ -177,7 +182,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
             response.success, response.message = False, f'{NAME} is not active'
         elif self._last_ns is None:
             response.success = False
-            response.message = 'no joint_states came yet, so the instant has no stamp; start the arm first'
+            response.message = 'no joint_states with a stamp came yet, so the instant has no stamp; start the arm first'
         elif silent > self.config.stale_after:
             response.success = False
             response.message = f'no joint_states for {silent:.1f} s; is the driver alive?'

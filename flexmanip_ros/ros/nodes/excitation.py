@@ -19,7 +19,7 @@ from flexmanip_ros.parameters import ExcitationParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import doubles
 from flexmanip_ros.ros.diagnostics import CLOCK, WARN, Report
-from flexmanip_ros.ros.node import FlexmanipNode, SampleGrid, run
+from flexmanip_ros.ros.node import NO_STAMP, FlexmanipNode, SampleGrid, run
 from flexmanip_ros.simulation import excitation
 from flexmanip_ros.types import Array
 
@@ -84,7 +84,7 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
     def _on_joint_state(self, raw: bytes) -> None:
         """Send the torque that the arm needs at the sample after this one."""
         stamp = self.stamp_of(raw)
-        if stamp is None:
+        if stamp is None or stamp == NO_STAMP:
             return
         if self._first_ns is None or stamp < self._first_ns:
             self._first_ns, self._last = stamp, 0
