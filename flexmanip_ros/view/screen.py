@@ -122,6 +122,9 @@ class Screen:
         """Number of joint states taken since the start, in all runs."""
         self.runs = 0
         """Number of runs begun; each run has its own time 0."""
+        self._joints = {name.rpartition('/')[0] for name in source.columns}
+        self._is_known = False
+        """Whether a joint state with any of these joints came."""
         self._begin()
 
     def _begin(self) -> None:
@@ -135,8 +138,22 @@ class Screen:
         self._known: deque[CaptureEvent] = deque(maxlen=MOST_EVENTS)
         self._events: deque[CaptureEvent] = deque(maxlen=MOST_EVENTS)
 
+    def _begin_with(self, events: list[CaptureEvent]) -> None:
+        self._begin()
+        for event in events:
+            self.event(event)
+
     def joint_states(self, block: JointBlock) -> None:
-        """Take joint states. Stamps that do not advance are left out; a jump back begins a new run."""
+        """Take joint states. Stamps that do not advance are left out; a jump back begins a new run.
+
+        Those with none of the joints shown, such as those of a gripper, are left out once others came.
+        """
+        has_joint = not self._joints.isdisjoint(block.names)
+        if self._is_known and not has_joint:
+            return
+        if has_joint and not self._is_known and self.first_ns is not None:
+            self._begin_with(list(self._known))
+        self._is_known = has_joint
         stamps = block.stamp_ns
         highest = np.maximum.accumulate(np.concatenate([[self._last_ns], stamps]))[:-1]
         back = np.flatnonzero(stamps < highest - LOOPED_NS)
@@ -144,10 +161,7 @@ class Screen:
             k = int(back[0])
             if k:
                 self.joint_states(block.part(slice(0, k)))
-            ahead = [event for event in self._known if event.stamp_ns >= stamps[k]]
-            self._begin()
-            for event in ahead:
-                self.event(event)
+            self._begin_with([event for event in self._known if event.stamp_ns >= stamps[k]])
             self.joint_states(block.part(slice(k, None)))
             return
         self.samples += len(stamps)

@@ -86,6 +86,23 @@ def test_missing_samples_are_a_gap_in_every_line_also_between_two_frames() -> No
     assert not np.isnan(found[1:]).any()
 
 
+@pytest.mark.parametrize('stamped', [True, False])
+def test_joint_states_of_other_joints_draw_no_gap_and_begin_no_run(stamped: bool) -> None:
+    shown = screen()
+    shown.event(CaptureEvent(START_NS + 3 * STEP_NS, EventKind.CAPTURE))
+    shown.joint_states(block(0, 1)._replace(names=('finger', 'b', 'c', 'd', 'e'), stamp_ns=np.array([0])))
+    for k in range(20):
+        shown.joint_states(block(k, 1))
+        at = START_NS + k * STEP_NS + 1000 if stamped else 0
+        shown.joint_states(JointBlock(('finger',), np.array([at]), np.ones((1, 1)), np.ones((1, 0)), np.ones((1, 0))))
+    frame = shown.frame()
+    found = rows(frame)
+    assert found[:, 0] == pytest.approx(1e-3 * np.arange(20), abs=1e-6)
+    assert not np.isnan(found).any()
+    assert frame['events'] == [[0.003, True]]
+    assert shown.runs == 2  # that of the joint state that came before the first of the arm
+
+
 def test_signals_that_are_not_there_are_gaps_and_no_error() -> None:
     shown = screen()
     shown.joint_states(JointBlock(('joint1',), np.array([START_NS]), np.ones((1, 1)), np.ones((1, 0)), np.ones((1, 0))))
