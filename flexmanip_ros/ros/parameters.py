@@ -31,7 +31,8 @@ class NodeParameters(Generic[Config]):
     """The parameters of one node, kept as a valid configuration at all times.
 
     ``check_change`` is called with the configuration that a set of changes gives; it rejects them by a ParameterError.
-    ``on_change`` is called after a set of changes was accepted, with the new configuration and the names that were set.
+    ``on_change`` is called when a set of changes was accepted, with the new configuration and the names that were set;
+    ``config`` is still the old one then.
     """
 
     def __init__(
@@ -67,9 +68,10 @@ class NodeParameters(Generic[Config]):
         names = self._changed(changes).keys()
         if not names:
             return
-        self.config = self._candidate(changes)
+        changed = self._candidate(changes)
         if self._on_change is not None:
-            self._on_change(self.config, names)
+            self._on_change(changed, names)
+        self.config = changed
 
 
 def descriptor(leaf: Leaf) -> ParameterDescriptor:

@@ -122,6 +122,20 @@ def test_a_set_of_changes_is_taken_as_a_whole_or_refused_with_the_reason(ros: Ro
         names=['offset'])).values[0].double_array_value.tolist() == [0.5, 0.5]
 
 
+def test_a_node_that_is_told_of_a_change_has_the_old_parameters_for_what_came_before_it(ros: Ros) -> None:
+    node = ros.add(Node('declaring', context=ros.context))
+    seen: list[tuple[float, float]] = []
+
+    def changed(config: IdentifierParameters, names: object) -> None:
+        seen.append((parameters.config.max_gap, config.max_gap))
+
+    parameters = NodeParameters(node, IdentifierParameters, changed)
+    (result,) = node.set_parameters([Parameter('max_gap', value=0.0)])
+    assert result.successful
+    assert seen == [(0.2, 0.0)]
+    assert parameters.config.max_gap == 0.0
+
+
 def test_what_may_not_change_at_run_time_is_read_only(ros: Ros) -> None:
     node = ros.add(Node('declaring', context=ros.context))
     parameters = NodeParameters(node, PlantParameters)
