@@ -419,11 +419,12 @@ def too_noisy(rates: Array, dt: float) -> NDArray[np.bool_]:
     mean tanh(v / r) nearly, r^2 = s^2 + pi w / 2 (MacKay 1992). So its variance at v = 0 is 1 - s / r. To that the
     waves in the rate add ``MEASURED_SHARE``^2; with the model's rates they are ``MODELLED_SHARE``^2.
     """
-    known = rates[~np.isnan(rates).any(axis=1)]
-    if len(known) < FEWEST or dt > LONGEST_PERIOD:
-        return np.zeros(rates.shape[1], dtype=np.bool_)
-    by_noise = 1.0 - 1.0 / np.sqrt(1.0 + np.pi / 2.0 * white_noise(known) / STICTION_RATE ** 2)
-    noisy: NDArray[np.bool_] = by_noise + MEASURED_SHARE ** 2 > MODELLED_SHARE ** 2
+    noisy = np.zeros(rates.shape[1], dtype=np.bool_)
+    for joint in range(noisy.size if dt <= LONGEST_PERIOD else 0):
+        known = rates[~np.isnan(rates[:, joint]), joint:joint + 1]  # a message may have the rate of one joint alone
+        if len(known) >= FEWEST:
+            by_noise = 1.0 - 1.0 / np.sqrt(1.0 + np.pi / 2.0 * white_noise(known)[0] / STICTION_RATE ** 2)
+            noisy[joint] = by_noise + MEASURED_SHARE ** 2 > MODELLED_SHARE ** 2
     return noisy
 
 

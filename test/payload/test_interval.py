@@ -97,6 +97,13 @@ def test_rates_tell_the_friction_unless_their_noise_hides_where_it_reverses(
     assert not too_noisy(rates, 1e-3).any()  # one sample tells no noise
 
 
+@pytest.mark.parametrize(('joint', 'noisy'), [(0, [True, False]), (1, [False, True])])
+def test_rates_of_one_joint_alone_are_looked_at_too(joint: int, noisy: list[bool]) -> None:
+    rates = np.full((24, 2), np.nan)
+    rates[:, joint] = np.random.default_rng(0).normal(0.0, 0.01, 24)
+    assert too_noisy(rates, 1e-3).tolist() == noisy
+
+
 def test_noise_hides_the_share_of_friction_as_reckoned() -> None:
     rng = np.random.default_rng(1)
     for std in (0.3, 1.0, 2.0):  # of the noise, over the rate where friction reverses
