@@ -205,7 +205,10 @@ def learned(config: IdentifierParameters) -> tuple[tuple[Kind, int], ...]:
     given = {name for name, neutral in (('torque_gain', 1.0), ('bend_gain', 1.0), ('bend_offset', 0.0),
                                         ('torque_delay', 0.0), ('torque_lag', 0.0), ('bend_delay', 0.0))
              if np.any(np.array(getattr(config.arm, name)) != neutral)}
-    for name in (*config.payload.learn, *sorted(given.difference(config.payload.learn))):
+    wanted = set(config.payload.learn)
+    if 'mode_stiffness' in wanted:  # a factor on the stiffness of its link, which must come before it
+        wanted.add('stiffness')
+    for name in (*(name for name in LEARNED if name in wanted), *sorted(given - wanted)):
         kind = LEARNED[name]
         if kind is Kind.MODE:  # static shapes are no modes
             k = config.arm.modes if config.arm.shape_functions == 'sines' else 0

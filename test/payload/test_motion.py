@@ -258,3 +258,19 @@ def test_steps_are_counted_and_an_arm_too_stiff_to_be_one_is_refused(arm):
         steps.append(process_model.predict(arm, state, spread, 0, rows, 1e-3, 1e-3))
     assert 1 <= steps[0] < steps[1]
     assert steps[2] == 0
+
+
+@pytest.mark.parametrize('learn', [['mode_stiffness'], ['mode_stiffness', 'stiffness'], ['stiffness', 'mode_stiffness'],
+                                   ['stiffness', 'mode_stiffness', 'stiffness']])
+def test_the_stiffness_of_a_mode_is_a_factor_on_that_of_its_link_whatever_is_learned_in_whatever_order(learn):
+    arm = motion(configure(IdentifierParameters, {'arm.shape_functions': 'sines', 'payload.learn': learn}))
+    x = np.zeros(2 * arm.arm.stiffness.size + arm.kind.size)
+    p = x[2 * arm.arm.stiffness.size:]
+    p[arm.kind == Kind.MODE] = 0.01
+    p[(arm.kind == Kind.STIFFNESS) & (arm.prior > 0.0)] = 0.1
+    links = np.exp(0.1 if 'stiffness' in learn else 0.0)
+    for _ in range(2):
+        process_model.set_parameters(arm, x)
+        np.testing.assert_allclose(arm.arm.stiffness[2:] / arm.stiffness[2:],
+                                   np.tile(links * np.exp([0.0, 0.01, 0.01]), 2), rtol=1e-12)
+    assert np.count_nonzero(arm.kind == Kind.STIFFNESS) == 2
