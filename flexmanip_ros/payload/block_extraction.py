@@ -15,7 +15,7 @@ from flexmanip_ros.identification.factor import POWER_RATE
 from flexmanip_ros.identification.realization import to_continuous
 from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
-from flexmanip_ros.payload.structured_model import Quantity, signals
+from flexmanip_ros.payload.structured_model import Quantity, signals, working_point
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.types import QUANTILE, Array, Payload, Status
 
@@ -245,14 +245,6 @@ def _excess(config: IdentifierParameters, theta: Array, kappa: int, mass_of: Cal
             return 0.0
         excess = float(mass_of(*model)) - payload
     return excess
-
-
-def working_point(config: IdentifierParameters, angles: Array) -> Array:
-    """Return the chord angles (L,) that a model belongs to: measured ones, or where a linear plant stays."""
-    given = config.payload.working_point
-    if config.payload.dynamics == 'linear' and given:
-        return np.array(given, dtype=np.float64)
-    return chords(config.arm, angles)
 
 
 def masses(arm: ArmParameters, empty: Blocks, Ac: Array, Bc: Array, known_mb: bool) -> Array:

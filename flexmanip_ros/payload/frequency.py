@@ -12,7 +12,8 @@ import numpy as np
 
 from flexmanip_ros.arm.linearization import blocks
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
-from flexmanip_ros.payload.block_extraction import unknown, working_point
+from flexmanip_ros.payload.block_extraction import unknown
+from flexmanip_ros.payload.structured_model import working_point
 from flexmanip_ros.types import Array, Mode, Payload, Status
 
 GRID = 400

@@ -259,8 +259,7 @@ def sensors(config: IdentifierParameters, model: Model, dt: float, angles: Array
     rate = np.zeros(count, dtype=np.bool_)
     # a damping ratio of zero is one that was not given
     damping = config.arm.damping_ratio or min(config.payload.damping_std, MOST_DAMPING)
-    beyond = omitted_modes(replace(config.arm, damping_ratio=damping),
-                           np.array(config.payload.working_point or chords(config.arm, angles)))
+    beyond = omitted_modes(replace(config.arm, damping_ratio=damping), working_point(config, angles))
     turn = np.exp((1j * beyond.frequency - 0.5 / beyond.duration) * dt)
     omitted = np.empty((count, links))
     gain, offset, delay = (np.full(count, -1) for _ in range(3))
@@ -497,6 +496,14 @@ def take_as_known(model: Model, m: mem.FilterState, beyond: Kind = Kind.DAMPING)
             m.S[2 * n + c] = 0.0
 
 
+def working_point(config: IdentifierParameters, angles: Array) -> Array:
+    """Return the chord angles (L,) that a model belongs to: measured ones, or where a linear plant stays."""
+    given = config.payload.working_point
+    if config.payload.dynamics == 'linear' and given:
+        return np.array(given, dtype=np.float64)
+    return chords(config.arm, angles)
+
+
 def freeze(config: IdentifierParameters, model: Model, angles: Array) -> None:
     """Set the mass matrices of a linear plant at its unbent working point, given or at the measured angles (L,).
 
@@ -505,7 +512,7 @@ def freeze(config: IdentifierParameters, model: Model, angles: Array) -> None:
     """
     nominal, motion = manipulator(config.arm), model.motion
     rest = np.zeros(nominal.stiffness.size)
-    rest[:len(angles)] = config.payload.working_point or chords(config.arm, angles)
+    rest[:len(angles)] = working_point(config, angles)
     turn = np.zeros(rest.size)
     turn[len(angles) - 1] = np.pi / 2.0
     unit = np.eye(4)

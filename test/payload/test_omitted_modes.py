@@ -12,7 +12,14 @@ from recording import BENDS
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm.linearization import MORE_SINES, omitted_modes
-from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, IdentifierParameters, PlantParameters
+from flexmanip_ros.parameters import (
+    ArmParameters,
+    ExcitationParameters,
+    IdentifierParameters,
+    PayloadParameters,
+    PlantParameters,
+)
+from flexmanip_ros.payload import structured_model
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, Status
 
@@ -55,6 +62,18 @@ def test_a_link_alone_and_a_floating_base_have_theirs_too() -> None:
     pinned = omitted_modes(ARM, np.array(ANGLES))
     heavy = omitted_modes(replace(ARM, base_mass=1e9, base_inertia=1e9), np.array(ANGLES))
     np.testing.assert_allclose(heavy.variance, pinned.variance, rtol=1e-3)
+
+
+def test_they_belong_to_the_measured_angles_unless_a_linear_plant_stays_at_its_working_point() -> None:
+    there, elsewhere, found = np.array([1.0, -0.3]), (0.0, 1.5), {}
+    for name, payload in (('nowhere', {}), ('moving', {'working_point': elsewhere}),
+                          ('linear', {'working_point': elsewhere, 'dynamics': 'linear'})):
+        config = IdentifierParameters(arm=ARM, payload=PayloadParameters(**payload))
+        model = structured_model.build(config)
+        assert model is not None
+        found[name] = structured_model.sensors(config, model, 1e-3, there).omitted
+    np.testing.assert_array_equal(found['moving'], found['nowhere'])
+    assert (found['linear'] != found['nowhere']).any()
 
 
 @pytest.mark.parametrize(('own', 'snr_db'), [
