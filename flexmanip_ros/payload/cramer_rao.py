@@ -110,7 +110,8 @@ def start(config: IdentifierParameters, theta: Array) -> tuple[Model, FilterStat
         raise ModelError('the configured signals cannot give a payload', 'name both torques and both angles')
     m = memory(2 * model.motion.arm.stiffness.size + model.motion.kind.size, len(model.roles), len(theta))
     structured_model.first(config, model, m, np.zeros(len(model.roles)))
-    structured_model.freeze(config, model, theta)
+    straight = theta if config.arm.angle_convention == 'chord' else np.diff(theta, prepend=0.0)
+    structured_model.freeze(config, model, straight)
     m.x[:model.payload] = 0.0
     m.x[:len(theta)] = theta
     return model, m

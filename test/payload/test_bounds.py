@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from recording import config
 
-from flexmanip_ros.arm.linearization import discretize, vibration_model
-from flexmanip_ros.arm.manipulator import payload_array
+from flexmanip_ros.arm.linearization import discretize, mass_matrix, vibration_model
+from flexmanip_ros.arm.manipulator import manipulator, payload_array
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PayloadParameters, PlantParameters
 from flexmanip_ros.payload import cramer_rao, structured_model
 from flexmanip_ros.payload.filter_state import memory
@@ -142,3 +142,11 @@ def test_bounds_of_arm_body_and_spin_are_those_of_differences_of_the_simulated_a
     expected['object_spin'] = 0.3 * deviations[-1]
     assert {name: found[name][0] for name in expected} == pytest.approx(expected, rel=0.03)
     assert expected['object_spin'] < 0.02
+
+
+@pytest.mark.parametrize('convention', ['encoder', 'chord'])
+def test_a_linear_plant_starts_with_the_mass_matrix_at_the_chords_that_are_given(convention):
+    settings = config(ArmParameters(angle_convention=convention), payload=PayloadParameters(dynamics='linear'))
+    model, m = cramer_rao.start(settings, THETA)
+    there = mass_matrix(manipulator(settings.arm), np.zeros(4), m.x[:model.motion.arm.stiffness.size])
+    np.testing.assert_allclose(model.motion.M0, there, rtol=1e-12, atol=1e-12)
