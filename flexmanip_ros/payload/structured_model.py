@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from flexmanip_ros.arm.capture import tip_jacobian
-from flexmanip_ros.arm.equations_of_motion import STICTION_RATE
+from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, assemble
 from flexmanip_ros.arm.late_torque import efforts_needed
 from flexmanip_ros.arm.linearization import mass_matrix, omitted_modes
 from flexmanip_ros.arm.manipulator import (
@@ -126,7 +126,7 @@ def _in_order_of_links(names: tuple[str, ...], links: int) -> tuple[str, ...] | 
 
 
 class Model(NamedTuple):
-    """Constants of the estimator. Its scratch arrays hold nothing between calls."""
+    """Constants of the estimator. Its scratch arrays hold nothing between calls, but see ``freeze``."""
 
     motion: ProcessModel
     roles: tuple[Role, ...]
@@ -508,7 +508,8 @@ def freeze(config: IdentifierParameters, model: Model, angles: Array) -> None:
     """Set the mass matrices of a linear plant at its unbent working point, given or at the measured angles (L,).
 
     An element of M is a + b cos(t) + c sin(t), t the angle between the links. So its derivative by t is half the
-    difference of its values at t + pi / 2 and t - pi / 2.
+    difference of its values at t + pi / 2 and t - pi / 2. The Jacobians in the scratch of the motion are those of that
+    point too: the detector reads them, and no step of a linear plant writes them.
     """
     nominal, motion = manipulator(config.arm), model.motion
     rest = np.zeros(nominal.stiffness.size)
@@ -521,6 +522,7 @@ def freeze(config: IdentifierParameters, model: Model, angles: Array) -> None:
     motion.M0[:], motion.Mp[:] = here[0], np.array(here[1:]) - here[0]
     motion.Mt[:] = 0.5 * (np.array(ahead) - np.array(behind))
     motion.Mt[1:] -= motion.Mt[0]
+    assemble(nominal, np.zeros(4), rest, np.zeros_like(rest), motion.work.M, motion.work.E, motion.work)
 
 
 def widen(S: Array, columns: Array) -> Array:
