@@ -72,8 +72,6 @@ class StructuredState(NamedTuple):
     """How often the empty arm's fit was begun again."""
     white: Array = np.empty(0)
     """(m, 2) variance of each measurement's white noise at the last restart, and its bound by the spectrum."""
-    first_angles: Array = np.empty(0)
-    """(L,) mean measured angles of the samples before the filter first started [rad]: a linear plant stays there."""
 
     @property
     def running(self) -> Running:
@@ -329,15 +327,16 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     """Start the filter with its first rows, and take them and the events among them."""
     dt = float(np.median(np.diff(rows.stamp_ns) * 1e-9))
     fewer = structured_model.sampled(config, dt)
-    model = state.model if fewer is config else build(fewer)
+    again = state.efforts is not None  # then the model is that of the first start, with its working point
+    model = state.model if again or fewer is config else build(fewer)
     assert model is not None
     Y = measurements(model, rows)
     m = mem.memory(2 * model.motion.arm.stiffness.size + model.motion.kind.size, len(model.roles),
                    model.motion.effort.size)
     m.noise[:] = structured_model.noise(model, Y)
     structured_model.first(config, model, m, Y[0])
-    first_angles = state.first_angles if state.first_angles.size else np.mean(rows.angles, axis=0)
-    structured_model.freeze(fewer, model, first_angles)
+    if not again:
+        structured_model.freeze(fewer, model, np.mean(rows.angles, axis=0))
     if state.white.size:
         m.noise[:, [mem.WHITE, mem.LEVEL]] = state.white
     structured_model.guess_noise(m, FIRST_LOOK)
@@ -357,7 +356,7 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     unused = structured_model.too_noisy(rows.rates, dt) if rows.rates.shape[1] else np.zeros(rates.size, dtype=np.bool_)
     state = state._replace(
         model=model, memory=m, sensors=seen, begin=None, early=(), cursor=rows.first, last_ns=int(rows.stamp_ns[0]),
-        time_ns=time_ns, efforts=efforts, rates=rates, unused=unused, first_angles=first_angles)
+        time_ns=time_ns, efforts=efforts, rates=rates, unused=unused)
     state = state._replace(horizon=state.here)
     for row, item in events:
         state = event(config, _part(config, state, rows, row), item)
@@ -571,8 +570,8 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
             m.noise[:, column] = m.noise[:, mem.AT_EVENT]
         _set_arrival_cost(model, m)
         return state._replace(memory=m, horizon=state.here)
-    fresh = init(config)._replace(restarts=state.restarts + (not unfit), cursor=state.cursor, refits=refits,
-                                  efforts=state.efforts, first_angles=state.first_angles)
+    fresh = StructuredState(model, restarts=state.restarts + (not unfit), cursor=state.cursor, refits=refits,
+                            efforts=state.efforts)
     if unfit and m.counts[mem.SEEN] >= UNTAUGHT:
         fresh = fresh._replace(white=m.noise[:, [mem.WHITE, mem.LEVEL]])
     if m.counts[mem.HELD]:

@@ -269,6 +269,17 @@ def test_at_its_working_point_a_linear_plant_with_learned_rotors_jumps_as_the_mo
         np.testing.assert_allclose(linear, moving, rtol=1e-6, atol=1e-9 * np.abs(moving).max())
 
 
+def test_a_linear_plant_whose_fit_is_begun_again_keeps_the_working_point_that_was_measured_first():
+    arm = replace(ARM, rotor_inertia=(10.0, 5.0))  # the simplest arm fails
+    settings = config(payload=PayloadParameters(dynamics='linear'))
+    samples = record(0.2, arm=arm, degrees=(60.0, 150.0), model='linear', scale=5.0)
+    first = run(settings, samples.between(0, 40))
+    begun = first.model.motion.M0.copy()
+    again = structured.advance(settings, first, samples.since(40))
+    assert again.memory.counts[mem.REFITS] == 1
+    np.testing.assert_array_equal(again.model.motion.M0, begun)
+
+
 OTHER_ARM = {'link_length': (2.0, 1.5), 'linear_density': (3.0, 2.0), 'bending_stiffness': (1500.0, 600.0),
              'joint_mass': 5.0, 'tip_mass': 3.0}
 
