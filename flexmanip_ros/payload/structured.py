@@ -373,7 +373,9 @@ def _resume(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
     model, sensors, *_ = state.running
     state = state._replace(missing=0, last_ns=int(rows.stamp_ns[0]), time_ns=int(rows.time_ns[0]),
                            efforts=latest(sensors, rows.u[:1]))
-    return reopen(config, state, measurements(model, rows.between(rows.first, rows.first + 1))[0])
+    state = reopen(config, state, measurements(model, rows.between(rows.first, rows.first + 1))[0])
+    state.running.memory.counts[mem.IN_A_ROW] = 0  # differences over a gap tell no noise
+    return state
 
 
 def latest(sensors: MeasurementModel, efforts: Array, before: Array | None = None) -> Array:
