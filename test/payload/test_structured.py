@@ -202,6 +202,18 @@ def test_two_captures_without_a_release_give_what_is_held_altogether():
     assert found.lower < 30.0 < found.upper
 
 
+@pytest.mark.parametrize(('payload', 'com'), [(15.0, (0.15, -0.1)), (30.0, (0.1, 0.1))])
+def test_a_body_that_joins_a_body_is_known_half_a_second_later(payload, com):
+    """Fitted as a point at first, what is held stayed INCONSISTENT for two seconds: only the mass was open."""
+    arm, events = ArmParameters(damping_ratio=0.003), (event(2.0), event(3.0))
+    samples = record(3.5, events, payload=payload, payload_com=com, payload_inertia=1.0, arm=arm)
+    found = structured.estimate(config(arm), run(config(arm), samples, events))
+    assert found.status is Status.TRACKING
+    assert found.mass == pytest.approx(2.0 * payload, rel=0.02)
+    assert found.lower < 2.0 * payload < found.upper
+    assert found.com[:2] == pytest.approx(com, abs=0.01)
+
+
 def test_stiffness_wrong_by_three_per_cent_costs_less_than_one_per_cent():
     wrong = replace(ARM, bending_stiffness=(5150.0, 4850.0))
     samples = record(4.0, (event(2.0),))
