@@ -201,12 +201,12 @@ def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, even
     if kind is EventKind.CAPTURE:
         if not held:
             _forget_payload(model, m)  # the arm was empty: its payload was the bias of the model
+            m.counts[mem.LEARNED] = m.counts[mem.SEEN] >= UNTAUGHT
         # a point first, but one that joins a body makes a body
         added = model.body if m.S[payload + 1:payload + model.body].any() else 1
         opened[payload:payload + added, :added] = np.diag(structured_model.body_std(config, model)[:added])
         m.x[payload:payload + added] += structured_model.body_mean(config, model)[:added]
         m.counts[mem.REFITS] = 0
-        m.counts[mem.LEARNED] = m.counts[mem.SEEN] >= UNTAUGHT
         m.counts[mem.HELD] = 1
     else:
         _forget_payload(model, m)

@@ -202,6 +202,13 @@ def test_two_captures_without_a_release_give_what_is_held_altogether():
     assert found.lower < 30.0 < found.upper
 
 
+@pytest.mark.parametrize(('first', 'learned'), [(0.0, 0), (0.2, 1)])
+def test_a_second_object_teaches_nothing_of_an_arm_that_was_never_seen_empty(first, learned):
+    events = (event(first), event(0.5))
+    state = run(config(), record(0.6, events), events)
+    assert state.memory.counts[mem.LEARNED] == learned
+
+
 @pytest.mark.parametrize(('payload', 'com'), [(15.0, (0.15, -0.1)), (30.0, (0.1, 0.1))])
 def test_a_body_that_joins_a_body_is_known_half_a_second_later(payload, com):
     """Fitted as a point at first, what is held stayed INCONSISTENT for two seconds: only the mass was open."""
