@@ -335,8 +335,6 @@ def advance(
         clock[QUIET] = clock[QUIET] + 1 if settled(m) else 0
         if clock[ALARMED] > 0:
             clock[ALARMED] += 1
-            if clock[ALARMED] > confirm:
-                return k + 1
         elif clock[QUIET] > glr.trace.shape[0]:  # the statistic is of samples since then alone
             if clock[QUIET] > hold:
                 clock[ALARMED] = glr.level[STATISTIC] > limit(glr)
@@ -349,6 +347,8 @@ def advance(
                 glr.level[PEAK] = 0.0
                 glr.history[0] = 0.0
             remember(glr, fade)
+        if clock[ALARMED] > confirm:  # at once where a sample takes longer than the confirmation
+            return k + 1
         # while an alarm is confirmed, what moves an arm at rest is taken for an event
         if rests and clock[ALARMED] == 0 and slides_or_begins(motion, sensors, m):
             return -k - 1

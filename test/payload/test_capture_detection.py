@@ -9,10 +9,16 @@ import pytest
 import scipy.linalg
 from recording import ARM, BENDS, RATES, event, record, rows_of
 
-from flexmanip_ros.parameters import ArmParameters, PayloadParameters, PlantParameters, TriggerParameters
+from flexmanip_ros.parameters import (
+    ArmParameters,
+    ExcitationParameters,
+    PayloadParameters,
+    PlantParameters,
+    TriggerParameters,
+)
 from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.payload import capture_detection_kernel as kernel
-from flexmanip_ros.simulation import simulator
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import EventKind
 
 
@@ -144,6 +150,20 @@ def test_single_samples_give_the_events_of_a_block():
         state, events = capture_detection.advance(config, state, samples.between(row, row + 1))
         single.extend(events)
     assert single == list(capture_detection.advance(config, capture_detection.init(config), samples)[1])
+
+
+@pytest.mark.parametrize('rate', [40.0, 50.0])
+def test_where_a_sample_takes_longer_than_the_confirmation_a_block_still_gives_the_events_of_single_ones(rate):
+    arm = ArmParameters(damping_ratio=0.01, modes=1)
+    plant = PlantParameters(arm=arm, rate=rate, payload_mass=20.0)
+    torques = excitation.sequence(ExcitationParameters(rate=rate), round(13 * rate))
+    trajectory = simulator.simulate(plant, torques, (event(12.0),))
+    samples = rows_of(trajectory.effort[:, :2], trajectory.position[:, 2:], trajectory.position[:, :2],
+                      trajectory.stamp_ns)
+    config = TriggerParameters(mode='auto', arm=arm, outputs=BENDS)
+    single = [found for found, _ in detect(config, samples, block=1)]
+    assert [found.kind for found in single] == [EventKind.CAPTURE]
+    assert single == [found for found, _ in detect(config, samples, block=len(samples))]
 
 
 def test_fewer_false_alarms_mean_a_higher_threshold():
