@@ -10,7 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flexmanip_ros.arm.linearization import blocks
+from flexmanip_ros.arm.linearization import mass_matrix, momentum
+from flexmanip_ros.arm.manipulator import manipulator, payload_array
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload.block_extraction import unknown
 from flexmanip_ros.payload.structured_model import working_point
@@ -28,14 +29,30 @@ MISFIT = 10.8
 
 def frequencies(arm: ArmParameters, theta: Array, payloads: Array, count: int) -> Array:
     """Return the lowest undamped frequencies [Hz], (payloads, count), at chords theta (L,)."""
-    empty, one = blocks(arm, theta), blocks(arm, theta, 1.0)
-    Ma = empty.Ma + payloads[:, None, None] * (one.Ma - empty.Ma)
-    coupling = np.broadcast_to(empty.Mb, (payloads.size, *empty.Mb.shape))
-    Mt = empty.Mc - empty.Mb.T @ np.linalg.solve(Ma, coupling)
-    root = np.sqrt(np.diag(empty.Kc))
+    (Ma, Mb, Mc), (one, _, _) = (_inertia(arm, theta, payload) for payload in (0.0, 1.0))
+    coupling = np.broadcast_to(Mb, (payloads.size, *Mb.shape))
+    Mt = Mc - Mb.T @ np.linalg.solve(Ma + payloads[:, None, None] * (one - Ma), coupling)
+    root = np.sqrt(manipulator(arm).stiffness[len(theta):len(theta) + len(Mc)])
     # Kc is diagonal: eigenvalues of Kc^-1/2 Mt Kc^-1/2 are 1 / omega^2
     periods = np.linalg.eigvalsh(Mt / np.outer(root, root))[:, ::-1]
     return np.asarray(1.0 / np.sqrt(periods[:, :count]) / (2 * np.pi))
+
+
+def _inertia(arm: ArmParameters, theta: Array, payload: float) -> tuple[Array, Array, Array]:
+    """Return the mass matrices of the rigid motion, its coupling with the bending (r, L k), and the bending (L k, L k).
+
+    The rigid motion (r, r) is the turning of the links, with translation and turning of a floating base. So all are
+    linear in the payload [kg].
+    """
+    own, body = manipulator(arm), payload_array(payload)
+    L, n = len(theta), own.stiffness.size
+    q = np.append(theta, np.zeros(n - L))
+    M, bending = mass_matrix(own, body, q), np.arange(L, L * (1 + own.kappa))
+    if own.floating:
+        P, mass = momentum(own, body, q)
+        M, bending = np.block([[mass * np.eye(2), P], [P.T, M + P.T @ P / mass]]), bending + 2
+    rigid = np.delete(np.arange(len(M)), bending)
+    return M[np.ix_(rigid, rigid)], M[np.ix_(rigid, bending)], M[np.ix_(bending, bending)]
 
 
 def estimate(config: IdentifierParameters, modes: Sequence[Mode], angles: Array, configuration_range: Array) -> Payload:
