@@ -101,9 +101,12 @@ def unobservable_reason(config: IdentifierParameters) -> str:
         return 'angles does not name the position of two joints'
     if not known.torques:
         return 'inputs does not name the effort of both joints, in the order of angles'
-    if len(config.arm.link_length) == 1:
-        return f'the payload method {config.payload_method} needs an arm of two links'
-    return 'the outputs do not show the bending of both links'
+    if config.arm.base_mass:  # beyond here the method is block
+        return 'the payload method block needs a fixed base'
+    states = 2 * len(config.arm.link_length)
+    if config.order % states:
+        return f'the payload method block needs an order that {states} divides'
+    return 'the outputs are not bends that show every mode of the links'
 
 
 def _names(of: tuple[str, ...]) -> tuple[str, ...]:
