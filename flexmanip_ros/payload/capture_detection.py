@@ -58,9 +58,9 @@ def init(config: TriggerParameters) -> DetectionState:
 def first_needed(state: DetectionState) -> int:
     """Return the first row of the sample log that will be read again."""
     first = structured.first_needed(state.filter)
-    if state.since is None:
+    if state.since is None or state.glr is None:
         return first
-    window = state.filter.cursor if state.glr is None else state.glr.trace.shape[0]
+    window: int = state.glr.trace.shape[0]
     return min(first, max(state.since, state.filter.cursor - window))
 
 
@@ -70,7 +70,9 @@ def advance(
     """Take the next rows of the sample log; return the events found, the same as one by one."""
     found: list[CaptureEvent] = []
     rows = rows.with_outputs(state.kept)
-    while len(rows) and state.filter.model is not None:
+    if state.filter.model is None:
+        return replace(state, filter=structured.advance(state.identifier, state.filter, rows)), ()
+    while len(rows):
         one = rows.between(rows.first, rows.first + 1)
         if state.glr is None or state.filter.memory is None:
             state = _start(config, state, one)
@@ -125,7 +127,8 @@ def _start(config: TriggerParameters, state: DetectionState, row: Rows) -> Detec
     state = replace(state, filter=structured.advance(state.identifier, state.filter, row), since=since)
     if state.filter.memory is None or state.filter.model is None or state.glr is not None:
         return state
-    dt = float(np.median(np.diff(row.since(since).stamp_ns))) * 1e-9
+    assert state.filter.sensors is not None
+    dt = state.filter.sensors.period
     w = max(kernel.SHORTEST + 2, round(config.detection_window / dt))
     n2 = 2 * state.filter.model.motion.arm.stiffness.size
     m = len(state.filter.model.roles)

@@ -19,7 +19,7 @@ from flexmanip_ros.parameters import (
 from flexmanip_ros.payload import capture_detection
 from flexmanip_ros.payload import capture_detection_kernel as kernel
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import EventKind
+from flexmanip_ros.types import EventKind, JointBlock
 
 
 def settings(outputs=BENDS + RATES, **parameters):
@@ -170,6 +170,19 @@ def test_fewer_false_alarms_mean_a_higher_threshold():
     often, rarely = (capture_detection.threshold(settings(false_alarms_per_hour=rate), 1e-3)
                      for rate in (1.0, 1e-6))
     assert 30.0 < often < rarely < 100.0
+
+
+@pytest.mark.parametrize(('scale', 'parameters'), [(1.0, {'angles': ()}), (1e12, {})], ids=['no angles', 'other units'])
+def test_samples_in_which_nothing_can_be_found_are_not_kept(scale, parameters):
+    """The log of a node grew by 100 kB a second: the detector had never begun, and asked for all rows."""
+    rng, names = np.random.default_rng(0), ('joint1', 'joint2', 'link1_bend', 'link2_bend')
+    now = capture_detection.watching(TriggerParameters(mode='auto', **parameters))
+    for begin in range(0, 1024, 64):
+        stamps, values = 1_000_000 * (begin + np.arange(64)), scale * rng.normal(0.0, 1e-3, (64, 4))
+        now, events = capture_detection.look(now, JointBlock(names, stamps, values, values, rng.normal(size=(64, 4))))
+        assert events == ()
+    assert now.log.end == 1024
+    assert now.log.end - now.log.start <= 64
 
 
 def test_signals_of_no_arm_detect_nothing():
