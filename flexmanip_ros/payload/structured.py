@@ -67,7 +67,7 @@ class StructuredState(NamedTuple):
     slope: Array = np.zeros(1)
     """(L,) change of each torque over the last sample that was measured [N m]."""
     restarts: int = 0
-    """How often numbers left the finite range."""
+    """How often all was forgotten because numbers left the finite range."""
     refits: int = 0
     """How often the empty arm's fit was begun again."""
     white: Array = np.empty(0)
