@@ -154,6 +154,9 @@ class IdentifierParameters:
         if len(self.payload.working_point) not in (0, links):
             raise ParameterError(f"parameter 'payload.working_point' has {len(self.payload.working_point)} elements",
                                  f'give {links}, or [] for the measured ones')
+        if self.payload.dynamics == 'linear' and self.arm.base_mass:
+            raise ParameterError("parameter 'payload.dynamics' is 'linear', but arm.base_mass is set",
+                                 'choose nonlinear: a linear plant has no floating base')
         for group in ('inputs', 'outputs'):
             if not getattr(self, group):
                 raise ParameterError(f"parameter '{group}' is empty", 'name at least one NAME/FIELD')

@@ -202,8 +202,7 @@ def learned(config: IdentifierParameters) -> tuple[tuple[Kind, int], ...]:
     bends = {role.link for role in known.outputs if role.quantity in (Quantity.BEND, Quantity.BEND_RATE)} \
         if known else set()
     entries = [(kind, 0) for kind in body]
-    is_told = config.payload.dynamics == 'nonlinear' or config.payload.working_point or config.arm.base_mass
-    if len(config.arm.link_length) == 2 and not is_told:
+    if config.payload.dynamics == 'linear' and not config.payload.working_point and len(config.arm.link_length) == 2:
         entries.append((Kind.POINT, 0))
     given = {name for name, neutral in (('torque_gain', 1.0), ('bend_gain', 1.0), ('bend_offset', 0.0),
                                         ('torque_delay', 0.0), ('torque_lag', 0.0), ('bend_delay', 0.0))

@@ -9,6 +9,7 @@ import pytest
 from recording import ARM, BENDS, RATES, altered, config, event, joined, record, rows_of, run
 
 from flexmanip_ros import pipeline
+from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import (
     ArmParameters,
     ExcitationParameters,
@@ -259,6 +260,12 @@ def test_a_linear_plant_whose_working_point_nobody_told_is_known_as_well_as_one_
         assert found.mass == pytest.approx(20.0, rel=error)
         assert found.lower < 20.0 < found.upper
         assert found.status is Status.TRACKING
+
+
+def test_a_linear_plant_is_told_to_have_no_floating_base():
+    """Its mass matrix is not linear in the payload: with a base of 100 kg it read 18.2 kg for 20."""
+    with pytest.raises(ParameterError, match='base_mass'):
+        config(replace(ARM, base_mass=100.0), payload=PayloadParameters(dynamics='linear'))
 
 
 def test_a_linear_plant_that_is_fitted_again_stays_where_it_was_first_seen():
