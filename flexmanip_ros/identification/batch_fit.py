@@ -227,6 +227,7 @@ def _attempt(
     (VARX). With too low an order a free K improves the next sample's prediction at the expense of all slower motion.
     """
     n, r = len(begin.A), begin.D.shape[1]
+    begin, scale = _without_idle(samples, begin), np.where(scale > 0.0, scale, 1.0)
     U, Y = scaled(samples, scale, begin)
     m, count = Y.shape[1], len(U)
     penalty = _price(n * m, count)
@@ -247,6 +248,20 @@ def _attempt(
         return None
     shift = 2.0 * float(np.sum(np.log(scale[r:])))
     return Attempt(best, chosen, scale, cost - shift, wanted, begin.K)
+
+
+def _without_idle(samples: Array, begin: Theta) -> Theta:
+    """Return a starting point in which an input that is zero in all samples (N, r + m) has no effect.
+
+    The samples say nothing of its effect. Where that is exactly zero, its coordinates stand alone in ``directions`` and
+    have no information at all. Otherwise they are mixed with others, and rounding errors count as information on them.
+    """
+    idle = np.flatnonzero(np.all(samples[:, :begin.D.shape[1]] == 0.0, axis=0))
+    if not idle.size:
+        return begin
+    B, D = begin.B.copy(), begin.D.copy()
+    B[:, idle], D[:, idle] = 0.0, 0.0
+    return begin._replace(B=B, D=D)
 
 
 def _with_constant(samples: Array, best: Attempt | None, likeliest: Callable[[], Attempt | None]) -> Attempt | None:
