@@ -189,7 +189,10 @@ def _after(config: IdentifierParameters, rows: Rows) -> rpbsid.RpbsidState:
 
 def _configurations(config: IdentifierParameters, state: rpbsid.RpbsidState, dt: float) -> Configurations | None:
     """Return the model of every configuration after the last sample; None where it holds at one configuration only."""
-    found = rpbsid.identified(config, rpbsid.finish(config, state), dt)
+    state = rpbsid.finish(config, state)
+    if state.refined is None or state.refined.varying is None:  # a model of one configuration may be singular
+        return None
+    found = rpbsid.identified(config, state, dt)
     return found.configurations if found is not None and isinstance(found.configurations, Configurations) else None
 
 

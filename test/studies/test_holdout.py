@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flexmanip_ros import pipeline
 from flexmanip_ros.errors import ModelError, ParameterError
 from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.samples.sample_log import Signals
-from flexmanip_ros.studies.whole_recording import score, smooth
-from flexmanip_ros.types import StateSpace
+from flexmanip_ros.studies.whole_recording import score, smooth, sweep
+from flexmanip_ros.types import JointRecord, StateSpace
 
 DT = 0.01
 
@@ -133,3 +134,18 @@ def test_what_never_came_moves_no_fit_of_the_whole_recording():
         (found[wrong],) = smooth(config, replace(signals, y=y, missing=absent), [], DT)
     assert found[1.0].method == 'maximum likelihood'
     assert found[1.0].modes[0].frequency_hz == pytest.approx(found[1e-3].modes[0].frequency_hz, rel=1e-3)
+
+
+def test_dead_sensors_of_an_arm_with_angles_give_no_model_and_no_error():
+    config = configure(IdentifierParameters, {
+        'payload_method': 'none', 'inputs': ['a/effort'], 'outputs': ['b/position'],
+        'angles': ['a/position', 'c/position'], 'order': 2})
+    signals = _signals(noise=0.05, count=1500)
+    angles = np.column_stack([np.zeros(1500), np.linspace(0.0, 1.0, 1500)])
+    (found,) = smooth(config, replace(signals, y=np.zeros_like(signals.y), angles=angles), [], DT)
+    assert found.method == 'none'
+    names = ('a', 'b', 'c')
+    records = [JointRecord(int(stamp), names, np.array([one, 0.0, other]), np.empty(0), np.array([u, 0.0, 0.0]))
+               for stamp, (one, other), (u,) in zip(signals.stamp_ns, angles, signals.u, strict=True)]
+    *_, last = pipeline.absorb(config, records)
+    assert sweep(last, angles) is None
