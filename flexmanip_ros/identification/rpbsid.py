@@ -308,7 +308,7 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float, rows
             np.zeros(0) if last is None else last.singular_values, float('nan') if last is None else last.condition)
         return read.with_relative(refined.varying.angle, present=True) if rows is None else read.now(rows)
     if refined is not None and refined.recursion and len(refined.recursion.theta.A) == config.order \
-            and FRESH * refined.recursion.weight >= state.counts[USED]:
+            and FRESH * refined.recursion.weight >= min(state.counts[USED], recursive_fit.MEMORY):
         return model_output.from_fit(
             config, refined.recursion, state.scalars, model_output.excitation(state.memory[0][:d, :d]), dt)
     few = state.counts[USED] <= max(config.past_window, config.order)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from linear_arm import benchmark, configuration, random_system, record, run, shared_data, sorted_poles, start
 
-from flexmanip_ros.identification import decimation, rpbsid, validation
+from flexmanip_ros.identification import decimation, recursive_fit, rpbsid, validation
 from flexmanip_ros.identification.factor import REJECTED, USED
 from flexmanip_ros.identification.prediction_check import MOST_ROWS
 from flexmanip_ros.identification.realization import stabilized, suggested_order, to_continuous, to_discrete
@@ -161,3 +161,19 @@ def test_long_fit_recursion_tracks_and_an_event_restarts_it():
     restarted = rpbsid.restart(config, state)
     assert restarted.refined is not None
     assert restarted.refined.recursion is None
+
+
+def test_a_fit_is_published_however_long_the_machine_runs():
+    rng = np.random.default_rng(6)
+    u, y = record(random_system(2, 1, 2, rng), 3000, 0.0, rng)
+    y = y + 0.1 * np.std(y, axis=0) * rng.standard_normal(y.shape)
+    config = configuration(1, 2, order=2, past_window=4, future_window=2)
+    state = run(config, u, y).state.owned()
+    assert state.refined is not None
+    assert state.refined.recursion is not None
+    state.counts[USED] = 3_600_000  # an hour at 1 kHz, in which the weight of the fit has reached its limit
+    for weight, refined in ((recursive_fit.MEMORY, True), (0.1 * recursive_fit.MEMORY, False)):
+        fit = state.refined._replace(recursion=state.refined.recursion._replace(weight=weight))
+        found = rpbsid.identified(config, state._replace(refined=fit), 0.01)
+        assert found is not None
+        assert found.refined == refined
