@@ -149,6 +149,7 @@ def is_fit_due(config: IdentifierParameters, refined: Refined) -> bool:
 
     With a parameter-varying model from before an event the stretch is also fitted at ``SOON`` samples, where that model
     may already hold. A fit from before a gap is replaced once the stretch has more than half of the samples behind it.
+    No fit is due while another one is under way; only the last fit, that of LONGEST samples, is then made later.
     """
     total = refined.total
     if not refined.batch or refined.request is not None or total <= 0:
@@ -157,6 +158,8 @@ def is_fit_due(config: IdentifierParameters, refined: Refined) -> bool:
         return False
     if total in SOON and refined.varying_before is not None:
         return parameter_varying.roles(config) is not None
+    if total > LONGEST:
+        return total % CHUNK == 0
     doublings = total // FIRST
     return total % FIRST == 0 and doublings & (doublings - 1) == 0
 

@@ -8,6 +8,7 @@ from linear_arm import configuration, random_system, record, run, start
 from test_rpbsid import same
 
 from flexmanip_ros.identification import batch_fit, recursive_fit, rpbsid
+from flexmanip_ros.numerics.background import Request
 from flexmanip_ros.samples.sample_log import log_of
 
 COUNT = 1300
@@ -69,3 +70,28 @@ def test_a_block_has_a_twentieth_of_a_second_and_is_over_before_the_next(
     refined = recursive_fit.start(0)._replace(end=1024, seen=768)
     asked = recursive_fit.ask_block(CONFIG, refined, rows)
     assert asked.due - asked.end == samples < batch_fit.BLOCK
+
+
+class Noting:
+    """Solves requests when their results are wanted, and notes the lengths of the fits of whole stretches."""
+
+    def __init__(self) -> None:
+        self.fits: list[int] = []
+
+    def start(self, request: Request) -> None:
+        if isinstance(request, recursive_fit.FitRequest) and request.R is not None:
+            self.fits.append(len(request.rows))
+
+    def result(self, request: Request) -> object:
+        return request.solve()
+
+
+@pytest.mark.parametrize(('rate', 'fits'), [
+    (1000.0, [256, 512, 1024, 2048]), (4000.0, [256, 2048]), (5500.0, [256, 1024, 2176])])
+def test_the_last_fit_of_a_stretch_is_not_missed_while_another_is_under_way(rate: float, fits: list[int]) -> None:
+    rng = np.random.default_rng(3)
+    u, y = record(random_system(2, 1, 2, rng), 4300, 0.0, rng)
+    y = y + 0.1 * np.std(y, axis=0) * rng.standard_normal(y.shape)
+    background = Noting()
+    start(CONFIG).feed(u, y, np.round(np.arange(4300) * 1e9 / rate).astype(np.int64), background)
+    assert background.fits == fits
