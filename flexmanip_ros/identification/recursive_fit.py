@@ -264,9 +264,9 @@ def broken(refined: Refined, background: Background) -> Refined:
     The fits are kept, their state is unknown. A fit of fewer than ``LONGEST`` samples may be a poor one, and blocks
     alone may not mend it. So the new stretch is fitted as a whole, too.
     """
-    if refined.total == 0:
-        return refined
     refined = delivered(refined, background)
+    if refined.total <= 0:  # nothing to break; a pause goes on
+        return refined
     old = refined.recursion
     fresh = start(refined.end, refined.before, refined.varying_before)
     if refined.varying is not None:

@@ -95,3 +95,14 @@ def test_the_last_fit_of_a_stretch_is_not_missed_while_another_is_under_way(rate
     background = Noting()
     start(CONFIG).feed(u, y, np.round(np.arange(4300) * 1e9 / rate).astype(np.int64), background)
     assert background.fits == fits
+
+
+def test_neither_a_gap_nor_a_refused_sample_ends_the_pause_after_fits_that_failed() -> None:
+    rng = np.random.default_rng(3)
+    u, y = rng.standard_normal((3000, 1)), rng.standard_normal((3000, 2))  # outputs that no input explains
+    y[2900, 0] = np.nan
+    state = run(CONFIG, u, y, 1_000_000 * np.arange(3000)).state
+    for paused in (state, rpbsid.window_restart(CONFIG, state)):
+        assert paused.refined is not None
+        assert paused.refined.total == 439 - recursive_fit.PAUSE  # it began at row 2560; the refused one does not count
+    assert rpbsid.restart(CONFIG, state).refined == recursive_fit.start(3000)
