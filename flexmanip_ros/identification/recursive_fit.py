@@ -166,7 +166,8 @@ def is_fit_due(config: IdentifierParameters, refined: Refined) -> bool:
 
 def is_first_under_way(refined: Refined) -> bool:
     """Whether the first fit of a stretch is being made."""
-    return refined.batch and refined.request is not None and len(refined.request.rows) == FIRST
+    request = refined.request
+    return refined.batch and request is not None and request.R is not None and len(request.rows) == FIRST
 
 
 def is_block_due(refined: Refined) -> bool:

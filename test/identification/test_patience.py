@@ -106,3 +106,12 @@ def test_neither_a_gap_nor_a_refused_sample_ends_the_pause_after_fits_that_faile
         assert paused.refined is not None
         assert paused.refined.total == 439 - recursive_fit.PAUSE  # it began at row 2560; the refused one does not count
     assert rpbsid.restart(CONFIG, state).refined == recursive_fit.start(3000)
+
+
+def test_a_block_is_no_first_fit() -> None:
+    rows = log_of(np.zeros((1024, 1)), np.zeros((1024, 2)), stamp_ns=1_000_000 * np.arange(1024)).rows(0, 1024)
+    refined = recursive_fit.start(0)._replace(end=1024, seen=768)
+    assert not recursive_fit.is_first_under_way(recursive_fit.ask_block(CONFIG, refined, rows))
+    first = recursive_fit.start(0)._replace(end=256)
+    asked = recursive_fit.ask_fit(CONFIG, first, rows.between(0, 256), np.zeros((1, 1)), np.ones(3))
+    assert recursive_fit.is_first_under_way(asked)
