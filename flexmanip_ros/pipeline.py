@@ -401,17 +401,18 @@ def _advance(state: State, until: int, background: Background) -> State:
 
 def _without_old_rows(state: State) -> State:
     """Drop the rows that neither estimator reads again."""
-    _, payload, identifier = _running(state)
+    config, payload, identifier = _running(state)
     needed = min(sampling.first_needed(state.log),
                  event_replay.first_needed(payload), event_replay.first_needed(identifier),
-                 identifier.cursor - prediction_check.length(state.clock.dt))
+                 identifier.cursor - prediction_check.length(state.clock.dt, config.order))
     return state._replace(log=state.log.from_row(needed))
 
 
 def _latest(state: State, until: int) -> Rows:
-    """Return the rows before ``until`` on which a model is judged: the last 1.5 s, but none before the last event."""
-    first = max(state.log.start, until - prediction_check.length(state.clock.dt))
-    first = min(state.log.row_at(_running(state)[2].estimator.since_ns, first), until)
+    """Return the rows before ``until`` on which a model is judged, none of them before the last event."""
+    config, _, identifier = _running(state)
+    first = max(state.log.start, until - prediction_check.length(state.clock.dt, config.order))
+    first = min(state.log.row_at(identifier.estimator.since_ns, first), until)
     return state.log.rows(first, until)
 
 

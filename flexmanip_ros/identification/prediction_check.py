@@ -66,9 +66,12 @@ TWO_SIDED = 0.975
 """Probability of the upper quantile of Student's t that bounds a two-sided 95 % interval."""
 
 
-def length(dt: float) -> int:
-    """Return the number of latest samples on which a model is judged. dt: sample time [s]."""
-    return min(math.ceil(LAST_S / max(dt, 1e-9)), MOST_ROWS)
+def length(dt: float, order: int = 0) -> int:
+    """Return the number of latest samples on which a model is judged: those of 1.5 s, or as many as the order needs.
+
+    dt: sample time [s].
+    """
+    return max(min(math.ceil(LAST_S / max(dt, 1e-9)), MOST_ROWS), STRETCHES * order)
 
 
 def white_noise(Y: Array) -> Array:

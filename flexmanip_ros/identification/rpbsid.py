@@ -229,8 +229,7 @@ def latest(config: IdentifierParameters, state: RpbsidState, since_ns: int, dt: 
     log = state.decimated
     if log is None:
         return None
-    count = max(prediction_check.length(dt * config.decimation), prediction_check.STRETCHES * config.order)
-    first = max(log.start, log.end - count)
+    first = max(log.start, log.end - prediction_check.length(dt * config.decimation, config.order))
     return log.rows(min(log.row_at(since_ns, first), log.end), log.end)
 
 
