@@ -56,11 +56,16 @@ class Configurations(NamedTuple):
         v, role = self.varying, shown(self.config)
         assert role is not None
         count = math.ceil(PERIODS * 2.0 * math.pi / (v.shift * self.dt))
-        rows = rows.between(max(rows.first, rows.until - count), rows.until)
+        latest = rows.between(max(rows.first, rows.until - count), rows.until)
+        rows = latest.stretches()[-1]  # in a gap the links may have turned
         here = rows.missing == 0
         Y, angles = rows.y[:, list(role.displacements)] - v.center, relative_angle(self.config, rows.angles)
-        if np.count_nonzero(here) < count // 2:  # too few measured rows since a gap
-            return self.with_relative(v.angle, present=True)
+        if np.count_nonzero(here) < count // 2:  # too few measured rows
+            found = self.with_relative(v.angle, present=True)
+            if len(rows) == len(latest) or found.status is not Status.TRACKING:
+                return found
+            return found._replace(status=Status.WARMING_UP, reason='the angle between the links since the last gap is '
+                                                                   'not known yet')
         s = np.linspace(-1.0, 0.0, len(rows))
         return self.with_relative(float(straight(s[here], Y[here] * v.scale_y, angles[here, None])[0, 0]), present=True)
 

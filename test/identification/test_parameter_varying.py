@@ -243,6 +243,26 @@ def test_a_simulated_block_is_the_solution_of_the_differential_equation_with_pro
     assert np.all(np.abs(moments) < 1e-10)
 
 
+def test_after_a_gap_the_model_is_that_of_the_configuration_after_it() -> None:
+    """In the gap the angle between the links changes by 1.3 degrees, which is 0.5 % of the second frequency."""
+    trajectory, event, chords = record()
+    kept = np.r_[:9000, 10500:11000]
+    parts = trajectory._replace(**{name: getattr(trajectory, name)[kept]
+                                   for name in ('stamp_ns', 'position', 'velocity', 'effort')})
+    config = replace(CONFIG, model_rate=50.0)
+    after = [one for one in pipeline.run(config, [event, *blocks(parts, 500)])
+             if one.model_is_new and one.stamp_ns >= 10_500_000_000]
+    early = [one for one in after if one.stamp_ns < 10_600_000_000]
+    assert {one.model_status for one in early} == {Status.WARMING_UP}
+    assert 'gap' in early[0].reason
+    tracking = [one for one in after if one.model_status is Status.TRACKING]
+    assert len(tracking) > 0.5 * len(after)
+    for one in tracking:
+        row = round(one.stamp_ns * 1e-6)
+        for mode, hertz in zip(one.modes, true_frequencies(float(chords[row, 1] - chords[row, 0])), strict=True):
+            assert abs(mode.frequency_hz - hertz) < 1.96 * mode.frequency_std_hz
+
+
 def test_a_model_is_not_trusted_while_the_links_swing_by_a_quarter_of_a_radian(run: Run) -> None:
     read = identified(run).configurations
     assert isinstance(read, Configurations)
