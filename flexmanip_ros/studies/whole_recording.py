@@ -14,8 +14,16 @@ import numpy as np
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.errors import ModelError, ParameterError
-from flexmanip_ros.identification import decimation, model_output, parameter_varying, recursive_fit, rpbsid, validation
-from flexmanip_ros.identification.batch_fit import BLOCK
+from flexmanip_ros.identification import (
+    decimation,
+    model_output,
+    parameter_varying,
+    prediction_check,
+    recursive_fit,
+    rpbsid,
+    validation,
+)
+from flexmanip_ros.identification.batch_fit import BLOCK, interpolated
 from flexmanip_ros.identification.prediction_check import MOST_TURN
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.identification.varying_model import Configurations
@@ -203,10 +211,12 @@ def _stretch(config: IdentifierParameters, signals: Signals, a: int, b: int, dt:
     found, method = None, 'none'
     try:
         rows = _rows(signals, a, b)
-        state = _after(config, rows)
-        found, method = _fit(config, state, _longest(config, rows), noise, b - a, dt), 'maximum likelihood'
+        state, samples = _after(config, rows), _longest(config, rows)
+        found, method = _fit(config, state, samples, noise, b - a, dt), 'maximum likelihood'
         if found is None:
             found, method = rpbsid.identified(config, state, dt), 'subspace'
+        if found is not None:
+            found = _judged(config, found, samples, signals.angles[a:b])
     except np.linalg.LinAlgError:
         found = None
     start_s, end_s = float(signals.time[a]), float(signals.time[b - 1])
@@ -225,6 +235,21 @@ def _longest(config: IdentifierParameters, rows: Rows) -> Array:
     samples = samples.copy()
     samples[rows.missing[at] > config.decimation // 2, rows.log.width.inputs:] = np.nan  # as the identifier counts them
     return samples
+
+
+def _judged(config: IdentifierParameters, found: Identified, samples: Array, angles: Array) -> Identified:
+    """Return the model with the status and the bands that its predictions of all samples (N, r + m) give.
+
+    angles: (N, 2) measured ones [rad], or (N, 0).
+    """
+    missing, r = np.isnan(samples[:, -1]), len(config.inputs)
+    if missing.all():
+        return found
+    role, samples = parameter_varying.roles(config), interpolated(samples)
+    rows = log_of(samples[:, :r], samples[:, r:], missing=missing.astype(np.int64)).rows(0, len(samples))
+    turned = 0.0 if role is None or angles.shape[1] != 2 else float(np.ptp(relative_angle(config, angles)))
+    return prediction_check.judged(found, rows, config.outputs, 0 if role is None else len(role.displacements), turned,
+                                   filtered=config.decimation > 1)
 
 
 def _fit(config: IdentifierParameters, state: rpbsid.RpbsidState, samples: Array, noise: str, count: int, dt: float

@@ -12,7 +12,7 @@ from flexmanip_ros.errors import ModelError, ParameterError
 from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.whole_recording import score, smooth, sweep
-from flexmanip_ros.types import JointRecord, StateSpace
+from flexmanip_ros.types import JointRecord, StateSpace, Status
 
 DT = 0.01
 
@@ -149,3 +149,19 @@ def test_dead_sensors_of_an_arm_with_angles_give_no_model_and_no_error():
                for stamp, (one, other), (u,) in zip(signals.stamp_ns, angles, signals.u, strict=True)]
     *_, last = pipeline.absorb(config, records)
     assert sweep(last, angles) is None
+
+
+@pytest.mark.parametrize(('faster', 'status'), [(1.0, {Status.TRACKING}),
+                                                (1.5, {Status.INCONSISTENT, Status.POORLY_EXCITED})])
+def test_a_stretch_in_which_the_machine_changes_is_not_smoothed_as_tracking(faster, status):
+    config = configure(IdentifierParameters, {
+        'payload_method': 'none', 'inputs': ['a/effort'], 'outputs': ['a/position'], 'order': 2})
+    pole, signals = 0.98 * np.exp(0.15j), _signals(count=2000)
+    y, x = np.empty((2000, 1)), np.zeros(2)
+    for k in range(2000):
+        now = pole if k < 1000 else 0.98 * (pole / abs(pole)) ** faster
+        y[k] = x[0]
+        x = np.array([[now.real, -now.imag], [now.imag, now.real]]) @ x + np.array([0.5, 1.0]) * signals.u[k]
+    y += 0.01 * np.std(y) * np.random.default_rng(3).normal(size=y.shape)
+    (found,) = smooth(config, replace(signals, y=y), [], DT)
+    assert found.status in status
