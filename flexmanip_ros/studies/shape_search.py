@@ -244,8 +244,12 @@ def _models(R: Array, search: Search, orders: Sequence[int], shape: Shape) -> li
 
 
 def powers(search: Search, model: StateSpace, kept: list[Kept], factor: int, past: int,
-            chosen: NDArray[np.bool_]) -> Array:
-    """Return variances (2, m): of the error of the prediction ahead at the samples chosen (N,), and of the samples."""
+            chosen: NDArray[np.bool_], constant: Array | None = None) -> Array:
+    """Return variances (2, m): of the error of the prediction ahead at the samples chosen (N,), and of the samples.
+
+    constant: (n,) of the model, see ``Identified``. A model with K = 0 learns no state from the outputs on the way: its
+    first state is the one that fits the samples before best.
+    """
     steps = max(1, round(search.horizon_s / model.dt)) + (decimation.LAG if factor > 1 else 0)
     targets, errors = [np.empty((0, search.m))], [np.empty((0, search.m))]
     with np.errstate(all='ignore'):
@@ -258,7 +262,9 @@ def powers(search: Search, model: StateSpace, kept: list[Kept], factor: int, pas
                 at = np.arange(max(first, begin + steps - 1 + past), end)
                 if not len(at):
                     continue
-                ahead = validation.predict_ahead(model, some[:, :search.r], some[:, search.r:], steps)
+                whole, U = validation.affine(model, constant, samples[:end, :search.r])
+                x0 = None if model.K.any() else validation.state_at_end(whole, U[:begin], samples[:begin, search.r:])
+                ahead = validation.predict_ahead(whole, U[begin:], some[:, search.r:], steps, x0)
                 target = part.raw[rows[at], search.r:]
                 targets.append(target)
                 errors.append(target - ahead[at - begin - steps + 1])

@@ -195,5 +195,5 @@ def _identified_error(search: Search, values: Mapping[str, Any]) -> float:
         if found is None:
             return np.inf
         powers += shape_search.powers(search, found.model, kept, config.decimation, config.past_window,
-                          (number >= now) & (number < later))
+                          (number >= now) & (number < later), found.constant)
     return shape_search.loss(powers)
