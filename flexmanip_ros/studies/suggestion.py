@@ -59,13 +59,18 @@ def suggest(given: Mapping[str, Any], signals: Signals, dt: float, horizon_s: fl
         progress(done, total)
 
     shape = shape_search.search_shapes(search, runs, step)
-    values, told = _settings(search, shape, step)
+    values, settled, told = _settings(search, shape, step)
     progress(total, total)
-    return values, [*_shape_reasons(search, shape), *told]
+    of_order = 'best of those that are refined' if settled != shape else (
+        f'smallest within {100.0 * (shape_search.MARGIN - 1.0):.0f} % of the best')
+    return values, [*_shape_reasons(search, settled, of_order), *told]
 
 
-def _shape_reasons(search: Search, shape: Shape) -> list[tuple[str, str]]:
-    """Return the reason for each part of the shape, with the unexplained shares of the values compared."""
+def _shape_reasons(search: Search, shape: Shape, of_order: str) -> list[tuple[str, str]]:
+    """Return the reason for each part of the shape, with the unexplained shares of the values compared.
+
+    of_order: reason for the order where it is not given.
+    """
     found = []
     for name, part, text in (
             ('decimation', 'factor', lambda factor: f'{1.0 / (factor * search.dt):.4g} Hz'),
@@ -80,8 +85,7 @@ def _shape_reasons(search: Search, shape: Shape) -> list[tuple[str, str]]:
         near = sorted(kinds, key=lambda kind: abs(kinds.index(kind) - kinds.index(value)))[:SHOWN]
         shares = ', '.join(f'{text(kind)} {_percent(search.tried[search.best(**same, **{part: kind})])}'
                            for kind in sorted(near))
-        why = 'given; ' if name in search.given else (
-            f'smallest within {100.0 * (shape_search.MARGIN - 1.0):.0f} % of the best; ' if part == 'order' else '')
+        why = 'given; ' if name in search.given else f'{of_order}; ' if part == 'order' else ''
         found.append((name, f'{text(value)}: {why}unexplained {search.horizon_s:g} s ahead at {shares}'))
     return found
 
@@ -116,8 +120,11 @@ def _ridge(errors: Mapping[float, float], alpha: float) -> float:
 
 
 def _settings(search: Search, shape: Shape, step: Callable[[], None]
-              ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
-    """Choose what the moments cannot tell by runs of the identifier itself; return all values, and the reasons."""
+              ) -> tuple[dict[str, Any], Shape, list[tuple[str, str]]]:
+    """Choose what the moments cannot tell by runs of the identifier itself.
+
+    Return all values, the shape among them (that of a refinement may be another one), and the reasons.
+    """
     memory = max(0.5, 1.0 - FORGOTTEN * shape.factor / search.count)
     alpha = _prior(search, shape)
     plain: dict[str, Any] = {
@@ -133,8 +140,10 @@ def _settings(search: Search, shape: Shape, step: Callable[[], None]
     chosen = _ridge(errors, alpha)
     if chosen != alpha:
         plain['regularization'] = (chosen,) * 3
+    is_set = 'forgetting' in search.given
     trials: list[tuple[str, float, dict[str, Any]]] = [
-        ('forgetting where the model ceases to fit', PLAIN, {'forgetting_factor': (0.99,) * 3}),
+        ('forgetting_factor 0.99' if is_set else 'forgetting where the model ceases to fit', PLAIN,
+         {'forgetting_factor': (0.99,) * 3}),
         (f'forgetting beyond {search.count * search.dt / FORGOTTEN:.3g} s', PLAIN,
          {'forgetting': 'constant', 'forgetting_factor': (memory,) * 3})]
     r, m = search.r, search.m
@@ -144,9 +153,10 @@ def _settings(search: Search, shape: Shape, step: Callable[[], None]
     refined = own is not None and search.tried[own] < NEARLY * search.tried[shape]
     if own is not None and refined:
         trials += [(f'{kind} of order {own.order}', REFINED, {**_values(own), 'refinement': kind})
-                   for kind in ('output_error', 'prediction_error')]
-    settled, name, least = plain, 'no forgetting', errors[chosen]
-    told = [f'no forgetting {_percent(least)}']
+                   for kind in ('output_error', 'prediction_error') if search.given.get('refinement', kind) == kind]
+    words = 'no forgetting' if plain['forgetting_factor'][0] == 1.0 else 'forgetting as it is set'
+    settled, name, least = plain, words, errors[chosen]
+    told = [f'{words} {_percent(least)}']
     for words, gain, trial in trials:
         values = {**plain, **trial, **search.given}
         error = np.inf
@@ -163,7 +173,8 @@ def _settings(search: Search, shape: Shape, step: Callable[[], None]
     why = 'given' if 'regularization' in search.given else (
         f'best of {", ".join(f"{value:g}" for value in tried)} by the same error' if chosen == alpha else
         f'run through the recording, {", ".join(f"{value:g} {_percent(errors[value])}" for value in sorted(errors))}')
-    return settled, [
+    is_own = own is not None and all(settled[name] == value for name, value in _values(own).items())
+    return settled, own if own is not None and is_own else shape, [
         ('forgetting, refinement', f'{name}: run through the recording, unexplained {search.horizon_s:g} s ahead with '
                                    f'{", ".join(told)}{beside}'),
         ('regularization', f'{settled["regularization"][0]:g}: {why}')]

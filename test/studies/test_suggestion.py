@@ -49,6 +49,20 @@ def test_a_model_without_a_gain_is_scored_from_the_state_that_fits_the_samples_b
     assert np.all(error < 2e-4 * power)
 
 
+def test_a_refined_model_that_predicts_better_is_taken_and_each_reason_is_that_of_its_value() -> None:
+    values, reasons = chosen()
+    assert values['refinement'] == 'output_error'
+    for name in ('decimation', 'past_window', 'future_window', 'order', 'direct_feedthrough', 'weighted_observability'):
+        if name not in GIVEN:
+            assert reasons[name].startswith(f'{values[name]}: ')
+
+
 def test_a_refinement_that_is_set_stays_in_use() -> None:
     values, _ = chosen(('refinement', 'output_error'), ('order', 4))
     assert (values['refinement'], values['forgetting']) == ('output_error', 'innovation')
+
+
+def test_a_forgetting_that_is_set_is_not_called_none() -> None:
+    values, reasons = chosen(('forgetting', 'constant'), ('forgetting_factor', (0.995,) * 3), ('order', 4))
+    assert values['forgetting_factor'] == (0.995,) * 3
+    assert 'no forgetting' not in reasons['forgetting, refinement']
