@@ -112,7 +112,7 @@ class Summary:
     def held_since_s(self) -> float | None:
         """Time of the capture of what is held at the end [s]; None where nothing is held."""
         capture, release = self.capture_time_s, self.release_time_s
-        return None if capture is None or (release is not None and release >= capture) else capture
+        return None if capture is None or (release is not None and release > capture) else capture
 
 
 def result_rows(summary: Summary, config: IdentifierParameters, modes: Sequence[Mode], events: str = ''

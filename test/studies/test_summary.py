@@ -29,6 +29,7 @@ def test_an_empty_arm_holds_none_and_a_caught_object_has_its_instant():
     assert replace(empty, capture_time_s=3.0).held_since_s == 3.0
     assert replace(empty, capture_time_s=3.0, release_time_s=4.0).held_since_s is None
     assert replace(empty, capture_time_s=5.0, release_time_s=4.0).held_since_s == 5.0
+    assert replace(empty, capture_time_s=4.0, release_time_s=4.0).held_since_s == 4.0, 'a release comes first'
 
 
 @pytest.mark.parametrize('status', Status)
