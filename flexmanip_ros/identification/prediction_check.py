@@ -48,8 +48,9 @@ UNSHOWN = 0.1
 """Half 95 % interval of a relative frequency error above which the samples do not show the frequency. It was at most
 0.066 in 4762 readings of right models, and 0.21 to 0.41 for a mode that the plant did not have."""
 EARLY_S = 4.0
-"""Time since the last event [s] below which an uncertain mode means WARMING_UP, not POORLY_EXCITED: 22 periods of the
-default arm's first mode. It is a time, as a slow sensor tells no more about a mode in as many samples."""
+"""Time learned since the last event [s] below which an uncertain mode means WARMING_UP, not POORLY_EXCITED: 22 periods
+of the default arm's first mode. An arm at rest teaches nothing. It is a time, as a slow sensor tells no more about a
+mode in as many samples."""
 DAMPED = 0.3
 """Damping ratio above which the frequency of a mode is not judged."""
 LOOSE = 0.1
@@ -296,9 +297,9 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
     """Return the model with the status that its predictions of the last samples give; outputs: the outputs' names.
 
     bends: number of measured bends, where the model is to be one of every configuration; turned: range of the angle
-    between the links since the last event [rad]; since: number of samples since then, where they are more than those
-    behind the model. An arm at rest adds none to a model. filtered: rows are those of ``decimation``; frequencies are
-    not looked for in them, as right ones were not found (a mode 0.3 % off seemed to be 3.1 +- 1.3 % off).
+    between the links since the last event [rad]; since: number of samples learned since then, where they are more than
+    those behind the model. filtered: rows are those of ``decimation``; frequencies are not looked for in them, as right
+    ones were not found (a mode 0.3 % off seemed to be 3.1 +- 1.3 % off).
 
     INCONSISTENT: the predictions miss over half of the outputs' mean power, or the last samples show another frequency.
     ORDER_TOO_LOW: they miss over half of one output. POORLY_EXCITED, in the first ``EARLY_S`` WARMING_UP: a mode
