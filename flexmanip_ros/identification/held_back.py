@@ -204,7 +204,7 @@ def delivered(held: HeldBack, background: Background) -> HeldBack:
     kept = max(request.weight - (request.used - before.used), 0.0) / before.weight
     total = np.full(latest.shape, 1e-9 * STRETCH_NS) if held.total is None else min(kept, 1.0) * held.total
     tried = heard if held.tried is None else held.tried | heard
-    if held.latest is not None and not heard.any():  # nothing was predicted: what was said before remains
+    if not heard.any():  # nothing was predicted: what was said before remains
         return held
     return held._replace(latest=latest, total=total + latest, tried=tried)
 

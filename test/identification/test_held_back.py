@@ -122,6 +122,17 @@ def test_a_machine_at_rest_counts_neither_for_nor_against_a_model() -> None:
     assert np.all(resting[1] < moving[1] + 1e-9 * STRETCH_NS)
 
 
+def test_a_machine_at_rest_whose_sensors_are_noisy_has_predicted_nothing() -> None:
+    u, y = signals(1000)
+    rng = np.random.default_rng(1)
+    u = np.vstack([1e-3 * rng.standard_normal((3000, 1)), u])
+    y = np.vstack([0.01 * np.std(y, axis=0) * rng.standard_normal((3000, 2)), y])
+    for count in (3000, 3100, 3200):  # it moves from 3000 on
+        run = fed(CONFIG, u[:count], y[:count])
+        assert held_back.misses(held(run)) is None
+        assert said(run) is Status.WARMING_UP
+
+
 def test_an_event_begins_anew() -> None:
     run = fed(CONFIG, *signals(2000))
     assert rpbsid.restart(CONFIG, run.state).held == held_back.HeldBack()
