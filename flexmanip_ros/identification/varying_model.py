@@ -57,7 +57,9 @@ class Configurations(NamedTuple):
         assert role is not None
         count = math.ceil(PERIODS * 2.0 * math.pi / (v.shift * self.dt))
         latest = rows.between(max(rows.first, rows.until - count), rows.until)
-        rows = latest.stretches()[-1]  # in a gap the links may have turned
+        longest = 1e9 * max(self.config.max_gap, 2.0 * self.dt)
+        jumps = np.flatnonzero(np.diff(latest.stamp_ns) > longest)  # in such a gap the links may have turned
+        rows = latest.since(latest.first + 1 + int(jumps[-1])) if jumps.size else latest
         here = rows.missing == 0
         Y, angles = rows.y[:, list(role.displacements)] - v.center, relative_angle(self.config, rows.angles)
         if np.count_nonzero(here) < count // 2:  # too few measured rows
