@@ -31,8 +31,6 @@ RESULT_DELAY_S = 0.005
 """Time from the row where a model is requested to the row where its result is used [s]. Reading it takes 1 to 3 ms."""
 ARM_RATE = 1.0
 """Rate at which estimates carry the learned arm parameters [Hz]. It is low because they change slowly."""
-HOPELESS = 2000
-"""Number of messages after which a replay gives up if none of them is usable."""
 REPLAY_GROUP = 2000
 """Number of rows that wait in a replay, where ``GROUP`` rows wait in the live node. Python's overhead is then below a
 microsecond a row."""
@@ -162,8 +160,6 @@ def absorb(config: IdentifierParameters, items: Iterable[Item], background: Back
                 state = _joined(state, ahead, background)
                 ahead = _ahead(state, state.log.end, background, TRAILING)
         yield state
-        if _hopeless(state):
-            break
     state = _joined(state, ahead, background)
     if state.config is not None:
         state = _sampled(config, state, sampling.flush(config, state.clock, state.log), background)
@@ -185,10 +181,6 @@ def _push(config: IdentifierParameters, state: State, item: JointRecord | JointB
     else:
         sampled, some = sampling.push(config, state.clock, state.log, item), 1
     return _sampled(config, state, sampled, background), some
-
-
-def _hopeless(state: State) -> bool:
-    return state.counters.accepted == 0 and state.counters.received >= HOPELESS
 
 
 def catch_up(state: State, background: Background = INLINE, group: int = 1) -> tuple[State, list[Estimate]]:
@@ -267,8 +259,6 @@ def _steps(config: IdentifierParameters, state: State, items: Iterable[Item], ba
     for item in items:
         state, found = step(config, state, item, background, REPLAY_GROUP)
         yield state, found
-        if _hopeless(state):
-            break
     yield finish(config, state, background)
 
 

@@ -43,6 +43,8 @@ REGRESSED = 32
 """Rows of which it is asked at once whether their samples jitter as their stamps do."""
 NEVER = 6.0
 """Standard deviations of a stamp that chance does not reach in years: 1e-9."""
+OF_LAYOUT = ('missing_signal', 'unequal_sizes')
+"""Outcomes that all messages of a block share, as they follow from names and array lengths."""
 RELEARN = 20
 """Number of consecutive irregular intervals after which the sample time is learned again."""
 
@@ -70,9 +72,9 @@ class Counters(NamedTuple):
         """Return the counters with one of them raised by one."""
         return self._replace(**{name: getattr(self, name) + 1})
 
-    def received_and(self, name: str) -> Counters:
-        """Return the counters after one message with this outcome."""
-        return self._replace(**{'received': self.received + 1, name: getattr(self, name) + 1})
+    def received_and(self, name: str, count: int = 1) -> Counters:
+        """Return the counters after one message, or ``count`` of them, with this outcome."""
+        return self._replace(**{'received': self.received + count, name: getattr(self, name) + count})
 
 
 class Clock(NamedTuple):
@@ -149,13 +151,17 @@ def push_block(config: IdentifierParameters, clock: Clock, log: SampleLog, block
                ) -> tuple[Sampled, int]:
     """Take messages of a block from number ``first`` on; return clock and log, and how many were taken.
 
-    Messages that follow one another regularly are taken at once, any other message alone. The rows equal those of
-    ``push``.
+    Messages that follow one another regularly are taken at once, and so are those whose layout cannot be used; any
+    other message alone. The rows equal those of ``push``.
     """
     times, advanced = _regular(config, clock, log, block, first)
     regular = len(times)
     if regular == 0:
-        return push(config, clock, log, block.record(first)), 1
+        sampled, left = push(config, clock, log, block.record(first)), len(block.stamp_ns) - first - 1
+        now, why = sampled.clock, sampled.clock.rejection
+        if why is None or why is clock.rejection or why.reason not in OF_LAYOUT:
+            return sampled, 1
+        return sampled._replace(clock=now._replace(counters=now.counters.received_and(why.reason, left))), 1 + left
     channels = clock.channels
     assert channels is not None
     taken = slice(first, first + regular)

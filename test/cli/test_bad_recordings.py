@@ -268,3 +268,11 @@ def test_a_recording_that_is_not_there_leaves_the_last_results(capsys, tmp_path)
     folder = tmp_path / 'out'
     assert main([str(tmp_path / 'typo'), '--output', str(folder), PLAIN]) == 2
     assert not folder.exists()
+
+
+@pytest.mark.parametrize(('names', 'level', 'status'), [(('wheel',), 0.0, 0), (NAMES, np.nan, 2)],
+                         ids=['another machine', 'not finite'])
+def test_however_many_unusable_messages_come_first_the_others_are_used(capsys, tmp_path, names, level, status):
+    first = [JointRecord(START - (2500 - k) * MS, names, *np.full((3, len(names)), level)) for k in range(2500)]
+    ended, found, _ = _run(capsys, _bag(tmp_path / 'bag', first + _records()), PLAIN)
+    assert (ended, found['samples']) == (status, 300)

@@ -255,3 +255,16 @@ def test_blocks_drop_repeated_and_late_stamps_whatever_gap_factor_is() -> None:
     assert at_once.counters == clock.counters
     assert at_once.counters.accepted == 198
     assert (rows.rows(0, rows.end).stamp_ns == log.rows(0, log.end).stamp_ns).all()
+
+
+@pytest.mark.parametrize(('names', 'size'), [(('a', 'b', 'c', 'd'), 4), (NAMES, 3)])
+def test_a_block_whose_layout_cannot_be_used_is_counted_as_its_single_messages(names: tuple[str, ...], size: int
+                                                                               ) -> None:
+    block = JointBlock(names, 1_000_000 * np.arange(50), *np.zeros((3, 50, size)))
+    start = drive([record(k) for k in range(30)])[0]
+    clock = start
+    for k in range(50):
+        clock, _, _ = sampling.push(IdentifierParameters(), clock, sampling.EMPTY, block.record(k))
+    sampled, taken = sampling.push_block(IdentifierParameters(), start, sampling.EMPTY, block)
+    assert taken == 50
+    assert (sampled.clock.counters, sampled.clock.rejection) == (clock.counters, clock.rejection)
