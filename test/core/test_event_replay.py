@@ -207,3 +207,25 @@ def test_a_first_message_that_cannot_be_used_sets_no_clock(position: list[float]
     good = [record._replace(stamp_ns=record.stamp_ns + 10**12) for record in records(300)]
     unusable = good[0]._replace(stamp_ns=stamp_ns, position=np.array(position))
     assert same(step_through([unusable, *good])[1], step_through(good)[1])
+
+
+@pytest.mark.parametrize('is_announced', [False, True], ids=['taken', 'announced'])
+def test_a_change_of_the_sample_time_loses_no_event_and_keeps_time_0(is_announced: bool) -> None:
+    every = records(900)
+    items = with_event([*every[:300], *every[300::2]], 600.0 if is_announced else 100.0, 100)
+    state, live = step_through(items)
+    assert state.counters.resets == 1
+    assert state.payload is not None
+    assert state.payload.estimator.since_ns == state.stamp_of(EventKind.CAPTURE) == items[100].stamp_ns
+    assert state.first_ns == 0
+    assert same(live, list(pipeline.run(CONFIG, items)))
+
+
+def test_a_wrong_stamp_before_the_sample_time_is_known_loses_no_event() -> None:
+    items = with_event(records(300), 200.0, 0)
+    items[4] = items[4]._replace(stamp_ns=10**13)
+    state, _ = step_through(items)
+    assert state.counters.resets == 1
+    assert state.payload is not None
+    assert state.payload.estimator.since_ns == 200 * MS
+    assert state.first_ns == 0
