@@ -131,6 +131,8 @@ def _sqlite(path: Path) -> Iterator[Raw]:
 STORAGE = ('.mcap', '.db3')
 COMPRESSED = tuple(f'{ending}.zstd' for ending in STORAGE)
 """Ends of the names of a recording's files; the second ones are of `ros2 bag record --compression-mode file`."""
+PACKED = b'\x28\xb5\x2f\xfd'
+"""First bytes of a message that `ros2 bag record --compression-mode message` compressed; CDR begins otherwise."""
 METADATA_FAULTS = ('Could not load YAML', 'Invalid bag metadata', 'A metadata key is missing')
 """How the library begins what it says of a metadata.yaml whose content is unusable."""
 JOINT_STATE = 'sensor_msgs/msg/JointState'
@@ -278,7 +280,7 @@ class _Recording:
                 self.total = sum(connection.msgcount for connection in chosen)
                 for connection, _, data in reader.messages(connections=chosen):
                     self.taken += 1
-                    yield connection.topic, data
+                    yield connection.topic, _plain(data)
         except BagError:
             raise
         except Exception as err:  # broken bytes lead the library to errors of many kinds
@@ -309,7 +311,7 @@ class _Recording:
                         skip -= 1
                         continue
                     self.taken += 1
-                    yield raw.topic, raw.data
+                    yield raw.topic, _plain(raw.data)
         except DamagedError as err:
             self._damage = str(err)
         except OSError as err:  # no permission to read, or a disk that was taken out
@@ -398,6 +400,14 @@ class _Recording:
                 self.event_topics[name] = event
             elif complete and self.topics.events_required:
                 raise BagError(f"bag '{self.path}' has no topic '{name}'", _event_topics(there))
+
+
+def _plain(data: bytes) -> bytes:
+    """Return a message as it was published: metadata.yaml alone says that each one is compressed."""
+    if data.startswith(PACKED):
+        with suppress(zstd.ZstdError, EOFError):
+            return zstd.decompress(data)
+    return data
 
 
 def _event_topics(there: dict[str, str]) -> str:

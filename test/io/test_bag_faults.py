@@ -168,11 +168,11 @@ def test_an_unknown_event_is_answered_with_the_two_texts_and_other_ways_to_tell_
     assert '--detect' in line
 
 
-def _compressed(path, storage):
-    """Write a recording as ``ros2 bag record --compression-mode file`` does."""
+def _compressed(path, storage, mode=CompressionMode.FILE):
+    """Write a recording as ``ros2 bag record --compression-mode file`` (or ``message``) does."""
     store = get_typestore(Stores.ROS2_JAZZY)
     writer = Writer(path, version=9, storage_plugin=storage)
-    writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
     with Reader(write(path.with_name('plain'))) as reader, writer:
         made = {item.topic: writer.add_connection(item.topic, item.msgtype, typestore=store)
                 for item in reader.connections}
@@ -203,6 +203,18 @@ def test_a_compressed_file_without_its_metadata_is_answered_with_the_command_tha
     items, line = good_part(path)
     assert len(items) == 51
     assert 'metadata.yaml is missing' in line
+
+
+@pytest.mark.parametrize('storage', list(StoragePlugin))
+def test_messages_that_are_compressed_one_by_one_are_read_without_the_metadata_too(tmp_path, storage):
+    path = _compressed(tmp_path / 'packed', storage, CompressionMode.MESSAGE)
+    plain = list(map(str, bag.read(tmp_path / 'plain')))
+    assert list(map(str, bag.read(path))) == plain
+    assert list(map(str, bag.read(storage_file(path)))) == plain
+    (path / 'metadata.yaml').unlink()
+    items, line = good_part(path)
+    assert list(map(str, items)) == plain
+    assert 'its data are whole' in line
 
 
 def test_compressed_recordings_are_read_and_salvaged(tmp_path):
