@@ -207,9 +207,7 @@ def event_topics(path: str | Path, topics: Topics | None = None) -> tuple[str, .
     with suppress(BagError):
         recording = _Recording(Path(path), topics or Topics())
         with closing(recording.messages()) as messages:
-            for _ in messages:
-                if not recording.is_damaged:  # every topic is known from the start
-                    break
+            next(messages, None)  # every topic is known before the first message
     return () if recording is None else tuple(sorted(set(recording.event_topics.values())))
 
 
@@ -226,7 +224,7 @@ class _Recording:
         self.event_topics: dict[str, str] = {}
         """Event topics that were found so far, by the names that were asked for."""
         self._there: dict[str, str] = {}
-        """Types of the topics of the messages that were read without the library."""
+        """Types of the topics of the messages, where the library did not tell them."""
         self._metadata = ''
         """What is wrong with metadata.yaml."""
         self._damage = ''
@@ -297,14 +295,17 @@ class _Recording:
         """Yield the messages after the last one that the library could read."""
         skip = self.taken
         self.total = None
+        if not self.joint_topic:  # the topics of all messages decide, as those of a whole recording do
+            for file in self._files():
+                with suppress(DamagedError, OSError):
+                    self._there.update((raw.topic, raw.msgtype) for raw in salvaged(file))
+            self._choose(self._there, complete=False)
         try:
             for file in self._files():
                 if file.name.endswith(COMPRESSED):
                     raise BagError(f"bag '{self.path}' cannot be read: {self._metadata or self._damage}, and its files "
                                    'are compressed', f'{_unpacking(file)}; then give that file or the directory')
                 for raw in salvaged(file):
-                    self._there[raw.topic] = raw.msgtype
-                    self._choose({raw.topic: raw.msgtype}, complete=False)
                     if not self._is_chosen(raw.topic):
                         continue
                     if skip:

@@ -10,7 +10,7 @@ from contextlib import suppress
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from recordings import START, good_part, joint_state_record, storage_file, write
+from recordings import NAMES, START, good_part, joint_state_record, storage_file, write
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -140,6 +140,27 @@ def test_a_recording_without_metadata_and_without_the_topic_names_the_topics_tha
     line = good_part(path)[1]
     assert "has no topic 'joint_states'; name one with --joint-states NAME" in line
     assert '/other (sensor_msgs/msg/JointState)' in line
+
+
+@pytest.mark.parametrize('is_cut', [False, True])
+@pytest.mark.parametrize('other', ['/right/joint_states', '/joint_states'])
+def test_without_metadata_a_topic_is_chosen_as_in_a_whole_recording(tmp_path, other, is_cut):
+    path = tmp_path / 'bag'
+    with BagWriter(path, flush_period=None) as writer:
+        for k in range(1500):
+            for topic, joint in (('/left/joint_states', 'left'), (other, 'other')):
+                record = joint_state_record(k)
+                writer.write(topic, record.stamp_ns, record._replace(names=(joint, *NAMES[1:])))
+    (path / 'metadata.yaml').unlink()
+    if is_cut:
+        file = storage_file(path)
+        file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
+    items, line = good_part(path)
+    if other == '/joint_states':
+        assert {item.names[0] for item in items} == {'other'}
+    else:
+        assert items == []
+        assert 'has several topics' in line
 
 
 @pytest.mark.parametrize('is_cut', [False, True])
