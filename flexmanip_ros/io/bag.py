@@ -117,8 +117,15 @@ def _text(content: bytes, at: int) -> str:
     return content[at + 4:at + 4 + size].decode('utf-8')
 
 
+def _has_log(path: Path) -> bool:
+    """Whether a .db3 file has a write-ahead log: `--storage-preset-profile resilient`, and the recorder was killed."""
+    log = path.with_name(f'{path.name}-wal')
+    return path.suffix == '.db3' and log.is_file() and log.stat().st_size > 0
+
+
 def _sqlite(path: Path) -> Iterator[Raw]:
-    with closing(sqlite3.connect(f'{path.resolve().as_uri()}?immutable=1', uri=True)) as database:
+    how = 'mode=ro' if _has_log(path) else 'immutable=1'  # an immutable database is read without its log
+    with closing(sqlite3.connect(f'{path.resolve().as_uri()}?{how}', uri=True)) as database:
         database.execute('PRAGMA writable_schema=ON')  # a file shorter than its header says is read all the same
         topics = {number: (name, kind) for number, name, kind in database.execute('SELECT id, name, type FROM topics')}
         # In row order, without the index: the rows come out until the first missing page.
@@ -270,6 +277,8 @@ class _Recording:
         from rosbags.rosbag2 import Reader  # not before a recording is read: it takes 20 ms
 
         try:
+            if any(_has_log(file) for file in self._files()):  # which the library does not read
+                raise DamagedError('its recorder was killed, and the last messages are in its write-ahead log')
             reader = Reader(self.path)
             reader.open()
             with closing(reader):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import sqlite3
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -282,6 +283,28 @@ def test_a_foreign_database_is_rejected(tmp_path):
         database.execute('CREATE TABLE cats (name TEXT)')
     database.close()
     assert 'cannot be read' in good_part(tmp_path / 'other.db3')[1]
+
+
+@pytest.mark.parametrize('has_metadata', [False, True])
+def test_messages_in_the_write_ahead_log_of_a_killed_recorder_are_read(tmp_path, has_metadata):
+    path = write(tmp_path / 'bag', 1000, storage=StoragePlugin.SQLITE3, event_at=None)
+    file = storage_file(path)
+    with closing(sqlite3.connect(file)) as database:
+        database.execute('PRAGMA journal_mode=WAL')
+        kept = database.execute('SELECT topic_id, timestamp, data FROM messages WHERE id > 600').fetchall()
+        database.execute('DELETE FROM messages WHERE id > 600')
+        database.commit()
+        database.execute('PRAGMA wal_checkpoint(TRUNCATE)')
+        database.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)', kept)
+        database.commit()
+        shutil.copytree(path, tmp_path / 'killed')
+    killed = tmp_path / 'killed'
+    if not has_metadata:
+        (killed / 'metadata.yaml').unlink()
+    for place in (killed, killed / file.name):
+        items, line = good_part(place)
+        assert len(items) == 1000
+        assert '1000 messages' in line
 
 
 def test_a_recording_that_was_split_and_not_finished_is_read_in_the_order_of_its_numbers(tmp_path):
