@@ -236,8 +236,9 @@ class _Recording:
         """What is wrong with metadata.yaml."""
         self._damage = ''
         """What is wrong with the data."""
-        self._faults: list[tuple[str, str]] = []
-        """What is wrong with single messages, and what to do."""
+        self._fault: tuple[str, str] | None = None
+        """What is wrong with the first message that is left out, and what to do."""
+        self._left_out = 0
         self._joint_states = 0
         self._layout: cdr.Layout | None = None
         self._run = BLOCK
@@ -359,13 +360,16 @@ class _Recording:
         except (cdr.CdrError, UnicodeDecodeError) as err:
             self._garbled(self.taken, topic, err)
         except ValueError as err:
-            self._faults.append((f"an event on '{topic}' is left out: {err}", (
-                "publish 'capture' or 'release' as its frame_id; of this recording give --capture-time or "
-                '--release-time, or let --detect look for it in the signals')))
+            self._leave_out(f"an event on '{topic}' is left out: {err}",
+                            "publish 'capture' or 'release' as its frame_id; of this recording give --capture-time or "
+                            '--release-time, or let --detect look for it in the signals')
 
     def _garbled(self, number: int, topic: str, err: Exception) -> None:
-        self._faults.append((f"message {number} (on '{topic}') is garbled: {err}",
-                             'correct the publisher and record again'))
+        self._leave_out(f"message {number} (on '{topic}') is garbled: {err}", 'correct the publisher and record again')
+
+    def _leave_out(self, fault: str, remedy: str) -> None:
+        self._fault = self._fault or (fault, remedy)
+        self._left_out += 1
 
     def check(self) -> None:
         """Raise BagError if a fault was found, or no joint state."""
@@ -381,9 +385,9 @@ class _Recording:
         if self._damage:
             raise BagError(f"bag '{self.path}' is damaged: {self._damage}; {count}",
                            "repair it with 'ros2 bag reindex' or 'mcap recover', or record again")
-        if self._faults:
-            (fault, remedy), *others = self._faults
-            more = f' (and {len(others)} more)' if others else ''
+        if self._fault is not None:
+            fault, remedy = self._fault
+            more = f' (and {self._left_out - 1} more)' if self._left_out > 1 else ''
             raise BagError(f"bag '{self.path}': {fault}{more}; {count}", remedy)
         if self._metadata:
             raise BagError(f"bag '{self.path}': {self._metadata}; its data are whole: {count}",
