@@ -61,7 +61,7 @@ def _main(given: argparse.Namespace) -> int:
 
     todo, identity = _plan(given)
     if given.report is not None:
-        check_place(given.report)
+        check_place(given.report, '.html', '.htm')  # so it is neither the table nor the scenario
     interrupted = False
     with Journal(given.output, identity) as journal:
         done = {row.get(workers.KEY) for row in journal.rows}

@@ -46,6 +46,16 @@ def test_the_report_shows_scores_runs_and_failures(tmp_path):
     assert 'Failed: 1' in text
 
 
+@pytest.mark.parametrize('name', ['study.csv', 'quick.yaml'], ids=['the table', 'the scenario'])
+def test_a_report_is_written_over_no_table_and_no_scenario(scenario_file, tmp_path, capsys, name):
+    scenario = scenario_file.read_text(encoding='utf-8')
+    assert run(scenario_file, '--runs', 1, '--workers', 0, '--output', tmp_path / 'study.csv',
+               '--report', tmp_path / name) == 2
+    assert 'does not end in .html' in capsys.readouterr().err
+    assert scenario_file.read_text(encoding='utf-8') == scenario
+    assert not (tmp_path / 'study.csv').exists()
+
+
 def test_a_folder_of_recordings_is_a_study_and_a_broken_one_a_row(tmp_path):
     import numpy as np
 
