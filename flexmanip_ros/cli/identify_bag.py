@@ -85,11 +85,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(given: argparse.Namespace) -> int:
-    from flexmanip_ros.cli.replay import Request, identify, places
+    from flexmanip_ros.cli.replay import Request, check_places, identify, places
     from flexmanip_ros.io.bag import Topics
     from flexmanip_ros.io.outputs import check_apart
 
     check_apart({'--suggest': given.suggest, **places(given)}, given.params, given.bag)
+    check_places(given)  # before --suggest, which takes a minute
     topics = Topics(given.joint_states, tuple(given.capture_event or Topics().events), given.capture_event is not None)
     if given.suggest is not None:
         from flexmanip_ros.cli.suggest import given_values, suggest

@@ -16,7 +16,7 @@ from flexmanip_ros.errors import BagError, FlexmanipError, MissingSignalError, M
 from flexmanip_ros.event_replay import FAR_EVENT_NS
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.bag import Topics
-from flexmanip_ros.io.outputs import Output, check_apart, check_place, write_rows, write_text
+from flexmanip_ros.io.outputs import Output, check_apart, check_output, check_place, write_rows, write_text
 from flexmanip_ros.numerics.background import REPLAY_THREADS, Threads, read_ahead
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import yaml_text
@@ -62,6 +62,16 @@ def places(given: Any) -> dict[str, str | None]:
     return {f'--{name.replace("_", "-")}': getattr(given, name) for name in names}
 
 
+def check_places(given: Any) -> None:
+    """Raise FlexmanipError where one of these files cannot be written, or has a wrong ending. given: see ``places``."""
+    for place, endings in ((given.report, ('.html', '.htm')), (given.save_arm, ('.yaml', '.yml')),
+                           (given.configurations, ('.csv',))):
+        if place is not None:
+            check_place(place, *endings)
+    if given.output is not None:
+        check_output(given.output)
+
+
 @dataclass(frozen=True, eq=False)
 class Result:
     """The result of a run. fault: what was wrong with the recording; its sound messages were used all the same."""
@@ -87,11 +97,7 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     """
     started = time.perf_counter()
     check_apart(places(request), None, str(request.bag))
-    if request.report is not None:
-        check_place(request.report, '.html', '.htm')
-    for place, endings in ((request.save_arm, ('.yaml', '.yml')), (request.configurations, ('.csv',))):
-        if place is not None:
-            check_place(place, *endings)
+    check_places(request)
     progress = progress or Report()
     screen = None if request.report is None else Screen(of_identifier(request.config, Path(request.bag).name))
     messages = Messages(request, progress, screen)

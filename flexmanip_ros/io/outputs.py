@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 PAYLOAD = ('mass', 'std', 'lower', 'upper', 'consistency')
 SCALARS = ('excitation', 'condition', 'innovation_power')
 NODE = 'rpbsid_identifier'
+TABLES = ('.csv', '.npz')
+"""Endings of the names of tables of estimates."""
 
 
 def write_file(path: str | Path, fill: Callable[[Any], Any]) -> None:
@@ -193,6 +195,13 @@ def _cell(value: Any) -> Any:
     return None if isinstance(value, np.floating) and np.isnan(value) else value.item()
 
 
+def check_output(path: str | Path) -> None:
+    """Raise FlexmanipError where ``Output`` cannot write, or would write over a recording."""
+    if ending(path) not in TABLES and os.path.exists(path):  # check_place names what is wrong with a name too long
+        raise BagError(f"'{path}' exists already", 'remove it or give another name')
+    check_place(path)
+
+
 class Output:
     """Takes estimates one by one: a table where the name ends in .csv or .npz, else a recording.
 
@@ -205,13 +214,11 @@ class Output:
         self.start_ns: int | None = None
         """Stamp at which the time of a table is 0; None: the first estimate."""
         self._frame_id = frame_id
-        self._is_table = ending(path) in ('.csv', '.npz')
+        self._is_table = ending(path) in TABLES
         self._estimates: list[Estimate] = []
         """Rows of the table."""
         self._writer: BagWriter | None = None
-        if not self._is_table and os.path.exists(path):  # check_place names what is wrong with a name that is too long
-            raise BagError(f"'{path}' exists already", 'remove it or give another name')
-        check_place(path)
+        check_output(path)
 
     def write(self, estimate: Estimate) -> None:
         """Keep one estimate as a row of the table, or append the messages that the node would have published."""

@@ -181,6 +181,16 @@ def test_a_place_that_cannot_be_written_is_said_before_the_work(recording, capsy
     assert 'does not exist' in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(('option', 'place', 'words'), [
+    ('--output', 'no/such/folder/out.csv', 'does not exist'), ('--output', '', 'exists already'),
+    ('--report', 'page.pdf', 'does not end in .html'), ('--save-arm', 'no/such/arm.yaml', 'does not exist')])
+def test_a_place_that_cannot_be_written_is_said_before_the_search(
+        recording, tmp_path, capsys, option, place, words):
+    assert main([str(recording), '--suggest', str(tmp_path / 'found.yaml'), option, str(tmp_path / place)]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / 'found.yaml').exists()
+
+
 def _found(*names: str) -> list[Found]:
     return [Found(name, -1.0, 1.0, 0.5, 100.0, 0, 100) for name in names]
 
