@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 PAYLOAD = ('mass', 'std', 'lower', 'upper', 'consistency')
 SCALARS = ('excitation', 'condition', 'innovation_power')
 NODE = 'rpbsid_identifier'
+LEAST_MODES = 2
 TABLES = ('.csv', '.npz')
 """Endings of the names of tables of estimates."""
 
@@ -172,7 +173,8 @@ def _padded(parts: Sequence[Array | None]) -> Array:
 def write_table(path: str | Path, estimates: Sequence[Estimate], start_ns: int | None = None) -> None:
     """Write columns and matrices as numpy arrays (.npz, nothing pickled), or a line for each estimate (.csv).
 
-    In the lines, columns of several modes are numbered from 1, and NaN is an empty cell.
+    In the lines, columns of several modes are numbered from 1, and NaN is an empty cell. There are columns of
+    ``LEAST_MODES`` modes at least, so that a script finds them whatever the recording gave.
     """
     found = columns(estimates, start_ns)
     if ending(path) == '.npz':
@@ -183,7 +185,8 @@ def write_table(path: str | Path, estimates: Sequence[Estimate], start_ns: int |
     for name, values in found.items():
         if values.ndim == 2:
             stem, _, unit = name.partition('_')
-            flat |= {f'{stem}{k + 1}_{unit}': values[:, k] for k in range(values.shape[1])}
+            none = np.full((len(values), max(LEAST_MODES - values.shape[1], 0)), np.nan)
+            flat |= {f'{stem}{k + 1}_{unit}': column for k, column in enumerate(np.hstack([values, none]).T)}
         else:
             flat[name] = values
     rows = ({name: _cell(values[row]) for name, values in flat.items()} for row in range(len(estimates)))

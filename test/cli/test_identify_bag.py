@@ -110,6 +110,15 @@ def test_a_table_holds_what_the_pipeline_says(recording, capsys, tmp_path):
     assert rows[-1]['status'] == estimates[-1].status.name
 
 
+def test_a_table_without_any_mode_has_its_columns_all_the_same(recording, capsys, tmp_path):
+    place = _bag(tmp_path / 'bag', _oscillator(5))
+    assert _run(capsys, place, *SETTINGS, '--output', tmp_path / 'out.csv')[0] == 0
+    with (tmp_path / 'out.csv').open(encoding='utf-8') as file:
+        row = next(csv.DictReader(file))
+    assert [row[name] for k in (1, 2) for name in (
+        f'frequency{k}_hz', f'damping{k}_ratio', f'frequency{k}_std_hz', f'damping{k}_ratio_std')] == [''] * 8
+
+
 def test_models_of_different_orders_share_a_table() -> None:
     """Of an arm that moves a larger order becomes two states a displacement once every configuration has its model."""
     def estimate(order: int) -> Estimate:
