@@ -12,7 +12,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -210,11 +210,16 @@ def aligned(rows: Iterable[Sequence[str]], formats: Sequence[str]) -> list[str]:
 
 
 def run(prog: str, body: Callable[[], int]) -> int:
-    """Run a program; return its exit status: 2 after an error of the package, 130 when interrupted, 1 for a defect."""
+    """Run a program; return its exit status.
+
+    That is 2 after an error of the package or of the file system, 130 when interrupted, 1 for a defect.
+    """
     try:  # around all of it, as a signal may come while a context manager ends
         with _signals_as_interrupt(), warnings.catch_warnings():
             warnings.simplefilter('ignore')  # the status reports numbers out of range; stderr is for one line
-            return body()
+            status = body()
+            sys.stdout.flush()  # at the end of the process an error of it would be a traceback and status 120
+            return status
     except FlexmanipError as error:
         print_error(prog, error)
         return BAD_INPUT
@@ -222,14 +227,26 @@ def run(prog: str, body: Callable[[], int]) -> int:
         print_error(prog, 'interrupted')
         return INTERRUPTED
     except BrokenPipeError:
-        sys.stderr.close()  # the reader of the output has ended
+        _drop_output()  # its reader has ended
         return SUCCESS
     except Exception as error:
         if os.environ.get(TRACEBACK):
             raise
+        if isinstance(error, OSError):  # a name that is too long, a folder of somebody else, a full disk
+            if error.filename is None:
+                _drop_output()
+            place = '' if error.filename is None else f"'{error.filename}': "
+            print_error(prog, f'{place}{error.strerror or error}; check names, permissions and space on the disk')
+            return BAD_INPUT
         print_error(prog, f'a defect of this program: {type(error).__name__}: {error}; '
                     f'please report it with the recording ({TRACEBACK}=1 shows where)')
         return DEFECT
+
+
+def _drop_output() -> None:
+    """Send what is left of stdout nowhere: Python would write it at the end of the process, and fail again."""
+    with suppress(OSError):  # it is not a file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def is_postponed(number: int, frame: FrameType | None) -> bool:

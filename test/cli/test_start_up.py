@@ -73,3 +73,35 @@ def test_an_interrupt_at_the_end_of_the_work_is_no_traceback(monkeypatch: pytest
 
     monkeypatch.setattr(console.warnings, 'catch_warnings', Ending)
     assert console.run('program', lambda: console.SUCCESS) == console.INTERRUPTED
+
+
+def ended(output: Any, *arguments: str) -> tuple[int, str]:
+    """Return exit status and stderr of a write_urdf whose stdout is ``output``, buffered as a user's shell has it."""
+    command = [sys.executable, '-m', 'flexmanip_ros.cli.write_urdf', *arguments]
+    made = subprocess.run(command, stdout=output, stderr=subprocess.PIPE, text=True, check=False,
+                          env={name: value for name, value in os.environ.items() if name != 'PYTHONUNBUFFERED'})
+    return made.returncode, made.stderr
+
+
+@pytest.mark.parametrize('segments', ['2', '30'], ids=['less than a buffer', 'more'])
+def test_a_reader_that_ended_is_no_error(segments: str) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    assert ended(writer, '--segments', segments) == (console.SUCCESS, '')
+    os.close(writer)
+
+
+@pytest.mark.parametrize('segments', ['2', '30'], ids=['less than a buffer', 'more'])
+def test_a_full_disk_is_one_line_and_exit_2(segments: str) -> None:
+    with open('/dev/full', 'wb') as full:
+        status, err = ended(full, '--segments', segments)
+    assert (status, err.count('\n')) == (console.BAD_INPUT, 1)
+    assert 'No space left on device' in err
+
+
+def test_an_error_of_the_file_system_is_one_line_and_exit_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert console.run('program', lambda: len(os.listdir('x' * 300))) == console.BAD_INPUT
+    err = capsys.readouterr().err
+    assert err.count('\n') == 1
+    assert f"'{'x' * 300}': File name too long" in err
+    assert 'defect' not in err
