@@ -11,7 +11,7 @@ import yaml
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import ArmParameters, PlantParameters, configure
 from flexmanip_ros.parameters.document import NODES, package_names, scalar
-from flexmanip_ros.parameters.field import dotted, leaves
+from flexmanip_ros.parameters.field import as_float, dotted, leaves
 
 Config = TypeVar('Config')
 STANDARD = re.compile(r'^(use_sim_time|start_type_description_service|autostart|qos_overrides\..*)$')
@@ -124,7 +124,7 @@ def _reject_mixed(tree: Any, where: str) -> None:
     """Raise ParameterError for a list with integers and doubles: rcl refuses the whole file for it."""
     for name, value in dotted(tree if isinstance(tree, Mapping) else {}):
         if isinstance(value, list) and {int, float} <= set(map(type, value)):
-            items = ', '.join(scalar(float(item) if type(item) is int else item) for item in value)
+            items = ', '.join(scalar(as_float(item) if type(item) is int else item) for item in value)
             raise ParameterError(
                 f"{where}: the list '{name}' has numbers with and without a point, which ROS cannot read",
                 f'write [{items}]')

@@ -197,12 +197,20 @@ def _check_one(leaf: Leaf, value: Any) -> Any:
     return converted
 
 
+def as_float(value: float) -> float:
+    """Return a number as a float; a whole number beyond the range of floats becomes infinite."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
+
+
 def _convert(kind: type, value: Any) -> Any:
     """Return the value as the declared type, None where it is of another one."""
     if kind is bool or isinstance(value, bool):
         return value if kind is bool and isinstance(value, bool) else None
     if kind is float and isinstance(value, (int, float)):
-        return float(value)
+        return as_float(value)
     if kind is int and isinstance(value, int):
         return value
     if kind is str and isinstance(value, str):

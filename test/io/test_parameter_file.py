@@ -71,6 +71,8 @@ def test_an_override_that_does_not_go_with_the_file_is_named(tmp_path):
     (f'{NODE}: {{ros__parameters: {{ordre: 4}}}}', "did you mean 'order'"),
     (f'{NODE}: {{ros__parameters: {{order: 1000}}}}', 'from 1 to 60'),
     (f'{NODE}: {{ros__parameters: {{order: .nan}}}}', 'whole number'),
+    (f'{NODE}: {{ros__parameters: {{max_gap: {"9" * 400}}}}}', "'max_gap' is infinite"),
+    (f'{NODE}: {{ros__parameters: {{arm.link_length: [{"9" * 400}, 1.0]}}}}', 'write [.inf, 1.0]'),
     (f'{NODE}: {{ros__parameters: {{order: 4', 'not valid YAML in line 1'),
     (f'a: &x {{b: 1}}\n{NODE}: {{ros__parameters: *x}}', 'aliases'),
     (f'{NODE}: !!python/object/apply:os.system ["true"]', 'not valid YAML'),
