@@ -230,7 +230,8 @@ class Output:
             return
         writer = self._opened()
         for name, value in outgoing(estimate, self._frame_id):
-            writer.write(f'/{NODE}/{name}', estimate.stamp_ns, value, latched=name in LATCHED)
+            recorded_ns = max(estimate.stamp_ns, 0)  # unlike a stamp it has no sign in a recording
+            writer.write(f'/{NODE}/{name}', recorded_ns, value, latched=name in LATCHED)
 
     def _opened(self) -> BagWriter:
         if self._writer is None:

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.rosbag2 import Reader
 
 from flexmanip_ros.cli import monte_carlo, replay, reproduce_paper, simulate_bag, write_urdf
 from flexmanip_ros.cli.identify_bag import main
 from flexmanip_ros.errors import FlexmanipError
+from flexmanip_ros.io import cdr
 from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
@@ -276,3 +278,14 @@ def test_however_many_unusable_messages_come_first_the_others_are_used(capsys, t
     first = [JointRecord(START - (2500 - k) * MS, names, *np.full((3, len(names)), level)) for k in range(2500)]
     ended, found, _ = _run(capsys, _bag(tmp_path / 'bag', first + _records()), PLAIN)
     assert (ended, found['samples']) == (status, 300)
+
+
+def test_stamps_below_zero_are_written_as_they_are(capsys, tmp_path):
+    records = [record._replace(stamp_ns=record.stamp_ns - START - 10**12) for record in _records()]
+    status, _, err = _run(capsys, _bag(tmp_path / 'bag', records), PLAIN, '--output', tmp_path / 'out')
+    assert (status, err) == (0, '')
+    with Reader(tmp_path / 'out') as reader:
+        found = [(recorded_ns, cdr.stamp_ns(raw)) for topic, recorded_ns, raw in reader.messages()
+                 if topic.topic == '/rpbsid_identifier/status']
+    assert {recorded_ns for recorded_ns, _ in found} == {0}
+    assert {stamp_ns for _, stamp_ns in found} <= {record.stamp_ns for record in records}
