@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import yaml
 
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.parameters import ArmParameters, PlantParameters, configure
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
 from flexmanip_ros.parameters.document import NODES, package_names, scalar
 from flexmanip_ros.parameters.field import as_float, dotted, leaves
 
@@ -174,4 +174,4 @@ def load_arm(path: str | Path | None, overrides: Iterable[str] = ()) -> ArmParam
             found.update(item for item in read(path, node, optional=True).items() if item[0].startswith('arm.'))
         if not found:
             raise ParameterError(f"parameter file '{path}' has no parameters arm.*", "write the arm's measures there")
-    return configure(PlantParameters, {**found, **parse_overrides(overrides)}).arm
+    return configure(IdentifierParameters, {**found, **parse_overrides(overrides)}).arm
