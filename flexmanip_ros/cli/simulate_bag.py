@@ -89,6 +89,11 @@ def _main(given: argparse.Namespace) -> int:
         raise ParameterError(f'--duration is {given.duration:g}', 'give seconds above 0, up to 1e6')
     count = max(round(given.duration * plant.rate), 1)
     events = simulator.on_samples(plant, _events(given), START_NS)
+    last_s = (count - 1) / plant.rate
+    for event in events:
+        if event.stamp_ns > START_NS + round(last_s * 1e9):  # no sample would show it
+            raise ParameterError(f'the {event.kind.value} comes after the last sample, which is at {last_s:g} s',
+                                 'give an earlier time or a longer --duration')
     target = Path(given.bag)
     if not target.name:
         raise BagError(f"'{given.bag}' is no name for a recording", 'give the name of a directory to make')
