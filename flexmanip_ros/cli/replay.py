@@ -186,6 +186,7 @@ class Messages:
         self.foreign = 0
         """Messages that hold none of the configured joints."""
         self.first_ns: int | None = None
+        """Stamp of the first message that can become a sample."""
         self.events: list[CaptureEvent] = []
         self._recorded: list[CaptureEvent] = []
         """The events that are neither given nor found in the signals."""
@@ -290,10 +291,10 @@ class Messages:
         if self._screen is not None:
             self._screen.joint_states(block)
         if self.first_ns is None:
-            self.first_ns = int(block.stamp_ns[0])
+            self.first_ns = sampling.first_usable_ns(self._request.config, block)
             for at, kind in ((self._request.capture_time, EventKind.CAPTURE),
                              (self._request.release_time, EventKind.RELEASE)):
-                if at is not None:
+                if at is not None and self.first_ns is not None:
                     yield from self._event(CaptureEvent(self.first_ns + round(at * 1e9), kind))
         used = block.stamp_ns < self._limit_ns()
         if used.any():

@@ -180,6 +180,15 @@ def push_block(config: IdentifierParameters, clock: Clock, log: SampleLog, block
     return Sampled(_judged(clock, log, before), log), regular
 
 
+def first_usable_ns(config: IdentifierParameters, block: JointBlock) -> int | None:
+    """Return the stamp of the first message of a block that can become a sample [ns]; None where none can."""
+    channels = resolve(config, block)
+    if isinstance(channels, Rejection):
+        return None
+    usable = np.isfinite(columns(block, channels.places, slice(0, len(block.stamp_ns)))).all(axis=1)
+    return int(block.stamp_ns[np.argmax(usable)]) if usable.any() else None
+
+
 def _is_expected(clock: Clock, message: JointBlock) -> bool:
     """Whether the sample time is known, no stamp is in doubt, and messages have the layout of the last one."""
     channels = clock.channels

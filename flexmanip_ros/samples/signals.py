@@ -36,7 +36,7 @@ class Rejection:
 
 
 def resolve(
-    config: IdentifierParameters, record: JointRecord, outputs: tuple[str, ...] | None = None
+    config: IdentifierParameters, record: JointRecord | JointBlock, outputs: tuple[str, ...] | None = None
 ) -> Channels | Rejection:
     """Find every configured signal in a record.
 
@@ -150,20 +150,20 @@ def columns(block: JointBlock, places: tuple[tuple[str, int], ...], taken: slice
     return np.column_stack([getattr(block, field)[taken, index] for field, index in places])
 
 
-def _find(signal: str, record: JointRecord) -> tuple[str, int] | None:
+def _find(signal: str, record: JointRecord | JointBlock) -> tuple[str, int] | None:
     joint, _, field = signal.rpartition('/')
     if joint not in record.names or getattr(record, field).size == 0:
         return None
     return field, record.names.index(joint)
 
 
-def _is_unfilled(signal: str, record: JointRecord) -> bool:
+def _is_unfilled(signal: str, record: JointRecord | JointBlock) -> bool:
     """Whether the joint is there and its field is empty; a joint that is not there is a wrong name."""
     joint, _, field = signal.rpartition('/')
     return joint in record.names and getattr(record, field).size == 0
 
 
-def _missing(group: str, signal: str, record: JointRecord) -> Rejection:
+def _missing(group: str, signal: str, record: JointRecord | JointBlock) -> Rejection:
     joint, _, field = signal.rpartition('/')
     if joint not in record.names:
         return Rejection(

@@ -289,3 +289,14 @@ def test_stamps_below_zero_are_written_as_they_are(capsys, tmp_path):
                  if topic.topic == '/rpbsid_identifier/status']
     assert {recorded_ns for recorded_ns, _ in found} == {0}
     assert {stamp_ns for _, stamp_ns in found} <= {record.stamp_ns for record in records}
+
+
+@pytest.mark.parametrize(('names', 'level'), [(('wheel',), 0.0), (NAMES, np.nan)],
+                         ids=['another machine', 'not finite'])
+def test_times_count_from_the_first_sample_whatever_came_before_it(capsys, tmp_path, names, level):
+    first = [JointRecord(START - (500 - k) * MS, names, *np.full((3, len(names)), level)) for k in range(500)]
+    table = tmp_path / 'out.csv'
+    _, found, _ = _run(capsys, _bag(tmp_path / 'bag', first + _records()), PLAIN, '--capture-time=0.2',
+                       '--output', table)
+    assert found['capture_time_s'] == 0.2
+    assert table.read_text(encoding='utf-8').splitlines()[1].startswith(f'{START},0.0,')
