@@ -44,9 +44,11 @@ def write_file(path: str | Path, fill: Callable[[Any], Any]) -> None:
         with partial.open('wb') as file:
             fill(file)
         os.replace(partial, path)
-    except OSError as err:
+    except BaseException as err:
         with suppress(OSError):  # a name may be too long for it
             partial.unlink()
+        if not isinstance(err, OSError):  # an interrupt
+            raise
         raise FlexmanipError(f"'{path}' cannot be written: {err.strerror}", 'give another place') from err
 
 

@@ -16,7 +16,7 @@ from flexmanip_ros.cli.identify_bag import main
 from flexmanip_ros.cli.simulate_bag import main as simulate
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.bag_writer import BagWriter
-from flexmanip_ros.io.outputs import matrices
+from flexmanip_ros.io.outputs import matrices, write_file
 from flexmanip_ros.io.parameter_file import read
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, PlantParameters, configure, flatten
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, StateSpace, Status
@@ -117,6 +117,17 @@ def test_a_table_without_any_mode_has_its_columns_all_the_same(recording, capsys
         row = next(csv.DictReader(file))
     assert [row[name] for k in (1, 2) for name in (
         f'frequency{k}_hz', f'damping{k}_ratio', f'frequency{k}_std_hz', f'damping{k}_ratio_std')] == [''] * 8
+
+
+def test_an_interrupt_while_a_file_is_written_keeps_the_old_one_and_leaves_no_scraps(tmp_path):
+    def interrupted(file):
+        file.write(b'half of')
+        raise KeyboardInterrupt
+
+    (tmp_path / 'out.npz').write_text('the last results', encoding='utf-8')
+    with pytest.raises(KeyboardInterrupt):
+        write_file(tmp_path / 'out.npz', interrupted)
+    assert [file.read_text(encoding='utf-8') for file in tmp_path.iterdir()] == ['the last results']
 
 
 def test_models_of_different_orders_share_a_table() -> None:
