@@ -367,7 +367,7 @@ def _remarks(state: pipeline.State, foreign: int) -> list[str]:
         if events.late_events:
             one = events.late_events == 1
             parts.append(f'{events.late_events} {"event" if one else "events"} arrived more than rewind_time after '
-                         f'{"its stamp and was" if one else "their stamps and were"} applied on arrival: the samples '
-                         'between were estimated as if nothing had been caught or released; raise rewind_time, or '
-                         'announce events earlier')
+                         f'{"its stamp and was" if one else "their stamps and were"} applied on arrival, or not at all '
+                         'where a later one was known: the samples between were estimated as if nothing had been '
+                         'caught or released; raise rewind_time, or announce events earlier')
     return parts

@@ -300,3 +300,10 @@ def test_times_count_from_the_first_sample_whatever_came_before_it(capsys, tmp_p
                        '--output', table)
     assert found['capture_time_s'] == 0.2
     assert table.read_text(encoding='utf-8').splitlines()[1].startswith(f'{START},0.0,')
+
+
+def test_an_event_too_old_that_comes_after_a_later_one_is_not_said_to_be_applied(capsys, tmp_path):
+    events = CaptureEvent(START + 250 * MS, EventKind.RELEASE), CaptureEvent(START + 100 * MS, EventKind.CAPTURE)
+    _, found, err = _run(capsys, _bag(tmp_path / 'bag', _records(700), *events, at=600), PLAIN)
+    assert (found['capture_time_s'], found['release_time_s']) == (None, 0.25)
+    assert 'applied on arrival, or not at all where a later one was known' in err
