@@ -51,10 +51,10 @@ def _parser() -> console.Parser:
 
 
 def _speed(text: str) -> float:
-    value = console.seconds(text)
-    if value <= 0.0:
-        raise argparse.ArgumentTypeError(f"'{text}' is no speed; give a factor above 0, such as 2")
-    return value
+    try:
+        return console.positive_seconds(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"'{text}' is no speed; give a factor above 0, such as 2") from None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -157,6 +157,7 @@ def test_an_interrupt_ends_it_with_code_0(playing: tuple[subprocess.Popen[str], 
 @pytest.mark.parametrize(('arguments', 'said'), [
     (['no_such_bag'], "bag 'no_such_bag' does not exist"),
     (['bag', '--speed', '0'], "'0' is no speed"),
+    (['bag', '--speed', 'fast'], "'fast' is no speed"),
     (['bag', '--port', '70000'], '70000 is more than 65535'),
     (['--speed', '2'], 'no recording is given'),
 ])
