@@ -104,7 +104,8 @@ def check_apart(outputs: Mapping[str, str | None], params: str | None, bag: str 
 
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file as UTF-8, whole or not at all."""
-    write_file(path, lambda file: file.write(text.encode('utf-8')))
+    data = text.encode('utf-8', 'backslashreplace')  # a name of a file need not be UTF-8
+    write_file(path, lambda file: file.write(data))
 
 
 def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]], names: Iterable[str] = ()) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -184,6 +186,13 @@ def test_an_existing_recording_is_kept_and_said_before_the_work(recording, capsy
     status, _, err = _run(capsys, recording, *SETTINGS, '--output', tmp_path / 'out')
     assert status == 2
     assert 'exists already' in err
+
+
+def test_a_recording_whose_name_is_not_utf_8_has_a_report(recording, capsys, tmp_path):
+    place = tmp_path / os.fsdecode(b'caf\xe9')
+    shutil.copytree(recording, place)
+    assert _run(capsys, place, *SETTINGS, '--report', tmp_path / 'report.html')[0] == 0
+    assert 'Identification of caf\\udce9' in (tmp_path / 'report.html').read_text(encoding='utf-8')
 
 
 def test_the_report_is_one_page_that_needs_nothing_else(recording, capsys, tmp_path):
