@@ -321,16 +321,15 @@ def reconfigure(config: IdentifierParameters, state: State, background: Backgrou
 def _sampled(config: IdentifierParameters, state: State, sampled: sampling.Sampled, background: Background) -> State:
     """Return the state with new clock and log; at the first usable message build the estimators.
 
-    Where the sample time changed, time 0 and the events stay: the arm still holds what it caught. They stay too where a
-    stamp was wrong before the sample time was known. Any other jump back of the stamps begins a new run.
+    Where the sample time changed, the events stay: the arm still holds what it caught. They stay too where a stamp was
+    wrong before the sample time was known. Any other jump back of the stamps begins a new run.
     """
     outputs, first_ns = sampled.clock.outputs, sampled.clock.last_ns
     if sampled.reset:
-        before, events, begun_ns = state.clock, state.payload, state.first_ns
+        before, events = state.clock, state.payload
         state = State(config=state.config)
         if events is not None and first_ns is not None and before.last_ns is not None and (
                 first_ns > before.last_ns or before.interval_count == 0):
-            first_ns = min(first_ns, begun_ns)
             state = state._replace(early=tuple(dict.fromkeys((*events.latest, *events.pending))))
     state = state._replace(clock=sampled.clock, log=sampled.log)
     if state.payload is not None or outputs is None or first_ns is None:
