@@ -112,6 +112,8 @@ def identify(request: Request, progress: Report | None = None) -> Result:
                     state = now
             else:
                 for now, estimate in pipeline.replay(request.config, items, background):
+                    if now.counters.resets > state.counters.resets:
+                        kept.clear()  # the report shows what the result is of
                     state = now
                     if estimate is not None and output is not None:
                         output.write(estimate)

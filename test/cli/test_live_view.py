@@ -173,6 +173,20 @@ def test_bad_input_is_told_in_one_line_with_code_2(
     assert err.count('\n') == 1
 
 
+def test_the_report_of_a_looped_recording_shows_the_last_pass_alone(recording: Path, tmp_path: Path) -> None:
+    pytest.importorskip('matplotlib')
+    messages = list(bag.read(recording))
+    with BagWriter(tmp_path / 'looped') as writer:
+        for k, item in enumerate([*messages, *messages]):
+            writer.write('/joint_states' if isinstance(item, JointRecord) else '/capture_event', k, item)
+    path = tmp_path / 'report.html'
+    assert identify_bag.main([str(tmp_path / 'looped'), '--report', str(path)]) == 0
+    (inner,) = re.findall(r'<iframe title="[^"]+" srcdoc="([^"]*)"></iframe>', path.read_text(encoding='utf-8'))
+    _, frame = shown(html.unescape(inner))
+    times = [row[0] for row in frame['payloads']]
+    assert times == sorted(set(times))
+
+
 def test_the_report_of_identify_bag_plays_the_recording(recording: Path, tmp_path: Path) -> None:
     pytest.importorskip('matplotlib')
     path = tmp_path / 'report.html'
