@@ -70,7 +70,8 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     # of the payload, by the error of all inertia at the tip [kg]
     considered = config.payload.model_error * ((max(float(body[0]), 0.0) if held else 0.0) + model.motion.scale)
     spread[0, 0] += (share * considered) ** 2
-    prior = float(structured_model.body_std(config, model)[0])
+    expected, deviation = structured_model.body_mean(config, model), structured_model.body_std(config, model)
+    prior = float(deviation[0])
     if not held:
         std = math.sqrt(spread[0, 0])
         if status is Status.TRACKING and std > UNTOLD * structured_model.EMPTY_STD * model.motion.scale:
@@ -83,8 +84,7 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         return Payload(max(float(body[0]), 0.0), math.inf, 0.0, math.inf, consistency, status)
     known_point = model.body > 1 and not spread[1:, 1:].any()
     if model.body > 1 and not known_point:
-        body, spread = point_or_body(body, spread, structured_model.body_mean(config, model),
-                                     structured_model.body_std(config, model))
+        body, spread = point_or_body(body, spread, expected, deviation)
     mass, std = max(float(body[0]), 0.0), math.sqrt(spread[0, 0])
     # a linearization is too sure of a payload that is hardly excited, or was not known where it was made
     least = 0.0 if fitting else structured_model.EMPTY_STD * model.motion.scale  # a gripper may close on nothing
@@ -92,7 +92,11 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         std = max(std, prior)
         status = Status.POORLY_EXCITED if status is Status.TRACKING else status
     found = Payload(mass, std, max(0.0, mass - QUANTILE * std), mass + QUANTILE * std, consistency, status)
-    return found if model.body == 1 or known_point else with_body(found, body, spread)
+    if model.body == 1 or known_point:
+        return found
+    if body[0] < math.sqrt(spread[0, 0]):  # a centre of mass h / m may be anywhere: it is that of an unknown object
+        body, spread = expected, np.diag(deviation ** 2)
+    return with_body(found, body, spread)
 
 
 def is_behind(m: mem.FilterState) -> bool:

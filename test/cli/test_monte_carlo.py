@@ -27,7 +27,7 @@ def test_one_row_a_run_and_the_same_bits_for_the_same_seed(scenario_file, tmp_pa
 
 
 def test_a_failed_run_is_a_row_with_its_error(scenario_file, tmp_path, capsys):
-    scenario_file.write_text(SCENARIO + 'excitation: {amplitude: [1.0e+150, 1.0e+150]}\n', encoding='utf-8')
+    scenario_file.write_text(SCENARIO + 'excitation: {amplitude: [1.0e+9, 1.0e+9]}\n', encoding='utf-8')
     out = tmp_path / 'out.csv'
     assert run(scenario_file, '--runs', 1, '--workers', 0, '--output', out) == 0
     assert 'diverged' in rows_of(out)[0]['error']

@@ -13,10 +13,11 @@ from flexmanip_ros import pipeline
 from flexmanip_ros.arm.linearization import mass_matrix
 from flexmanip_ros.arm.manipulator import manipulator
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, IdentifierParameters, PlantParameters
+from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.filter_state import memory
-from flexmanip_ros.payload.interval import SHARE_ERROR, by_rotors, friction_error
+from flexmanip_ros.payload.interval import SHARE_ERROR, by_rotors, friction_error, judge
 from flexmanip_ros.payload.process_model import Kind
-from flexmanip_ros.payload.structured_model import ROTOR_ERROR, build, too_noisy
+from flexmanip_ros.payload.structured_model import ROTOR_ERROR, build, sensors, too_noisy
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, Status
 
@@ -56,6 +57,29 @@ def test_the_bias_is_of_the_links_alone_however_large_hub_and_rotor_are() -> Non
     M = mass_matrix(links_alone, np.zeros(4), np.zeros(links_alone.stiffness.size))
     fast = [1.0 / (row @ np.linalg.solve(M, row)) for row in links_alone.joint]
     np.testing.assert_allclose(model.rotor_error, ROTOR_ERROR * np.array(fast), rtol=1e-12)
+
+
+@pytest.mark.parametrize('mass', [-0.1, 0.0, 0.01, 0.05, 20.0])
+def test_what_weighs_no_more_than_its_deviation_has_the_centre_of_mass_of_an_unknown_object(mass: float) -> None:
+    """It was h / m with m at least 1e-9 kg: some 1e7 m."""
+    config, dt = IdentifierParameters(), 1e-3
+    assert MODEL is not None
+    seen = sensors(config, MODEL, dt, np.zeros(2))
+    m = memory(2 * MODEL.motion.arm.stiffness.size + MODEL.motion.kind.size, len(MODEL.roles), 2)
+    m.x[BODY] = mass, 0.01, 0.02, 0.05
+    m.S[np.ix_(BODY, BODY)] = np.diag([0.03, 0.005, 0.005, 0.01])
+    m.counts[[mem.HELD, mem.SEEN, mem.SINCE_EVENT, mem.BLOCKS]] = 1, 2000, 5000, 100
+    m.counts[mem.STORED] = mem.HORIZON
+    m.noise[:, [mem.WHITE, mem.POWER, mem.EFFECTIVE, mem.LEVEL, mem.WEIGHT]] = 1e-6
+    found = judge(config, MODEL, seen, m, 0, np.array([10.0, 5.0]))
+    assert found.com is not None
+    covariance = np.array(found.covariance).reshape(4, 4)
+    reach = config.arm.link_length[-1]
+    assert np.hypot(*found.com[:2]) < reach
+    if mass < 0.03:
+        assert found.com == (0.0, 0.0, 0.0)
+        assert 0.1 * reach < np.sqrt(covariance[1, 1]) < reach
+    assert np.all(np.linalg.eigvalsh(covariance) > 0.0)
 
 
 @pytest.mark.parametrize(('friction', 'torques', 'error'), [
