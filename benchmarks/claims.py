@@ -267,6 +267,17 @@ def payload_minute(rows: list[dict[str, Any]]) -> Claims:
         yield Claim(f'{row["case"]}: TRACKING and outside', row['tracking_and_outside'], high=0.05)
 
 
+def payload_combinations(rows: list[dict[str, Any]]) -> Claims:
+    """Whatever the conventions, signals, rates and parameters, `structured` knows at 60 dB what the simulator holds."""
+    estimates = [one for row in rows for one in zip(row['tracking'], row['inside'], strict=True)]
+    yield Claim('TRACKING and outside', 100.0 * estimates.count((True, False)) / len(estimates), high=5.0, unit='%')
+    yield Claim('combinations TRACKING in the end', 100.0 * sum(row['tracking'][-1] for row in rows) / len(rows), 95.0,
+                unit='%')
+    # where two sides mean another thing by a parameter it is ten and more
+    yield Claim('error in the end over half width, worst', max(
+        abs(row['error_percent'][-1]) / row['half_width_percent'][-1] for row in rows), high=3.0)
+
+
 def payload_elements(rows: list[dict[str, Any]]) -> Claims:
     """On nine in ten arms of finite elements, damped or not, `structured` is within 1 % after a second."""
     for row in rows:
@@ -503,10 +514,11 @@ CLAIMS: dict[str, Callable[[Any], Claims]] = {
         control_payload, detection_delay, detection_real_arms, identification_coverage, identification_measured_arms,
         identification_missions, identification_moving_arm, identification_paper_settings, identification_soak,
         identification_speed, identification_status, identification_suggested, identification_ten_minutes,
-        io_bag_reading, payload_block, payload_bounds, payload_coverage, payload_elements, payload_jitter,
-        payload_linear, payload_minute, payload_mismatched, payload_precise_sensors, payload_random_arms,
-        payload_real_arms, payload_speed, plant_convergence, plant_hour, plant_live, plant_segment_chain, plant_speed,
-        replay_speed, ros_fuzz, ros_latency, ros_loss, ros_signals, setup_time, study_scaling)}
+        io_bag_reading, payload_block, payload_bounds, payload_combinations, payload_coverage, payload_elements,
+        payload_jitter, payload_linear, payload_minute, payload_mismatched, payload_precise_sensors,
+        payload_random_arms, payload_real_arms, payload_speed, plant_convergence, plant_hour, plant_live,
+        plant_segment_chain, plant_speed, replay_speed, ros_fuzz, ros_latency, ros_loss, ros_signals, setup_time,
+        study_scaling)}
 
 
 def claims_of(name: str, result: Any) -> list[Claim]:
