@@ -90,11 +90,11 @@ def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.io.outputs import check_apart
 
     check_apart({'--suggest': given.suggest, **places(given)}, given.params, given.bag)
-    check_places(given)  # before --suggest, which takes a minute
     topics = Topics(given.joint_states, tuple(given.capture_event or Topics().events), given.capture_event is not None)
     if given.suggest is not None:
         from flexmanip_ros.cli.suggest import given_values, suggest
 
+        check_places(given)  # the search takes a minute; ``identify`` checks them too late
         config, lines = suggest(given.bag, given.suggest, given_values(given.params, given.set), topics,
                                 given.validate_from, given.horizon,
                                 [at for at in (given.capture_time, given.release_time) if at is not None])

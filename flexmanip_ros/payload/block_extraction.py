@@ -160,9 +160,8 @@ def estimate(config: IdentifierParameters, identified: Identified, angles: Array
     links, model, known = len(config.arm.link_length), identified.model, config.payload.known_coupling
     kappa = model.order // (2 * links)
     seen = sensor_matrix(config, kappa) if kappa and model.order == 2 * links * kappa else None
-    if seen is None or angles.shape != (links,) or np.linalg.matrix_rank(seen[0]) < links * kappa:
-        return unknown(Status.UNOBSERVABLE)
-    if config.arm.base_mass:  # the extraction is that of an arm on a fixed base
+    floats = config.arm.base_mass > 0.0  # the extraction is that of an arm on a fixed base
+    if floats or seen is None or angles.shape != (links,) or np.linalg.matrix_rank(seen[0]) < links * kappa:
         return unknown(Status.UNOBSERVABLE)
     theta = working_point(config, angles)
     empty = blocks(config.arm, theta, kappa=kappa)

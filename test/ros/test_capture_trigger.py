@@ -59,30 +59,26 @@ def test_a_looped_recording_starts_the_count_again(ros: Ros) -> None:
     ros.wait(lambda: node.announced == 2)  # counted on the node's thread, once the event is out
 
 
-def test_joint_states_without_a_stamp_as_those_of_a_gripper_do_not_disturb_the_count(ros: Ros) -> None:
+def assert_captured_once(ros: Ros, messages: list[JointState]) -> None:
+    """Joint states of 80 ms give one event, at its time since the first of them."""
     node = ros.managed(CaptureTrigger(context=ros.context, overrides=overrides(
         mode='time', capture_time=0.03, lead_time=0.0)))
     heard = ros.listen(Header, 'capture_event', qos.latched_input())
     publisher = ros.publisher(JointState, 'joint_states', qos.sensor_output())
-    for k in range(80):
-        if k % 10 == 0:
-            publisher.publish(JointState(name=['finger'], position=[0.1]))
-        publisher.publish(joint_state(k))
+    for message in messages:
+        publisher.publish(message)
     ros.wait(lambda: node._last_ns == START_NS + 79_000_000)
     ros.wait(lambda: heard)
     assert [stamp_ns(event.stamp) for event in heard] == [START_NS + 30_000_000]
+
+
+def test_joint_states_without_a_stamp_as_those_of_a_gripper_do_not_disturb_the_count(ros: Ros) -> None:
+    finger = JointState(name=['finger'], position=[0.1])
+    assert_captured_once(ros, [message for k in range(80) for message in ([finger] * (k % 10 == 0) + [joint_state(k)])])
 
 
 def test_one_stamp_from_far_ahead_does_not_make_the_count_begin_again(ros: Ros) -> None:
-    node = ros.managed(CaptureTrigger(context=ros.context, overrides=overrides(
-        mode='time', capture_time=0.03, lead_time=0.0)))
-    heard = ros.listen(Header, 'capture_event', qos.latched_input())
-    publisher = ros.publisher(JointState, 'joint_states', qos.sensor_output())
-    for k in range(80):
-        publisher.publish(joint_state(k, start_ns=START_NS + (k == 10) * 10**11))
-    ros.wait(lambda: node._last_ns == START_NS + 79_000_000)
-    ros.wait(lambda: heard)
-    assert [stamp_ns(event.stamp) for event in heard] == [START_NS + 30_000_000]
+    assert_captured_once(ros, [joint_state(k, start_ns=START_NS + (k == 10) * 10**11) for k in range(80)])
 
 
 def test_a_requested_capture_is_stamped_after_the_latest_sample_and_latched(ros: Ros) -> None:

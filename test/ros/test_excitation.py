@@ -8,6 +8,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from joint_states import joint_state
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -62,12 +63,18 @@ def test_nothing_is_sent_before_it_is_active(ros: Ros) -> None:
     assert heard == []
 
 
-def test_torques_keep_in_step_with_the_stamps_of_the_arm_whenever_they_come(ros: Ros) -> None:
+def in_step(ros: Ros) -> tuple[Excitation, list[Float64MultiArray], Publisher]:
+    """A node that follows the stamps of joint states, what it sends, and the publisher of the joint states."""
     heard = ros.listen(Float64MultiArray, 'effort_controller/commands', qos.sensor_output())
     node = ros.managed(Excitation(context=ros.context, overrides=overrides(
         clock='joint_states', period=[0.02, 0.01])))
     ros.wait(lambda: node.commands.get_subscription_count() == 1)
     states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    return node, heard, states
+
+
+def test_torques_keep_in_step_with_the_stamps_of_the_arm_whenever_they_come(ros: Ros) -> None:
+    node, heard, states = in_step(ros)
     for k in range(100):
         states.publish(joint_state(k))
     ros.wait(lambda: len(heard) == 100)
@@ -76,11 +83,7 @@ def test_torques_keep_in_step_with_the_stamps_of_the_arm_whenever_they_come(ros:
 
 
 def test_joint_states_without_a_stamp_as_those_of_a_gripper_do_not_disturb_the_torques(ros: Ros) -> None:
-    heard = ros.listen(Float64MultiArray, 'effort_controller/commands', qos.sensor_output())
-    node = ros.managed(Excitation(context=ros.context, overrides=overrides(
-        clock='joint_states', period=[0.02, 0.01])))
-    ros.wait(lambda: node.commands.get_subscription_count() == 1)
-    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    node, heard, states = in_step(ros)
     for k in range(50):
         states.publish(JointState(name=['finger'], position=[0.1]))
         states.publish(joint_state(k))

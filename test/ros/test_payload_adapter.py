@@ -143,14 +143,20 @@ def test_a_payload_that_is_not_that_of_its_estimate_is_not_told(ros: Ros) -> Non
     assert (plant.config.payload_mass, adapter.sent) == (31.5, 1)
 
 
-def test_a_driver_that_does_not_answer_is_said_and_its_requests_are_not_kept(
-        ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+def beside_a_deaf_driver(ros: Ros, monkeypatch: pytest.MonkeyPatch, min_period: float) -> tuple[PayloadAdapter, Node]:
+    """An adapter whose driver takes requests and never answers, and that driver's node."""
     monkeypatch.setattr(payload_adapter, 'ANSWER_S', 0.05)
     node = Node('deaf', context=ros.context)  # never spun
     node.create_service(SetParameters, 'driver/set_parameters', lambda request, response: response)
     adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
-        target_node='driver', settle_time=0.0, min_period=0.01)))
+        target_node='driver', settle_time=0.0, min_period=min_period)))
     ros.wait(adapter._client.service_is_ready)
+    return adapter, node
+
+
+def test_a_driver_that_does_not_answer_is_said_and_its_requests_are_not_kept(
+        ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    adapter, node = beside_a_deaf_driver(ros, monkeypatch, min_period=0.01)
     say(ros, 31.5, 0.1)
     ros.wait(lambda: 'has not answered' in adapter.problem)
     for _ in range(5):
@@ -165,12 +171,7 @@ def test_a_driver_that_does_not_answer_is_said_and_its_requests_are_not_kept(
 
 def test_a_driver_that_does_not_answer_is_not_asked_again_before_min_period(
         ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(payload_adapter, 'ANSWER_S', 0.05)
-    node = Node('deaf', context=ros.context)  # never spun
-    node.create_service(SetParameters, 'driver/set_parameters', lambda request, response: response)
-    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
-        target_node='driver', settle_time=0.0, min_period=60.0)))
-    ros.wait(adapter._client.service_is_ready)
+    adapter, node = beside_a_deaf_driver(ros, monkeypatch, min_period=60.0)
     requests: list[Any] = []
     call = adapter._client.call_async
     monkeypatch.setattr(adapter._client, 'call_async', lambda request: requests.append(request) or call(request))
