@@ -342,9 +342,6 @@ def payload_mismatched(rows: list[dict[str, Any]]) -> Claims:
     yield Claim('cases that are not TRACKING at 3 s', sum(row['status'] != ['TRACKING'] for row in rows), high=0)
 
 
-"""docs/lab/payload.md, "Model check": estimates at 25 dB whose interval misses the truth untold, with the check [%]."""
-
-
 def payload_random_arms(result: dict[str, Any]) -> Claims:
     """Whatever arm, torques and sensors are, at most 5 % of the payloads are TRACKING and outside their interval."""
     yield Claim('TRACKING', result['tracking_percent'], 85.0, unit='%')  # the first 0.3 s are mostly not
@@ -362,7 +359,7 @@ def payload_speed(rows: list[dict[str, Any]]) -> Claims:
         if row['kappa'] == 3:
             for name, part in (('filter', 'filter_us'), ('with moving-horizon estimation', 'refit_us')):
                 yield Claim(f'kappa 3, {name}', row[part], high=60.0, unit='us')
-        # docs/lab/payload.md: 12 over 9 us at kappa 3; above twice that the code has changed, not the machine
+        # 12 over 9 us at kappa 3 when it was first measured; above twice that the code has changed, not the machine
         yield Claim(f'kappa {row["kappa"]}: filter over a step of the plant', row['ratio_filter_to_plant'], high=3.0)
 
 
