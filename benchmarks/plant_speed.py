@@ -1,6 +1,6 @@
 """One sample of 1 ms takes at most 10 us at kappa = 1 and 25 us at kappa = 3, far below scipy's time.
 
-Offline loop of the nonlinear plant (shortening and slope correction on) under the paper's square waves with a
+Offline loop of the nonlinear plant (shortening on) under the paper's square waves with a
 capture half way; best of several runs (processor time). Beside it, in the same run: real time, one step of
 the live interface, the linear and the finite element plant, and a bare scipy.integrate solution of the same
 equations (DOP853, one call for each stretch of constant torque, the compiled accelerations its right side).
