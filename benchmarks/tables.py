@@ -30,7 +30,10 @@ def page() -> str:
              'Each row is a claim: a value that a benchmark measured, and the bounds it is compared with. `make bench` '
              'measures again and ends with exit code 1 when a claim falls short; `make docs` writes this page. '
              '`benchmarks/claims.py` says where each bound comes from. Values without a date are older than the '
-             'records of dates.\n']
+             'records of dates.\n',
+             'Coverage is the share of 95 % intervals that hold the true value. `TRACKING and outside` is the share of '
+             'all estimates (in missions: of those that are TRACKING) that have the status TRACKING and an interval '
+             'that misses the true mass. `error over bound` is the root mean square error over the Cramer-Rao bound.\n']
     for prefix, title in SUBJECTS.items():
         rows = []
         for name, function in claims.CLAIMS.items():
