@@ -294,7 +294,7 @@ def payload_elements(rows: list[dict[str, Any]]) -> Claims:
 
 
 def payload_jitter(rows: list[dict[str, Any]]) -> Claims:
-    """Header stamps may jitter by a fifth of the sample time, alone or with their samples; payloads stay right."""
+    """Header stamps may jitter by a fifth of the sample time, or with their samples by a tenth; payloads stay right."""
     for row in rows:
         name = 'no jitter' if row['jitter'] == 'none' else f'{row["jitter"]}, {row["std_ms"]:g} ms'
         yield Claim(f'{name}: TRACKING', row['tracking_percent'], 90.0, unit='%')  # the first 0.3 s are mostly not

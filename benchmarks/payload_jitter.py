@@ -1,4 +1,4 @@
-"""Claim: header stamps may jitter by a fifth of the sample time, alone or with their samples; payloads stay right.
+"""Claim: header stamps may jitter by a fifth of the sample time, or with their samples by a tenth; payloads stay right.
 
 Arms of ``parts.real_arms`` at 1 kHz. ``stamps``: samples are regular and stamps are off by white noise. ``loop``: a
 control loop wakes up off by white noise, and samples, stamps and torques are off together (simulated at 10 kHz).
