@@ -45,45 +45,12 @@ def restart(decimator: Decimator) -> Decimator:
 
 
 def decimate(decimator: Decimator, samples: Array, missing: Missing, factor: int
-             ) -> tuple[Decimator, Array, list[int], Missing]:
+             ) -> tuple[Decimator, Array, NDArray[np.int64], Missing]:
     """Filter samples (k, r + m); return the kept ones (j, r + m), and for each the index of the sample it ends with.
 
     missing: (k,) of the samples; last result: (j,) of those that the kept ones describe, ``LAG`` earlier. A sample that
-    is not finite restarts the filter and is passed on unfiltered, so the identifier sees the gap.
+    is not finite makes those not finite that depend on it, and the identifier rejects them.
     """
-    kept: list[Array] = []
-    at: list[int] = []
-    absent: list[Missing] = []
-    good = np.all(np.isfinite(samples), axis=1)
-    begin = 0
-    for k in [*np.flatnonzero(~good).tolist(), len(samples)]:
-        decimator, some, due, lost = _run(decimator, samples[begin:k], missing[begin:k], factor)
-        kept.append(some)
-        absent.append(lost)
-        at.extend(begin + i for i in due)
-        if k < len(samples):
-            decimator = restart(decimator)
-            kept.append(samples[k:k + 1])
-            at.append(k)
-            absent.append(missing[k:k + 1])
-        begin = k + 1
-    return decimator, np.vstack(kept), at, np.concatenate(absent)
-
-
-def whole(samples: Array, factor: int) -> tuple[Array, NDArray[np.int64]]:
-    """Filter one stretch (N, w) at once; return the kept samples (k, w) and the row (k,) that each describes.
-
-    factor 1: the samples themselves. The last row on which kept sample i depends is LAG * factor rows later.
-    """
-    if factor == 1:
-        return samples, np.arange(len(samples))
-    _, kept, due, _ = decimate(start(factor, samples.shape[1]), samples, np.zeros(len(samples), np.int64), factor)
-    return kept, np.array(due, dtype=np.int64) - LAG * factor
-
-
-def _run(decimator: Decimator, samples: Array, missing: Missing, factor: int
-         ) -> tuple[Decimator, Array, list[int], Missing]:
-    """Filter finite samples of one stretch without a gap."""
     taps, history, before, seen = decimator
     joint, missing = np.vstack([history, samples]), np.concatenate([before, missing])
     order = len(taps) - 1
@@ -94,4 +61,15 @@ def _run(decimator: Decimator, samples: Array, missing: Missing, factor: int
     for row, i in enumerate(due):
         out[row] = taps @ joint[i:i + order + 1]
     going_on = Decimator(taps, joint[len(joint) - order:], missing[len(joint) - order:], seen + len(samples))
-    return going_on, out, due.tolist(), missing[due + LAG * factor]
+    return going_on, out, due, missing[due + LAG * factor]
+
+
+def whole(samples: Array, factor: int) -> tuple[Array, NDArray[np.int64]]:
+    """Filter one stretch (N, w) at once; return the kept samples (k, w) and the row (k,) that each describes.
+
+    factor 1: the samples themselves. The last row on which kept sample i depends is LAG * factor rows later.
+    """
+    if factor == 1:
+        return samples, np.arange(len(samples))
+    _, kept, due, _ = decimate(start(factor, samples.shape[1]), samples, np.zeros(len(samples), np.int64), factor)
+    return kept, due - LAG * factor
