@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,38 +24,6 @@ from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKi
 
 FEWEST = 200
 """Smallest number of samples since the event with which a payload is estimated."""
-
-
-@dataclass(frozen=True, eq=False)
-class BaselineState:
-    """Everything that a method remembers; constant in size."""
-
-    x: Array
-    """States of filters or integrals."""
-    sums: Array
-    """Sums of the least squares."""
-    held: bool = False
-    dt: float = 0.0
-    last_ns: int | None = None
-    effort: Array | None = None
-    """(2,) torque that is held since the last sample [N m]."""
-
-
-def _series(config: IdentifierParameters, state: BaselineState, rows: Rows) -> tuple[Array, Array, float]:
-    """Return efforts held before each sample (N, 2), chord angles (N, 2), and the sample time [s]."""
-    first = rows.u[0] if state.effort is None else state.effort
-    efforts = np.vstack([first, rows.u[:-1]])
-    angles = np.array([chords(config.arm, measured) for measured in rows.angles])
-    dt = state.dt
-    if dt == 0.0:
-        stamps = [*(() if state.last_ns is None else (state.last_ns,)), *rows.stamp_ns.tolist()]
-        dt = float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.0
-    return efforts, angles, dt
-
-
-def _usable(config: IdentifierParameters) -> bool:
-    """Whether both torques and both angles are configured."""
-    return len(config.inputs) == 2 and len(config.angles) == 2
 
 
 def _unknown(status: Status) -> Payload:
@@ -95,12 +62,12 @@ def _rigid_take(config: IdentifierParameters, x: Array, sums: Array, dt: float, 
     _rigid_kernel(_arm(config, dt), x, sums, dt, efforts, angles)
 
 
-def _rigid_estimate(config: IdentifierParameters, state: BaselineState) -> Payload:
+def _rigid_estimate(config: IdentifierParameters, x: Array, sums: Array, dt: float) -> Payload:
     """Return the payload; the interval takes the residuals as correlated over the filter's memory."""
-    information, score, residual, count, _ = state.sums
+    information, score, residual, count, _ = sums
     if count < 2 * FEWEST or information <= 0.0:
         return _unknown(Status.WARMING_UP)
-    correlated = max(1.0, 4.0 / (_cutoff(config) * state.dt))
+    correlated = max(1.0, 4.0 / (_cutoff(config) * dt))
     variance = residual / count * correlated / information
     total = residual + score ** 2 / information
     return _interval(score / information, float(np.sqrt(variance)), residual / max(total, 1e-300))
@@ -142,14 +109,14 @@ def _algebraic_take(config: IdentifierParameters, x: Array, sums: Array, dt: flo
                       x, sums, dt, np.ascontiguousarray(angles[:, 1]), np.ascontiguousarray(efforts[:, 1]))
 
 
-def _algebraic_estimate(config: IdentifierParameters, state: BaselineState) -> Payload:
+def _algebraic_estimate(config: IdentifierParameters, x: Array, sums: Array, dt: float) -> Payload:
     """Return the payload; each tenth of the record counts as one independent residual."""
-    if state.sums[6] < FEWEST:
+    if sums[6] < FEWEST:
         return _unknown(Status.WARMING_UP)
-    A = np.array([[state.sums[0], state.sums[1]], [state.sums[1], state.sums[2]]])
-    b, square = state.sums[3:5], float(state.sums[5])
+    A = np.array([[sums[0], sums[1]], [sums[1], sums[2]]])
+    b, square = sums[3:5], float(sums[5])
     scale = np.sqrt(np.diag(A))
-    still = STILL * config.arm.link_length[1] ** 2 * state.x[0] ** 2 * np.sqrt(state.sums[6])
+    still = STILL * config.arm.link_length[1] ** 2 * x[0] ** 2 * np.sqrt(sums[6])
     if scale[0] <= still or scale[1] == 0.0 or np.linalg.cond(A / np.outer(scale, scale)) > 1e12:
         return _unknown(Status.POORLY_EXCITED)
     solved = np.linalg.solve(A / np.outer(scale, scale), np.column_stack([b / scale, [1.0 / scale[0], 0.0]]))
@@ -278,48 +245,27 @@ def _algebraic_kernel(
 
 
 class Baseline(NamedTuple):
-    """One estimator; its calls are those of ``payload.structured``."""
+    """One of the two methods."""
 
-    start: BaselineState
-    """The state at the start, with an empty arm."""
+    x: tuple[int, ...]
+    """Shape of the states of filters or integrals."""
+    sums: int
+    """Number of sums of the least squares."""
     keeps_filters: bool
     """Whether an event restarts the sums alone, not the states of filters or integrals."""
     take: Callable[[IdentifierParameters, Array, Array, float, Array, Array, bool], None]
     """Take samples into states and sums: efforts (N, 2), chord angles (N, 2), whether a gap comes before them."""
-    fitted: Callable[[IdentifierParameters, BaselineState], Payload]
-
-    def init(self, config: IdentifierParameters) -> BaselineState:
-        """Start with an empty arm."""
-        return self.start
-
-    def advance(self, config: IdentifierParameters, state: BaselineState, rows: Rows) -> BaselineState:
-        """Take the next rows of the sample log."""
-        if not len(rows) or not _usable(config):
-            return state
-        efforts, angles, dt = _series(config, state, rows)
-        x, sums = state.x.copy(), state.sums.copy()
-        self.take(config, x, sums, dt, efforts, angles, state.last_ns is None or bool(rows.gap[0]))
-        return replace(state, x=x, sums=sums, dt=dt, last_ns=int(rows.stamp_ns[-1]), effort=rows.u[-1].copy())
-
-    def event(self, config: IdentifierParameters, state: BaselineState, event: CaptureEvent) -> BaselineState:
-        """Restart the least squares, and the integrals (not the filters), whose time counts from the event."""
-        return replace(state, x=state.x if self.keeps_filters else self.start.x, sums=self.start.sums,
-                       held=event.kind is EventKind.CAPTURE)
-
-    def estimate(self, config: IdentifierParameters, state: BaselineState) -> Payload:
-        """Return the payload; without a captured object it is exactly 0, as these methods do not test for one."""
-        if not _usable(config):
-            return _unknown(Status.UNOBSERVABLE)
-        return self.fitted(config, state) if state.held else Payload(0.0, 0.0, 0.0, 0.0, 1.0, Status.TRACKING)
+    fitted: Callable[[IdentifierParameters, Array, Array, float], Payload]
+    """Return the payload of states and sums."""
 
 
-RIGID_RLS = Baseline(BaselineState(np.zeros((4, 4)), np.zeros(5)), True, _rigid_take, _rigid_estimate)
-ALGEBRAIC = Baseline(BaselineState(np.zeros(11), np.zeros(7)), False, _algebraic_take, _algebraic_estimate)
-BASELINES: Mapping[str, Baseline] = {'rigid_rls': RIGID_RLS, 'algebraic': ALGEBRAIC}
+BASELINES: Mapping[str, Baseline] = {
+    'rigid_rls': Baseline((4, 4), 5, True, _rigid_take, _rigid_estimate),
+    'algebraic': Baseline((11,), 7, False, _algebraic_take, _algebraic_estimate)}
 
 
 class Recorded(NamedTuple):
-    """The rows of a recording, and its events by stamp."""
+    """The rows of a recording with both torques and both angles, and its events by stamp."""
 
     rows: Rows
     events: tuple[CaptureEvent, ...]
@@ -339,19 +285,30 @@ def recorded(config: IdentifierParameters, items: Iterable[JointRecord | Capture
 
 
 def run(name: str, config: IdentifierParameters, recorded: Recorded) -> Iterator[Estimate]:
-    """Yield estimates with a payload and no model: at each publishing instant and at the last sample."""
-    baseline, rows = BASELINES[name], recorded.rows
-    if not len(rows):
-        return
+    """Yield estimates with a payload and no model: at each publishing instant and at the last sample.
+
+    The least squares begin again at an event. Without a captured object the payload is exactly 0, as these methods do
+    not test for one.
+    """
+    method, (rows, given) = BASELINES[name], recorded
     stamps = rows.stamp_ns
     instants = ((stamps - stamps[0]) * config.publish_rate * 1e-9 + 1e-6).astype(np.int64)
-    due = set((np.flatnonzero(np.diff(instants, prepend=-1) > 0) + rows.first + 1).tolist()) | {rows.until}
-    events = [(rows.log.row_at(event.stamp_ns, rows.first), event) for event in recorded.events]
-    state, cursor = baseline.init(config), rows.first
-    for until in sorted(due | {row for row, _ in events if row > cursor}):
+    due = {*(np.flatnonzero(np.diff(instants, prepend=-1) > 0) + 1).tolist(), len(rows)}
+    events = [(rows.log.row_at(event.stamp_ns, rows.first) - rows.first, event) for event in given]
+    efforts = np.vstack([rows.u[:1], rows.u[:-1]])  # held before each sample
+    angles = np.array([chords(config.arm, measured) for measured in rows.angles])
+    dt = float(np.median(np.diff(stamps))) * 1e-9
+    x, sums, held, cursor = np.zeros(method.x), np.zeros(method.sums), False, 0
+    for until in sorted(due | {row for row, _ in events if row > 0}):
         while events and events[0][0] == cursor:
-            state = baseline.event(config, state, events.pop(0)[1])
-        state, cursor = baseline.advance(config, state, rows.between(cursor, until)), until
+            held = events.pop(0)[1].kind is EventKind.CAPTURE
+            sums[:] = 0.0
+            if not method.keeps_filters:
+                x[:] = 0.0
+        # no time has passed before the first sample, which is a piece of its own
+        method.take(config, x, sums, dt if cursor else 0.0, efforts[cursor:until], angles[cursor:until],
+                    cursor == 0 or bool(rows.gap[cursor]))
+        cursor = until
         if until in due:
-            payload = baseline.estimate(config, state)
-            yield Estimate(int(stamps[until - 1 - rows.first]), payload.status, None, (), payload)
+            payload = method.fitted(config, x, sums, dt) if held else Payload(0.0, 0.0, 0.0, 0.0, 1.0, Status.TRACKING)
+            yield Estimate(int(stamps[until - 1]), payload.status, None, (), payload)
