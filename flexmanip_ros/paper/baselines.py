@@ -105,8 +105,8 @@ def _algebraic_take(config: IdentifierParameters, x: Array, sums: Array, dt: flo
         x[:], sums[:] = 0.0, 0.0
     arm = config.arm
     L, rho = arm.link_length[1], arm.linear_density[1]
-    _algebraic_kernel(rho * L ** 3 / 3 + arm.tip_mass * L ** 2, rho * L / 2 + arm.tip_mass, L, config.payload.gravity,
-                      x, sums, dt, np.ascontiguousarray(angles[:, 1]), np.ascontiguousarray(efforts[:, 1]))
+    _algebraic_kernel(rho * L ** 3 / 3 + arm.tip_mass * L ** 2, rho * L / 2 + arm.tip_mass, L, -arm.gravity[1], x,
+                      sums, dt, np.ascontiguousarray(angles[:, 1]), np.ascontiguousarray(efforts[:, 1]))
 
 
 def _algebraic_estimate(config: IdentifierParameters, x: Array, sums: Array, dt: float) -> Payload:

@@ -73,7 +73,7 @@ IDENTIFIERS: Mapping[str, Mapping[str, Any]] = {
 }
 """The identifiers that are run: parameters that differ from the defaults."""
 _BLOCK = {'payload_method': 'block'}
-_WEIGHED = {'payload.gravity': GRAVITY, 'outputs': ['joint2/position'], 'order': 1}
+_WEIGHED = {'arm.gravity': [0.0, -GRAVITY], 'outputs': ['joint2/position'], 'order': 1}
 METHODS = (
     Method('paper', "the paper's settings: beta 0.99, no restart, block extraction", 'paper', _BLOCK),
     Method('restart', 'ours: restart at the capture, beta 0.9995, maximum-likelihood refinement; block '

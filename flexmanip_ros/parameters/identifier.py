@@ -50,8 +50,6 @@ class PayloadParameters:
         True, 'method structured: Coulomb friction follows the measured rates of the joints where messages carry them; '
         'false, or at samples of 1.5 ms and less where their noise is above 1.4 mrad/s: those of the model (false is '
         'for rates that are late or smoothed by more than a sample)')
-    gravity: float = parameter(
-        0.0, 'gravity along -y, in the algebraic method of the paper alone (there 9.81)', unit='m/s^2', low=0.0)
     memory_time: float = parameter(
         20.0, 'time over which the structured filter forgets old samples', unit='s', low=0.1, high=1e6)
 

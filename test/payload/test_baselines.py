@@ -9,7 +9,6 @@ import pytest
 from recording import ARM, config, event, record, rows_of
 
 from flexmanip_ros.paper import baselines
-from flexmanip_ros.parameters import PayloadParameters
 from flexmanip_ros.types import EventKind, Status
 
 STIFF = replace(ARM, bending_stiffness=(1e6, 1e6), damping_ratio=0.7, modes=1, angle_convention='chord')
@@ -56,7 +55,7 @@ def pendulum(mass, gravity, seconds=3.0, dt=1e-3):
 
 @pytest.mark.parametrize('gravity', [0.0, 9.81])
 def test_the_algebraic_method_finds_the_payload_of_one_rigid_link(gravity):
-    settings = config(replace(ARM, angle_convention='chord'), payload=PayloadParameters(gravity=gravity))
+    settings = config(replace(ARM, angle_convention='chord', gravity=(0.0, -gravity)))
     found = run('algebraic', settings, pendulum(20.0, gravity), event(0.0))[-1]
     assert found.mass == pytest.approx(20.0, rel=1e-3)
     assert found.lower <= 20.0 + 1e-2
