@@ -23,7 +23,15 @@ from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.whole_recording import Scores, Smoothed, Sweep
 from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, JointRecord, Payload, Status
-from flexmanip_ros.view.screen import COLOURS, EVENT_COLOUR, KNOWN_BAND, MODES_APART, PAYLOAD_COLOUR, STATUS_LOOKS
+from flexmanip_ros.view.screen import (
+    COLOURS,
+    EVENT_COLOUR,
+    KNOWN_BAND,
+    MODES_APART,
+    PAYLOAD_COLOUR,
+    STATUS_LOOKS,
+    thinned,
+)
 
 LINES: tuple[Any, ...] = ('-', (0, (4, 1.2)), (0, (1.2, 1)), (0, (6, 1.2, 1.2, 1.2)))
 """Line styles, so that signals in one plot differ by more than their colour."""
@@ -33,7 +41,7 @@ WIDTH = 10.0
 """Width of a figure [inches], about that of a page."""
 DPI = 120
 POINTS = 2000
-"""Number of points above which a line is reduced to its envelope."""
+"""Number of points above which a line is thinned out."""
 
 Event = tuple[float, EventKind]
 Known = tuple[float, float, Sequence[float]]
@@ -57,23 +65,11 @@ def figure(heights: Sequence[float], *, columns: int = 1, share_time: bool = Tru
     return made, list(axes)
 
 
-def envelope(time: Array, values: Array) -> tuple[Array, Array]:
-    """Return fewer points of a line (N,) that look the same: the extremes of each stretch, in order."""
-    stretch = 2 * values.size // POINTS
-    if stretch < 2:
-        return time, values
-    count = values.size // stretch * stretch
-    blocks = values[:count].reshape(-1, stretch)
-    low, high = blocks.argmin(axis=1), blocks.argmax(axis=1)
-    base = np.arange(0, count, stretch)
-    keep = np.unique(np.concatenate([base + low, base + high, [values.size - 1]]))
-    return time[keep], values[keep]
-
-
 def lines(ax: Any, time: Array, columns: Array, labels: Sequence[str], title: str, unit: str) -> None:
     """Draw signals (N, k) over time."""
+    rows = thinned(np.column_stack([time, columns]), POINTS)
     for k, label in enumerate(labels):
-        ax.plot(*envelope(time, columns[:, k]), color=COLOURS[k % len(COLOURS)],
+        ax.plot(rows[:, 0], rows[:, 1 + k], color=COLOURS[k % len(COLOURS)],
                 linestyle=LINES[k % len(LINES)], linewidth=1.1, label=label)
     ax.set_ylabel(f'{title}\n[{unit}]')
     legend(ax)
@@ -394,8 +390,8 @@ def validation_figure(scores: Scores, outputs: Sequence[str], *, has_arm: bool) 
                 (scores.measured, 'measured', '#9A9A9A', 2.6, LINES[0]),
                 (scores.simulated, 'simulated', COLOURS[1], 1.1, LINES[0]),
                 (scores.predicted, 'one step ahead', COLOURS[0], 0.9, LINES[1])):
-            ax.plot(*envelope(scores.time, scale * values[:, k]), color=colour, linewidth=width,
-                    linestyle=line, label=label)
+            rows = thinned(np.column_stack([scores.time, scale * values[:, k]]), POINTS)
+            ax.plot(rows[:, 0], rows[:, 1], color=colour, linewidth=width, linestyle=line, label=label)
         spread = scale * scores.measured[:, k]
         room = 0.3 * (float(spread.max() - spread.min()) or 1.0)
         ax.set_ylim(float(spread.min()) - room, float(spread.max()) + room)
