@@ -202,7 +202,7 @@ def with_payload(config: IdentifierParameters, estimate: Estimate, payload: Payl
     if payload is None:
         return estimate
     status = estimate.status if estimate.model is None else _overall(config, estimate.model_status, payload)
-    return estimate._replace(payload=payload, status=status)
+    return estimate._replace(payload=payload, status=status, payload_is_new=False)
 
 
 def with_model_of(config: IdentifierParameters, stamp_ns: int, last: Estimate, payload: Payload | None

@@ -500,7 +500,7 @@ def _with_payloads(state: State, steps: list[ModelStep], readings: list[estimato
     held: Payload | None = None
     for k, (step, (payload, arm)) in enumerate(zip(steps, readings, strict=True)):
         if k > 0:
-            estimates += [_with_payload(config, model, held) for model in step.taken]
+            estimates += [estimator.with_payload(config, model, held) for model in step.taken]
         last, held = step.last, payload if step.asked else held
         if payload is not None and last is None:
             estimate = estimator.without_model(config, step.stamp_ns, payload)
@@ -522,9 +522,4 @@ def _take_model(state: State, background: Background) -> tuple[State, list[Estim
     estimate = background.result(pending.request)
     model = None if estimate.model is None else ModelEstimate(estimate, pending.since_ns, pending.instant)
     state = state._replace(pending=None, model=model)
-    return state, [_with_payload(_running(state)[0], estimate, pending.payload)]
-
-
-def _with_payload(config: IdentifierParameters, model: Estimate, payload: Payload | None) -> Estimate:
-    """Return the estimate of a model with the payload of its row."""
-    return estimator.with_payload(config, model, payload)._replace(payload_is_new=payload is None)
+    return state, [estimator.with_payload(_running(state)[0], estimate, pending.payload)]
