@@ -69,7 +69,7 @@ def advance(
 ) -> tuple[DetectionState, tuple[CaptureEvent, ...]]:
     """Take the next rows of the sample log; return the events found, the same as one by one."""
     found: list[CaptureEvent] = []
-    rows = rows.with_outputs(state.kept)
+    rows = replace(rows, chosen=state.kept)
     if state.filter.model is None:
         return replace(state, filter=structured.advance(state.identifier, state.filter, rows)), ()
     while len(rows):

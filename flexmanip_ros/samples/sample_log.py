@@ -168,10 +168,6 @@ class Rows:
         """Return the rows ``first <= row < until`` of the same log."""
         return Rows(self.log, first, until, self.chosen)
 
-    def with_outputs(self, chosen: tuple[int, ...]) -> Rows:
-        """Return the same rows showing only these outputs."""
-        return Rows(self.log, self.first, self.until, chosen)
-
     def _column(self, name: str, kind: type[Kind]) -> NDArray[Kind]:
         buffer = self.log._buffer
         if buffer is None:

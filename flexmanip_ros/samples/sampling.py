@@ -256,7 +256,8 @@ def flush(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Sampled
     """Place the samples that wait for the sample time, or whose stamp is in doubt: no message follows."""
     if clock.jump_candidate is not None:
         return _placed(config, clock._replace(jump_candidate=None), log, clock.jump_candidate)
-    return _learned(config, clock, log) if _is_learning(clock, log) else Sampled(clock, log)
+    is_learning = clock.interval_count == 0 and log.waiting > 0
+    return _learned(config, clock, log) if is_learning else Sampled(clock, log)
 
 
 def signals(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Signals:
@@ -358,10 +359,6 @@ def _restart(clock: Clock, log: SampleLog, raw: Sample) -> Sampled:
     counters = clock.counters.plus('resets').received_and('accepted')
     fresh = Clock(channels=clock.channels, outputs=clock.outputs, counters=counters, last_ns=raw.stamp_ns)
     return Sampled(fresh, SampleLog(log.width).wait(raw), reset=True)
-
-
-def _is_learning(clock: Clock, log: SampleLog) -> bool:
-    return clock.interval_count == 0 and log.waiting > 0
 
 
 def _learned(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Sampled:

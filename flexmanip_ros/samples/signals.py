@@ -48,7 +48,8 @@ def resolve(
         return fault
     wanted = config.outputs if outputs is None else outputs
     if outputs is None and _is_default('outputs', config):
-        kept = (name for name in wanted if not _is_unfilled(name, record))
+        # A joint that is there without this field has no such sensor; one that is not there has a wrong name.
+        kept = (name for name in wanted if _find(name, record) or name.rpartition('/')[0] not in record.names)
         wanted = tuple(kept) or wanted
     groups: list[tuple[tuple[str, int], ...]] = []
     needs_angles = reads_angles(config)
@@ -155,12 +156,6 @@ def _find(signal: str, record: JointRecord | JointBlock) -> tuple[str, int] | No
     if joint not in record.names or getattr(record, field).size == 0:
         return None
     return field, record.names.index(joint)
-
-
-def _is_unfilled(signal: str, record: JointRecord | JointBlock) -> bool:
-    """Whether the joint is there and its field is empty; a joint that is not there is a wrong name."""
-    joint, _, field = signal.rpartition('/')
-    return joint in record.names and getattr(record, field).size == 0
 
 
 def _missing(group: str, signal: str, record: JointRecord | JointBlock) -> Rejection:
