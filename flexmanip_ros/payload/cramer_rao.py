@@ -32,7 +32,7 @@ def structure_known(
 
     theta: (2,) chords; states: (N, 4 kappa) true [eta; eta'], efforts: (N, 2), noise_std: (4 kappa,).
     """
-    kappa = _kappa(states, efforts, noise_std, counts)
+    kappa = noise_std.size // 4
     step = 1e-4 * (payload + arm.tip_mass + arm.linear_density[-1] * arm.link_length[-1] / 3)
     (A_up, B_up), (A, _), (A_down, B_down) = (
         discretize(*vibration_model(arm, theta, payload + change, kappa), dt)
@@ -61,7 +61,7 @@ def structure_unknown(
 
     Arguments as ``structure_known``; known_mb: the extraction takes M_b from the arm.
     """
-    kappa = _kappa(states, efforts, noise_std, counts)
+    kappa = noise_std.size // 4
     A, B = discretize(*vibration_model(arm, theta, payload, kappa), dt)
     n, r = B.shape
     size = n * (n + r)
@@ -148,15 +148,6 @@ def gathered(
 def posterior(information: Array, row: Array) -> float:
     """Return the least deviation of what is ``row`` (c,) times unknowns of unit prior deviation."""
     return float(np.sqrt(row @ np.linalg.solve(np.eye(len(row)) + information, row)))
-
-
-def _kappa(states: Array, efforts: Array, noise_std: Array, counts: Sequence[int]) -> int:
-    short = min(len(states), len(efforts)) < max(counts)
-    if states.shape[1] % 4 or states.shape[1] != noise_std.size or short:
-        raise ModelError(
-            f'states {states.shape}, efforts {efforts.shape} and noise {noise_std.shape} do not fit {counts}',
-            'give [eta; eta\'] (N, 4 kappa), torques (N, 2) and one deviation for each state')
-    return int(states.shape[1] // 4)
 
 
 def _extraction_gradient(
