@@ -137,7 +137,10 @@ def scenario(tree: Any) -> Scenario:
         if name in given:
             given[name] = _number(name, given[name])
     if 'window' in given:
-        given['window'] = _pair('window', given['window'])
+        window = given['window']
+        if not isinstance(window, (list, tuple)) or len(window) != 2:
+            raise _wrong('window', window, 'give [from, to] in seconds')
+        given['window'] = tuple(_number('window', value) for value in window)
     if not isinstance(given.get('bound', True), bool):
         raise _wrong('bound', given['bound'], 'give true or false')
     return Scenario(**given)
@@ -161,12 +164,6 @@ def _number(name: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         raise _wrong(name, value, 'give a finite number')
     return float(value)
-
-
-def _pair(name: str, value: Any) -> tuple[float, float]:
-    if not isinstance(value, (list, tuple)) or len(value) != 2:
-        raise _wrong(name, value, 'give [from, to] in seconds')
-    return _number(name, value[0]), _number(name, value[1])
 
 
 def _check_varied(name: str, how: Mapping[str, Any]) -> None:
