@@ -414,11 +414,6 @@ def _latest(state: State, until: int) -> Rows:
     return state.log.rows(first, until)
 
 
-def _advance_identifier(state: State, until: int, background: Background) -> State:
-    config, _, identifier = _running(state)
-    return state._replace(identifier=event_replay.advance(config, identifier, state.log, until, background))
-
-
 def _instant(state: State, stamp_ns: int, rate: float) -> int:
     """Return the number of the instant at or before a stamp on the grid of a rate [Hz] from the first stamp on."""
     return int((stamp_ns - state.first_ns) * rate * 1e-9 + ROUNDING)
@@ -482,8 +477,9 @@ def _models(state: State, due: list[int], background: Background) -> tuple[State
         instant = _instant(state, stamp_ns, config.model_rate)
         asked = last is None or last.since_ns != since_ns or young or instant > last.instant
         if asked:
-            state = _advance_identifier(state, row + 1, background)
-            request = estimator.ModelRequest(config, _running(state)[2].estimator, stamp_ns, state.clock.dt,
+            identifier = event_replay.advance(config, identifier, state.log, row + 1, background)
+            state = state._replace(identifier=identifier)
+            request = estimator.ModelRequest(config, identifier.estimator, stamp_ns, state.clock.dt,
                                              _latest(state, row + 1))
             background.start(request)
             result = row + int(np.ceil(RESULT_DELAY_S / max(state.clock.dt, 1e-9)))
