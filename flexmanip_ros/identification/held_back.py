@@ -134,8 +134,7 @@ def spacing(rows: Rows) -> float:
 def held_model(config: IdentifierParameters, learned: Learned, dt: float) -> StateSpace | None:
     """Return the model that was held back, in any basis; None where there is none. dt: sample time [s]."""
     if config.estimator == 'paper':
-        peaks = np.tile(learned.mean[1, len(config.inputs):], config.future_window)
-        realized, _ = model_output.from_recursion(config, learned.memory, peaks)
+        realized, _ = model_output.from_recursion(config, learned.memory, learned.mean)
         scale = learned.scale
     else:
         realized, _, scale = model_output.from_factor(config, learned.memory[0], learned.scale)

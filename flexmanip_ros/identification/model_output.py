@@ -46,14 +46,15 @@ def from_factor(config: IdentifierParameters, R: Array, scale: Array) -> tuple[R
 
 
 def from_recursion(
-    config: IdentifierParameters, memory: tuple[Array, ...], peaks: Array,
+    config: IdentifierParameters, memory: tuple[Array, ...], mean: Array,
 ) -> tuple[Realized | None, Array]:
     """Form the model from the paper's three recursions, and the factor of the moments from their covariance.
 
-    peaks: (f m,) of the outputs. A tracked state selection was scaled by them.
+    mean: see ``RpbsidState``. A tracked state selection was scaled by the outputs' peaks in it.
     """
     S1, xi, _, _, _, theta_x, _, _, theta_y, _, W = memory[:11]
     if config.state_basis == 'tracked':
+        peaks = np.tile(mean[1, len(config.inputs):], config.future_window)
         W = np.divide(W, peaks, out=np.zeros_like(W), where=peaks > 0.0)
     r, m, n, f = len(config.inputs), len(config.outputs), config.order, config.future_window
     width = r + m

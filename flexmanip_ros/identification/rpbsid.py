@@ -315,8 +315,7 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float, rows
         return None
     if config.estimator == 'paper':
         scale = state.scale
-        realized, R = model_output.from_recursion(
-            config, state.memory, np.tile(state.mean[1, len(config.inputs):], config.future_window))
+        realized, R = model_output.from_recursion(config, state.memory, state.mean)
     else:
         realized, R, scale = model_output.from_factor(config, state.memory[0], state.scale)
     if realized is None:
