@@ -9,7 +9,7 @@ import scipy
 from flexmanip_ros.identification import realization, uncertainty
 from flexmanip_ros.identification.batch_fit import Recursion
 from flexmanip_ros.identification.factor import POWER, WEIGHT, WEIGHT2
-from flexmanip_ros.identification.moments import Realized, realize_orders, triangle
+from flexmanip_ros.identification.moments import Realized, realize_orders, regress, triangle
 from flexmanip_ros.identification.pbsid import observability_controllability, open_loop_weight
 from flexmanip_ros.identification.uncertainty import Identified, Tangent
 from flexmanip_ros.parameters import IdentifierParameters
@@ -73,6 +73,11 @@ def from_recursion(
     R[:d, :past] = root[:, :past]
     if d > past:
         R[:d, past:past + r] = root[:, past:]
+    else:  # from the window one sample later, as its moments are the same: the older samples predict the newest input
+        older, newest = root[:, :past - width], root[:, past - width:past - m]
+        weights = regress(older, newest)
+        R[:d, past:past + r] = root[:, width:] @ weights.T
+        R[d:d + r, past:past + r] = triangle(newest - older @ weights.T)
     R[:d, past + r:] = root @ xi.T
     head = triangle(root)
     values = np.asarray(np.linalg.svd(G @ root[:, :past].T, compute_uv=False), dtype=np.float64)

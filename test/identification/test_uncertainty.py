@@ -68,6 +68,20 @@ def test_change_of_basis_carries_the_tangent():
         assert np.allclose(numeric, getattr(along, name)[0], atol=1e-4 * (1 + np.abs(numeric).max())), name
 
 
+@pytest.mark.parametrize('feedthrough', [True, False])
+@pytest.mark.parametrize('estimator', ['factor', 'paper'])
+def test_deviations_of_A_and_B_are_the_scatter_of_many_runs(estimator, feedthrough):
+    config = configuration(1, 2, order=2, past_window=6, future_window=4, estimator=estimator, refinement='none',
+                           forgetting='constant', forgetting_factor=[0.9995] * 3, regularization=[1e-6] * 3,
+                           direct_feedthrough=feedthrough)
+    system = random_system(2, 1, 2, np.random.default_rng(0))
+    records = [record(system, 2000, 0.05, np.random.default_rng(seed)) for seed in range(40)]
+    found = [rpbsid.identified(config, run(config, u, y).state, 0.01) for u, y in records]
+    scatter = np.std([np.append(one.model.A, one.model.B) for one in found if one is not None], axis=0)
+    claimed = np.median([np.linalg.norm(one.spread[:6], axis=1) for one in found if one is not None], axis=0)
+    np.testing.assert_allclose(claimed / scatter, 1.0, atol=0.5)
+
+
 def test_intervals_cover_at_40_and_20_db_and_are_as_wide_as_the_bound():
     study = benchmark('identification_coverage')
     for snr_db in (40.0, 20.0):
