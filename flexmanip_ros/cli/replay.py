@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -150,7 +150,7 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     config, fault = state.config or request.config, messages.fault or _dropped(state)
     if request.save_arm is not None:
         _save_arm(request.save_arm, Path(request.bag).name, config, state, last)
-    found = None if signals is None else whole_recording.sweep(state, _angles_held(signals, messages.events))
+    found = None if signals is None else whole_recording.sweep(state, messages.angles_held(signals))
     if request.configurations is not None:
         if found is None:
             raise ModelError('the model is not one of every configuration, so --configurations has nothing to write',
@@ -306,18 +306,18 @@ class Messages:
         """Return the samples of the recording, held-out ones included."""
         return sampling.collect(self._request.config, self._blocks)
 
+    def angles_held(self, signals: Signals) -> Array:
+        """Return the identified angles since the last event (N, 2) [rad]; (0, 2) where none were read."""
+        since = max((event.stamp_ns for event in self.events), default=0)
+        used = (signals.stamp_ns >= since) & (signals.stamp_ns < self._limit_ns())
+        return signals.angles[used] if signals.angles.shape[1] == 2 else np.zeros((0, 2))
+
     def _limit_ns(self) -> float:
         """Return the stamp from which on messages are held out of the identification [ns]."""
         limit = self._request.validate_from
         if limit is None or self.first_ns is None:
             return math.inf
         return self.first_ns + round(limit * 1e9)
-
-
-def _angles_held(signals: Signals, events: Sequence[CaptureEvent]) -> Array:
-    """Return the angles since the last event (N, 2) [rad]; (0, 2) where none were read."""
-    since = max((event.stamp_ns for event in events), default=0)
-    return signals.angles[signals.stamp_ns >= since] if signals.angles.shape[1] == 2 else np.zeros((0, 2))
 
 
 def _save_arm(place: str, recording: str, config: IdentifierParameters, state: pipeline.State, last: Estimate | None

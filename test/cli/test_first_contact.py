@@ -130,6 +130,17 @@ def test_a_topic_of_events_without_one_is_named(
     assert result.events == 'none on /capture_event; --detect looks for them in the signals'
 
 
+def test_configurations_that_are_held_out_do_not_count_as_seen(caught: list[JointRecord], tmp_path: Path) -> None:
+    place, seen = written(tmp_path / 'bag', caught[:300]), []
+    for limit in (None, 0.25):
+        request = replay.Request(place, IdentifierParameters(), validate_from=limit, configurations='table.csv')
+        messages = replay.Messages(request, Report())
+        assert list(messages)
+        seen.append(messages.angles_held(messages.signals()))
+    assert len(seen[0]) == 300
+    np.testing.assert_array_equal(seen[1], seen[0][:250])
+
+
 @pytest.mark.parametrize(('parameters', 'words'), [
     ({'angles': ()}, 'captures cannot be found in the signals without angles'),
     ({'inputs': ('joint1/effort',)}, 'captures cannot be found in these signals'),
