@@ -29,6 +29,8 @@ POSTPONED_S = 0.05
 UNINTERRUPTED = ('llvmlite.', 'flexmanip_ros.io.bag_writer')
 """Modules in which no signal is handled. An exception in a callback of LLVM, which loads a kernel, is printed and lost,
 or ends the process with SIGSEGV; one between two writes to a recording leaves a file without its end."""
+MOST_RUNS, MOST_WORKERS = 1_000_000, 10_000
+"""Largest numbers of runs in one command and of processes. The runs to do are listed first, in 0.2 kB each."""
 TRACEBACK = 'FLEXMANIP_TRACEBACK'
 """Environment variable; where it is set, a defect prints its traceback."""
 PATIENCE = 2.0
@@ -81,10 +83,10 @@ def positive_seconds(text: str) -> float:
     return value
 
 
-def whole(text: str) -> int:
+def whole(text: str, most: int = 2**63 - 1) -> int:
     """Return an argument as a seed or count. Raises ArgumentTypeError."""
-    if not text.strip().isdecimal():
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 up")
+    if not text.strip().isdecimal() or len(text.strip()) > 19 or int(text) > most:
+        raise argparse.ArgumentTypeError(f"'{text:.30}' is not a whole number from 0 to {most}")
     return int(text)
 
 
@@ -113,9 +115,15 @@ def add_parameters(made: Parser, owner: str, note: str = '') -> None:
                       help=f'set one parameter{note}; the value is YAML; may be repeated')
 
 
+def add_runs(made: Parser, default: int, words: str) -> None:
+    """Add --runs: a count. words: what is run so often."""
+    made.add_argument('--runs', type=lambda text: whole(text, MOST_RUNS), default=default, metavar='N',
+                      help=f'{words}; default: {default}')
+
+
 def add_workers(made: Parser) -> None:
     """Add --workers: a count, or None for one per core."""
-    made.add_argument('--workers', type=whole, metavar='N',
+    made.add_argument('--workers', type=lambda text: whole(text, MOST_WORKERS), metavar='N',
                       help='number of processes; default: one per core; 0: this process alone')
 
 

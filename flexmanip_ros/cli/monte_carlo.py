@@ -39,7 +39,7 @@ def _parser() -> console.Parser:
         PROG, 'Run a scenario with many seeds, or identify every recording in a folder; one row per run.', EXAMPLES)
     add = made.add_argument
     add('source', metavar='SCENARIO.yaml|FOLDER', help='scenario to repeat, or folder with recordings')
-    add('--runs', type=int, default=100, metavar='N', help='run the seeds FIRST .. FIRST+N-1; default: 100')
+    console.add_runs(made, 100, 'run the seeds FIRST .. FIRST+N-1')
     add('--first-seed', type=console.whole, default=0, metavar='FIRST', help='first seed; default: 0')
     add('--output', default='study.csv', metavar='TABLE', help='table to write, .csv; default: study.csv')
     add('--report', metavar='REPORT.html', help='write a report: one HTML page with scores and figures')

@@ -37,7 +37,7 @@ def _parser() -> console.Parser:
     made = console.parser(
         PROG, "Reproduce the results of the paper's section 4, with our estimators beside its own.", EXAMPLES)
     add = made.add_argument
-    add('--runs', type=int, default=30, metavar='N', help='runs per case; default: 30, as in the paper')
+    console.add_runs(made, 30, 'runs per case, of which the paper has 30')
     add('--case', action='append', choices=[case.name for case in experiments.CASES], metavar='NAME',
         help=f'run only this case; may be repeated: {", ".join(case.name for case in experiments.CASES)}')
     add('--first-seed', type=console.whole, default=0, metavar='SEED', help='first seed; default: 0')

@@ -46,6 +46,18 @@ def test_the_report_shows_scores_runs_and_failures(tmp_path):
     assert 'Failed: 1' in text
 
 
+@pytest.mark.parametrize(('option', 'value'), [
+    ('--runs', '100000000000'), ('--runs', '-1'), ('--workers', '9' * 400), ('--first-seed', '9' * 400)])
+def test_numbers_beyond_all_use_are_refused_in_one_line(scenario_file, capsys, option, value):
+    with pytest.raises(SystemExit, match='2'):
+        run(scenario_file, option, value)
+    error = capsys.readouterr().err
+    assert f'{option}: ' in error
+    assert 'is not a whole number from 0 to' in error
+    assert error.count('\n') == 1
+    assert len(error) < 200
+
+
 @pytest.mark.parametrize('name', ['study.csv', 'quick.yaml'], ids=['the table', 'the scenario'])
 def test_a_report_is_written_over_no_table_and_no_scenario(scenario_file, tmp_path, capsys, name):
     scenario = scenario_file.read_text(encoding='utf-8')
