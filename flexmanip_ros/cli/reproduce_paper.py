@@ -79,6 +79,8 @@ def _main(given: argparse.Namespace) -> int:
     drawn: dict[int, bytes] = {}
     with console.progress('drawing', 'figures') as progress:
         for outcome in workers.compute(report.drawing, planned, given.workers):
+            if outcome.error is not None:
+                _tell(f'figure {outcome.task[1].numbers} could not be drawn', outcome.error)
             drawn[outcome.task[0]] = outcome.result or b''
             progress(len(drawn), len(planned))
     wall = time.perf_counter() - started
@@ -109,8 +111,11 @@ def _results(cases: Sequence[experiments.Case], seeds: Sequence[int], processes:
             case, seed = task
             if error is None:
                 found[task] = result
+            elif seed is None:
+                found[task] = {}
+                _tell(f'the bounds of {case.name} could not be computed', error)
             else:
-                found[task] = {} if seed is None else case_run.failed(case, seed, error)
+                found[task] = case_run.failed(case, seed, error)
             progress(count, len(tasks))
     bounds = {(case.name, method): value for case in cases for method, value in found[case, None].items()}
     rows = [row for case in cases for seed in seeds for row in found[case, seed][0]]
@@ -121,6 +126,13 @@ def _results(cases: Sequence[experiments.Case], seeds: Sequence[int], processes:
             for method, track in found[case, seed][1].items():
                 tracks[case.name][method].append(track)
     return bounds, rows, tracks
+
+
+def _tell(words: str, error: BaseException) -> None:
+    """Say on stderr what is missing from the results, and why."""
+    from flexmanip_ros.studies.trial import describe
+
+    console.print_error(PROG, f'{words}: {describe(error)}')
 
 
 def describe(lines: Sequence[Mapping[str, Any]]) -> list[str]:

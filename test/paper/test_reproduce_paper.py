@@ -109,6 +109,21 @@ def test_a_run_without_a_model_has_no_test_response():
     assert identified_response(experiments.PAYLOADS[0], track) is None
 
 
+def test_what_cannot_be_drawn_or_computed_is_said(tmp_path, capsys, monkeypatch):
+    def fails(*_):
+        raise ValueError('a reason')
+
+    monkeypatch.setattr(report, 'drawing', fails)
+    monkeypatch.setattr(case_run, 'bounds', fails)
+    monkeypatch.setattr(case_run, 'run', fails)
+    assert main(['--runs', '1', '--case', 'payload_20', '--workers', '0', '--output', str(tmp_path)]) == 0
+    told = capsys.readouterr().err.splitlines()
+    assert 'reproduce_paper: the bounds of payload_20 could not be computed: ValueError: a reason' in told
+    assert 'reproduce_paper: figure 2 could not be drawn: ValueError: a reason' in told
+    assert 'could not be drawn' in (tmp_path / 'report.html').read_text(encoding='utf-8')
+    assert all(row['error'] == 'ValueError: a reason' for row in _rows(tmp_path / 'runs.csv'))
+
+
 @pytest.mark.parametrize('arguments', [['--runs', '0'], ['--output', '/dev/null/x']])
 def test_bad_arguments_are_one_line_and_exit_2(capsys, arguments):
     assert main(arguments) == 2
