@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
+from flexmanip_ros.identification.prediction_check import MOST_SKEW
 from flexmanip_ros.identification.prediction_error import (
     Fit,
     Structure,
@@ -57,8 +58,6 @@ PERIODS = 5.0
 drift."""
 APART = 1e-4
 """Least share of the information on a drift rate that is left after the parameters of the fit have taken up theirs."""
-MOST_SKEW = 1e8
-"""Condition number of the eigenvectors of A above which A counts as defective."""
 
 
 class Drift(NamedTuple):

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from flexmanip_ros.identification.batch_fit import BLOCK
 from flexmanip_ros.identification.moments import triangle
+from flexmanip_ros.identification.prediction_check import white_noise
 from flexmanip_ros.identification.prediction_error import condition
 from flexmanip_ros.identification.varying_kernel import basis, low_pass, simulate_block
 from flexmanip_ros.parameters import IdentifierParameters
@@ -432,10 +433,9 @@ def _first_state(v: Varying, block: Block, noise: Array) -> Array:
 def noise_of(signals: Array, v: Varying) -> Array:
     """(h, h) covariance of the sensors' white noise after the filter, from fourth differences of signals (N, w)."""
     r, h = len(v.scale_u), len(v.scale_y)
-    white = np.median(np.abs(np.diff(signals[:, r:r + h], 4, axis=0)), axis=0) / (0.6745 * math.sqrt(70.0))
-    size = np.std(signals[:, r:r + h], axis=0) * v.scale_y
-    inside = math.sqrt(2.0 * v.corner * v.dt)
-    return np.diag(np.maximum(white * v.scale_y * inside, 1e-4 * size + 1e-12) ** 2)
+    scaled = signals[:, r:r + h] * v.scale_y
+    inside = 2.0 * v.corner * v.dt
+    return np.diag(np.maximum(white_noise(scaled) * inside, (1e-4 * np.std(scaled, axis=0) + 1e-12) ** 2))
 
 
 def updated(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, iterations: int) -> Varying | None:

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from flexmanip_ros.io import outputs
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.whole_recording import Scores, Smoothed, Sweep
-from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, JointRecord, Payload, Status
+from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, Payload, Status
 from flexmanip_ros.view.screen import (
     COLOURS,
     EVENT_COLOUR,
@@ -257,14 +256,6 @@ class Run:
     def end(self) -> float:
         """Time of the last sample [s]."""
         return float(self.signals.time[-1]) if self.signals.stamp_ns.size else 0.0
-
-
-def collect(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent],
-            estimates: Sequence[Estimate], truth: Truth | None = None) -> Run:
-    """Return a run from its messages and its estimates."""
-    items = list(items)
-    seen = [item for item in items if isinstance(item, CaptureEvent)]
-    return run(config, sampling.collect(config, items), estimates, seen, truth)
 
 
 def run(config: IdentifierParameters, signals: Signals, estimates: Sequence[Estimate],

@@ -32,8 +32,8 @@ from std_msgs.msg import Float64MultiArray
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.arm.linearization import frequencies, vibration_model
 from flexmanip_ros.errors import FlexmanipError, ParameterError
-from flexmanip_ros.io import bag
-from flexmanip_ros.io.plots import Truth, collect, overview_figure
+from flexmanip_ros.io import bag, plots
+from flexmanip_ros.io.plots import Truth
 from flexmanip_ros.parameters import DemoParameters, PlantParameters, configure, flatten, leaves
 from flexmanip_ros.parameters.arm import settings
 from flexmanip_ros.parameters.document import NODES, written, yaml_text
@@ -41,6 +41,7 @@ from flexmanip_ros.ros import rclpy_workarounds
 from flexmanip_ros.ros.composition import Composition, foreign_arm
 from flexmanip_ros.ros.conversions import to_message
 from flexmanip_ros.ros.node import BAD_INPUT, reject
+from flexmanip_ros.samples import sampling
 from flexmanip_ros.studies.results import status_text
 from flexmanip_ros.types import QUANTILE, CaptureEvent, Estimate, JointRecord
 
@@ -187,7 +188,9 @@ def _run(config: DemoParameters, folder: Path, console: Console, view: Viewer | 
     # The picture shows the two lowest modes, which a payload changes. On an axis that reaches to the next mode, at
     # 50 Hz, these two look like one line.
     shown = [estimate._replace(modes=estimate.modes[:len(truth.before)]) for estimate in estimates]
-    overview_figure(collect(identifier, items, shown, truth), folder / 'overview.png', _title(config))
+    events = [item for item in items if isinstance(item, CaptureEvent)]
+    plots.overview_figure(plots.run(identifier, sampling.collect(identifier, items), shown, events, truth),
+                          folder / 'overview.png', _title(config))
     console.print(_table(config, estimates, items, truth))
     console.print(f'replay: {different}' if different else
                   f'replay of the bag ({replay_s:.1f} s): all {sum(map(len, live.values()))} live messages of the '

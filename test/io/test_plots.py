@@ -9,6 +9,7 @@ pytest.importorskip('matplotlib')
 
 from flexmanip_ros.io import plots
 from flexmanip_ros.parameters import IdentifierParameters
+from flexmanip_ros.samples import sampling
 from flexmanip_ros.types import Estimate, JointRecord, Mode, Payload, Status
 
 BEFORE, AFTER = (5.76, 6.89), (5.63, 6.55)
@@ -77,7 +78,7 @@ def test_the_torques_drawn_are_the_efforts_in_the_joint_states():
     names = ('joint1', 'joint2', 'link1_bend', 'link2_bend')
     records = [JointRecord(k * 1_000_000, names, np.full(4, 0.1), np.zeros(4), np.array([k, -k, 0.0, 0.0]))
                for k in range(50)]
-    made = plots.collect(IdentifierParameters(), records, ())
+    made = plots.run(IdentifierParameters(), sampling.collect(IdentifierParameters(), records), (), ())
     (drawn, labels, title, unit), *_ = plots.signal_groups(made)
     assert (labels, title, unit) == (['joint1', 'joint2'], 'torque', 'N m')
     assert drawn.tolist() == [[k, -k] for k in range(50)]
