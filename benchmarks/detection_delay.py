@@ -80,12 +80,12 @@ def trusted_and_wrong(followed: list[trials.Trial]) -> np.ndarray:
 
 
 def at_rest(runs: int) -> dict[str, object]:
-    """Caught at rest by an arm of which nothing is learned; torque a second later."""
+    """Caught at rest by an arm of which nothing is learned; torque a second later. No earlier alarm has found it."""
     efforts = np.vstack([np.zeros((2000, 2)), SQUARES[:300]])
     delay = []
     for seed in range(runs):
         found = told(samples_of(efforts, seed, CaptureEvent(1_000_000_000, EventKind.CAPTURE)), KNOWN)
-        delay.append(found[0][1] * 1e-6 - 2000.0 if found else np.inf)
+        delay.append(found[0][1] * 1e-6 - 2000.0 if found and found[0][1] >= 1_000_000_000 else np.inf)
     return {'case': 'at rest', 'runs': runs, 'within_100_ms': float(np.mean(np.array(delay) <= 100.0)),
             'median_delay_ms': float(np.median(delay)), 'longest_delay_ms': float(np.max(delay))}
 

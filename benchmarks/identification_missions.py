@@ -1,4 +1,4 @@
-"""Claim: over two minutes of pick and place 5 % of the trusted payloads, 1 % of the models are wrong at most.
+"""Claim: in pick and place 5 % of the trusted payloads, 1 % of the trusted models are wrong at most.
 
 A controlled arm catches an object of 0.5 to 60 kg, carries it to random angles and lets go, eight times in 128 s. The
 controller's torques are all the excitation there is, and the arm rests between the moves. Cases: an arm with a damping

@@ -48,14 +48,15 @@ def readings(mass: float, degrees: tuple[float, float], seed: int) -> list[np.nd
     rows = []
     for estimate in pipeline.run(config, simulator.records(run, events)):
         time = estimate.stamp_ns * 1e-9
-        if not estimate.model_is_new or time < CAPTURE_S + AFTER_S or len(estimate.modes) != 2:
+        if not estimate.model_is_new or time < CAPTURE_S + AFTER_S:
             continue
         last = round(time * plant.rate)
         lately = run.position[last - round(LATELY_S * plant.rate):last + 1, :2]
         truth = [frequencies(plant, chords(plant.arm, angles), mass)
                  for angles in (lately.mean(axis=0), lately[-1])]
-        found = np.array([mode.frequency_hz for mode in estimate.modes])
-        std = np.array([mode.frequency_std_hz for mode in estimate.modes])
+        found = std = np.full(2, np.nan)
+        if len(estimate.modes) == 2:
+            found, std = np.array([(mode.frequency_hz, mode.frequency_std_hz) for mode in estimate.modes]).T
         rows.append(np.concatenate([[time], *((found - f) / f for f in truth), std / truth[0]]))
     return rows
 

@@ -91,9 +91,9 @@ def main() -> None:
             u, y = response(20.0, (60.0, 45.0), 'paper', 40.0, seed)
             every.append(payload_errors(settings, u, y, 20.0, (60.0, 45.0), 'paper'))
         size = np.abs(np.concatenate(every))
-        row = {'settings': name, 'parameters': settings, 'mean_percent': 100 * float(np.nanmean(size)),
-               'median_percent': 100 * float(np.nanmedian(size)),
-               'rms_percent': 100 * float(np.sqrt(np.nanmean(size ** 2))), 'seeds': seeds}
+        row = {'settings': name, 'parameters': settings, 'mean_percent': 100 * float(np.mean(size)),
+               'median_percent': 100 * float(np.median(size)),
+               'rms_percent': 100 * float(np.sqrt(np.mean(size ** 2))), 'seeds': seeds}
         rows.append(row)
         print(f'{name:<52}{row["mean_percent"]:8.2f}%{row["median_percent"]:8.2f}%{row["rms_percent"]:8.2f}%',
               flush=True)

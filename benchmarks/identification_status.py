@@ -160,9 +160,9 @@ def row_of(case: Case) -> dict[str, Any]:
 
 
 def misses(modes: Sequence[Mode], truth: Array) -> bool:
-    """Whether the band of a frequency misses the truth (2,) [Hz] by three times its width, or a mode is not there."""
-    return len(modes) != len(truth) or any(abs(mode.frequency_hz - known) > 3.0 * 1.96 * mode.frequency_std_hz
-                                           for mode, known in zip(modes, truth, strict=True))
+    """Whether a mode is not there, or its band unknown or off the true frequency (2,) [Hz] by three times its width."""
+    return len(modes) != len(truth) or not all(abs(mode.frequency_hz - known) <= 3.0 * 1.96 * mode.frequency_std_hz
+                                               for mode, known in zip(modes, truth, strict=True))
 
 
 def band_misses(case: Case, held: float, estimate: Estimate) -> bool:

@@ -47,10 +47,11 @@ CASES = (Case('gentle', torques=0.1), Case('damped', damping_ratio=0.003), Case(
 
 
 class Minute(NamedTuple):
-    """What was estimated: errors [kg], deviations [kg] and whether the status was TRACKING, each (N,)."""
+    """What was estimated, each (N,): errors and deviations [kg], whether the truth is inside, whether TRACKING."""
 
     error: np.ndarray
     std: np.ndarray
+    inside: np.ndarray
     tracking: np.ndarray
 
 
@@ -71,6 +72,7 @@ def one(seed: int, case: Case) -> Minute:
     found = [estimate.payload for estimate in pipeline.run(config, (event, block))
              if estimate.stamp_ns > (CAPTURE + STEP) * 1_000_000]
     return Minute(np.array([payload.mass - MASS for payload in found]), np.array([payload.std for payload in found]),
+                  np.array([payload.lower <= MASS <= payload.upper for payload in found]),
                   np.array([payload.status is Status.TRACKING for payload in found]))
 
 
@@ -82,7 +84,7 @@ def main() -> None:
     for case in CASES:
         with ProcessPoolExecutor() as pool:
             done = list(pool.map(partial(one, case=case), range(1, runs + 1)))
-        inside = [np.abs(minute.error) <= 1.96 * minute.std for minute in done]
+        inside = [minute.inside for minute in done]
         tracking = np.concatenate([minute.tracking for minute in done])
         normalised = np.concatenate([minute.error / minute.std for minute in done])
         everywhere = np.concatenate(inside)

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import importlib
 import math
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
+
+from flexmanip_ros.types import Estimate, Mode, Status
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -100,3 +104,40 @@ def test_the_documentation_has_the_values_measured_last(claims):
     assert tables.TARGET.read_text(encoding='utf-8') == tables.page(), 'run `make docs`'
     readme = tables.README.read_text(encoding='utf-8')
     assert readme == tables.readme(readme), 'run `make docs`'
+
+
+@pytest.fixture
+def benchmark(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
+    monkeypatch.syspath_prepend(str(ROOT / 'benchmarks'))
+    return importlib.import_module
+
+
+def test_a_reading_without_both_modes_is_not_found(benchmark, monkeypatch):
+    arm = benchmark('identification_moving_arm')
+    both = (Mode(5.6, 0.0, 0.01, 0.01), Mode(6.5, 0.0, 0.01, 0.01))
+    estimates = [Estimate(4_000_000_000, Status.TRACKING, None, modes, None, model_is_new=True)
+                 for modes in (both, both[:1], ())]
+    monkeypatch.setattr(arm.pipeline, 'run', lambda *_: estimates)
+    rows = np.array(arm.readings(20.0, (60.0, 45.0), 1))
+    assert arm.row_of('', rows, 0, 'lately')['found_percent'] == pytest.approx(100.0 / 3.0)
+
+
+@pytest.mark.parametrize(('std', 'missed'), [(0.1, False), (0.01, True), (math.nan, True)])
+def test_a_band_that_is_off_or_unknown_misses_the_frequency(benchmark, std, missed):
+    assert benchmark('identification_status').misses([Mode(5.0, 0.0, std, 0.01)], np.array([5.1])) is missed
+
+
+@pytest.mark.parametrize(('told_ms', 'share'), [(500.0, 0.0), (1500.0, 1.0), (2050.0, 1.0), (2150.0, 0.0)])
+def test_an_alarm_before_the_capture_has_found_nothing(benchmark, monkeypatch, told_ms, share):
+    detection = benchmark('detection_delay')
+    monkeypatch.setattr(detection, 'samples_of', lambda *_: None)
+    monkeypatch.setattr(detection, 'told', lambda *_: [(None, round(told_ms * 1e6))])
+    assert detection.at_rest(2)['within_100_ms'] == share
+
+
+def test_wrong_models_are_a_share_of_those_that_are_trusted(claims):
+    row = {'case': 'pick and place', 'estimates': 10, 'trusted': 10, 'outside': 0, 'readings': 1000, 'tracking': 50,
+           'wrong': 1}
+    (found,) = (claim for claim in claims.claims_of('identification_missions', [row]) if 'models' in claim.name)
+    assert found.value == pytest.approx(2.0)
+    assert not found.holds
