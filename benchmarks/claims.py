@@ -388,7 +388,7 @@ def payload_real_arms(rows: list[dict[str, Any]]) -> Claims:
         if 'com_worst_mm' in row:
             yield Claim(f'{row["case"]}: centre of mass, worst', row['com_worst_mm'], high=6.0, unit='mm')
             yield Claim(f'{row["case"]}: inertia, worst', row['inertia_worst_percent'], high=5.0, unit='%')
-            yield Claim(f'{row["case"]}: runs of which these two are', row['body_known'] / runs, 0.9)
+            yield Claim(f'{row["case"]}: runs that know the body', row['body_known'] / runs, 0.9)
 
 
 def plant_convergence(result: dict[str, Any]) -> Claims:
