@@ -138,13 +138,14 @@ def truth(plant: PlantParameters, torque: ExcitationParameters, events: Sequence
     from flexmanip_ros.types import EventKind
 
     at = {event.kind: (event.stamp_ns - START_NS) * 1e-9 for event in events}
+    mass = plant.payload_mass if EventKind.CAPTURE in at else 0.0
     return {
-        'payload_mass_kg': plant.payload_mass if EventKind.CAPTURE in at else 0.0,
+        'payload_mass_kg': mass,
         'capture_time_s': at.get(EventKind.CAPTURE), 'release_time_s': at.get(EventKind.RELEASE),
         'working_point_deg': [math.degrees(angle) for angle in plant.initial_angles],
         'sample_time_s': 1.0 / plant.rate,
         'frequencies_before_hz': true_frequencies(plant, 0.0),
-        'frequencies_after_hz': true_frequencies(plant, plant.payload_mass),
+        'frequencies_after_hz': true_frequencies(plant, mass),
         'plant': flatten(plant), 'excitation': flatten(torque),
     }
 

@@ -6,11 +6,13 @@ Faults of networks and publishers can be put into the messages of the simulation
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from flexmanip_ros import pipeline
+from flexmanip_ros.arm.capture import free_object
 from flexmanip_ros.arm.linearization import frequencies, vibration_model
 from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import IdentifierParameters, PlantParameters
@@ -155,8 +157,12 @@ def frequency_columns(run: Run, row: Mapping[str, Any]) -> Row:
 
 
 def true_frequencies(plant: PlantParameters, mass: float) -> list[float]:
-    """Return the two lowest damped frequencies of the arm, linearized at its start, with a payload [kg]: [Hz]."""
-    found = frequencies(vibration_model(plant.arm, np.array(plant.initial_angles), mass)[0])
+    """Return the two lowest damped frequencies of the arm, linearized at its start, with the plant's object [Hz].
+
+    mass: that of the object, or 0 for the empty arm [kg].
+    """
+    held = free_object(replace(plant, payload_mass=mass)).payload if mass else 0.0
+    found = frequencies(vibration_model(plant.arm, np.array(plant.initial_angles), held)[0])
     return [float(frequency) for frequency in found[:2]]
 
 

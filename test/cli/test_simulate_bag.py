@@ -48,6 +48,14 @@ def test_the_truth_stands_beside_the_recording(tmp_path):
     assert truth['plant']['arm.modes'] == 5
 
 
+@pytest.mark.parametrize(('arguments', 'lowest_hz'), [  # a point of 20 kg: 5.634 Hz; the empty arm: 5.757 Hz
+    (['--capture-time', '0.1', '--set', 'payload_inertia=2.0'], 5.05), (['--capture-time', '-1'], 5.757)])
+def test_the_true_frequencies_are_those_of_what_is_held(tmp_path, arguments, lowest_hz):
+    path = _simulate(tmp_path, *arguments)
+    truth = json.loads(path.with_name('recording.truth.json').read_text(encoding='utf-8'))
+    assert truth['frequencies_after_hz'][0] == pytest.approx(lowest_hz, abs=0.005)
+
+
 def test_the_same_arguments_give_the_same_bytes(tmp_path):
     contents = []
     for folder in ('a', 'b'):
