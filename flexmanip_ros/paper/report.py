@@ -3,6 +3,7 @@
 ``summary`` returns one line for each case and method, from the rows of all runs.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from html import escape
@@ -37,8 +38,9 @@ def summary(rows: Sequence[trial.Row], bounds: Bounds) -> list[Line]:
             good = [row for row in mine if not row['error'] and row['error_percent'] is not None]
             last = [row for row in good if row['payload_mass_kg'] is not None]
             final = np.array([100.0 * (row['payload_mass_kg'] / case.payload - 1.0) for row in last])
-            half = [50.0 * (row['payload_upper_kg'] - row['payload_lower_kg']) / case.payload for row in good
-                    if row['payload_upper_kg'] is not None and row['payload_lower_kg'] is not None]
+            half = [50.0 * ((math.inf if row['payload_upper_kg'] is None else row['payload_upper_kg'])
+                            - row['payload_lower_kg']) / case.payload
+                    for row in good if row['payload_lower_kg'] is not None]
             least = bounds.get((case.name, method.name))
             share, low, high = coverage(sum(bool(row['covered']) for row in good), len(good))
             lines.append({
@@ -48,7 +50,7 @@ def summary(rows: Sequence[trial.Row], bounds: Bounds) -> list[Line]:
                 'bias at 6 s [%]': _of(final, np.mean), 'rms error at 6 s [%]': _of(final, _rms),
                 'bound at 6 s [%]': None if least is None else 100.0 * least / case.payload,
                 '95 % interval holds [%]': share, 'from [%]': low, 'to [%]': high,
-                'half width [%]': _of(np.array(half), np.median),
+                'half width [%]': float(np.median(half)) if half else None,
                 'frequency error [%]': _of(np.array([_frequency(row) for row in good]), np.nanmean),
                 'time per sample [us]': _of(column(good, 'us_per_sample'), np.median)})
     return lines

@@ -83,6 +83,19 @@ def test_the_summary_has_error_coverage_and_cost(output):
         assert float(line['time per sample [us]']) > 0.0
 
 
+def test_intervals_without_an_end_count_in_their_median_width():
+    case = experiments.PAYLOADS[0]
+    rows = [{'case': case.name, 'method': 'paper', 'error': '', 'error_percent': 1.0, 'payload_mass_kg': 20.0,
+             'payload_lower_kg': 19.0, 'payload_upper_kg': upper, 'covered': True, COST: 1.0}
+            for upper in (21.0, None, None)]
+    (line,) = report.summary(rows, {})
+    assert line['half width [%]'] == np.inf
+    (line,) = report.summary(rows[:2], {(case.name, 'paper'): 0.2})
+    assert line['half width [%]'] == np.inf  # the mean of 5 % and of one without an end
+    (line,) = report.summary([rows[0], rows[0], rows[1]], {})
+    assert line['half width [%]'] == pytest.approx(5.0)
+
+
 def test_the_page_has_every_figure_and_needs_nothing_else(output):
     text = (output / 'report.html').read_text(encoding='utf-8')
     for title in (*PAGE_OF_ONE_CASE, 'Table 1:', 'Table 2:', 'Deviations'):
