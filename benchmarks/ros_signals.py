@@ -189,7 +189,8 @@ def attempt(program: Program, number: signal.Signals, delay: float, places: dict
         allowed = {-number} if killed else {0, 128 + number, 130}
         loud = 'Traceback' in err or 'terminate called' in err
         # Python's own site.py has a function main too, which runs before ours
-        early = process.returncode in (-number, 1) and not re.search(r'flexmanip_ros/.*, in main\n', err)
+        interrupted = process.returncode == -number or (process.returncode == 1 and 'KeyboardInterrupt' in err)
+        early = interrupted and not re.search(r'flexmanip_ros/.*, in main\n', err)
         if process.returncode not in allowed and not early and not finished:
             problem.append(f'exit code {process.returncode}')
         if loud and not early:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import math
+import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -141,3 +143,19 @@ def test_wrong_models_are_a_share_of_those_that_are_trusted(claims):
     (found,) = (claim for claim in claims.claims_of('identification_missions', [row]) if 'models' in claim.name)
     assert found.value == pytest.approx(2.0)
     assert not found.holds
+
+
+@pytest.mark.parametrize(('answer', 'problem'), [
+    ("print('a defect of this program', file=sys.stderr); sys.exit(1)", 'exit code 1'), ('sys.exit(130)', ''),
+    ('signal.default_int_handler(2, None)', '')])
+def test_a_program_that_ends_a_signal_with_a_defect_has_a_problem(benchmark, monkeypatch, answer, problem):
+    signals = benchmark('ros_signals')
+    code = f"""
+import signal, sys, time
+def answer(*_):
+    {answer}
+signal.signal(signal.SIGINT, answer)
+time.sleep(20.0)"""
+    monkeypatch.setattr(signals, 'command', lambda _: [sys.executable, '-c', code])
+    trial = signals.attempt(signals.Program('a', 'a', (), 1.0), signal.SIGINT, 0.5, {})
+    assert trial.problem == problem
