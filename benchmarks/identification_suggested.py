@@ -93,7 +93,8 @@ def grids(u: Array, y: Array, dt: float, half: int) -> tuple[Best, Best]:
                     for ahead, first in ((filtered, steps - 1),
                                          windowed(model, whole[:, :r], whole[:, r:], past, steps)):
                         at = rows[first:]
-                        scores = validation.vaf(y[at[at >= half]], ahead[at >= half])
+                        scored = at >= half + round(HORIZON_S / dt) - 1  # the predictions that ours has there
+                        scores = validation.vaf(y[at[scored]], ahead[scored])
                         name = f'decimation {factor}, order {order}, window {window:g} s'
                         found = Best(float(scores.mean()) if len(scores) else -1.0, tuple(scores.tolist()), name)
                         wide = max(wide, found)
