@@ -149,6 +149,8 @@ def publish(
     power = float(scalars[POWER])
     covariance = innovation.T @ innovation
     total = np.einsum('ij,ij->j', R[:, -m:], R[:, -m:]) / scalars[WEIGHT]
+    if not realized.residual.any():  # the moments of the paper's recursion are those that it explains
+        total += variance
     unexplained = float(np.min(np.diag(covariance) / np.where(total > 0.0, total, np.inf)))
     status = judge(used, d, condition, unexplained, too_low)
     reasons = {

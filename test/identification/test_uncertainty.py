@@ -10,7 +10,7 @@ from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.model_output import based, from_factor
 from flexmanip_ros.identification.moments import realize_orders
 from flexmanip_ros.identification.uncertainty import Tangent, modes, tangent
-from flexmanip_ros.types import StateSpace
+from flexmanip_ros.types import StateSpace, Status
 
 
 @pytest.mark.parametrize(
@@ -80,6 +80,17 @@ def test_deviations_of_A_and_B_are_the_scatter_of_many_runs(estimator, feedthrou
     scatter = np.std([np.append(one.model.A, one.model.B) for one in found if one is not None], axis=0)
     claimed = np.median([np.linalg.norm(one.spread[:6], axis=1) for one in found if one is not None], axis=0)
     np.testing.assert_allclose(claimed / scatter, 1.0, atol=0.5)
+
+
+@pytest.mark.parametrize(('noise', 'status'), [(0.3, Status.TRACKING), (3.0, Status.POORLY_EXCITED)])  # 44 %, 9 %
+@pytest.mark.parametrize('estimator', ['factor', 'paper'])
+def test_a_model_that_explains_more_than_a_tenth_is_not_poorly_excited(estimator, noise, status):
+    config = configuration(1, 1, order=2, past_window=6, future_window=4, estimator=estimator, refinement='none',
+                           forgetting='constant', forgetting_factor=[0.9995] * 3)
+    u, y = record(random_system(2, 1, 1, np.random.default_rng(1)), 4000, noise, np.random.default_rng(3))
+    found = rpbsid.identified(config, run(config, u, y).state, 0.01)
+    assert found is not None
+    assert found.status is status
 
 
 def test_intervals_cover_at_40_and_20_db_and_are_as_wide_as_the_bound():
