@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from flexmanip_ros.identification import model_output, parameter_varying, varying_start
+from flexmanip_ros.identification import decimation, model_output, parameter_varying, varying_start
 from flexmanip_ros.identification.batch_fit import (
     BLOCK,
     UNEXPLAINED,
@@ -332,8 +332,11 @@ def whole_fit(config: IdentifierParameters, samples: Array, R: Array, scale: Arr
     if config.order > len(config.outputs) and config.past_window > config.future_window:
         longer = replace(config, future_window=config.past_window)
         starts.append(model_output.from_factor(longer, R, scale))
-    return fit_stretch(samples, [realized for realized, _, _ in starts if realized is not None], old, starts[0][2],
-                       config.direct_feedthrough, noise, parameter_varying.has_constant(config))
+    found = fit_stretch(samples, [realized for realized, _, _ in starts if realized is not None], old, starts[0][2],
+                        config.direct_feedthrough, noise, parameter_varying.has_constant(config))
+    if found is None or found.structure.free_gain:  # a free K makes the residuals white
+        return found
+    return found._replace(widening=max(found.widening, decimation.colour(config.decimation)))
 
 
 def _stretch(request: FitRequest, R: Array, scale: Array) -> Recursion | None:
