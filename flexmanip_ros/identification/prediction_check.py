@@ -37,7 +37,7 @@ SILENT = 10.0
 FOURTH = 0.6744897501960817 * math.sqrt(70.0)
 """Median of the absolute fourth differences of white noise, in standard deviations of the noise."""
 
-MEDIAN_SPREAD = 2.9
+MEDIAN_SPREAD = 3.2
 """Relative standard deviation of ``white_noise`` from N samples of white noise, times the root of N."""
 CHANCE = 4.0
 """Number of standard deviations (``MEDIAN_SPREAD``) by which the power of the residuals may exceed that of the white

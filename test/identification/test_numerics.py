@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from linear_arm import configuration, random_system, record, run, sorted_poles
 
-from flexmanip_ros.identification import rpbsid
+from flexmanip_ros.identification import prediction_check, rpbsid
 from flexmanip_ros.identification.factor import REJECTED, USED
 
 MODES = [{'forgetting': 'innovation'}, {'forgetting': 'excitation'}, {'forgetting': 'constant'},
@@ -108,3 +108,10 @@ def test_signals_that_grow_for_good_are_followed_after_two_samples():
     grown = half.feed(1e3 * u[600:], 1e3 * y[600:]).state
     assert grown.counts[REJECTED] == 2
     assert grown.counts[USED] > half.state.counts[USED] + 580
+
+
+def test_the_white_noise_of_a_sensor_is_known_to_the_deviation_that_is_assumed():
+    rng = np.random.default_rng(0)
+    found = np.concatenate([prediction_check.white_noise(rng.standard_normal((1000, 200))) for _ in range(10)])
+    assert found.mean() == pytest.approx(1.0, abs=0.01)
+    assert np.std(found) * np.sqrt(1000.0) == pytest.approx(prediction_check.MEDIAN_SPREAD, rel=0.04)
