@@ -15,7 +15,7 @@ from flexmanip_ros.identification import validation
 from flexmanip_ros.io import plots
 from flexmanip_ros.io.report import plain
 from flexmanip_ros.paper import experiments
-from flexmanip_ros.paper.case_run import Track
+from flexmanip_ros.paper.case_run import RATE, Track
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, configure
 from flexmanip_ros.simulation import excitation
 from flexmanip_ros.simulation.simulator import Trajectory
@@ -37,7 +37,6 @@ CLOSE = ('restart', 'known M_b', 'structured')
 """Methods whose own 95 % interval is drawn."""
 LEAST_SHARE = 1e-5
 """Bottom of the logarithmic error axes, as a fraction of the payload."""
-RATE = 1000.0
 DURATION = 3.0
 TEST_INPUT = {'shape': 'multisine', 'band': [0.5, 10.0], 'repeat_time': 3.0, 'amplitude': [10.0, 5.0], 'seed': 4}
 """Parameters of the test torque, with which the model was not identified."""
