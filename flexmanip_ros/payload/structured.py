@@ -172,7 +172,8 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     if state.model is None:
         return state
     if state.memory is None:
-        return state._replace(early=(*state.early, (state.cursor, event)))
+        refits = 0 if event.kind is EventKind.CAPTURE else state.refits
+        return state._replace(early=(*state.early, (state.cursor, event)), refits=refits)
     model, sensors, memory, efforts, _ = state.running
     m = mem.copy(memory)
     ahead = max(event.stamp_ns - state.time_ns, 0)
@@ -349,7 +350,6 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
         structured_model.take_as_known(model, m, Kind.MODE if state.refits else Kind.DAMPING)
     m.S[:] = structured_model.triangular(m.S)
     _set_arrival_cost(model, m)
-    m.counts[mem.REFITS] = state.refits
     seen = sensors(fewer, model, dt, np.mean(rows.angles, axis=0))
     events = state.early
     time_ns, efforts = int(rows.time_ns[0]), latest(seen, rows.u[:1], state.efforts)
@@ -362,6 +362,8 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     state = state._replace(horizon=state.here)
     for row, item in events:
         state = event(config, _part(config, state, rows, row), item)
+    if state.memory is not None:  # the capture with which ``restart`` begins again is no new one
+        state.memory.counts[mem.REFITS] = state.refits
     return _part(config, state, rows, rows.until)
 
 

@@ -120,6 +120,18 @@ def test_a_fit_of_the_empty_arm_that_ended_ten_deviations_off_is_fitted_again():
     assert abs(again.memory.x[again.model.payload]) < 3.0 * found.std
 
 
+@pytest.mark.parametrize('told', [(2.6, 3.4), (2.0, 4.0)])
+def test_a_wrong_arm_that_holds_something_from_the_first_sample_is_given_up(told):
+    settings = config(replace(ARM, link_length=told))
+    samples = record(5.0, (event(0.001),))
+    state = structured.event(settings, structured.init(settings), event(0.0))
+    ended = structured.advance(settings, state, samples.between(0, 4000))
+    later = structured.advance(settings, ended, samples.since(4000))
+    assert later.memory.counts[mem.SINCE_EVENT] == ended.memory.counts[mem.SINCE_EVENT] + 1000
+    assert later.memory.counts[mem.STORED] == mem.HORIZON
+    assert structured.estimate(settings, later).status is Status.INCONSISTENT
+
+
 @pytest.mark.parametrize(('bias', 'seeming', 'soon', 'late'), [
     (0.0, 0.0, Status.TRACKING, Status.TRACKING),
     (6.0, 0.0, Status.INCONSISTENT, Status.TRACKING),
