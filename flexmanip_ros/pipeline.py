@@ -338,7 +338,7 @@ def _sampled(config: IdentifierParameters, state: State, sampled: sampling.Sampl
     early = state.early
     payload, identifier = estimator.init(settled)
     state = state._replace(config=settled, payload=EventReplay(payload), identifier=EventReplay(identifier),
-                           first_ns=first_ns, published=-1, early=())
+                           first_ns=state.log.first_ns, published=-1, early=())
     for event in early:
         state = _insert(state, event, background)
     return state

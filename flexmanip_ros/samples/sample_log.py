@@ -115,6 +115,11 @@ class SampleLog:
         """Return the waiting rows."""
         return Rows(self, self.end, self.end + self.waiting)
 
+    @property
+    def first_ns(self) -> int:
+        """Stamp of the first row that is kept, waiting or not [ns]."""
+        return int(Rows(self, self.start, self.end + self.waiting).stamp_ns[0])
+
     def without_waiting(self) -> SampleLog:
         """Return the log without the waiting rows."""
         return SampleLog(self.width, self.start, self.end, 0, self._buffer) if self.waiting else self

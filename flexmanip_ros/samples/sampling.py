@@ -186,7 +186,16 @@ def first_usable_ns(config: IdentifierParameters, block: JointBlock) -> int | No
     if isinstance(channels, Rejection):
         return None
     usable = np.isfinite(columns(block, channels.places, slice(0, len(block.stamp_ns)))).all(axis=1)
-    return int(block.stamp_ns[np.argmax(usable)]) if usable.any() else None
+    stamps = block.stamp_ns[usable][:LEARNING + 1]
+    return int(stamps[_first_of_clock(config, stamps)]) if stamps.size else None
+
+
+def _first_of_clock(config: IdentifierParameters, stamps: NDArray[np.int64]) -> int:
+    """Return the number of the stamp (N,) behind the last far jump: those before it are zero, or of another clock."""
+    intervals = np.abs(np.diff(stamps)) * 1e-9
+    usual = np.sort(intervals)[intervals.size // 2] if intervals.size else 0.0
+    jumps = np.flatnonzero(intervals > max(config.max_time_jump, FAR * usual))
+    return int(jumps[-1]) + 1 if jumps.size else 0
 
 
 def _is_expected(clock: Clock, message: JointBlock) -> bool:
@@ -362,18 +371,24 @@ def _restart(clock: Clock, log: SampleLog, raw: Sample) -> Sampled:
 
 
 def _learned(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Sampled:
-    """Set the sample time to the median of the first intervals; place the waiting samples on that clock."""
+    """Set the sample time to the median of the first intervals; place the waiting samples on that clock.
+
+    Those before a far jump are left out, and clock and log begin behind it.
+    """
     rows = log.waiting_rows()
+    first = _first_of_clock(config, rows.stamp_ns)
     stamps = rows.stamp_ns.tolist()
     samples = [Sample(stamps[k], *(part[k].copy() for part in (rows.u, rows.y, rows.angles, rows.rates)))
-               for k in range(len(rows))]
+               for k in range(first, len(rows))]
     intervals = np.sort(np.diff(rows.stamp_ns)).tolist()
     clock = clock._replace(last_ns=None, latest=None, interval_count=1,
                            interval_sum_ns=intervals[len(intervals) // 2] if intervals else 0)
-    log = log.without_waiting()
+    if first:
+        clock = clock._replace(counters=clock.counters.plus('resets'))
+    log = SampleLog(log.width) if first else log.without_waiting()
     for raw in samples:
         clock, log = _next(config, clock, log, raw)
-    return Sampled(clock._replace(irregular=0), log)
+    return Sampled(clock._replace(irregular=0), log, reset=first > 0)
 
 
 def _next(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sample) -> tuple[Clock, SampleLog]:

@@ -209,6 +209,18 @@ def test_a_first_message_that_cannot_be_used_sets_no_clock(position: list[float]
     assert same(step_through([unusable, *good])[1], step_through(good)[1])
 
 
+@pytest.mark.parametrize('wrong', [1, 5])
+def test_stamps_of_another_clock_before_the_first_far_jump_are_left_out(wrong: int) -> None:
+    """A driver may publish its first messages before it has the time."""
+    good = [record._replace(stamp_ns=record.stamp_ns + 10**12) for record in records(300)]
+    bad = [record._replace(stamp_ns=record.stamp_ns - 10**12) for record in good[:wrong]]
+    items = with_event([*bad, *good[wrong:]], 900e3, 250)  # latched, heard late
+    state, live = step_through(items)
+    assert state.first_ns == good[wrong].stamp_ns
+    assert state.counters.resets == 1
+    assert same(live, step_through(with_event(good[wrong:], 900e3, 250 - wrong))[1])
+
+
 @pytest.mark.parametrize('is_announced', [False, True], ids=['taken', 'announced'])
 def test_a_change_of_the_sample_time_loses_no_event(is_announced: bool) -> None:
     every = records(900)
