@@ -22,7 +22,7 @@ SNAPSHOTS = 2
 FAR_EVENT_NS = 10_000_000_000
 """Time between an event and the samples beyond which its stamp is probably of another clock, or zero [ns]."""
 MOST_EVENTS = 100
-"""Largest number of events that wait for their stamps; beyond it the latest ones are dropped."""
+"""Largest number of events that wait in a node for their stamps; it rejects more. A recording may have more."""
 MOST_ROWS = 20_000
 """Largest number of rows kept for a rewind. Where ``rewind_time`` has more rows, a rewind goes back less far."""
 
@@ -150,8 +150,7 @@ def _order(event: CaptureEvent) -> tuple[int, bool]:
 
 
 def _wait(replay: EventReplay[E], event: CaptureEvent) -> EventReplay[E]:
-    pending = sorted((*replay.pending, event), key=_order)
-    return replay._replace(pending=tuple(pending[:MOST_EVENTS]))
+    return replay._replace(pending=tuple(sorted((*replay.pending, event), key=_order)))
 
 
 def _next_snapshot(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog, until: int) -> int:

@@ -346,7 +346,7 @@ def _sampled(config: IdentifierParameters, state: State, sampled: sampling.Sampl
 
 def _insert(state: State, event: CaptureEvent, background: Background) -> State:
     if state.payload is None or state.config is None:
-        return state._replace(early=(*state.early, event)[-event_replay.MOST_EVENTS:])
+        return state._replace(early=(*state.early, event))
     if state.log.row_at(event.stamp_ns, state.log.start) < state.log.end:  # a late one may rewind what was taken
         state = _advance(state, state.log.end, background)
     config, payload, identifier = _running(state)

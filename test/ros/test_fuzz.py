@@ -80,14 +80,17 @@ def test_after_all_of_it_the_controller_gives_a_torque_for_each_good_sample(ros:
     assert (bench.node.dropped, bench.node.sent) == (dropped, sent + 50)
 
 
-@pytest.mark.parametrize('name', ['rpbsid_identifier', 'plant_simulator'])
-def test_events_without_end_do_not_fill_the_memory(ros: Ros, name: str) -> None:
+@pytest.mark.parametrize(('name', 'counter'), [
+    ('rpbsid_identifier', 'rejected'), ('plant_simulator', 'rejected_events')])
+def test_events_without_end_do_not_fill_the_memory_and_those_left_out_are_counted(
+        ros: Ros, name: str, counter: str) -> None:
     bench = Bench(ros, name)
     far = 2_000_000_000 * 10**9
     for first in range(0, 3000, 100):
         bench.send([('capture_event', Header(stamp=time_message(far + k * 10**9), frame_id='capture'))
                     for k in range(first, first + 100)])
     assert bench.remembered() <= 200
+    assert getattr(bench.node, counter) == 200  # of 300: the subscription keeps 10 of each 100
 
 
 def test_samples_whose_stamps_hardly_advance_do_not_fill_the_memory(

@@ -36,7 +36,7 @@ from visualization_msgs.msg import MarkerArray
 
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.errors import CheckpointError, FlexmanipError, ParameterError, SignalError
-from flexmanip_ros.event_replay import FAR_EVENT_NS
+from flexmanip_ros.event_replay import FAR_EVENT_NS, MOST_EVENTS
 from flexmanip_ros.identification import batch_fit, recursive_fit
 from flexmanip_ros.io.checkpoint import CheckpointWriter, too_old
 from flexmanip_ros.numerics.background import Deferred
@@ -294,6 +294,10 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             event = capture_event(message).heard_on(topic)
         except FlexmanipError as error:
             self._reject(topic, str(error))
+            return
+        replay = self.state.payload
+        if len(self.state.early if replay is None else replay.pending) >= MOST_EVENTS:
+            self._reject(topic, f'{MOST_EVENTS} events wait for their stamps already; one more was rejected')
             return
         words = f'{topic}: {event.kind.value} at {event.stamp_ns * 1e-9:.6f}'
         last_ns = self.state.clock.last_ns
