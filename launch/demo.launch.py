@@ -28,9 +28,10 @@ ARGUMENTS = (
     ('log_level', 'info', 'debug | info | warn | error'),
 )
 
-CHOICES = {'view': ('true', 'false', 'True', 'False', '1', '0')}
+CHOICES = {'view': ('true', 'false', 'True', 'False', '1', '0'),
+           'payload_method': ('none', 'block', 'frequency', 'structured')}
 NUMBERS = {'rate': float, 'payload_mass': float, 'capture_time': float, 'release_time': float, 'view_port': int}
-"""launch tells of a bad value of these only once some nodes have been started, and leaves them running."""
+"""A bad value of these would end one node, or the launch once some nodes have been started, and leave the others."""
 
 
 def check_numbers(context):

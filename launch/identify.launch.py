@@ -46,7 +46,8 @@ def generate_launch_description():
         DeclareLaunchArgument('use_sim_time', default_value='false', description='take time from /clock'),
         DeclareLaunchArgument('trigger', default_value='true', choices=YES_OR_NO,
                               description='start capture_trigger too (services capture and release)'),
-        DeclareLaunchArgument('trigger_mode', default_value='service', description='service | time | auto'),
+        DeclareLaunchArgument('trigger_mode', default_value='service', choices=('service', 'time', 'auto'),
+                              description='service | time | auto'),
         DeclareLaunchArgument('prefix', default_value='', description=(
             "command before the identifier's own, such as 'taskset -c 1' or 'chrt -f 20'")),
         OpaqueFunction(function=check_params_file),

@@ -97,6 +97,20 @@ def test_every_node_and_parameter_is_of_the_package(described: list[Any]) -> Non
 
 
 @pytest.mark.parametrize('described', FILES, indirect=True, ids=lambda path: path.name)
+def test_a_word_that_no_node_takes_ends_the_launch_before_the_first_node(described: list[Any]) -> None:
+    """The node alone would end, and the others go on."""
+    offered = {item.args[0]: item.kwargs.get('choices') for item in described
+               if isinstance(item, DeclareLaunchArgument)}
+    for node in (item for item in described if isinstance(item, Node)):
+        choices = {leaf.name: leaf.choices for leaf in leaves(NODES[node.kwargs['executable']])}
+        for group in node.kwargs['parameters']:
+            for name, value in (group.items() if isinstance(group, dict) else ()):
+                for used in everything(value):
+                    if isinstance(used, LaunchConfiguration) and choices.get(name):
+                        assert offered[used.args[0]] == choices[name]
+
+
+@pytest.mark.parametrize('described', FILES, indirect=True, ids=lambda path: path.name)
 def test_every_argument_is_declared_described_and_used(described: list[Any]) -> None:
     arguments = [item for item in described if isinstance(item, DeclareLaunchArgument)]
     names = {item.args[0] for item in arguments}
