@@ -123,7 +123,7 @@ def _build(cls: type[Config], values: Mapping[str, Any], prefix: str) -> Config:
 def dotted(tree: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
     """Yield the dotted name and the value of each leaf of nested names and values."""
     for key, value in tree.items():
-        if isinstance(value, Mapping):
+        if isinstance(value, Mapping) and value:
             yield from dotted(value, f'{prefix}{key}.')
         else:
             yield f'{prefix}{key}', value
@@ -170,7 +170,7 @@ def check(leaf: Leaf, value: Any) -> Any:
     if not leaf.is_array:
         return _check_one(leaf, value)
     wanted = WANTED[leaf.kind][1]
-    if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
+    if isinstance(value, (str, bytes, Mapping)) or not hasattr(value, '__iter__'):
         raise ParameterError(f"parameter '{leaf.name}' is {value!r}", f'give a list of {wanted}')
     items = tuple(_check_one(leaf, item) for item in value)
     if leaf.kind is str and items == ('',):

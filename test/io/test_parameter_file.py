@@ -43,6 +43,14 @@ plant_simulator: {{ros__parameters: {{rate: 500.0}}}}
     assert read(path, NODE) == {'order': 6}
 
 
+@pytest.mark.parametrize(('text', 'words'), [('order: {}', "parameter 'order' is {}"),
+                                             ('inputs: {}', "parameter 'inputs' is {}"),
+                                             ('arm: {}', "unknown parameter 'arm'")])
+def test_a_name_with_nothing_below_it_is_an_error_as_it_is_for_a_node(tmp_path, text, words):
+    with pytest.raises(ParameterError, match=words):
+        load(IdentifierParameters, NODE, _file(tmp_path, f'{NODE}: {{ros__parameters: {{{text}}}}}'))
+
+
 def test_numbers_are_read_as_ros_reads_them():
     assert parse_overrides(['a=1e-3', 'b=[1e3, -2E+2]', 'c=5', 'd=none', 'e=[]']) == {
         'a': 0.001, 'b': [1000.0, -200.0], 'c': 5, 'd': 'none', 'e': []}
