@@ -130,7 +130,7 @@ class Screen:
     def _begin(self) -> None:
         """Forget the run."""
         self.first_ns: int | None = None
-        self._last_ns = -1
+        self._last_ns: int | None = None
         self._intervals: Array = np.zeros(0)
         self._rows: list[Array] = []
         self._payloads: list[tuple[int, list[Any]]] = []
@@ -155,27 +155,26 @@ class Screen:
             self._begin_with(list(self._known))
         self._is_known = has_joint
         stamps = block.stamp_ns
-        highest = np.maximum.accumulate(np.concatenate([[self._last_ns], stamps]))[:-1]
+        if not len(stamps):
+            return
+        before = self._last_ns
+        highest = np.maximum.accumulate(np.concatenate([[stamps[0] - 1 if before is None else before], stamps]))[:-1]
         back = np.flatnonzero(stamps < highest - LOOPED_NS)
-        if self.first_ns is not None and back.size:
+        if back.size:
             k = int(back[0])
-            if k:
-                self.joint_states(block.part(slice(0, k)))
+            self.joint_states(block.part(slice(0, k)))
             self._begin_with([event for event in self._known if event.stamp_ns >= stamps[k]])
             self.joint_states(block.part(slice(k, None)))
             return
         self.samples += len(stamps)
-        if self.first_ns is None and len(stamps):
+        if self.first_ns is None:
             self.first_ns = int(stamps[0])
             self.runs += 1
-            highest[0] = self.first_ns - 1
         advancing = stamps > highest
         if not advancing.any():
             return
-        assert self.first_ns is not None
         values = self._values(block)[advancing]
         stamps = stamps[advancing]
-        before = self._last_ns if self._last_ns >= 0 else None
         self._last_ns = int(stamps[-1])
         time = (stamps - self.first_ns) * 1e-9
         self._rows.append(self._with_gaps(np.column_stack([time, values]), before))

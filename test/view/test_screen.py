@@ -116,11 +116,13 @@ def test_late_and_repeated_stamps_draw_no_line_backwards() -> None:
     assert (np.diff(rows(shown.frame())[:, 0]) > 0.0).all()
 
 
-def test_a_jump_back_begins_a_new_run_with_a_time_0_of_its_own() -> None:
-    shown = screen()
-    shown.joint_states(block(0, 10, START_NS + 10**12))
-    looped = block(0, 10, START_NS)
-    shown.joint_states(looped)
+@pytest.mark.parametrize('start_ns', [START_NS, -5_000_000_000])
+@pytest.mark.parametrize('size', [10, 20])
+def test_a_jump_back_begins_a_new_run_with_a_time_0_of_its_own(size: int, start_ns: int) -> None:
+    shown, whole = screen(), block(0, 20, start_ns)
+    stamps = np.where(np.arange(20) < 10, whole.stamp_ns + 10**12, whole.stamp_ns - 10 * STEP_NS)
+    for first in range(0, 20, size):
+        shown.joint_states(whole._replace(stamp_ns=stamps).part(slice(first, first + size)))
     assert shown.runs == 2
     assert rows(shown.frame())[:, 0] == pytest.approx(1e-3 * np.arange(10), abs=1e-6)
 
