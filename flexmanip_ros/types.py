@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 QUANTILE = 1.959963984540054
 """Half width of a 95 % interval, in standard deviations."""
+LOOPED_NS = 1_000_000_000
+"""Step back of the stamps [ns] beyond which a new run begins, such as a looped recording."""
 
 
 class EventKind(Enum):

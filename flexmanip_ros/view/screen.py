@@ -20,7 +20,7 @@ from flexmanip_ros import messages
 from flexmanip_ros.messages import Diagnostics, DiagnosticStatus
 from flexmanip_ros.parameters import IdentifierParameters, ViewParameters
 from flexmanip_ros.parameters.nodes import WINDOWS
-from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, Status
+from flexmanip_ros.types import LOOPED_NS, Array, CaptureEvent, Estimate, EventKind, JointBlock, Status
 
 COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#7F7F7F', '#000000')
 """Colours of lines on this page and in figures: the palette of Okabe and Ito, distinct for any colour vision."""
@@ -37,8 +37,6 @@ MODES_APART = 4.0
 KNOWN_BAND = 0.3
 """Largest half width of the 95 % band of a mode that counts as known, as a fraction of its frequency [-]."""
 
-LOOPED_NS = 1_000_000_000
-"""Backward jump of the stamps beyond which a new run begins and the page starts again [ns]."""
 GAP = 3.0
 """Interval between samples above which a line has a gap [sample times]."""
 SAME_EVENT_S = 0.2

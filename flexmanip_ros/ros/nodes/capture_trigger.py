@@ -31,11 +31,9 @@ from flexmanip_ros.ros.conversions import JointStateReader, to_message
 from flexmanip_ros.ros.diagnostics import RECENT_S, WARN, JointStateFaults, Recent, Report, number
 from flexmanip_ros.ros.node import NO_STAMP, FlexmanipNode, run
 from flexmanip_ros.samples.signals import joints
-from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, events_at
+from flexmanip_ros.types import LOOPED_NS, CaptureEvent, EventKind, JointRecord, events_at
 
 NAME = 'capture_trigger'
-LOOPED_NS = 1_000_000_000
-"""Step back of the stamps [ns] beyond which a new recording begins, whose times count from its first stamp."""
 WARM_UP_SAMPLES = 1500
 """Number of made-up samples, enough to call every compiled function of the detector."""
 

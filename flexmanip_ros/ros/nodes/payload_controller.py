@@ -30,13 +30,11 @@ from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, doubles
 from flexmanip_ros.ros.diagnostics import ERROR, WARN, Recent, Report, Stamps
 from flexmanip_ros.ros.node import FlexmanipNode, run
-from flexmanip_ros.types import Array, JointRecord
+from flexmanip_ros.types import LOOPED_NS, Array, JointRecord
 
 NAME = 'payload_controller'
 LONG_GAP = 10
 """Longest gap, in sample times, that the filter bridges with its prediction; after a longer one it starts again."""
-CLOCK_SET_BACK_NS = 1_000_000_000
-"""Step back of the stamps [ns] beyond which the clock is a new one (a simulation that began again)."""
 AT_LIMIT_S = 0.5
 """Time at the limits of the torque, less the time within them, after which the log warns [s]: no move takes that."""
 LARGEST = 1e6
@@ -182,7 +180,7 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
         """Return whether a sample is not newer than the last, and drop it; a long step back counts as a new clock."""
         if self._last_ns is None or stamp_ns > self._last_ns:
             return False
-        if stamp_ns < self._last_ns - CLOCK_SET_BACK_NS:
+        if stamp_ns < self._last_ns - LOOPED_NS:
             self.state = self.state._replace(x=None)
             return False
         self._drop('stamps', 'a joint state whose stamp does not advance was dropped')
