@@ -202,6 +202,13 @@ def _listener(say: Callable[[], None]) -> Any:
     return Listener()
 
 
+def open_streams() -> None:
+    """Send stdout and stderr nowhere where they were closed, as by a service manager; Python has None instead."""
+    for name in ('stdout', 'stderr'):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), 'w'))
+
+
 def print_error(prog: str, error: BaseException | str) -> None:
     """Write one line on stderr."""
     print(f'{prog}: {" ".join(str(error).split())}', file=sys.stderr)
@@ -222,6 +229,7 @@ def run(prog: str, body: Callable[[], int]) -> int:
 
     That is 2 after an error of the package or of the file system, 130 when interrupted, 1 for a defect.
     """
+    open_streams()
     try:  # around all of it, as a signal may come while a context manager ends
         with _signals_as_interrupt(), warnings.catch_warnings():
             warnings.simplefilter('ignore')  # the status reports numbers out of range; stderr is for one line

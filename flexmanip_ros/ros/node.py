@@ -441,6 +441,7 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
     parameters.
     """
     arguments = list(sys.argv if argv is None else argv)
+    console.open_streams()
     try:
         rclpy_workarounds.interrupt_on_signals(again=True)
         try:

@@ -99,6 +99,11 @@ def test_a_full_disk_is_one_line_and_exit_2(segments: str) -> None:
     assert 'No space left on device' in err
 
 
+def test_a_program_works_without_stdout_and_stderr() -> None:
+    command = ['sh', '-c', 'exec "$0" -m flexmanip_ros.cli.write_urdf >&- 2>&-', sys.executable]
+    assert subprocess.run(command, check=False).returncode == console.SUCCESS
+
+
 def test_an_error_of_the_file_system_is_one_line_and_exit_2(capsys: pytest.CaptureFixture[str]) -> None:
     assert console.run('program', lambda: len(os.listdir('x' * 300))) == console.BAD_INPUT
     err = capsys.readouterr().err

@@ -103,6 +103,11 @@ def test_a_process_says_it_too() -> None:
     assert err == "capture_trigger: unknown parameter 'lead_tim'; did you mean 'lead_time'?\n"
 
 
+def test_a_node_works_without_stderr() -> None:
+    shell = f'timeout --preserve-status --signal INT 5 "$0" -m {module("capture_trigger")} 2>&-'
+    assert subprocess.run(['sh', '-c', shell, sys.executable], check=False).returncode == 0
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_a_node_cleanly(number: int) -> None:
     process = start('capture_trigger', '--ros-args', '-p', 'mode:=time', '--log-level', 'debug')
