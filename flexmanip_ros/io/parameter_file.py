@@ -173,5 +173,6 @@ def load_arm(path: str | Path | None, overrides: Iterable[str] = ()) -> ArmParam
         for node in ('plant_simulator', 'rpbsid_identifier'):
             found.update(item for item in read(path, node, optional=True).items() if item[0].startswith('arm.'))
         if not found:
-            raise ParameterError(f"parameter file '{path}' has no parameters arm.*", "write the arm's measures there")
+            raise ParameterError(f"parameter file '{path}' has no parameters arm.* of the plant or the identifier",
+                                 "write the arm's measures there, in a section '/**'")
     return configure(IdentifierParameters, {**found, **parse_overrides(overrides)}).arm
