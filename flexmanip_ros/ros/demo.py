@@ -31,6 +31,7 @@ from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.arm.linearization import frequencies, vibration_model
+from flexmanip_ros.cli.console import Parser
 from flexmanip_ros.errors import FlexmanipError, ParameterError
 from flexmanip_ros.io import bag, plots
 from flexmanip_ros.io.plots import Truth
@@ -220,9 +221,9 @@ def _wait_for_a_page(view: Viewer, composition: Composition, console: Console) -
         composition.wait(lambda: view.pages() > 0, PAGE_TIMEOUT_S)
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """Return the arguments: an output folder and every parameter of the demonstration."""
-    made = argparse.ArgumentParser(
+    made = Parser(
         prog=NAME, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog='parameters of the nodes: demo --ros-args -p rpbsid_identifier:order:=4')
     made.add_argument('output', nargs='?', default='demo_output',

@@ -1,6 +1,5 @@
 """Base class and main program of every node: parameters, lifecycle, topics, diagnostics and log lines."""
 
-import argparse
 import math
 import sys
 import time
@@ -489,9 +488,8 @@ def reject(name: str, problem: str, code: int = BAD_INPUT) -> int:
     return code
 
 
-def parser(name: str, about: str | None, cls: type) -> argparse.ArgumentParser:
+def parser(name: str, about: str | None, cls: type) -> console.Parser:
     """Return the parser behind --help: what the node is, its topics and services, its parameters."""
-    return argparse.ArgumentParser(
-        prog=name, formatter_class=argparse.RawDescriptionHelpFormatter,
-        usage=f'{name} [--help] [--ros-args -p NAME:=VALUE --params-file FILE.yaml ...]',
-        description=about, epilog='parameters:\n' + help_text(cls))
+    made = console.parser(name, about or '', 'parameters:\n' + help_text(cls))
+    made.usage = f'{name} [--help] [--ros-args -p NAME:=VALUE --params-file FILE.yaml ...]'
+    return made

@@ -94,6 +94,7 @@ def test_bad_input_ends_with_one_clear_line_and_code_2(
     assert call(name, *arguments) == 2
     err = capfd.readouterr().err
     assert said in err
+    assert 'usage:' not in err
     assert 'Traceback' not in err
 
 
