@@ -144,8 +144,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         with viewer(given) if config.view else nullcontext() as view:
             return _run(config, folder, console, view)
     except KeyboardInterrupt:
-        console.print(f"interrupted; the bag so far is '{folder / 'bag'}'")
+        console.print('interrupted' + (f"; the bag so far is '{folder / 'bag'}'" if (folder / 'bag').exists() else ''))
         return INTERRUPTED
+    except OSError as error:  # a full disk
+        return reject(NAME, f"{error.strerror or error}; what was written before is in '{folder}'", FAILED)
     except FlexmanipError as error:
         return reject(NAME, str(error), BAD_INPUT if isinstance(error, ParameterError) else FAILED)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import errno
 import importlib
 import json
 import os
@@ -14,6 +15,7 @@ import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from unittest.mock import Mock
 from urllib.error import URLError
 from urllib.request import urlopen
 
@@ -188,6 +190,21 @@ def test_an_interrupted_demonstration_leaves_a_readable_bag(tmp_path: Path) -> N
     assert 'interrupted' in out
     assert 'Traceback' not in err
     assert sum(isinstance(item, JointRecord) for item in bag.read(tmp_path / 'run_001' / 'bag')) > 100
+
+
+@pytest.mark.parametrize(('error', 'code', 'said'), [
+    (KeyboardInterrupt(), 130, 'interrupted\n'),  # no bag was begun
+    (OSError(errno.ENOSPC, 'No space left on device'), 1, 'demo: No space left on device; what was written before'),
+])
+def test_a_demonstration_that_ends_early_says_why_and_what_there_is(
+        tmp_path: Path, signals: None, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
+        error: BaseException, code: int, said: str) -> None:
+    from flexmanip_ros.ros import demo
+
+    monkeypatch.setattr(demo, '_init', lambda *_: None)
+    monkeypatch.setattr(demo, '_run', Mock(side_effect=error))
+    assert call('demo', str(tmp_path)) == code
+    assert said in ''.join(capfd.readouterr())
 
 
 @pytest.mark.parametrize('number', [1033, 1049, 1099, 7])
