@@ -205,7 +205,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         """
         if not self.autostarts:
             self.get_logger().info('not started, as autostart is false; to start it: '
-                                   f'ros2 lifecycle set {self.get_fully_qualified_name()} configure')
+                                   f'ros2 lifecycle set {self.get_fully_qualified_name()} configure, then activate')
             return True
         return all(transition() == TransitionCallbackReturn.SUCCESS
                    for transition in (self.trigger_configure, self.trigger_activate))
