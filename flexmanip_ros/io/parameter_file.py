@@ -4,7 +4,7 @@ import difflib
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import yaml
 
@@ -21,7 +21,10 @@ LARGEST_FILE = 1 << 20
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML as ROS reads it: 1e-3 is a number; a repeated name and an alias are errors."""
+    """Safe YAML as ROS reads it: 1e-3 and -.5 are numbers, y is true; a repeated name and an alias are errors."""
+
+    yaml_implicit_resolvers: ClassVar[dict[Any, Any]] = {}
+    bool_values: ClassVar[dict[str, bool]] = yaml.SafeLoader.bool_values | {'y': True, 'n': False}
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.events.AliasEvent):
@@ -33,18 +36,21 @@ class _Loader(yaml.SafeLoader):
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
         for key, _ in node.value:
-            if isinstance(key.value, str) and key.value in seen:
-                problem = f"'{key.value}' is given twice"
-                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
-            seen.add(str(key.value))
+            if isinstance(key.value, str):
+                key.tag = 'tag:yaml.org,2002:str'  # a name is a text, even 'y' or '1'
+                if key.value in seen:
+                    problem = f"'{key.value}' is given twice"
+                    raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+                seen.add(key.value)
         mapping: dict[Any, Any] = super().construct_mapping(node, deep)
         return mapping
 
 
-_Loader.yaml_implicit_resolvers = {
-    first: list(resolvers) for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()}
-_Loader.add_implicit_resolver(
-    'tag:yaml.org,2002:float', re.compile(r'^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$'), list('-+.0123456789'))
+for _kind, _form in (
+        ('bool', '|'.join(f'{word}|{word.title()}|{word.upper()}' for word in _Loader.bool_values)),
+        ('int', r'[-+]?(0x[\da-fA-F]+|0[0-7]*|[1-9]\d*)'),
+        ('float', r'[-+]?((\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|\.(inf|Inf|INF))|\.(nan|NaN|NAN)')):
+    _Loader.add_implicit_resolver(f'tag:yaml.org,2002:{_kind}', re.compile(f'^({_form})$', re.ASCII), None)
 
 
 def parse(text: str, what: str) -> Any:

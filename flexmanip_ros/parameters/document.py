@@ -48,7 +48,8 @@ def scalar(value: Any) -> str:
     if isinstance(value, float):
         return number(value)
     if isinstance(value, str):
-        plain = re.fullmatch(r'[A-Za-z_][\w/.-]*', value) and yaml.safe_load(value) == value
+        plain = (re.fullmatch(r'[A-Za-z_][\w/.-]*', value) and yaml.safe_load(value) == value
+                 and value.lower() not in ('y', 'n', 'inf', 'infinity', 'nan'))  # ROS reads these as no text
         return value if plain else "'" + value.replace("'", "''") + "'"
     return str(value)
 

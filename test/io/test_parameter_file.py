@@ -52,8 +52,10 @@ def test_a_name_with_nothing_below_it_is_an_error_as_it_is_for_a_node(tmp_path, 
 
 
 def test_numbers_are_read_as_ros_reads_them():
-    assert parse_overrides(['a=1e-3', 'b=[1e3, -2E+2]', 'c=5', 'd=none', 'e=[]']) == {
-        'a': 0.001, 'b': [1000.0, -200.0], 'c': 5, 'd': 'none', 'e': []}
+    assert parse_overrides(['a=1e-3', 'b=[1e3, -2E+2]', 'c=5', 'd=none', 'e=[]', 'f=[-.5, +.5, 08]', 'g=[y, Off]',
+                            'h=[1_000, 1:30, 0b1, 2001-01-01, ~]', 'y=010']) == {
+        'a': 0.001, 'b': [1000.0, -200.0], 'c': 5, 'd': 'none', 'e': [], 'f': [-0.5, 0.5, 8.0], 'g': [True, False],
+        'h': ['1_000', '1:30', '0b1', '2001-01-01', '~'], 'y': 8}
 
 
 def test_an_override_wins_over_the_file(tmp_path):

@@ -45,6 +45,11 @@ def test_a_text_stays_a_text(value):
     assert yaml.safe_load(scalar(value)) == value
 
 
+@pytest.mark.parametrize('value', ['y', 'N', 'nan', 'Infinity'])
+def test_a_text_that_ros_reads_as_another_value_is_quoted(value):
+    assert scalar(value) == f"'{value}'"
+
+
 def test_only_what_differs_is_written_on_request():
     text = yaml_text('rpbsid_identifier', {'order': 2, 'arm.modes': 1, 'angles': ()})
     assert yaml.safe_load(text) == {
