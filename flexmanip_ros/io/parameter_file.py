@@ -106,13 +106,14 @@ def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, An
 
 def _sections(tree: Any, prefix: str, where: str) -> Iterable[tuple[str, Any]]:
     if not isinstance(tree, Mapping):
-        raise ParameterError(f'{where} has {tree!r:.60} in place of a node', "write 'NODE: {ros__parameters: {...}}'")
+        name = prefix.rpartition('/')[2]
+        raise ParameterError(f"{where} has {f'{name}: ' if name else ''}{tree!r:.60} in place of a node",
+                             "write 'NODE: {ros__parameters: {...}}', with the parameters of a node inside")
     for key, value in tree.items():
-        name = f'{prefix}/{key}'.replace('//', '/') if prefix else str(key)
-        if isinstance(value, Mapping) and 'ros__parameters' in value:
-            yield name, value['ros__parameters'] or {}
-        elif isinstance(value, Mapping) and any(isinstance(below, Mapping) for below in value.values()):
-            yield from _sections({k: v for k, v in value.items() if isinstance(v, Mapping)}, name, where)
+        if prefix and key == 'ros__parameters':
+            yield prefix, value or {}
+        else:
+            yield from _sections(value, f'{prefix}/{key}'.replace('//', '/') if prefix else str(key), where)
 
 
 def _flatten(tree: Any, where: str) -> dict[str, Any]:

@@ -75,6 +75,8 @@ def test_an_override_that_does_not_go_with_the_file_is_named(tmp_path):
     ('just words', 'in place of a node'),
     ('[1, 2]', 'in place of a node'),
     ('rpbsid_identifer: {ros__parameters: {order: 4}}', 'is close'),
+    (f'{NODE}: {{ros__parameters: {{order: 4}}, past_window: 12}}', 'past_window: 12 in place of a node'),
+    ('ros__parameters: {order: 4}', 'order: 4 in place of a node'),
     (f'{NODE}: {{ros__parameters: [1]}}', 'list the parameters below it'),
     (f'{NODE}: {{ros__parameters: {{order: 4, order: 5}}}}', 'given twice'),
     (f'{NODE}: {{ros__parameters: {{arm.modes: 4, arm: {{modes: 5}}}}}}', "'arm.modes' twice"),
