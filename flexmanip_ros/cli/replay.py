@@ -154,8 +154,8 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     if request.configurations is not None:
         if found is None:
             raise ModelError('the model is not one of every configuration, so --configurations has nothing to write',
-                             'name two angles and, as outputs, half as many positions as the order; see '
-                             'docs/moving_arm.md')
+                             'it needs over 1024 samples, two angles (with payload_method none only those that are '
+                             'given) and, as outputs, half as many positions as the order; see docs/moving_arm.md')
         write_rows(request.configurations, found.rows())
     remark = '; '.join((*messages.far_events(), *_remarks(state, messages.foreign)))
     if request.report is not None and signals is not None and screen is not None:
