@@ -24,7 +24,7 @@ from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import PlantParameters
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import capture_event, to_message
-from flexmanip_ros.ros.diagnostics import CLOCK, ERROR, WARN, LossCounter, Recent, Report
+from flexmanip_ros.ros.diagnostics import CLOCK, ERROR, WARN, LossCounter, Recent, Report, number
 from flexmanip_ros.ros.node import FlexmanipNode, SampleGrid, run
 from flexmanip_ros.simulation import simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
@@ -196,7 +196,7 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         self._drops.report(report, 'command', 'dropped')
         self.lost_commands.report(report, 'lost_commands', 'command')
         if self.rejected_events:
-            report.worse(WARN, f'{self.rejected_events} events rejected')
+            report.worse(WARN, f'{number(self.rejected_events, "event")} rejected')
 
 
 main = partial(run, PlantSimulator, NAME, __doc__, PlantParameters)
