@@ -83,17 +83,16 @@ def suggest(source: str, place: str, given: Mapping[str, Any], topics: bag.Topic
     """Look at a recording and write the parameters to identify it with; return them and the lines to print.
 
     given: parameters that stay as they are; until_s: time from which on samples are not looked at [s]; events_s:
-    captures and releases beside those recorded, seconds after the first message.
+    captures and releases beside those recorded, seconds after the first sample.
     Raises FlexmanipError where the recording tells too little, and where the file cannot be written.
     """
     check_place(place, '.yaml', '.yml')
     with console.progress('looking at the signals', 'messages') as shown:
         blocks, events = _recording(source, topics, until_s, shown)
-    events += [int(blocks[0].stamp_ns[0]) + round(at * 1e9) for at in events_s]
     signals = observe(blocks)
     chosen, reasons = choose_signals(signals, given)
     config = configure(IdentifierParameters, {**given, **chosen})
-    collected, dt = _collect(config, blocks, events)
+    collected, dt = _collect(config, blocks, events, events_s)
     for name, values in (('inputs', collected.u), ('outputs', collected.y)):
         if not np.any(np.ptp(values, axis=0) > 0.0):
             raise ParameterError(f'no signal of {name} moves: {", ".join(getattr(config, name))}',
@@ -117,8 +116,10 @@ def _recording(source: str, topics: bag.Topics, until_s: float | None, progress:
                ) -> tuple[list[JointBlock], list[int]]:
     """Return the blocks of a recording up to a time, and the stamps of its events [ns].
 
-    Of a damaged recording they are what comes before the damage.
+    The time counts from the first message with any of the same joints. Of a damaged recording they are what comes
+    before the damage.
     """
+    starts: dict[str, int] = {}
     blocks: list[JointBlock] = []
     events: list[int] = []
     is_cut = until_s is None
@@ -127,7 +128,8 @@ def _recording(source: str, topics: bag.Topics, until_s: float | None, progress:
             if isinstance(item, CaptureEvent):
                 events.append(item.stamp_ns)
                 continue
-            first = blocks[0].stamp_ns[0] if blocks else item.stamp_ns[0]
+            start = int(item.stamp_ns[0])
+            first = min((starts.setdefault(name, start) for name in item.names), default=start)
             used = np.full(len(item.stamp_ns), True) if until_s is None else (
                 item.stamp_ns < first + round(until_s * 1e9))
             is_cut |= not used.all()
@@ -224,7 +226,8 @@ def _check_there(group: str, names: tuple[str, ...], signals: list[Found]) -> No
                              f'the signals there are: {", ".join(sorted(there))}')
 
 
-def _collect(config: IdentifierParameters, blocks: list[JointBlock], events: list[int]) -> tuple[Signals, float]:
+def _collect(config: IdentifierParameters, blocks: list[JointBlock], events: list[int], events_s: Sequence[float]
+             ) -> tuple[Signals, float]:
     """Return the signals of the longest time between two events, and the sample time [s]."""
     clock, log = sampling.Clock(), sampling.EMPTY
     for block in blocks:
@@ -235,6 +238,7 @@ def _collect(config: IdentifierParameters, blocks: list[JointBlock], events: lis
     if len(whole.stamp_ns) < 2:
         raise ParameterError(f'{len(whole.stamp_ns)} samples are too few to choose parameters from',
                              'record for longer')
+    events = [*events, *(int(whole.stamp_ns[0]) + round(at * 1e9) for at in events_s)]
     borders = np.searchsorted(whole.stamp_ns, sorted(events)).tolist()
     a, b = max(pairwise([0, *borders, len(whole.stamp_ns)]), key=lambda pair: pair[1] - pair[0])
     return replace(whole, stamp_ns=whole.stamp_ns[a:b], u=whole.u[a:b], y=whole.y[a:b], angles=whole.angles[a:b],

@@ -12,7 +12,7 @@ import pytest
 from scipy.linalg import block_diag, expm
 
 from flexmanip_ros.cli.identify_bag import main
-from flexmanip_ros.cli.suggest import Found, choose_signals, suggest
+from flexmanip_ros.cli.suggest import Found, _recording, choose_signals, suggest
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io.bag import Topics
 from flexmanip_ros.io.bag_writer import BagWriter
@@ -26,6 +26,9 @@ DT = 0.004
 NAMES = ('hub', 'gauge', 'lamp')
 MODES = ((1.5, 0.05), (9.0, 0.02))
 """Frequency [Hz] and damping ratio of each mode of the machine; both sensors see both."""
+
+GRIPPER = JointRecord(0, ('finger',), np.array([0.1]), np.empty(0), np.empty(0))
+"""A message of another publisher on the same topic, which does not fill in its stamp."""
 
 
 @lru_cache
@@ -136,11 +139,17 @@ def test_a_capture_that_is_told_divides_a_recording_as_one_that_it_holds(recordi
     records = _machine()
     capture = CaptureEvent(records[0].stamp_ns + 3_000_000_000, EventKind.CAPTURE)
     announced = _bag(tmp_path / 'announced', records, capture)
+    beside = _bag(tmp_path / 'beside', (GRIPPER, *records))
     (held, _), (told, _), (whole, _) = (
         suggest(str(source), str(tmp_path / 'some.yaml'), {}, Topics(), None, 0.25, events_s)
-        for source, events_s in ((announced, ()), (recording, (3.0,)), (recording, ())))
+        for source, events_s in ((announced, ()), (beside, (3.0,)), (recording, ())))
     assert told == held
     assert told != whole
+
+
+def test_the_time_to_look_at_counts_from_the_first_message_of_the_machine(tmp_path):
+    blocks, _ = _recording(str(_bag(tmp_path / 'beside', (GRIPPER, *_machine()))), Topics(), 2.0, lambda *_: None)
+    assert sum(len(block.stamp_ns) for block in blocks if block.names == NAMES) == round(2.0 / DT)
 
 
 def test_what_is_set_stays_as_it_is(recording, tmp_path, capsys):
