@@ -14,6 +14,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 
 PACKAGE = 'flexmanip_ros'
+TRIGGER_MODES = 'service', 'time', 'auto'
 YES_OR_NO = 'true', 'false', 'True', 'False', '1', '0'
 """launch tells of another word only once a node has been started, and leaves it running."""
 
@@ -46,7 +47,7 @@ def generate_launch_description():
         DeclareLaunchArgument('use_sim_time', default_value='false', description='take time from /clock'),
         DeclareLaunchArgument('trigger', default_value='true', choices=YES_OR_NO,
                               description='start capture_trigger too (services capture and release)'),
-        DeclareLaunchArgument('trigger_mode', default_value='service', choices=('service', 'time', 'auto'),
+        DeclareLaunchArgument('trigger_mode', default_value='service', choices=TRIGGER_MODES,
                               description='service | time | auto'),
         DeclareLaunchArgument('prefix', default_value='', description=(
             "command before the identifier's own, such as 'taskset -c 1' or 'chrt -f 20'")),
