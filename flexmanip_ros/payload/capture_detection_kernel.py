@@ -287,9 +287,10 @@ def torques_begin(glr: GlrState) -> bool:
     """Whether the torques change far more than two windows before: they, and no event, move an arm at rest.
 
     An arm that has not moved has taught nothing of its friction and rotors, so its first motion differs from the
-    model's.
+    model's. Sooner than two windows after the test began it is compared with the first sample that was remembered.
     """
-    oldest = (glr.clock[HISTORY] + 1) % glr.history.shape[1]
+    remembered = min(glr.clock[QUIET] - 1 - glr.trace.shape[0], glr.history.shape[1])
+    oldest = (glr.clock[HISTORY] + 1 - remembered) % glr.history.shape[1]
     return bool(glr.level[ENERGY] > BEGIN * glr.history[1, oldest])
 
 

@@ -69,10 +69,12 @@ def test_the_first_motion_of_an_arm_with_friction_and_rotors_is_no_capture(rest_
     assert abs(found.stamp_ns - capture.stamp_ns) <= 20e6
 
 
-def test_a_blow_of_a_moving_object_on_an_arm_that_never_moved_is_found():
+@pytest.mark.parametrize('window', [0.1, 0.5])
+def test_a_blow_of_a_moving_object_on_an_arm_that_never_moved_is_found(window):
     plant = PlantParameters(arm=ARM, payload_mass=20.0, object_velocity=(0.0, 0.1))
-    trajectory = simulator.simulate(plant, np.zeros((1500, 2)), (event(1.0),))
-    config = TriggerParameters(mode='auto', arm=ARM, outputs=BENDS)
+    efforts = 1e-3 * np.random.default_rng(0).standard_normal((1500, 2))
+    trajectory = simulator.simulate(plant, efforts, (event(1.0),))
+    config = TriggerParameters(mode='auto', arm=ARM, outputs=BENDS, detection_window=window)
     _, (found,) = capture_detection.advance(config, capture_detection.init(config), samples_of(trajectory))
     assert found.kind is EventKind.CAPTURE
     assert abs(found.stamp_ns - 1_000_000_000) <= 20e6
