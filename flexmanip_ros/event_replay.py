@@ -117,10 +117,13 @@ def insert(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog,
     """Take an event: let it wait for its stamp, rewind to it, or apply it now where it is too old for a rewind.
 
     One that is too old, and has an event after it that was applied, is only counted: what the arm holds now is known
-    from the later event. first_ns: stamp of the first sample [ns].
+    from the later event. One near another of its kind is that one, unless an event of the other kind lies between
+    them. first_ns: stamp of the first sample [ns].
     """
     previous = replay.stamp_of(event.kind)
-    if previous is not None and abs(event.stamp_ns - previous) <= config.event_merge_time * 1e9:
+    if (previous is not None and abs(event.stamp_ns - previous) <= config.event_merge_time * 1e9
+            and not any(min(previous, event.stamp_ns) < one.stamp_ns <= max(previous, event.stamp_ns)
+                        for one in replay.latest if one.kind is not event.kind)):
         return replay._replace(repeated_events=replay.repeated_events + 1)
     known = replay.latest
     replay = replay._replace(latest=(*(e for e in known if e.kind is not event.kind), event))

@@ -135,6 +135,15 @@ def test_an_event_announced_twice_counts_once() -> None:
     assert same(once, twice)
 
 
+def test_a_capture_soon_after_a_release_is_no_repetition_of_the_one_before_it() -> None:
+    events = [CaptureEvent(stamp_ms * MS, kind) for stamp_ms, kind in (
+        (200, EventKind.CAPTURE), (210, EventKind.RELEASE), (220, EventKind.CAPTURE))]
+    state, _ = step_through([*events, *records(300)])
+    assert state.payload is not None
+    assert state.payload.repeated_events == 0
+    assert state.payload.estimator.since_ns == state.stamp_of(EventKind.CAPTURE) == 220 * MS
+
+
 def test_memory_stays_constant() -> None:
     state, _ = step_through(records(6000))
     assert state.payload is not None
