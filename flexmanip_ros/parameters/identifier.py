@@ -131,8 +131,8 @@ class IdentifierParameters:
     rewind_time: float = parameter(
         0.2, 'a late event is applied at its own stamp when it is at most this late', unit='s', low=0.0, high=10.0)
     event_merge_time: float = parameter(
-        0.1, 'an event of the same kind within this time of the last one is the same event', unit='s', low=0.0,
-        high=60.0, live=True)
+        0.1, 'an event this close to the last one of its kind, none of the other between, is the same', unit='s',
+        low=0.0, high=60.0, live=True)
     payload_frame: str = parameter('link2_tip', 'frame_id of the published payload', live=True)
     base_frame: str = parameter(
         'base_link', 'frame_id of the drawn arm (~/arm): joint 1 at its origin, angles from its x axis')
