@@ -57,14 +57,13 @@ FIRST_ITERATION = 8
 ROWS, ROWS_TIME = 8, 1e-3
 """Rows that are read again for each new sample, at a sample time up to this [s]. Slower samples leave more processor
 time, in proportion to their sample time, and a fit must not take longer with them."""
-CLOSING = 4096
-"""Rows that are read again at most when the horizon closes: four iterations over ``LATEST`` of them."""
+CLOSING = 16_384
+"""Rows that are read again at most when the horizon closes: a fit of an empty arm takes up to ten times all of them."""
 LATEST = 1024
 """Samples after which the horizon closes although the fit has not come to rest: by then those have that ever will."""
-WORK, CLOSING_WORK = 4, 2
+WORK = 4
 """Largest mean number of integration steps for each row that is read again, over that of an arm without friction: a
-joint that sticks takes three, wrong parameters may take hundreds. When the horizon closes that is 0.3 s at 34 us a
-step, in which a subscription keeps the messages that come."""
+joint that sticks takes three, wrong parameters may take hundreds."""
 GROWTH = 4
 """One over the share by which the horizon must grow before a converged fit is repeated: a quarter; less hardly moves
 it."""
@@ -323,7 +322,7 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState,
         close_horizon(motion, sensors, m)
         return True
     rows = CLOSING if last else int(ROWS * max(sensors.period / ROWS_TIME, 1.0))
-    work = (CLOSING_WORK if last else WORK) * rows * max(sensors.period / motion.substeps, 1.0)
+    work = WORK * rows * max(sensors.period / motion.substeps, 1.0)
     for _ in range(rows):
         if m.counts[mem.STORED] == mem.HORIZON > stored + 1:  # it has closed
             return True
