@@ -367,7 +367,7 @@ def test_a_gripper_may_be_two_milliseconds_wrong_where_nothing_but_the_impact_te
     assert found.mass == pytest.approx(10.0, rel=0.01)
 
 
-@pytest.mark.parametrize('seed', [1, 6, 7])  # of twelve seeds four end INCONSISTENT: docs/lab/payload.md
+@pytest.mark.parametrize('seed', [1, 5, 7])  # of twelve seeds five do not end TRACKING: docs/lab/payload.md
 def test_a_body_is_not_taken_for_a_point_whose_residuals_are_one_and_a_half_times_the_noise(seed):
     """With 25 dB a point that takes the body's place costs less than twice the noise; it has twice the mass."""
     arm, capture = ArmParameters(), event(3.0)
