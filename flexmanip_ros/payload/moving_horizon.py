@@ -343,9 +343,9 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState,
             begin_iteration(motion, m)
         until = m.counts[mem.BEFORE]
         if m.counts[mem.AGAIN] == 0:
-            # one that is begun again reads all samples at once: a few fit many bodies, and lead to a wrong minimum
-            more = m.counts[mem.STORED] if last or until == 0 else until // 2 + FIRST_ITERATION
-            until = min(m.counts[mem.STORED], until + more)
+            # a fit that is begun again reads all samples at once: a few fit many bodies, and lead to a wrong minimum
+            grown = m.counts[mem.STORED] if last or until == 0 else until + until // 2 + FIRST_ITERATION
+            until = min(m.counts[mem.STORED], grown)
         steps = iterate_sample(motion, sensors, m, table)
         work -= steps
         if steps == 0:
