@@ -60,14 +60,13 @@ def main() -> int:
                             message.velocity, message.effort)
 
         def by_layout() -> None:
-            layout = None
+            decoder = cdr.Decoder()
             for raw in raws:
-                _, layout = cdr.joint_record(raw, layout)
+                decoder.record(raw)
 
         def in_blocks() -> None:
-            layout = None
-            for first in range(0, MESSAGES, bag.BLOCK):
-                _, layout = cdr.joint_block(raws[first:first + bag.BLOCK], layout)
+            for _ in cdr.Decoder().blocks(raws):
+                pass
 
         rows = {
             'decode, library': best(by_library),

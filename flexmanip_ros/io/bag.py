@@ -144,8 +144,6 @@ METADATA_FAULTS = ('Could not load YAML', 'Invalid bag metadata', 'A metadata ke
 """How the library begins what it says of a metadata.yaml whose content is unusable."""
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 HEADER = 'std_msgs/msg/Header'
-BLOCK = 2048
-"""Largest number of messages decoded at once: 2 s at 1 kHz, half a megabyte. Larger blocks are no faster."""
 
 Progress = Callable[[int, int | None], None]
 """Callback with the number of messages read and their total number (None when the recording does not state it)."""
@@ -175,7 +173,7 @@ def read_blocks(path: str | Path, topics: Topics | None = None, progress: Progre
                 ) -> Iterator[JointBlock | CaptureEvent]:
     """Yield the joint states and events of a bag (its directory, or the .mcap or .db3 file itself).
 
-    Joint states come in blocks of up to ``BLOCK`` messages; a block ends before an event and where names or array
+    Joint states come in blocks of up to ``cdr.BLOCK`` messages; a block ends before an event and where names or array
     lengths change. From a damaged recording everything before the fault is yielded; then BagError says what is
     wrong, so that nothing recorded is lost and no damage goes unseen.
     """
@@ -187,7 +185,7 @@ def read_blocks(path: str | Path, topics: Topics | None = None, progress: Progre
             if topic == recording.joint_topic:
                 first = first if waiting else recording.taken
                 waiting.append(raw)
-                if len(waiting) < BLOCK:
+                if len(waiting) < cdr.BLOCK:
                     continue
             yield from recording.joint_states(waiting, first)
             waiting = []
@@ -240,9 +238,7 @@ class _Recording:
         """What is wrong with the first message that is left out, and what to do."""
         self._left_out = 0
         self._joint_states = 0
-        self._layout: cdr.Layout | None = None
-        self._run = BLOCK
-        """Number of messages that the next attempt decodes at once; small where the names change often."""
+        self._decoder = cdr.Decoder()
         try:
             self._look()
         except OSError as err:
@@ -338,26 +334,20 @@ class _Recording:
 
     def joint_states(self, raws: list[bytes], first: int) -> Iterator[JointBlock]:
         """Decode consecutive joint states; ``first`` is the number of the first one among the messages read."""
-        done = 0
-        while done < len(raws):
-            tried = raws[done:done + self._run]
-            try:
-                block, self._layout = cdr.joint_block(tried, self._layout)
-            except (cdr.CdrError, UnicodeDecodeError) as err:
-                self._garbled(first + done, self.joint_topic, err)
-                done += 1
-                continue
-            count = len(block.stamp_ns)
-            self._run = min(8 * self._run, BLOCK) if count == len(tried) else max(count, 1)
-            self._joint_states += count
-            done += count
-            yield block
+        for found in self._decoder.blocks(raws):
+            if isinstance(found, cdr.CdrError):
+                self._garbled(first, self.joint_topic, found)
+                first += 1
+            else:
+                self._joint_states += len(found.stamp_ns)
+                first += len(found.stamp_ns)
+                yield found
 
     def event(self, topic: str, raw: bytes) -> Iterator[CaptureEvent]:
         """Decode an event; record a fault if the message is not an event."""
         try:
             yield cdr.capture_event(raw).heard_on(topic)
-        except (cdr.CdrError, UnicodeDecodeError) as err:
+        except cdr.CdrError as err:
             self._garbled(self.taken, topic, err)
         except ValueError as err:
             self._leave_out(f"an event on '{topic}' is left out: {err}",

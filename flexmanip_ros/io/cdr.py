@@ -6,7 +6,7 @@ names and lengths are equal. That takes about 0.1 us a message, the general deco
 """
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +21,8 @@ START = 4
 HEAD = START + STAMP.size
 """Size of encapsulation header and stamp, after which frame_id begins [bytes]. Offsets count from the first byte."""
 LITTLE_ENDIAN = b'\x00\x01'
+BLOCK = 2048
+"""Largest number of messages decoded at once: 2 s at 1 kHz, half a megabyte. Larger blocks are no faster."""
 
 
 class CdrError(ValueError):
@@ -59,30 +61,45 @@ def capture_event(raw: bytes) -> CaptureEvent:
     return CaptureEvent(stamp, EventKind(frame))
 
 
-def joint_record(raw: bytes, layout: Layout | None) -> tuple[JointRecord, Layout]:
-    """Return one JointState and its layout; pass that layout with the next message. Raises CdrError."""
-    if layout is None or len(raw) != layout.size:
-        layout = _joint_layout(raw)
-    row: Any = np.frombuffer(raw, layout.table)[0].item()
-    if (row[0], row[3], row[4::2]) != (LITTLE_ENDIAN, layout.words, layout.counts):
-        layout = _joint_layout(raw)
-        row = np.frombuffer(raw, layout.table)[0].item()
-    _, seconds, nanoseconds, _, _, position, _, velocity, _, effort = row
-    return JointRecord(seconds * 1_000_000_000 + nanoseconds, layout.names, position, velocity, effort), layout
+class Decoder:
+    """Decodes JointStates. It keeps the layout of the latest message, which the next one mostly has as well."""
 
+    def __init__(self) -> None:
+        self._layout: Layout | None = None
+        self._run = BLOCK
+        """Number of messages that the next attempt decodes at once; small where the layout changes often."""
 
-def joint_block(raws: Sequence[bytes], layout: Layout | None) -> tuple[JointBlock, Layout]:
-    """Decode JointStates up to the first one with another layout; return them with their layout.
+    def record(self, raw: bytes) -> JointRecord:
+        """Return one message. Raises CdrError."""
+        layout = self._layout
+        if layout is None or len(raw) != layout.size:
+            self._layout = layout = _joint_layout(raw)
+        row: Any = np.frombuffer(raw, layout.table)[0].item()
+        if (row[0], row[3], row[4::2]) != (LITTLE_ENDIAN, layout.words, layout.counts):
+            self._layout = layout = _joint_layout(raw)
+            row = np.frombuffer(raw, layout.table)[0].item()
+        _, seconds, nanoseconds, _, _, position, _, velocity, _, effort = row
+        return JointRecord(seconds * 1_000_000_000 + nanoseconds, layout.names, position, velocity, effort)
 
-    layout: a guess, such as the layout of the messages before. Raises CdrError where the first is no JointState.
-    """
-    guess = None if layout is None else _decoded(raws, layout)
-    if layout is not None and guess is not None:
-        return guess, layout
-    layout = _joint_layout(raws[0])
-    found = _decoded(raws, layout)
-    assert found is not None
-    return found, layout
+    def blocks(self, raws: Sequence[bytes]) -> Iterator[JointBlock | CdrError]:
+        """Yield the messages in blocks of one layout each, and an error in place of each that is no JointState."""
+        done = 0
+        while done < len(raws):
+            tried = raws[done:done + self._run]
+            block = None if self._layout is None else _decoded(tried, self._layout)
+            if block is None:
+                try:
+                    self._layout = _joint_layout(tried[0])
+                except CdrError as error:
+                    yield error
+                    done += 1
+                    continue
+                block = _decoded(tried, self._layout)
+                assert block is not None
+            count = len(block.stamp_ns)
+            self._run = min(8 * self._run, BLOCK) if count == len(tried) else count
+            done += count
+            yield block
 
 
 def _decoded(raws: Sequence[bytes], layout: Layout) -> JointBlock | None:
@@ -138,7 +155,10 @@ def _string(raw: bytes, at: int) -> tuple[str, int]:
     size, at = _count(raw, at)
     if size < 1 or at + size > len(raw) or raw[at + size - 1] != 0:
         raise CdrError('a text runs past the end of its message')
-    return raw[at:at + size - 1].decode('utf-8'), at + size
+    try:
+        return raw[at:at + size - 1].decode('utf-8'), at + size
+    except UnicodeDecodeError as error:
+        raise CdrError(str(error)) from error
 
 
 def _count(raw: bytes, at: int) -> tuple[int, int]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import array
-import struct
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -36,7 +35,7 @@ class JointStateReader:
     """Decoder of the bytes of a raw subscription, the one that reads bags: it takes a third of the time of rclpy's."""
 
     def __init__(self) -> None:
-        self._layout: cdr.Layout | None = None
+        self._decoder = cdr.Decoder()
 
     def __call__(self, raw: bytes) -> JointRecord:
         """Return the message; rclpy's own decoder is used where the bytes have another encoding.
@@ -44,28 +43,23 @@ class JointStateReader:
         Raises SignalError for bytes that are no JointState.
         """
         try:
-            record, self._layout = cdr.joint_record(raw, self._layout)
-        except (cdr.CdrError, UnicodeDecodeError, struct.error):
+            return self._decoder.record(raw)
+        except cdr.CdrError:
             return _decoded(raw)
-        return record
 
     def blocks(self, raws: Sequence[bytes]) -> Iterator[JointBlock | SignalError]:
         """Yield the messages in blocks of one layout each; yield a SignalError for bytes that are no JointState."""
-        first, most = 0, len(raws)
-        while first < len(raws):
-            part = raws[first:first + most]
+        done = 0
+        for found in self._decoder.blocks(raws):
+            if isinstance(found, JointBlock):
+                yield found
+                done += len(found.stamp_ns)
+                continue
             try:
-                block, self._layout = cdr.joint_block(part, self._layout)
-            except (cdr.CdrError, UnicodeDecodeError, struct.error):
-                try:
-                    block = JointBlock.of(_decoded(part[0]))
-                except SignalError as error:
-                    yield error
-                    first += 1
-                    continue
-            yield block
-            count = len(block.stamp_ns)
-            first, most = first + count, 2 * count  # where layouts alternate, a block does not scan all the rest
+                yield JointBlock.of(_decoded(raws[done]))
+            except SignalError as error:
+                yield error
+            done += 1
 
 
 def _decoded(raw: bytes) -> JointRecord:

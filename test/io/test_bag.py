@@ -49,9 +49,8 @@ def test_the_fast_decoder_agrees_with_the_library(names, frame, missing, sec, na
     header = kinds['std_msgs/msg/Header'](kinds['builtin_interfaces/msg/Time'](sec, nanosec), frame)
     raw = bytes(store.serialize_cdr(kinds['sensor_msgs/msg/JointState'](header, names, *arrays),
                                     'sensor_msgs/msg/JointState'))
-    first, layout = cdr.joint_record(raw, None)
-    again, _ = cdr.joint_record(raw, layout)
-    for record in (first, again):
+    decoder = cdr.Decoder()
+    for record in (decoder.record(raw), decoder.record(raw)):
         assert (record.names, record.stamp_ns) == (tuple(names), sec * 10**9 + nanosec)
         for field, expected in zip(('position', 'velocity', 'effort'), arrays, strict=True):
             np.testing.assert_array_equal(getattr(record, field), expected)
@@ -60,13 +59,12 @@ def test_the_fast_decoder_agrees_with_the_library(names, frame, missing, sec, na
 def test_names_that_change_in_mid_recording_are_followed():
     store = get_typestore(Stores.ROS2_JAZZY)
     kinds = store.types
-    layout = None
+    decoder = cdr.Decoder()
     for names in (['a1', 'b1'], ['b1', 'a1'], ['longer', 'x'], []):
         header = kinds['std_msgs/msg/Header'](kinds['builtin_interfaces/msg/Time'](1, 2), '')
         values = np.zeros(len(names))
         message = kinds['sensor_msgs/msg/JointState'](header, names, values, values, values)
-        record, layout = cdr.joint_record(
-            bytes(store.serialize_cdr(message, 'sensor_msgs/msg/JointState')), layout)
+        record = decoder.record(bytes(store.serialize_cdr(message, 'sensor_msgs/msg/JointState')))
         assert record.names == tuple(names)
 
 
