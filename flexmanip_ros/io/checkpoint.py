@@ -5,13 +5,11 @@ rows of the sample log among them) and one text, ``tree``: JSON that says which 
 where. Reading makes only values of this package (NamedTuples, dataclasses, enumerations), so no file can run code.
 """
 
-import contextlib
 import dataclasses
 import hashlib
 import importlib
 import io
 import json
-import os
 import threading
 import time
 import zipfile
@@ -23,7 +21,8 @@ import numpy as np
 
 import flexmanip_ros
 from flexmanip_ros import pipeline
-from flexmanip_ros.errors import CheckpointError
+from flexmanip_ros.errors import CheckpointError, FlexmanipError
+from flexmanip_ros.io.outputs import write_file
 from flexmanip_ros.parameters import IdentifierParameters, flatten, leaves
 
 NAME, FORMAT = b'flexmanip_ros checkpoint ', b'33\n'
@@ -38,16 +37,11 @@ _EMPTY_START = 'the identifier starts with nothing known'
 
 def save(path: str | Path, value: Any) -> None:
     """Write a value; the old file stays until the new one is complete. Raises CheckpointError."""
-    target = Path(path)
-    partial = target.with_name(target.name + '.partial')
+    data = encode(value)
     try:
-        partial.write_bytes(encode(value))
-        os.replace(partial, target)
-    except OSError as err:
-        with contextlib.suppress(OSError):
-            partial.unlink()  # on a full disk it would take up space
-        raise CheckpointError(f"checkpoint '{path}' cannot be written: {err.strerror}",
-                              'give another checkpoint_file, or free some space') from err
+        write_file(path, lambda file: file.write(data))
+    except FlexmanipError as err:
+        raise CheckpointError(f'checkpoint {err.problem}', 'give another checkpoint_file, or free some space') from err
 
 
 def load(path: str | Path) -> Any:

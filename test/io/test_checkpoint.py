@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -105,12 +106,10 @@ def test_a_save_that_fails_keeps_the_old_state_and_leaves_no_scraps(
     path = tmp_path / 'state'
     checkpoint.save(path, (1.0, 2.0))
 
-    def full(self: Path, data: bytes) -> None:
-        with self.open('wb') as file:
-            file.write(data[:20])
+    def full(source: Path, target: Path) -> None:
         raise OSError(28, 'No space left on device')
 
-    monkeypatch.setattr(Path, 'write_bytes', full)
+    monkeypatch.setattr(os, 'replace', full)
     with pytest.raises(CheckpointError, match='No space left'):
         checkpoint.save(path, (3.0, 4.0))
     assert checkpoint.load(path) == (1.0, 2.0)
