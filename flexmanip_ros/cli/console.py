@@ -224,6 +224,14 @@ def aligned(rows: Iterable[Sequence[str]], formats: Sequence[str]) -> list[str]:
     return [' '.join(f'{cell:{how}}' for cell, how in zip(row, formats, strict=True)) for row in rows]
 
 
+def start(parser: Callable[[], Parser], body: Callable[[argparse.Namespace], int],
+          arguments: Sequence[str] | None = None) -> int:
+    """Run a program with its arguments; return its exit status."""
+    made = parser()
+    given = made.parse_args(arguments)
+    return run(made.prog, lambda: body(given))
+
+
 def run(prog: str, body: Callable[[], int]) -> int:
     """Run a program; return its exit status.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 from flexmanip_ros.cli import console
@@ -78,12 +78,6 @@ def _parser() -> console.Parser:
     return made
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; return its exit status."""
-    given = _parser().parse_args(arguments)
-    return console.run(PROG, lambda: _main(given))
-
-
 def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.cli.replay import Request, check_places, identify, places
     from flexmanip_ros.io.bag import Topics
@@ -133,6 +127,8 @@ def describe(result: Result) -> list[str]:
         rows.append(('smoothed', f'{part.start_s:.3f} to {part.end_s:.3f} s, {part.method}{last}: {told or "no mode"}'))
     return [f'{name:12s} {words}' for name, words in (*rows, *(('written', place) for place in result.written))]
 
+
+main = partial(console.start, _parser, _main)
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -9,6 +9,7 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,12 +48,6 @@ def _parser() -> console.Parser:
     add('--scheduler', metavar='ADDRESS', help='run on the Dask cluster with this scheduler instead')
     console.add_parameters(made, 'the identifier, for recordings', ' of the identifier, also over a scenario')
     return made
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; return its exit status."""
-    given = _parser().parse_args(arguments)
-    return console.run(PROG, lambda: _main(given))
 
 
 def _main(given: argparse.Namespace) -> int:
@@ -154,6 +149,8 @@ def describe(rows: Sequence[Row]) -> list[str]:
             number(made.bound_ratio), number(made.us_per_sample)))
     return console.aligned(lines, ('24', '>6', '>6', '>10', '>9', '>8', '>9', '>22', '>9', '>9'))
 
+
+main = partial(console.start, _parser, _main)
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -7,6 +7,7 @@ import importlib.util
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,12 +46,6 @@ def _parser() -> console.Parser:
         help='folder to write into; default: paper_reproduction')
     console.add_workers(made)
     return made
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; return its exit status."""
-    given = _parser().parse_args(arguments)
-    return console.run(PROG, lambda: _main(given))
 
 
 def _main(given: argparse.Namespace) -> int:
@@ -141,6 +136,8 @@ def describe(lines: Sequence[Mapping[str, Any]]) -> list[str]:
             *((line['case'], line['method'], *(console.number(line[name]) for name in SHOWN)) for line in lines)]
     return console.aligned(rows, ('40', '12', '>9', '>9', '>9', '>11', '>10'))
 
+
+main = partial(console.start, _parser, _main)
 
 if __name__ == '__main__':
     sys.exit(main())

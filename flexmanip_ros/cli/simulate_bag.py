@@ -7,6 +7,7 @@ import json
 import math
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,12 +57,6 @@ def _parser() -> console.Parser:
         help='print how accurate a payload estimate from this torque can be; this takes half a minute')
     console.add_parameters(made, 'plant_simulator and excitation', f', {PREFIX}NAME for one of the torque')
     return made
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; return its exit status."""
-    given = _parser().parse_args(arguments)
-    return console.run(PROG, lambda: _main(given))
 
 
 def configurations(given: argparse.Namespace) -> tuple[PlantParameters, ExcitationParameters]:
@@ -149,6 +144,8 @@ def truth(plant: PlantParameters, torque: ExcitationParameters, events: Sequence
         'plant': flatten(plant), 'excitation': flatten(torque),
     }
 
+
+main = partial(console.start, _parser, _main)
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -11,7 +11,7 @@ import argparse
 import math
 import sys
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 from flexmanip_ros.cli import console
@@ -38,12 +38,6 @@ def _parser() -> console.Parser:
     made.add_argument('--segments', metavar='N', type=int, default=12, help='segments of each link; default: 12')
     made.add_argument('--output', metavar='FILE', help='file to write; default: standard output')
     return made
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; return its exit status."""
-    given = _parser().parse_args(arguments)
-    return console.run(PROG, lambda: _main(given))
 
 
 def _main(given: argparse.Namespace) -> int:
@@ -159,6 +153,8 @@ def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str, off
     if mimic:
         ET.SubElement(joint, 'mimic', joint=mimic[0], multiplier=f'{mimic[1]:.9g}', offset='0')
 
+
+main = partial(console.start, _parser, _main)
 
 if __name__ == '__main__':
     sys.exit(main())
