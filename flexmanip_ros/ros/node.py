@@ -30,6 +30,7 @@ from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
+from std_srvs.srv import Trigger
 
 from flexmanip_ros.cli import console
 from flexmanip_ros.errors import FlexmanipError, ParameterError
@@ -274,6 +275,14 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         made = rclpy_workarounds.Alarm(self, callback)
         self._unknown_to_rclpy.callback(made.close)
         return made
+
+    def trigger_service(self, name: str, act: Callable[[], tuple[bool, str]]) -> None:
+        """Create a service without arguments; ``act`` returns whether it succeeded, and what the caller is told."""
+        def called(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            response.success, response.message = act()
+            return response
+
+        self.create_service(Trigger, name, called)
 
     def destroy_node(self) -> None:
         """Destroy the node, its alarms, and the subscriptions that the executor does not know."""

@@ -15,14 +15,12 @@ sensor_output = partial(_reliable, depth=SENSOR_DEPTH)
 """Profile for publishing joint states: reliable, so that reliable and best-effort subscriptions match."""
 sensor_input = partial(sensor_output, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Profile for subscribing to joint states: best effort, so that reliable and best-effort publishers match."""
-command = partial(_reliable, depth=10)
-"""Profile for effort commands."""
+output = partial(_reliable, depth=10)
+"""Profile for effort commands, and for whatever has no other profile here."""
 latched = partial(_reliable, depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Profile for publishing events, models and payloads: a late subscription still gets the last message."""
 latched_input = partial(latched, depth=10)
 """Profile for subscribing to latched topics, deeper than ``latched``: two events in quick succession both arrive."""
-output = partial(_reliable, depth=10)
-"""Profile for everything else that the identifier publishes."""
 
 
 def overridable() -> QoSOverridingOptions:

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from rclpy.publisher import Publisher
 from std_msgs.msg import Header
-from std_srvs.srv import Trigger
 
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.parameters import TriggerParameters
@@ -76,8 +75,8 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         self.events_publisher = self.publisher(Header, 'capture_event', qos.latched())
         self.detected_publisher = self.publisher(Header, 'capture_detected', qos.latched())
         self.each_joint_state(self._on_joint_state, self.faults.losses)
-        self.create_service(Trigger, '~/capture', lambda _, response: self._requested(EventKind.CAPTURE, response))
-        self.create_service(Trigger, '~/release', lambda _, response: self._requested(EventKind.RELEASE, response))
+        for kind in EventKind:
+            self.trigger_service(f'~/{kind.value}', partial(self._requested, kind))
 
     def start(self) -> None:
         """Compile or load what mode auto needs, before the first sample."""
@@ -174,22 +173,18 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
             return ''
         return ': the arm holds an object already, a second one is added (call release first if it let go)'
 
-    def _requested(self, kind: EventKind, response: Trigger.Response) -> Trigger.Response:
+    def _requested(self, kind: EventKind) -> tuple[bool, str]:
         silent = time.monotonic() - self._arrived
         if not self.active:
-            response.success, response.message = False, f'{NAME} is not active'
-        elif self._last_ns is None:
-            response.success = False
-            response.message = 'no joint_states with a stamp came yet, so the instant has no stamp; start the arm first'
-        elif silent > self.config.stale_after:
-            response.success = False
-            response.message = f'no joint_states for {silent:.1f} s; is the driver alive?'
-        else:
-            event = CaptureEvent(self._last_ns + round(self.config.service_delay * 1e9), kind)
-            response.success = True
-            response.message = f'{kind.value} at {event.stamp_ns * 1e-9:.6f}{self._adds_an_object(event)}'
-            self._announce(event)
-        return response
+            return False, f'{NAME} is not active'
+        if self._last_ns is None:
+            return False, 'no joint_states with a stamp came yet, so the instant has no stamp; start the arm first'
+        if silent > self.config.stale_after:
+            return False, f'no joint_states for {silent:.1f} s; is the driver alive?'
+        event = CaptureEvent(self._last_ns + round(self.config.service_delay * 1e9), kind)
+        words = f'{kind.value} at {event.stamp_ns * 1e-9:.6f}{self._adds_an_object(event)}'
+        self._announce(event)
+        return True, words
 
     def report(self, report: Report) -> None:
         """Report the rate of the joint states, losses, faults and restarts of the detection, and the events."""

@@ -37,7 +37,7 @@ class Excitation(FlexmanipNode[ExcitationParameters]):
 
     def make_entities(self) -> None:
         """Create the publisher, and the timer or the subscription whose callback sends each torque."""
-        self.commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.command())
+        self.commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.output())
         self._grid: SampleGrid | None = None
         if self.config.clock == 'joint_states':
             self.each_joint_state(self._on_joint_state)

@@ -73,12 +73,12 @@ class PayloadController(FlexmanipNode[ControllerParameters]):
 
     def make_entities(self) -> None:
         """Create the publisher, the subscriptions, and the timer that notices when joint states cease."""
-        self._commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.command())
+        self._commands = self.publisher(Float64MultiArray, 'effort_controller/commands', qos.output())
         self.each_joint_state(self._on_joint_state)
         self.subscription(Float64MultiArray, 'rpbsid_identifier/payload_estimate', self._on_estimate,
                           qos.latched_input())
         self.subscription(Float64MultiArray, 'rpbsid_identifier/payload_body', self._on_body, qos.latched_input())
-        self.subscription(Float64MultiArray, '~/added_efforts', self._on_added, qos.command())
+        self.subscription(Float64MultiArray, '~/added_efforts', self._on_added, qos.output())
         self.create_timer(self.config.stale_after / 4.0, self._watch, clock=self._steady)
 
     def start(self) -> None:

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
-from std_srvs.srv import Trigger
 
 from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import PlantParameters
@@ -60,10 +59,10 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
     def make_entities(self) -> None:
         """Create the publisher, the subscriptions, the service and the timer."""
         self.joint_states = self.publisher(JointState, 'joint_states', qos.sensor_output())
-        self.subscription(Float64MultiArray, 'effort_controller/commands', self._on_command, qos.command(),
+        self.subscription(Float64MultiArray, 'effort_controller/commands', self._on_command, qos.output(),
                           losses=self.lost_commands)
         self.subscription(Header, 'capture_event', self._on_event, qos.latched_input())
-        self.create_service(Trigger, '~/reset', self._on_reset)
+        self.trigger_service('~/reset', self._on_reset)
         self._grid = SampleGrid(self, self.config.rate, self._begin, self._advance)
         self._more = self.alarm(self._grid.tick) if self._grid.is_simulated else None
 
@@ -170,17 +169,16 @@ class PlantSimulator(FlexmanipNode[PlantParameters]):
         self.rejected_events += 1
         self.log_throttled('event', words)
 
-    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_reset(self) -> tuple[bool, str]:
         if not self.active:
-            response.success, response.message = False, f'{NAME} is not active'
-            return response
+            return False, f'{NAME} is not active'
         if self._grid.is_running:
             if self.fault is not None:  # the samples since the fault are not made up for
                 self.samples = max(self.samples, self._grid.latest() + 1)
             self._restart()
-        response.success, response.message = True, 'the arm is at its start, at rest and empty'
-        self.get_logger().info(f'reset: {response.message}')
-        return response
+        words = 'the arm is at its start, at rest and empty'
+        self.get_logger().info(f'reset: {words}')
+        return True, words
 
     def report(self, report: Report) -> None:
         """Report the rate, the backlog, dropped commands and events that came late."""

@@ -31,7 +31,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import InertiaStamped
 from numpy.typing import NDArray
 from std_msgs.msg import Float64, Float64MultiArray, Header
-from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from flexmanip_ros import messages, pipeline
@@ -165,7 +164,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self._alarm = self.alarm(self._take)
         self._alarm.after(LONGEST_WAIT_S)
         self.each_event(self._on_event)
-        self.create_service(Trigger, '~/reset', self._on_reset)
+        self.trigger_service('~/reset', self._on_reset)
         self._markers = ArmMarkers(self.config)
         if self._markers.drawn:
             self.arm = self.publisher(MarkerArray, f'~/{ARM}', qos.output())
@@ -363,12 +362,12 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self.problem = shortened(words)
         self.log_throttled(reason, words)
 
-    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_reset(self) -> tuple[bool, str]:
         self._waiting(None)
         self._forget()
-        response.success, response.message = True, 'everything identified so far is forgotten'
-        self.get_logger().info(f'reset: {response.message}')
-        return response
+        words = 'everything identified so far is forgotten'
+        self.get_logger().info(f'reset: {words}')
+        return True, words
 
     def report(self, report: Report) -> None:
         """Report the rate, losses, drops by reason, and the quality of the latest estimate."""
