@@ -129,11 +129,10 @@ def columns(estimates: Sequence[Estimate], start_ns: int | None = None) -> dict[
     start = start_ns if start_ns is not None else next(iter(stamps), 0)
     count = max((len(estimate.modes) for estimate in estimates), default=0)
     modes = np.full((len(estimates), count, 4), np.nan)
+    payload = np.full((len(estimates), len(PAYLOAD)), np.nan)
     for row, estimate in enumerate(estimates):
         if estimate.modes:
             modes[row, :len(estimate.modes)] = estimate.modes
-    payload = np.full((len(estimates), len(PAYLOAD)), np.nan)
-    for row, estimate in enumerate(estimates):
         if estimate.payload is not None:
             payload[row] = [getattr(estimate.payload, name) for name in PAYLOAD]
     found: dict[str, Any] = {

@@ -21,7 +21,7 @@ from flexmanip_ros.io import outputs
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.whole_recording import Scores, Smoothed, Sweep
-from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, Payload, Status
+from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, Status
 from flexmanip_ros.view.screen import (
     COLOURS,
     EVENT_COLOUR,
@@ -91,11 +91,6 @@ def events(axes: Iterable[Any], found: Sequence[Event]) -> None:
                             annotation_clip=True)
 
 
-def times(estimates: Sequence[Estimate], start_ns: int) -> Array:
-    """Return the time of each estimate [s]: (T,)."""
-    return np.array([(estimate.stamp_ns - start_ns) * 1e-9 for estimate in estimates], dtype=np.float64)
-
-
 def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int, truth: Sequence[Known] = ()) -> None:
     """Draw the identified frequencies with their 95 % bands."""
     found = outputs.columns(estimates, start_ns)
@@ -163,8 +158,8 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
 
     truth: (from [s], to [s], mass [kg]) of each stretch; zoom: show the range of the late estimates, without zero.
     """
-    time, payloads = _payloads(estimates, start_ns)
-    table = np.array([(p.mass, p.lower, p.upper) for p in payloads], dtype=np.float64).reshape(-1, 3)
+    found = _with_payload(estimates, start_ns)
+    time, table = found['time_s'], np.column_stack([found[f'payload_{name}_kg'] for name in ('mass', 'lower', 'upper')])
     ax.fill_between(time, table[:, 1], table[:, 2], color=PAYLOAD_COLOUR, alpha=0.25, linewidth=0,
                     label='95 % interval')
     ax.plot(time, table[:, 0], color=PAYLOAD_COLOUR, linewidth=1.5, label='estimate')
@@ -172,7 +167,7 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
         ax.plot([begin, end], [mass, mass], color=TRUTH_COLOUR, linestyle=(0, (4, 3)), linewidth=1.2,
                 label='true' if index == 0 else None)
     limit(ax, table, [mass for _, _, mass in truth[-1:]] if zoom else [0.0, *(mass for _, _, mass in truth)])
-    last = table[-1] if len(payloads) and np.isfinite(table[-1]).all() else None
+    last = table[-1] if len(table) and np.isfinite(table[-1]).all() else None
     if last is not None and not zoom:
         width = max(float(last[2] - last[1]), 1e-6)
         digits = min(max(1 - math.floor(math.log10(width)), 0), 6)  # two significant digits of the interval's width
@@ -183,10 +178,9 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
     legend(ax)
 
 
-def _payloads(estimates: Sequence[Estimate], start_ns: int) -> tuple[Array, list[Payload]]:
-    """Return the times (T,) [s] and the payloads of the estimates that have one."""
-    found = [(estimate, estimate.payload) for estimate in estimates if estimate.payload is not None]
-    return times([estimate for estimate, _ in found], start_ns), [payload for _, payload in found]
+def _with_payload(estimates: Sequence[Estimate], start_ns: int) -> dict[str, Array]:
+    """Return the columns of the estimates that have a payload."""
+    return outputs.columns([estimate for estimate in estimates if estimate.payload is not None], start_ns)
 
 
 def limit(ax: Any, values: Array, known: Sequence[float]) -> None:
@@ -206,7 +200,7 @@ def limit(ax: Any, values: Array, known: Sequence[float]) -> None:
 
 def statuses(ax: Any, estimates: Sequence[Estimate], start_ns: int) -> None:
     """Draw the status over time."""
-    time = times(estimates, start_ns)
+    time = outputs.columns(estimates, start_ns)['time_s']
     changes = [k for k in range(1, len(estimates)) if estimates[k].status is not estimates[k - 1].status]
     for begin, end in pairwise([0, *changes, len(estimates) - 1] if estimates else []):
         ax.axvspan(time[begin], time[end], **_status_look(estimates[begin].status))
@@ -270,7 +264,7 @@ def run(config: IdentifierParameters, signals: Signals, estimates: Sequence[Esti
     return Run(signals, estimates, tuple(found), config.payload_method != 'none', truth or Truth())
 
 
-def overview_figure(made: Run, path: str | Path, title: str = '') -> None:
+def overview_figure(made: Run, path: str | Path, title: str) -> None:
     """Write one picture of a run as PNG: torques, bends, frequencies, payload, status over time."""
     groups = signal_groups(made)
     with_payload = any(estimate.payload is not None for estimate in made.estimates)
@@ -280,8 +274,7 @@ def overview_figure(made: Run, path: str | Path, title: str = '') -> None:
         lines(ax, made.signals.time, *group)
     _estimates(axes[len(groups):], made, with_payload)
     events(axes, made.events)
-    if title:
-        drawn.suptitle(title, x=0.02, ha='left', fontsize=13, fontweight='bold')
+    drawn.suptitle(title, x=0.02, ha='left', fontsize=13, fontweight='bold')
     drawn.savefig(str(path), format='png')
 
 
@@ -358,9 +351,9 @@ def payload_figure(made: Run) -> Figure:
     drawn, axes = figure([2.0, 2.4, 1.3])
     payload(axes[0], made.estimates, made.start_ns, _stretches(made)[1])
     payload(axes[1], made.estimates, made.start_ns, _stretches(made)[1], zoom=True)
-    time, payloads = _payloads(made.estimates, made.start_ns)
-    values = np.array([found.consistency for found in payloads], dtype=np.float64)
-    axes[2].plot(time, values, color=COLOURS[0], linewidth=1.2)
+    found = _with_payload(made.estimates, made.start_ns)
+    values = found['consistency']
+    axes[2].plot(found['time_s'], values, color=COLOURS[0], linewidth=1.2)
     axes[2].axhline(1.0, color='#555555', linewidth=1.0, linestyle=':')
     finite = values[np.isfinite(values)]
     if finite.size:

@@ -41,7 +41,7 @@ POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inli
 class Feed:
     """Numbered events in order, which each page reads at its own pace."""
 
-    def __init__(self, page: bytes = b'') -> None:
+    def __init__(self, page: bytes) -> None:
         self._changed = threading.Condition()
         # The checksum of the page: a page that connects again and gets another checksum loads the new page.
         self._reset = f'{{"page":{zlib.crc32(page)}}}'
