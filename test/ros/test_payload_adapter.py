@@ -42,10 +42,15 @@ def say(ros: Ros, mass: float, std: float, period: float = 0.02) -> tuple[Any, A
     return payload, estimate
 
 
-def test_a_trusted_payload_becomes_a_parameter_of_another_node(ros: Ros) -> None:
+def beside_a_plant(ros: Ros, **values: Any) -> tuple[PayloadAdapter, PlantSimulator]:
+    """Return an adapter that sets a parameter of a plant, and the plant."""
     plant = ros.managed(PlantSimulator(context=ros.context, overrides=overrides(rate=50.0, arm__modes=1)))
-    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
-        target_node='plant_simulator', settle_time=0.1)))
+    return ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
+        target_node='plant_simulator', **values))), plant
+
+
+def test_a_trusted_payload_becomes_a_parameter_of_another_node(ros: Ros) -> None:
+    adapter, plant = beside_a_plant(ros, settle_time=0.1)
     say(ros, 31.5, 0.1)
     ros.wait(lambda: plant.config.payload_mass == 31.5, what='the parameter')
     ros.wait(lambda: adapter.sent == 1)
@@ -53,38 +58,28 @@ def test_a_trusted_payload_becomes_a_parameter_of_another_node(ros: Ros) -> None
 
 
 def test_a_doubtful_payload_is_not_told(ros: Ros) -> None:
-    plant = ros.managed(PlantSimulator(context=ros.context, overrides=overrides(rate=50.0, arm__modes=1)))
-    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
-        target_node='plant_simulator', settle_time=0.0)))
+    adapter, plant = beside_a_plant(ros, settle_time=0.0)
     heard = ros.listen(Float64MultiArray, 'rpbsid_identifier/payload_estimate', 10)
     say(ros, 31.5, 9.0)
     ros.wait(lambda: len(heard) > 20)
     assert (plant.config.payload_mass, adapter.sent) == (20.0, 0)
 
 
-def test_a_refusal_is_reported_with_its_reason_and_asked_again(ros: Ros) -> None:
-    ros.managed(PlantSimulator(context=ros.context, overrides=overrides(rate=50.0, arm__modes=1)))
-    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
-        target_node='plant_simulator', mass_parameter='rate', settle_time=0.0, min_period=0.05)))
+@pytest.mark.parametrize(('name', 'words'), [
+    ('rate', ('read-only',)),
+    ('pay_load', ("node 'plant_simulator' did not set its parameter 'pay_load' to 31.500 kg",
+                  'let target_node and mass_parameter name a double that the node declares'))])
+def test_a_parameter_that_the_node_does_not_set_is_named_with_the_reason_and_what_to_do(
+        ros: Ros, name: str, words: tuple[str, ...]) -> None:
+    adapter, _ = beside_a_plant(ros, mass_parameter=name, settle_time=0.0, min_period=0.05)
     say(ros, 31.5, 0.1)
-    ros.wait(lambda: 'read-only' in adapter.problem, what='the reason')
+    ros.wait(lambda: all(part in adapter.problem for part in words), what='the reason')
     assert adapter.sent == 0
-
-
-def test_a_parameter_that_the_node_does_not_have_is_named_with_what_to_do(ros: Ros) -> None:
-    ros.managed(PlantSimulator(context=ros.context, overrides=overrides(rate=50.0, arm__modes=1)))
-    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
-        target_node='plant_simulator', mass_parameter='pay_load', settle_time=0.0)))
-    say(ros, 31.5, 0.1)
-    ros.wait(lambda: "node 'plant_simulator' did not set its parameter 'pay_load' to 31.500 kg" in adapter.problem)
-    assert 'let target_node and mass_parameter name a double that the node declares' in adapter.problem
 
 
 def test_estimates_that_cease_are_a_warning_and_are_no_longer_trusted(
         ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
-    ros.managed(PlantSimulator(context=ros.context, overrides=overrides(rate=50.0, arm__modes=1)))
-    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
-        target_node='plant_simulator', settle_time=0.0)))
+    adapter, _ = beside_a_plant(ros, settle_time=0.0)
     heard = ros.listen(DiagnosticArray, '/diagnostics')
     say(ros, 31.5, 0.1)
     ros.wait(lambda: adapter.sent == 1)
@@ -101,9 +96,7 @@ def test_estimates_that_cease_are_a_warning_and_are_no_longer_trusted(
 def test_estimates_every_half_a_second_are_trusted_and_no_warning_where_a_fifth_of_a_second_counts_as_long(
         ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(handover, 'LONGEST_AGE', 0.2)
-    plant = ros.managed(PlantSimulator(context=ros.context, overrides=overrides(rate=50.0, arm__modes=1)))
-    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
-        target_node='plant_simulator', settle_time=3.0)))
+    adapter, plant = beside_a_plant(ros, settle_time=3.0)
     heard = ros.listen(DiagnosticArray, '/diagnostics')
     say(ros, 31.5, 0.1, period=0.5)
     ros.wait(lambda: adapter.sent == 1)
@@ -131,9 +124,7 @@ def test_a_request_without_a_place_for_a_payload_is_refused_before_it_is_needed(
 
 
 def test_a_payload_that_is_not_that_of_its_estimate_is_not_told(ros: Ros) -> None:
-    plant = ros.managed(PlantSimulator(context=ros.context, overrides=overrides(rate=50.0, arm__modes=1)))
-    adapter = ros.managed(PayloadAdapter(context=ros.context, overrides=overrides(
-        target_node='plant_simulator', settle_time=0.0)))
+    adapter, plant = beside_a_plant(ros, settle_time=0.0)
     payload, _ = say(ros, 31.5, 0.1)
     ros.wait(lambda: adapter.sent == 1)
     payload.publish(InertiaStamped(inertia=Inertia(m=90.0)))

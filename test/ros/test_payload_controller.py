@@ -9,6 +9,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from joint_states import joint_state
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -29,10 +30,15 @@ def start(ros: Ros, readers: int = 1, **values: object) -> PayloadController:
     return node
 
 
-def test_each_sample_gets_the_torque_of_the_core(ros: Ros) -> None:
+def controlled(ros: Ros, **values: object) -> tuple[PayloadController, Publisher, list[Float64MultiArray]]:
+    """Return the node, a publisher of joint states, and the torques that are sent."""
     heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
-    node = start(ros)
-    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    node = start(ros, **values)
+    return node, ros.publisher(JointState, 'joint_states', qos.sensor_output()), heard
+
+
+def test_each_sample_gets_the_torque_of_the_core(ros: Ros) -> None:
+    node, states, heard = controlled(ros)
     for k in range(50):
         states.publish(joint_state(k, ('link2_bend', 'joint1', 'other', 'joint2', 'link1_bend')))
     ros.wait(lambda: len(heard) == 50)
@@ -45,9 +51,7 @@ def test_each_sample_gets_the_torque_of_the_core(ros: Ros) -> None:
 
 
 def test_bad_samples_get_no_torque_and_are_counted(ros: Ros) -> None:
-    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
-    node = start(ros)
-    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    node, states, heard = controlled(ros)
     good, nan, nan_rate, short, unnamed, late = (joint_state(k) for k in (5, 6, 7, 8, 9, 4))
     nan.position[2] = nan_rate.velocity[1] = math.nan
     short.velocity = []
@@ -102,9 +106,7 @@ def test_a_trusted_latched_estimate_changes_the_schedule_and_a_wild_one_does_not
 
 
 def test_a_clock_that_was_set_back_is_followed(ros: Ros) -> None:
-    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
-    node = start(ros)
-    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    node, states, heard = controlled(ros)
     for start_ns in (2 * 10**18, 10**18):
         for k in range(5):
             states.publish(joint_state(k, start_ns=start_ns))
@@ -114,9 +116,7 @@ def test_a_clock_that_was_set_back_is_followed(ros: Ros) -> None:
 
 @pytest.mark.parametrize('value', [math.nan, math.inf, 1e308, -1e300])
 def test_no_value_of_a_sample_makes_the_torque_anything_but_a_limited_number(ros: Ros, value: float) -> None:
-    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
-    node = start(ros)
-    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    node, states, heard = controlled(ros)
     for k in range(20):
         message = joint_state(k)
         if k % 5 == 1:
@@ -146,9 +146,7 @@ def test_where_there_is_no_regulator_the_gains_stay(ros: Ros, monkeypatch: pytes
 
 
 def test_silence_means_zero_torque_once(ros: Ros) -> None:
-    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
-    start(ros, stale_after=0.1, hold_present=False, setpoint=[1.0, 1.0])
-    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    _, states, heard = controlled(ros, stale_after=0.1, hold_present=False, setpoint=[1.0, 1.0])
     for k in range(20):
         states.publish(joint_state(k))
     ros.wait(lambda: len(heard) == 21)
@@ -174,9 +172,7 @@ def test_the_arm_is_brought_to_a_new_setpoint_live(ros: Ros) -> None:
 
 
 def test_a_setpoint_ends_holding_the_present_angles_whatever_its_value_and_also_before_activation(ros: Ros) -> None:
-    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
-    node = start(ros)
-    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    node, states, heard = controlled(ros)
 
     def sample(k: int) -> None:
         before = len(heard)
@@ -203,9 +199,7 @@ def test_a_setpoint_ends_holding_the_present_angles_whatever_its_value_and_also_
 
 
 def test_a_parameter_that_is_no_setpoint_moves_nothing(ros: Ros) -> None:
-    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
-    node = start(ros, setpoint=[0.5, 0.3], hold_present=False)
-    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    node, states, heard = controlled(ros, setpoint=[0.5, 0.3], hold_present=False)
     for k, (name, value) in enumerate((('max_payload', 30.0), ('setpoint', [0.5, 0.3]), ('setpoint', [0.1, 0.0]))):
         (result,) = node.set_parameters([Parameter(name, value=value)])
         assert result.successful
@@ -256,9 +250,7 @@ def test_a_setpoint_beyond_two_turns_is_rejected_live_and_at_start(ros: Ros, ang
 
 
 def test_a_setpoint_with_a_passive_joint_gives_finite_torques(ros: Ros) -> None:
-    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
-    start(ros, effort_limit=[300.0, 0.0], hold_present=False, setpoint=[0.5, 0.2])
-    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    _, states, heard = controlled(ros, effort_limit=[300.0, 0.0], hold_present=False, setpoint=[0.5, 0.2])
     for k in range(200):
         states.publish(joint_state(k))
     ros.wait(lambda: len(heard) == 200)
@@ -270,10 +262,8 @@ def test_a_setpoint_with_a_passive_joint_gives_finite_torques(ros: Ros) -> None:
 
 def test_a_torque_that_is_not_finite_is_never_sent_and_the_control_begins_again(
         ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
-    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
     diagnostics = ros.listen(DiagnosticArray, '/diagnostics')
-    node = start(ros)
-    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    node, states, heard = controlled(ros)
     for k, bad in enumerate((False, True, False, False)):
         with monkeypatch.context() as patch:
             if bad:
@@ -290,10 +280,8 @@ def test_a_torque_that_is_not_finite_is_never_sent_and_the_control_begins_again(
 
 def test_an_arm_too_heavy_for_its_joints_is_said_once_with_the_torques_that_it_needs(
         ros: Ros, capfd: pytest.CaptureFixture[str]) -> None:
-    heard = ros.listen(Float64MultiArray, 'effort_controller/commands')
     diagnostics = ros.listen(DiagnosticArray, '/diagnostics')
-    node = start(ros, arm__gravity=[0.0, -9.81], rate=250.0, hold_present=False)
-    states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    node, states, heard = controlled(ros, arm__gravity=[0.0, -9.81], rate=250.0, hold_present=False)
     words = 'holding the arm at 0 and 0 rad needs 1742 and 514.6 N m; effort_limit is 300 and 150 N m'
     for k in range(200):  # 0.8 s at the limits
         states.publish(joint_state(4 * k))
