@@ -7,19 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import NAMES, START, record
 from rosbags.rosbag2 import Reader
 
 from flexmanip_ros.cli import monte_carlo, replay, reproduce_paper, simulate_bag, write_urdf
 from flexmanip_ros.cli.identify_bag import main
 from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.io import cdr
-from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
-START = 1_700_000_000_000_000_000
 MS = 1_000_000
-NAMES = ('joint1', 'joint2', 'link1_bend', 'link2_bend')
 PLAIN = '--set=payload_method=none'
 
 
@@ -34,12 +32,7 @@ def _still(count: int, level: float) -> list[JointRecord]:
 
 
 def _bag(path: Path, records: list[JointRecord], *events: CaptureEvent, at: int = 0) -> Path:
-    with BagWriter(path, flush_period=None) as writer:
-        for k, record in enumerate(records):
-            for event in events if k == at else ():
-                writer.write('/capture_event', START + k * MS, event)
-            writer.write('/joint_states', START + k * MS, record)
-    return path
+    return record(path, [*records[:at], *events, *records[at:]])
 
 
 def _run(capsys, *arguments: object) -> tuple[int, dict, str]:

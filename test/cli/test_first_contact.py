@@ -8,19 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import START, record
 
 from flexmanip_ros.cli import replay
 from flexmanip_ros.cli.console import Report
 from flexmanip_ros.cli.identify_bag import main
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io import bag
-from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
 from flexmanip_ros.payload.capture_detection import watch, with_detected
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, JointRecord
 
-START = 1_700_000_000_000_000_000
 CAPTURE = CaptureEvent(START + 1_200_000_000, EventKind.CAPTURE)
 PLANT = configure(PlantParameters, {'payload_mass': 20.0, 'snr_db': 40.0, 'noise': 'snr'})
 
@@ -36,18 +35,9 @@ def caught() -> list[JointRecord]:
     return records()
 
 
-def written(path: Path, items: list[JointRecord], *events: CaptureEvent) -> Path:
-    with BagWriter(path) as writer:
-        for event in events:
-            writer.write('/capture_event', items[0].stamp_ns, event, latched=True)
-        for item in items:
-            writer.write('/joint_states', item.stamp_ns, item)
-    return path
-
-
 @pytest.fixture(scope='module')
 def unannounced(caught: list[JointRecord], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return written(tmp_path_factory.mktemp('bags') / 'unannounced', caught)
+    return record(tmp_path_factory.mktemp('bags') / 'unannounced', caught)
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -78,7 +68,7 @@ def test_without_looking_the_payload_is_said_to_be_unknown_and_no_number_is_prin
 
 def test_an_arm_that_caught_nothing_is_said_to_be_empty(
         caught: list[JointRecord], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    _, out, _ = run(capsys, written(tmp_path / 'empty', caught[:1100]))
+    _, out, _ = run(capsys, record(tmp_path / 'empty', caught[:1100]))
     assert 'none found in the signals, so the arm is taken as empty; give --capture-time' in out
     assert 'payload      none: the arm is taken as empty, 95 % interval 0 .. ' in out
 
@@ -93,7 +83,7 @@ def test_what_is_found_while_the_residuals_do_not_fit_is_called_a_guess(unannoun
 
 def test_a_recording_too_short_to_tell_is_not_called_empty(
         caught: list[JointRecord], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    _, out, _ = run(capsys, written(tmp_path / 'short', caught[:300]))
+    _, out, _ = run(capsys, record(tmp_path / 'short', caught[:300]))
     assert 'events       the signals cannot tell: ' in out
 
 
@@ -107,7 +97,7 @@ def test_where_events_are_announced_nobody_looks_unless_asked(
         return whole(*arguments)
 
     monkeypatch.setattr(replay.capture_detection, 'with_detected', counted)
-    place, config = written(tmp_path / 'announced', caught, CAPTURE), IdentifierParameters()
+    place, config = record(tmp_path / 'announced', [CAPTURE, *caught]), IdentifierParameters()
     result = replay.identify(replay.Request(place, config))
     assert (looked, result.events) == ([], '')
     assert result.summary.capture_time_s == pytest.approx(1.2)
@@ -121,17 +111,13 @@ def test_where_events_are_announced_nobody_looks_unless_asked(
 
 def test_a_topic_of_events_without_one_is_named(
         caught: list[JointRecord], tmp_path: Path) -> None:
-    place = tmp_path / 'announced'
-    with BagWriter(place) as writer:
-        for item in caught[:300]:
-            writer.write('/joint_states', item.stamp_ns, item)
-        writer.write('/capture_event', CAPTURE.stamp_ns, CAPTURE)  # in the part that is held out
+    place = record(tmp_path / 'announced', [*caught[:300], CAPTURE])  # the event is in the part that is held out
     result = replay.identify(replay.Request(place, IdentifierParameters(), validate_from=0.25))
     assert result.events == 'none on /capture_event; --detect looks for them in the signals'
 
 
 def test_configurations_that_are_held_out_do_not_count_as_seen(caught: list[JointRecord], tmp_path: Path) -> None:
-    place, seen = written(tmp_path / 'bag', caught[:300]), []
+    place, seen = record(tmp_path / 'bag', caught[:300]), []
     for limit in (None, 0.25):
         request = replay.Request(place, IdentifierParameters(), validate_from=limit, configurations='table.csv')
         messages = replay.Messages(request, Report())
@@ -149,7 +135,7 @@ def test_configurations_that_are_held_out_do_not_count_as_seen(caught: list[Join
 ])
 def test_signals_that_cannot_show_a_capture_end_nothing_unless_it_is_asked_for(
         caught: list[JointRecord], tmp_path: Path, parameters: dict[str, object], words: str) -> None:
-    place = written(tmp_path / 'bag', caught[:300])
+    place = record(tmp_path / 'bag', caught[:300])
     config = configure(IdentifierParameters, parameters | {'order': 2, 'past_window': 6, 'future_window': 5})
     result = replay.identify(replay.Request(place, config))
     assert (words in result.events) if words else (result.events == '')
@@ -183,7 +169,7 @@ def test_event_topics_of_a_recording_are_known_without_reading_it_also_where_it_
         caught: list[JointRecord], tmp_path: Path, unannounced: Path) -> None:
     assert bag.event_topics(unannounced) == ()
     assert bag.event_topics(tmp_path / 'nothing') == ()
-    place = written(tmp_path / 'bag', caught[:300], CAPTURE)
+    place = record(tmp_path / 'bag', [CAPTURE, *caught[:300]])
     assert bag.event_topics(place) == ('/capture_event',)
     (file,) = place.glob('*.mcap')
     file.write_bytes(file.read_bytes()[:-200])

@@ -6,10 +6,10 @@ import csv
 import json
 import os
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import START, record
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
@@ -17,13 +17,11 @@ from flexmanip_ros import messages, pipeline
 from flexmanip_ros.cli.identify_bag import main
 from flexmanip_ros.cli.simulate_bag import main as simulate
 from flexmanip_ros.io import bag
-from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.io.outputs import matrices, write_file
 from flexmanip_ros.io.parameter_file import read
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, PlantParameters, configure, flatten
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, StateSpace, Status
 
-START = 1_700_000_000_000_000_000
 KEYS = ['samples', 'gaps', 'sample_time_s', 'wall_s', 'status', 'frequencies_hz', 'damping_ratios',
         'payload_mass_kg', 'payload_std_kg', 'payload_ci95_kg', 'consistency', 'capture_time_s',
         'release_time_s', 'payload_com_m', 'payload_com_std_m', 'payload_inertia_kgm2', 'payload_inertia_std_kgm2',
@@ -52,19 +50,9 @@ def _oscillator(count: int = 1500, dt: float = 0.01) -> list[JointRecord]:
     return records
 
 
-def _bag(path: Path, records: list[JointRecord], event_s: float | None = None) -> Path:
-    with BagWriter(path) as writer:
-        for record in records:
-            writer.write('/joint_states', record.stamp_ns, record)
-        if event_s is not None:
-            stamp = START + round(event_s * 1e9)
-            writer.write('/capture_event', records[-1].stamp_ns, CaptureEvent(stamp, EventKind.CAPTURE))
-    return path
-
-
 @pytest.fixture(scope='module')
 def recording(tmp_path_factory):
-    return _bag(tmp_path_factory.mktemp('bags') / 'oscillator', _oscillator())
+    return record(tmp_path_factory.mktemp('bags') / 'oscillator', _oscillator())
 
 
 def _run(capsys, *arguments: object) -> tuple[int, str, str]:
@@ -113,7 +101,7 @@ def test_a_table_holds_what_the_pipeline_says(recording, capsys, tmp_path):
 
 
 def test_a_table_without_any_mode_has_its_columns_all_the_same(recording, capsys, tmp_path):
-    place = _bag(tmp_path / 'bag', _oscillator(5))
+    place = record(tmp_path / 'bag', _oscillator(5))
     assert _run(capsys, place, *SETTINGS, '--output', tmp_path / 'out.csv')[0] == 0
     with (tmp_path / 'out.csv').open(encoding='utf-8') as file:
         row = next(csv.DictReader(file))
@@ -219,7 +207,7 @@ def test_a_capture_time_can_be_given_by_hand(recording, capsys):
 
 
 def test_an_event_in_the_recording_is_found(capsys, tmp_path):
-    path = _bag(tmp_path / 'bag', _oscillator(600), 3.0)
+    path = record(tmp_path / 'bag', [*_oscillator(600), CaptureEvent(START + 3_000_000_000, EventKind.CAPTURE)])
     _, out, _ = _run(capsys, path, *SETTINGS, '--json')
     assert json.loads(out)['capture_time_s'] == 3.0
 
@@ -337,7 +325,7 @@ def test_faulty_messages_are_left_out_counted_and_reported(capsys, tmp_path):
     records[100].position[2] = np.nan
     short = records[200]
     records[200] = JointRecord(short.stamp_ns, short.names, short.position[:2], short.velocity, short.effort)
-    status, out, err = _run(capsys, _bag(tmp_path / 'bag', records), *SETTINGS, '--json')
+    status, out, err = _run(capsys, record(tmp_path / 'bag', records), *SETTINGS, '--json')
     assert status == 2
     assert '2 of 600 messages' in err
     assert "names but 2 values in 'position'" in err
@@ -346,9 +334,9 @@ def test_faulty_messages_are_left_out_counted_and_reported(capsys, tmp_path):
 
 def test_a_recording_of_nothing_but_nan_is_rejected(capsys, tmp_path):
     records = _oscillator(50)
-    for record in records:
-        record.effort[:] = np.nan
-    status, out, err = _run(capsys, _bag(tmp_path / 'bag', records), *SETTINGS, '--json',
+    for one in records:
+        one.effort[:] = np.nan
+    status, out, err = _run(capsys, record(tmp_path / 'bag', records), *SETTINGS, '--json',
                             '--output', tmp_path / 'out')
     assert (status, out) == (2, '')
     assert 'NaN' in err
@@ -368,15 +356,13 @@ GRIPPER = JointRecord(500_000, ('finger',), np.zeros(1), np.empty(0), np.empty(0
     (_at(0), 1), (_at(0, 1), 2), (_at(*range(19)), 19),
     ([*_at(*range(400)), *_at(*range(300))], None),
     ([*_at(*range(100)), *_at(*range(200, 300))], 200),
-    ([record for pair in zip(_at(*range(200)), [GRIPPER] * 200, strict=True) for record in pair], 200),
+    ([one for pair in zip(_at(*range(200)), [GRIPPER] * 200, strict=True) for one in pair], 200),
     (_at(*np.arange(300) + np.random.default_rng(2).normal(size=300) * 0.1), 300),
     (_at(*np.arange(60) * 1e6), 60),
 ], ids=['one', 'two', 'short', 'looped', 'hole', 'another publisher', 'jitter', 'slow'])
 def test_odd_recordings_give_a_status(capsys, tmp_path, records, samples):
-    with BagWriter(tmp_path / 'bag') as writer:
-        for k, record in enumerate(records):
-            writer.write('/joint_states', k, record)
-    status, out, err = _run(capsys, tmp_path / 'bag', *SETTINGS, '--json', '--output', tmp_path / 'out.csv')
+    path = record(tmp_path / 'bag', records)
+    status, out, err = _run(capsys, path, *SETTINGS, '--json', '--output', tmp_path / 'out.csv')
     assert status == 0
     assert err == '' or 'older than the one before' in err
     found = json.loads(out)

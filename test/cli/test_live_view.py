@@ -17,19 +17,18 @@ from urllib.request import urlopen
 import numpy as np
 import pytest
 from browser import Browser
+from recordings import START, record
 
 from flexmanip_ros.cli import identify_bag, live_view
 from flexmanip_ros.cli.console import Report
 from flexmanip_ros.cli.replay import Request
 from flexmanip_ros.errors import BagError
 from flexmanip_ros.io import bag
-from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, JointRecord
 from flexmanip_ros.view.screen import Screen, of_identifier
 
-START = 1_700_000_000_000_000_000
 COUNT = 3000
 WITHOUT_ROS = """
 import sys
@@ -49,12 +48,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp('live_view') / 'caught'
     event = CaptureEvent(START + 1_500_000_000, EventKind.CAPTURE)
     run = simulator.simulate(PlantParameters(), excitation.sequence(ExcitationParameters(), COUNT), (event,), START)
-    with BagWriter(path) as writer:
-        writer.write('/capture_event', START, event)
-        for item in simulator.records(run):
-            if isinstance(item, JointRecord):
-                writer.write('/joint_states', item.stamp_ns, item)
-    return path
+    return record(path, [event, *(item for item in simulator.records(run) if isinstance(item, JointRecord))])
 
 
 @pytest.fixture(scope='module')
@@ -176,9 +170,7 @@ def test_bad_input_is_told_in_one_line_with_code_2(
 def test_the_report_of_a_looped_recording_shows_the_last_pass_alone(recording: Path, tmp_path: Path) -> None:
     pytest.importorskip('matplotlib')
     messages = list(bag.read(recording))
-    with BagWriter(tmp_path / 'looped') as writer:
-        for k, item in enumerate([*messages, *messages]):
-            writer.write('/joint_states' if isinstance(item, JointRecord) else '/capture_event', k, item)
+    record(tmp_path / 'looped', [*messages, *messages])
     path = tmp_path / 'report.html'
     assert identify_bag.main([str(tmp_path / 'looped'), '--report', str(path)]) == 0
     (inner,) = re.findall(r'<iframe title="[^"]+" srcdoc="([^"]*)"></iframe>', path.read_text(encoding='utf-8'))

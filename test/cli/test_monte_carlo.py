@@ -9,11 +9,12 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from quick_study import SCENARIO, rows_of, run, without_cost
+from recordings import record
 
 from flexmanip_ros.cli import workers
-from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.types import JointRecord
 
 
@@ -69,17 +70,11 @@ def test_a_report_is_written_over_no_table_and_no_scenario(scenario_file, tmp_pa
 
 
 def test_a_folder_of_recordings_is_a_study_and_a_broken_one_a_row(tmp_path):
-    import numpy as np
-
     folder = tmp_path / 'bags'
     folder.mkdir()
     for name in ('one', 'two'):
-        with BagWriter(folder / name) as writer:
-            rng = np.random.default_rng(1)
-            for k in range(300):
-                record = JointRecord(k * 1_000_000, ('a',), rng.normal(size=1), rng.normal(size=1),
-                                     rng.normal(size=1))
-                writer.write('/joint_states', record.stamp_ns, record)
+        rng = np.random.default_rng(1)
+        record(folder / name, [JointRecord(k * 1_000_000, ('a',), *rng.normal(size=(3, 1))) for k in range(300)])
     (folder / 'three.mcap').write_bytes(b'not a recording')
     (folder / 'one.truth.json').write_text(json.dumps({'payload_mass_kg': 20.0}), encoding='utf-8')
     out = tmp_path / 'out.csv'

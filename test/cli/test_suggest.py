@@ -5,23 +5,21 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import START, record
 from scipy.linalg import block_diag, expm
 
 from flexmanip_ros.cli.identify_bag import main
 from flexmanip_ros.cli.suggest import Found, _recording, choose_signals, suggest
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io.bag import Topics
-from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.studies import suggestion
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
-START = 1_700_000_000_000_000_000
 DT = 0.004
 NAMES = ('hub', 'gauge', 'lamp')
 MODES = ((1.5, 0.05), (9.0, 0.02))
@@ -61,18 +59,9 @@ def _machine(count: int = 2500, slower_from: int | None = None) -> tuple[JointRe
     return tuple(records)
 
 
-def _bag(path: Path, records: tuple[JointRecord, ...], *events: CaptureEvent) -> Path:
-    with BagWriter(path, flush_period=None) as writer:
-        for event in events:
-            writer.write('/capture_event', records[0].stamp_ns, event)
-        for record in records:
-            writer.write('/joint_states', record.stamp_ns, record)
-    return path
-
-
 @pytest.fixture(scope='module')
 def recording(tmp_path_factory):
-    return _bag(tmp_path_factory.mktemp('bags') / 'machine', _machine())
+    return record(tmp_path_factory.mktemp('bags') / 'machine', _machine())
 
 
 @pytest.fixture(scope='module')
@@ -138,8 +127,8 @@ def test_a_model_with_modes_that_nothing_determines_is_not_tracking_whatever_its
 def test_a_capture_that_is_told_divides_a_recording_as_one_that_it_holds(recording, tmp_path):
     records = _machine()
     capture = CaptureEvent(records[0].stamp_ns + 3_000_000_000, EventKind.CAPTURE)
-    announced = _bag(tmp_path / 'announced', records, capture)
-    beside = _bag(tmp_path / 'beside', (GRIPPER, *records))
+    announced = record(tmp_path / 'announced', [capture, *records])
+    beside = record(tmp_path / 'beside', (GRIPPER, *records))
     (held, _), (told, _), (whole, _) = (
         suggest(str(source), str(tmp_path / 'some.yaml'), {}, Topics(), None, 0.25, events_s)
         for source, events_s in ((announced, ()), (beside, (3.0,)), (recording, ())))
@@ -148,7 +137,7 @@ def test_a_capture_that_is_told_divides_a_recording_as_one_that_it_holds(recordi
 
 
 def test_the_time_to_look_at_counts_from_the_first_message_of_the_machine(tmp_path):
-    blocks, _ = _recording(str(_bag(tmp_path / 'beside', (GRIPPER, *_machine()))), Topics(), 2.0, lambda *_: None)
+    blocks, _ = _recording(str(record(tmp_path / 'beside', (GRIPPER, *_machine()))), Topics(), 2.0, lambda *_: None)
     assert sum(len(block.stamp_ns) for block in blocks if block.names == NAMES) == round(2.0 / DT)
 
 
@@ -226,7 +215,7 @@ def test_a_given_arm_keeps_its_payload_method():
 
 
 def test_an_arm_of_one_link_needs_no_angle_of_a_second(tmp_path, capsys):
-    path = _bag(tmp_path / 'bag', tuple(
+    path = record(tmp_path / 'bag', tuple(
         item._replace(names=('joint1', 'link1_bend', 'lamp')) for item in _machine(2500)))
     place = tmp_path / 'one.yaml'
     _json(capsys, path, '--suggest', place, '--set=arm.link_length=[0.41]', '--set=arm.linear_density=[1.0]',
@@ -255,7 +244,7 @@ def test_efforts_that_stand_still_are_named():
 
 
 def test_a_recording_too_short_to_be_scored_asks_for_a_longer_one(tmp_path, capsys):
-    path = _bag(tmp_path / 'bag', _machine(65))
+    path = record(tmp_path / 'bag', _machine(65))
     assert main([str(path), '--suggest', str(tmp_path / 'no.yaml')]) == 2
     err = capsys.readouterr().err
     assert 'record for longer' in err
@@ -273,8 +262,8 @@ def test_a_signal_that_is_not_finite_at_times_serves_and_one_that_mostly_is_not_
 
 def test_smooth_gives_each_stretch_its_modes_with_a_band(tmp_path, capsys):
     change = 1300
-    path = _bag(tmp_path / 'bag', _machine(2500, change),
-                CaptureEvent(START + round(change * DT * 1e9), EventKind.CAPTURE))
+    capture = CaptureEvent(START + round(change * DT * 1e9), EventKind.CAPTURE)
+    path = record(tmp_path / 'bag', [capture, *_machine(2500, change)])
     page = tmp_path / 'report.html'
     found = _json(capsys, path, '--smooth', '--report', page, '--set=inputs=[hub/effort]',
                   '--set=outputs=[hub/position, gauge/position]', '--set=payload_method=none', '--set=angles=[]',

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -26,16 +27,21 @@ def joint_state_record(k: int, *, velocity: bool = True) -> JointRecord:
                        rng.normal(size=4) if velocity else np.empty(0), rng.normal(size=4))
 
 
-def write(path: Path, count: int = 50, storage: StoragePlugin = StoragePlugin.MCAP,
-           topic: str = '/joint_states', event_at: int | None = 20, velocity: bool = True) -> Path:
-    with BagWriter(path, storage=storage) as writer:
-        for k in range(count):
-            made = joint_state_record(k, velocity=velocity)
-            if k == event_at:
-                event = CaptureEvent(made.stamp_ns, EventKind.CAPTURE)
-                writer.write('/capture_event', made.stamp_ns, event)
-            writer.write(topic, made.stamp_ns, made)
+def record(path: Path, items: Iterable[JointRecord | CaptureEvent], storage: StoragePlugin = StoragePlugin.MCAP,
+           topic: str = '/joint_states') -> Path:
+    """Write joint states and events as a recording, in the order in which they are given."""
+    with BagWriter(path, storage=storage, flush_period=None) as writer:
+        for k, item in enumerate(items):
+            writer.write(topic if isinstance(item, JointRecord) else '/capture_event', START + k, item)
     return path
+
+
+def write(path: Path, count: int = 50, storage: StoragePlugin = StoragePlugin.MCAP,
+          topic: str = '/joint_states', event_at: int | None = 20, velocity: bool = True) -> Path:
+    items: list[JointRecord | CaptureEvent] = [joint_state_record(k, velocity=velocity) for k in range(count)]
+    if event_at is not None and event_at < count:
+        items.insert(event_at, CaptureEvent(items[event_at].stamp_ns, EventKind.CAPTURE))
+    return record(path, items, storage, topic)
 
 
 def storage_file(path: Path) -> Path:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import tracemalloc
 from contextlib import suppress
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import START, good_part, joint_state_record
+from recordings import START, good_part, joint_state_record, record
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -79,14 +78,6 @@ RECORDINGS = {
 }
 
 
-def record(path: Path, items: list[Item], storage: StoragePlugin = StoragePlugin.MCAP) -> Path:
-    with BagWriter(path, storage=storage) as writer:
-        for k, item in enumerate(items):
-            topic = '/joint_states' if isinstance(item, JointRecord) else '/capture_event'
-            writer.write(topic, START + k, item)
-    return path
-
-
 def bits(items: list[Item]) -> list[tuple[object, ...]]:
     return [(item.stamp_ns, item.names, item.position.tobytes(), item.velocity.tobytes(), item.effort.tobytes())
             if isinstance(item, JointRecord) else item for item in items]
@@ -137,10 +128,9 @@ def test_an_event_stands_between_the_messages_it_was_recorded_between(tmp_path):
 def test_padding_may_hold_anything(tmp_path):
     store = get_typestore(Stores.ROS2_JAZZY)
     raws = []
-    with BagWriter(tmp_path / 'source') as writer:
-        for k in range(40):
-            writer.write('/joint_states', START + k, joint_state_record(k)._replace(names=('a', 'bc', 'd', 'e')))
-    with Reader(tmp_path / 'source') as reader:
+    names = ('a', 'bc', 'd', 'e')
+    source = record(tmp_path / 'source', [joint_state_record(k)._replace(names=names) for k in range(40)])
+    with Reader(source) as reader:
         for k, (_, _, raw) in enumerate(reader.messages()):
             noisy = bytearray(raw)
             noisy[2:4] = bytes((k, k))  # options of the encapsulation

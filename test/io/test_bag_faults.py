@@ -11,7 +11,7 @@ from contextlib import closing, suppress
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from recordings import NAMES, START, good_part, joint_state_record, storage_file, write
+from recordings import NAMES, START, good_part, joint_state_record, record, storage_file, write
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -150,8 +150,8 @@ def test_without_metadata_a_topic_is_chosen_as_in_a_whole_recording(tmp_path, ot
     with BagWriter(path, flush_period=None) as writer:
         for k in range(1500):
             for topic, joint in (('/left/joint_states', 'left'), (other, 'other')):
-                record = joint_state_record(k)
-                writer.write(topic, record.stamp_ns, record._replace(names=(joint, *NAMES[1:])))
+                found = joint_state_record(k)
+                writer.write(topic, found.stamp_ns, found._replace(names=(joint, *NAMES[1:])))
     (path / 'metadata.yaml').unlink()
     if is_cut:
         file = storage_file(path)
@@ -311,10 +311,8 @@ def test_a_recording_that_was_split_and_not_finished_is_read_in_the_order_of_its
     split = tmp_path / 'split'
     split.mkdir()
     for part in range(12):
-        with BagWriter(tmp_path / f'part{part}') as writer:
-            for k in range(100 * part, 100 * part + 100):
-                writer.write('/joint_states', START + k * 1_000_000, joint_state_record(k))
-        storage_file(tmp_path / f'part{part}').rename(split / f'split_{part}.mcap')
+        made = record(tmp_path / f'part{part}', map(joint_state_record, range(100 * part, 100 * part + 100)))
+        storage_file(made).rename(split / f'split_{part}.mcap')
     (split / 'split_12.mcap').write_bytes(b'')
     messages, line = good_part(split)
     stamps = [item.stamp_ns for item in messages if isinstance(item, JointRecord)]
