@@ -168,7 +168,7 @@ def test_every_import_is_locked(locked: str) -> None:
         assert re.search(rf'^{pypi}==', lock, re.MULTILINE), f'{sorted(files)} import {name}: not locked'
 
 
-@pytest.mark.parametrize('name', ['runtime.txt', 'development.txt', 'benchmark.txt', 'jazzy.txt'])
+@pytest.mark.parametrize('name', ['runtime.txt', 'development.txt', 'benchmark.txt', 'jazzy.txt', 'docs.txt'])
 def test_locks_pin_every_version_with_hashes_and_name_no_host(name: str) -> None:
     lock = requirements(name)
     entries = re.split(r'\n(?=\S)', lock)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -90,13 +89,3 @@ def test_the_parameter_file_of_your_own_arm_is_one(tmp_path: Path) -> None:
     path.write_text(page.split('```yaml\n')[1].split('```')[0], encoding='utf-8')
     for node in ('rpbsid_identifier', 'plant_simulator', 'excitation'):
         assert load(NODES[node], node, str(path), []).arm.joint_mass == 1.2
-
-
-def test_the_locks_of_site_and_jazzy_pin_hashes() -> None:
-    for name in ('docs.txt', 'jazzy.txt'):
-        lock = (ROOT / 'requirements' / name).read_text(encoding='utf-8')
-        assert '://' not in lock
-        entries = re.split(r'\n(?=\S)', lock)
-        assert all('--hash=sha256:' in entry for entry in entries if not entry.startswith('#'))
-
-
