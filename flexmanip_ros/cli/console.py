@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from flexmanip_ros.errors import FlexmanipError
 
 if TYPE_CHECKING:
-    from multiprocessing.sharedctypes import Synchronized
+    from multiprocessing.synchronize import Lock
 
 SUCCESS, DEFECT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 LONGEST = 1e9
@@ -160,16 +160,13 @@ def announced(say: Callable[[], None] = tell_compiling) -> Iterator[None]:
         yield
 
 
-def announce_in_worker(told: 'Synchronized[bool]') -> None:
-    """Do as ``announced`` in a worker process. The workers of a pool share ``told``, so only one tells the user."""
+def announce_in_worker(turn: 'Lock') -> None:
+    """Do as ``announced`` in a worker process. The workers of a pool share ``turn``: the first to take it tells."""
     from numba.core import event
 
     def once() -> None:
-        with told.get_lock():
-            if told.value:
-                return
-            told.value = True
-        tell_compiling()
+        if turn.acquire(block=False):
+            tell_compiling()
 
     event.register('numba:compile', _listener(once))  # type: ignore[no-untyped-call]
 
@@ -209,9 +206,10 @@ def open_streams() -> None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), 'w'))
 
 
-def print_error(prog: str, error: BaseException | str) -> None:
-    """Write one line on stderr."""
+def print_error(prog: str, error: BaseException | str, code: int = BAD_INPUT) -> int:
+    """Write one line on stderr; return the exit code of a program that ends with it."""
     print(f'{prog}: {" ".join(str(error).split())}', file=sys.stderr)
+    return code
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -245,11 +243,9 @@ def run(prog: str, body: Callable[[], int]) -> int:
             sys.stdout.flush()  # at the end of the process an error of it would be a traceback and status 120
             return status
     except FlexmanipError as error:
-        print_error(prog, error)
-        return BAD_INPUT
+        return print_error(prog, error)
     except KeyboardInterrupt:
-        print_error(prog, 'interrupted')
-        return INTERRUPTED
+        return print_error(prog, 'interrupted', INTERRUPTED)
     except BrokenPipeError:
         _drop_output()  # its reader has ended
         return SUCCESS
@@ -260,11 +256,10 @@ def run(prog: str, body: Callable[[], int]) -> int:
             if error.filename is None:
                 _drop_output()
             place = '' if error.filename is None else f"'{error.filename}': "
-            print_error(prog, f'{place}{error.strerror or error}; check names, permissions and space on the disk')
-            return BAD_INPUT
-        print_error(prog, f'a defect of this program: {type(error).__name__}: {error}; '
-                    f'please report it with the recording ({TRACEBACK}=1 shows where)')
-        return DEFECT
+            words = f'{place}{error.strerror or error}; check names, permissions and space on the disk'
+            return print_error(prog, words)
+        return print_error(prog, f'a defect of this program: {type(error).__name__}: {error}; '
+                           f'please report it with the recording ({TRACEBACK}=1 shows where)', DEFECT)
 
 
 def _drop_output() -> None:

@@ -108,11 +108,9 @@ def _main(given: argparse.Namespace) -> int:
         print(json.dumps(result.summary.as_json(), allow_nan=False))
     if result.fault is not None:
         kept = ''.join(f"; what was identified is in '{place}'" for place in result.written)
-        console.print_error(PROG, f'{result.fault}{kept}')
-        return console.INTERRUPTED if result.interrupted else console.BAD_INPUT
-    if result.remark:
-        console.print_error(PROG, result.remark)
-    return console.SUCCESS
+        code = console.INTERRUPTED if result.interrupted else console.BAD_INPUT
+        return console.print_error(PROG, f'{result.fault}{kept}', code)
+    return console.print_error(PROG, result.remark, console.SUCCESS) if result.remark else console.SUCCESS
 
 
 def describe(result: Result) -> list[str]:

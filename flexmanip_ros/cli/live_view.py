@@ -64,9 +64,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             from flexmanip_ros.ros.nodes import live_view
         except ModuleNotFoundError as error:
-            console.print_error(PROG, f'the live view is a ROS node, and {error.name} is not installed; install ROS, '
-                                'or give a recording, which needs none')
-            return console.BAD_INPUT
+            return console.print_error(PROG, f'the live view is a ROS node, and {error.name} is not installed; '
+                                       'install ROS, or give a recording, which needs none')
         return live_view.main([sys.argv[0], *given])
     options = _parser().parse_args(given)
     if options.bag is None:

@@ -82,8 +82,8 @@ def _main(given: argparse.Namespace) -> int:
         print(line)
     print(f"wrote '{given.output}' ({len(journal.rows)} rows)")
     if interrupted:
-        console.print_error(PROG, 'interrupted; the same command continues where this one stopped')
-        return console.INTERRUPTED
+        words = 'interrupted; the same command continues where this one stopped'
+        return console.print_error(PROG, words, console.INTERRUPTED)
     return console.SUCCESS
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import importlib
 import json
@@ -17,7 +16,7 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from itertools import islice
-from multiprocessing.sharedctypes import Synchronized
+from multiprocessing.synchronize import Lock
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -153,10 +152,10 @@ def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome
         os.environ.setdefault(name, '1')  # one run per core leaves no core for more threads
     waiting = iter(tasks)
     spawn = multiprocessing.get_context('spawn')
-    told = spawn.Value(ctypes.c_bool, False)
+    turn = spawn.Lock()
 
     def tried(some: Iterator[Task]) -> Iterator[Outcome]:
-        with ProcessPoolExecutor(count, spawn, _serve, (told,)) as pool:
+        with ProcessPoolExecutor(count, spawn, _serve, (turn,)) as pool:
             yield from _outcomes(pool, work, some, lambda: count)
 
     while True:
@@ -201,11 +200,11 @@ def _outcomes(pool: Executor, work: Work, waiting: Iterator[Task], workers: Call
             future.cancel()
 
 
-def _serve(told: Synchronized[bool]) -> None:
+def _serve(turn: Lock) -> None:
     """Set up a worker: it ignores Ctrl-C, which its parent handles, and ends when its parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.set_threshold(GARBAGE)
-    console.announce_in_worker(told)
+    console.announce_in_worker(turn)
     warnings.simplefilter('ignore')  # as in the parent: numbers out of range are told by the status
     parent = multiprocessing.parent_process()
     if parent is not None:

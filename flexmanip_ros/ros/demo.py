@@ -31,7 +31,7 @@ from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros import messages, pipeline
 from flexmanip_ros.arm.linearization import frequencies, vibration_model
-from flexmanip_ros.cli.console import Parser
+from flexmanip_ros.cli.console import BAD_INPUT, INTERRUPTED, Parser, print_error
 from flexmanip_ros.errors import FlexmanipError, ParameterError
 from flexmanip_ros.io import bag, plots
 from flexmanip_ros.io.plots import Truth
@@ -41,7 +41,6 @@ from flexmanip_ros.parameters.document import NODES, written, yaml_text
 from flexmanip_ros.ros import rclpy_workarounds
 from flexmanip_ros.ros.composition import Composition, foreign_arm
 from flexmanip_ros.ros.conversions import to_message
-from flexmanip_ros.ros.node import BAD_INPUT, reject
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.studies.results import status_text
 from flexmanip_ros.types import QUANTILE, CaptureEvent, Estimate, JointRecord
@@ -116,8 +115,8 @@ LOOK_AROUND_S = 0.5
 """Time for which the program looks for another arm on a domain [s]."""
 LATEST_NS = 500_000_000
 """Time over which the joint angles are averaged [ns]; the true frequencies are those at the mean angles."""
-FAILED, INTERRUPTED = 1, 130
-"""Exit codes: FAILED if it could not run or live and replay differ, INTERRUPTED if a signal stopped it."""
+FAILED = 1
+"""Exit code if it could not run, or live and replay differ."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -137,9 +136,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except OSError as error:
-        return reject(NAME, f"'{options.output}' cannot be written: {error.strerror}; give another folder")
+        return print_error(NAME, f"'{options.output}' cannot be written: {error.strerror}; give another folder")
     except Exception as error:  # rcl raises types of its C extension for --ros-args and parameter files
-        return reject(NAME, rclpy_workarounds.first_line(error))
+        return print_error(NAME, rclpy_workarounds.first_line(error))
     try:
         with viewer(given) if config.view else nullcontext() as view:
             return _run(config, folder, console, view)
@@ -147,9 +146,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         console.print('interrupted' + (f"; the bag so far is '{folder / 'bag'}'" if (folder / 'bag').exists() else ''))
         return INTERRUPTED
     except OSError as error:  # a full disk
-        return reject(NAME, f"{error.strerror or error}; what was written before is in '{folder}'", FAILED)
+        return print_error(NAME, f"{error.strerror or error}; what was written before is in '{folder}'", FAILED)
     except FlexmanipError as error:
-        return reject(NAME, str(error), BAD_INPUT if isinstance(error, ParameterError) else FAILED)
+        return print_error(NAME, error, BAD_INPUT if isinstance(error, ParameterError) else FAILED)
 
 
 def _run(config: DemoParameters, folder: Path, console: Console, view: Viewer | None) -> int:

@@ -237,11 +237,12 @@ class JointStateFaults:
     no other message can be used.
     """
 
-    def __init__(self, joints: Collection[str]) -> None:
+    def __init__(self, joints: Collection[str], topic: str) -> None:
+        """topic: the full name of the topic of the joint states."""
         self.losses = LossCounter()
         self.foreign = 0
         """Number of messages with none of the configured joints."""
-        self._joints = frozenset(joints)
+        self._joints, self._topic = frozenset(joints), topic
         self._dropped, self._resets, self._gaps, self._unordered = Recent(), Recent(), Recent(), Recent()
         self._why = ''
         """Why the latest message of the configured joints was dropped."""
@@ -273,7 +274,7 @@ class JointStateFaults:
         self._unused, self._why = rejection, shortened(f'{rejection.problem}; {rejection.remedy}')
         return rejection
 
-    def likely_cause(self, topic: str) -> str:
+    def likely_cause(self) -> str:
         """Return that the topic has several publishers where that explains the faults, otherwise ''.
 
         Publishers of different joints on one topic are no fault. So the stamps must have jumped or come out of order,
@@ -284,31 +285,28 @@ class JointStateFaults:
         is_likely = self._resets.count() or self._unordered.count() or gaps > RECENT_S
         if self.losses.publishers - bool(self.foreign) < 2 or not is_likely:
             return ''
-        return (f'{self.losses.publishers} publishers are on {topic}: only one may publish these joints, '
+        return (f'{self.losses.publishers} publishers are on {self._topic}: only one may publish these joints, '
                 'with the stamps of one clock')
 
-    def jumped(self, topic: str) -> str:
+    def jumped(self) -> str:
         """Return the words for stamps that jumped: how often they did lately, and the likely cause."""
-        count, cause = self._resets.count(), self.likely_cause(topic)
+        count, cause = self._resets.count(), self.likely_cause()
         often = f' ({count} times in the last {RECENT_S:.0f} s)' if count > 1 else ''
         return f'the stamps jumped or their rate changed{often}{": " if cause else ""}{cause}'
 
-    def report(self, report: Report, topic: str) -> Rejection | None:
-        """Report losses and faults; return why no message since the last report could be used, None where one was.
-
-        topic: the full name of the topic.
-        """
+    def report(self, report: Report) -> Rejection | None:
+        """Report losses and faults; return why no message since the last report could be used, None where one was."""
         self.losses.report(report, 'lost', 'message')
         report.values.update(foreign=self.foreign, stamp_jitter_ms=self._jitter_ns * 1e-6)
         unused, self._unused = None if self._is_used else self._unused, None
         self._is_used = False
-        dropped, cause = self._dropped.count(), self.likely_cause(topic)
+        dropped, cause = self._dropped.count(), self.likely_cause()
         if unused is not None:
             report.worse(ERROR, shortened(f'no message can be used: {unused.problem}; {unused.remedy}'))
         elif dropped:
             report.worse(WARN, f'{number(dropped, "message")} dropped in the last {RECENT_S:.0f} s: {self._why}')
         if self._resets.count() > 1:
-            report.worse(WARN, self.jumped(topic))
+            report.worse(WARN, self.jumped())
         elif cause:
             report.worse(WARN, cause)
         return unused
@@ -331,12 +329,10 @@ UNANNOUNCED = ('nothing is known of the payload and no capture was announced: pu
 """Log line for a payload interval of [0, inf] when no event was announced: what to do."""
 
 
-def status_line(config: IdentifierParameters, status: Status, known: str = '') -> str:
+def status_line(config: IdentifierParameters, status: Status, reason: str) -> str:
     """Return a status with its meaning, its reason where that is known, and what to do about it."""
-    reason = f': {known}' if known else ''
-    if status is Status.UNOBSERVABLE:
-        reason = f': {unobservable_reason(config)}'
-    return f'status {status.name}: {status.value}{reason}; {ADVICE[status]}'
+    reason = unobservable_reason(config) if status is Status.UNOBSERVABLE else reason
+    return f'status {status.name}: {status.value}{": " if reason else ""}{reason}; {ADVICE[status]}'
 
 
 def report_estimate(report: Report, estimate: Estimate | None, order: int) -> None:

@@ -54,8 +54,6 @@ from flexmanip_ros.ros.parameters import NodeParameters, arm_line
 from flexmanip_ros.samples.signals import Rejection
 
 Config = TypeVar('Config')
-BAD_INPUT = 2
-"""Exit code of a program whose arguments or parameters are wrong."""
 THROTTLE_S = 2.0
 """Shortest time between two log lines of a repeated error [s]: the log stays readable and does not fill the disk."""
 NO_STAMP = 0
@@ -329,9 +327,8 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
 
     def report_faults(self, report: Report, faults: JointStateFaults) -> None:
         """Report the faults of the joint states; log why none can be used, and once what the likely cause is."""
-        topic = self.resolve_topic_name('joint_states')
-        self.log_dropped(faults.report(report, topic))
-        before, self._cause = self._cause, faults.likely_cause(topic)
+        self.log_dropped(faults.report(report))
+        before, self._cause = self._cause, faults.likely_cause()
         if self._cause and not before:
             self.get_logger().warning(f'the stamps of the joint states are irregular: {self._cause}')
 
@@ -446,17 +443,19 @@ def run(make: Callable[[], FlexmanipNode[Any]], name: str, about: str | None, cl
     """Run one node until it is asked to stop; return the exit code.
 
     The code is 0 after SIGINT or SIGTERM at any time, and 2, with the reason on stderr, for bad arguments or
-    parameters.
+    parameters. name, about, cls: the name of the node, its topics and services, and its parameters, for --help.
     """
     arguments = list(sys.argv if argv is None else argv)
     console.open_streams()
     try:
         rclpy_workarounds.interrupt_on_signals(again=True)
         try:
-            parser(name, about, cls).parse_args(remove_ros_args(arguments)[1:])
+            parser = console.parser(name, about or '', 'parameters:\n' + help_text(cls))
+            parser.usage = f'{name} [--help] [--ros-args -p NAME:=VALUE --params-file FILE.yaml ...]'
+            parser.parse_args(remove_ros_args(arguments)[1:])
             rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         except Exception as error:  # rcl raises types of its C extension for --ros-args and parameter files
-            return reject(name, rclpy_workarounds.first_line(error))
+            return console.print_error(name, rclpy_workarounds.first_line(error))
         return _spin(make, name)
     except KeyboardInterrupt:
         rclpy_workarounds.ignore_signals()
@@ -474,11 +473,11 @@ def _spin(make: Callable[[], FlexmanipNode[Any]], name: str) -> int:
         executor.add_node(node)
         started = node.autostart()
         if not started and not caught:
-            return BAD_INPUT  # the node has logged why
+            return console.BAD_INPUT  # the node has logged why
         if not caught:
             rclpy_workarounds.spin(executor)
     except (FlexmanipError, ParameterException) as error:
-        return reject(name, str(error))
+        return console.print_error(name, error)
     finally:
         with rclpy_workarounds.shutdown():
             if node is not None:
@@ -489,16 +488,3 @@ def _spin(make: Callable[[], FlexmanipNode[Any]], name: str) -> int:
                 node.destroy_node()
             executor = node = None
     return 0
-
-
-def reject(name: str, problem: str, code: int = BAD_INPUT) -> int:
-    """Print to stderr why a program ends; return its exit code."""
-    print(f'{name}: {problem}', file=sys.stderr)
-    return code
-
-
-def parser(name: str, about: str | None, cls: type) -> console.Parser:
-    """Return the parser behind --help: what the node is, its topics and services, its parameters."""
-    made = console.parser(name, about or '', 'parameters:\n' + help_text(cls))
-    made.usage = f'{name} [--help] [--ros-args -p NAME:=VALUE --params-file FILE.yaml ...]'
-    return made

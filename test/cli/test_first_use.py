@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-from ctypes import c_bool
 
 import pytest
 from numba import njit
@@ -54,11 +53,11 @@ def test_what_is_compiled_already_is_not_told(
 
 def test_of_many_workers_one_speaks(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(console, 'PATIENCE', 1e-4)
-    told = multiprocessing.get_context('spawn').Value(c_bool, False)
+    turn = multiprocessing.get_context('spawn').Lock()
     before = list(event._registered['numba:compile'])
     try:
-        console.announce_in_worker(told)
-        console.announce_in_worker(told)
+        console.announce_in_worker(turn)
+        console.announce_in_worker(turn)
         compile_something()
     finally:
         event._registered['numba:compile'][:] = before

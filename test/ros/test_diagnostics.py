@@ -112,14 +112,14 @@ def test_losses_are_counted_from_numbers_and_a_new_publisher_is_none() -> None:
 
 
 def test_several_publishers_are_a_likely_cause_of_gaps_that_no_loss_explains() -> None:
-    faults, clock = JointStateFaults(('joint1',)), Clock(counters=Counters(gaps=100))
+    faults, clock = JointStateFaults(('joint1',), '/joint_states'), Clock(counters=Counters(gaps=100))
     faults.losses.publishers = 2
     faults.note(Clock(), clock, ('joint1',))
-    assert faults.likely_cause('/joint_states').startswith('2 publishers are on /joint_states: ')
+    assert faults.likely_cause().startswith('2 publishers are on /joint_states: ')
     for number in (1, 1001, 2, 1102):  # those of two publishers; 100 of the second are missing
         faults.losses.note(number)
     assert faults.losses.recent() == 100
-    assert faults.likely_cause('/joint_states') == ''
+    assert faults.likely_cause() == ''
 
 
 def test_a_meter_counts_times_and_begins_again() -> None:

@@ -58,7 +58,7 @@ def test_a_signal_ends_a_program_cleanly_and_leaves_whole_files(
     assert trial.took_s < 20.0
 
 
-@pytest.mark.parametrize('moment', ['rclpy.init', 'flexmanip_ros.ros.node.parser', 'rclpy.node.Node.__init__'])
+@pytest.mark.parametrize('moment', ['rclpy.init', 'flexmanip_ros.cli.console.parser', 'rclpy.node.Node.__init__'])
 def test_a_signal_while_a_node_starts_ends_it_as_any_other(moment: str) -> None:
     where, _, name = moment.rpartition('.')
     owner = where if where != 'rclpy.node.Node' else 'rclpy.node'

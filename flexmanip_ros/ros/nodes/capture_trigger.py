@@ -66,7 +66,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         self.detected = self.announced = 0
         """Number of events published on capture_detected, and on capture_event."""
         self.latest: CaptureEvent | None = None
-        self.faults = JointStateFaults(joints(self.config))
+        self.faults = JointStateFaults(joints(self.config), self.resolve_topic_name('joint_states'))
         self._restarts = Recent()
         """How often the detection began again, after a gap or a jump of the stamps."""
 
@@ -142,7 +142,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
     def _log_restart(self, jumped: bool) -> None:
         """Warn that the detection began again. jumped: after a jump of the stamps, otherwise after a gap."""
         self._restarts.add(1)
-        words = (f'with an empty arm: {self.faults.jumped(self.resolve_topic_name("joint_states"))}' if jumped else
+        words = (f'with an empty arm: {self.faults.jumped()}' if jumped else
                  'after a gap in the joint states: a capture or release in the gap, or within '
                  f'{capture_detection.SETTLE:g} s after it, is not found')
         self.log_throttled('restart', f'the detection begins again {words}', is_error=False)

@@ -104,14 +104,13 @@ class PayloadAdapter(FlexmanipNode[AdapterParameters]):
         self._send(body, found._replace(mass=body.m), now)
 
     def _send(self, inertia: Inertia, found: PayloadEstimate, now: float) -> None:
+        self.state = self.state._replace(sent_at=now)
         if not self._client.service_is_ready():
             self.problem = f"service '{self._client.srv_name}' is not available"
             self.log_throttled('service', f'{self.problem}; start the driver, or correct the parameters')
-            self.state = self.state._replace(sent_at=now)
             return
         future = self._client.call_async(self._request(inertia))
         self._asked = future, now
-        self.state = self.state._replace(sent_at=now)
         future.add_done_callback(lambda future: self._answered(future, found))
 
     def _give_up(self, now: float) -> None:

@@ -139,7 +139,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self.rejected = self.published = 0
         self.problem = ''
         """Why the latest message was rejected."""
-        self.faults = JointStateFaults(joints(self.config))
+        self.faults = JointStateFaults(joints(self.config), self.resolve_topic_name('joint_states'))
         self.losses = self.faults.losses
         self._reader = JointStateReader()
         self._background = Deferred()
@@ -322,8 +322,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         if isinstance(item, JointBlock):
             self.log_dropped(self.faults.note(before, self.state.clock, item.names))
         if self.state.counters.resets > before.counters.resets:
-            self.log_throttled('reset', 'everything identified is forgotten: '
-                               + self.faults.jumped(self.resolve_topic_name('joint_states')), is_error=False)
+            self.log_throttled('reset', f'everything identified is forgotten: {self.faults.jumped()}', is_error=False)
 
     def _publish(self, estimates: tuple[Estimate, ...]) -> None:
         """Publish what is new in each estimate."""
