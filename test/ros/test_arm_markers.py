@@ -1,10 +1,11 @@
-"""The arm as viewers see it: ~/arm."""
+"""The arm as viewers see it: ~/arm, whose shape is what the simulator says of the same arm."""
 
 from __future__ import annotations
 
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from identifier_harness import CAPTURE, Live, recording
 from ros_harness import Ros
 from visualization_msgs.msg import Marker, MarkerArray
 
-from flexmanip_ros.parameters import IdentifierParameters, configure
+from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
 from flexmanip_ros.ros import conversions
 from flexmanip_ros.ros.arm_markers import ArmMarkers, draw, words
 from flexmanip_ros.ros.nodes.rpbsid_identifier import TOPICS
@@ -24,12 +25,49 @@ from flexmanip_ros.types import JointRecord, Payload, Status
 LAYOUTS = Path(__file__).resolve().parents[2] / 'config' / 'layouts'
 RECORD = JointRecord(1_500_000_000, ('link2_bend', 'joint2', 'joint1', 'link1_bend'),
                      np.array([0.01, 0.5, 0.3, 0.02]), np.empty(0), np.empty(0))
+ARM = ArmParameters(link_length=(3.0, 2.0), sensor_position=(0.5, 0.4))
 HELD = Payload(20.0, 0.1, 19.8, 20.2, 1.0, Status.TRACKING, com=(0.1, 0.0, 0.0))
 
 
 def by_name(drawn: MarkerArray | None) -> dict[str, Any]:
     assert drawn is not None
     return {f'{item.ns}{item.id}': item for item in drawn.markers}
+
+
+def test_a_straight_arm_is_two_straight_lines_from_joint_to_joint() -> None:
+    drawn = draw(ARM, np.array([np.pi / 2, -np.pi / 2]), np.zeros(2))
+    np.testing.assert_allclose(drawn.links[0, [0, -1]], [[0.0, 0.0], [0.0, 3.0]], atol=1e-12)
+    np.testing.assert_allclose(drawn.links[1, [0, -1]], [[0.0, 3.0], [2.0, 3.0]], atol=1e-12)
+    assert drawn.tip_angle == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize('convention', ['encoder', 'chord'])
+def test_the_deflection_of_the_sensor_point_from_the_chord_is_the_bend(convention: str) -> None:
+    arm = replace(ARM, angle_convention=convention)
+    bends = np.array([0.02, -0.03])
+    drawn = draw(arm, np.array([0.7, 0.4]), bends, points=11)  # 0.5 and 0.4 of a link are points
+    for link, index in ((0, 5), (1, 4)):
+        root, tip, there = drawn.links[link, 0], drawn.links[link, -1], drawn.links[link, index]
+        along = (tip - root) / np.linalg.norm(tip - root)
+        assert np.linalg.norm(tip - root) == pytest.approx(arm.link_length[link])
+        assert along[0] * (there - root)[1] - along[1] * (there - root)[0] == pytest.approx(bends[link])
+
+
+def test_an_encoder_reads_the_slope_of_the_root_from_the_tip_before_it() -> None:
+    angles = np.array([0.3, 0.5])
+    drawn = draw(ARM, angles, np.array([0.02, 0.01]), points=2001)
+    first, last = (np.diff(line, axis=1) for line in (drawn.links[:, :2], drawn.links[:, -2:]))
+    slopes, tips = (np.arctan2(part[:, 0, 1], part[:, 0, 0]) for part in (first, last))
+    assert slopes[0] == pytest.approx(angles[0], abs=1e-4)
+    assert slopes[1] - tips[0] == pytest.approx(angles[1], abs=1e-4)
+    assert drawn.tip_angle == pytest.approx(tips[1], abs=1e-4)
+
+
+def test_chord_angles_are_absolute() -> None:
+    arm = replace(ARM, angle_convention='chord')
+    drawn = draw(arm, np.array([0.3, 0.5]), np.array([0.02, 0.01]))
+    chords = drawn.links[:, -1] - drawn.links[:, 0]
+    np.testing.assert_allclose(np.arctan2(chords[:, 1], chords[:, 0]), [0.3, 0.5])
 
 
 def test_the_links_are_drawn_from_the_signals_by_name_and_the_object_at_its_centre_of_mass() -> None:
@@ -48,6 +86,14 @@ def test_the_links_are_drawn_from_the_signals_by_name_and_the_object_at_its_cent
     for item in found.values():
         assert item.header.frame_id == 'world'
         assert conversions.stamp_ns(item.header.stamp) == RECORD.stamp_ns
+
+
+def test_no_text_is_shown_before_the_first_estimate() -> None:
+    """RViz never draws a text that began empty."""
+    for payload, action in ((None, Marker.DELETE), (HELD, Marker.ADD), (None, Marker.DELETE)):
+        text = by_name(ArmMarkers(IdentifierParameters()).message(RECORD, payload))['payload0']
+        assert text.action == action
+        assert text.scale.x > 0.0  # else its spaces are those of letters of 1 m
 
 
 def test_a_payload_that_is_not_known_is_no_ball_and_no_number() -> None:
