@@ -121,12 +121,8 @@ def arm_parameters(config: IdentifierParameters, state: PayloadEstimator) -> tup
     return taught(config, state.structured)
 
 
-class PayloadReading(NamedTuple):
-    """Result of the payload's estimator at a row."""
-
-    payload: Payload | None
-    """None where it is read from the model."""
-    arm_parameters: tuple[ArmParameter, ...]
+PayloadReading = tuple[Payload | None, tuple[ArmParameter, ...]]
+"""The payload at a row, None where it is read from the model, and the arm parameters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,12 +143,12 @@ class PayloadRequest:
 
     def solve(self) -> tuple[EventReplay[PayloadEstimator], list[PayloadReading], int]:
         """Return the estimator before ``until``, its reading at each of ``rows``, and the last second told."""
-        now, told, readings = self.replay, self.told, []
+        now, told, readings = self.replay, self.told, list[PayloadReading]()
         for row, second in zip(self.rows, self.seconds, strict=True):
             now = event_replay.advance(self.config, now, self.log, row + 1, INLINE)
             arm = arm_parameters(self.config, now.estimator) if second > told else ()
             told = second if arm else told
-            readings.append(PayloadReading(payload(self.config, now.estimator), arm))
+            readings.append((payload(self.config, now.estimator), arm))
         return event_replay.advance(self.config, now, self.log, self.until, INLINE), readings, told
 
 

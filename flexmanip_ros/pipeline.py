@@ -5,6 +5,7 @@ identifier), take the rows of this log in groups, each with its own cursor. The 
 messages that came. A replay calls ``run`` with a recording. The same messages give the same estimates bit for bit.
 """
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -226,40 +227,21 @@ def replay(config: IdentifierParameters, items: Iterable[Item], background: Back
 
     Payload and model of one stamp come in one estimate. Raises SignalError when no message can be used.
     """
-    last = init()
-
-    def all_estimates() -> Iterator[tuple[State, Estimate]]:
-        nonlocal last
-        for now, found in _steps(config, last, items, background):
-            last = now
-            yield from ((now, estimate) for estimate in found)
-
-    yield from _one_a_stamp(all_estimates())
-    check_used(last)
-    yield last, None
-
-
-def _one_a_stamp(estimates: Iterable[tuple[State, Estimate]]) -> Iterator[tuple[State, Estimate]]:
-    """Merge the estimates of payload and model that have the same stamp."""
-    waiting: tuple[State, Estimate] | None = None
-    for state, estimate in estimates:
-        arm = estimate.arm_parameters
-        if waiting is not None and waiting[1].stamp_ns != estimate.stamp_ns:
-            yield waiting
-        elif waiting is not None:
-            arm = arm or waiting[1].arm_parameters
-        waiting = state, estimate._replace(payload_is_new=True, arm_parameters=arm)
+    state, waiting = init(), None
+    for item in itertools.chain(items, [None]):
+        state, found = (finish(config, state, background) if item is None
+                        else step(config, state, item, background, REPLAY_GROUP))
+        for estimate in found:
+            arm = estimate.arm_parameters
+            if waiting is not None and waiting[1].stamp_ns == estimate.stamp_ns:
+                arm = arm or waiting[1].arm_parameters
+            elif waiting is not None:
+                yield waiting
+            waiting = state, estimate._replace(payload_is_new=True, arm_parameters=arm)
     if waiting is not None:
         yield waiting
-
-
-def _steps(config: IdentifierParameters, state: State, items: Iterable[Item], background: Background
-           ) -> Iterator[tuple[State, tuple[Estimate, ...]]]:
-    """Yield state and estimates after each message of a recording, and after its end."""
-    for item in items:
-        state, found = step(config, state, item, background, REPLAY_GROUP)
-        yield state, found
-    yield finish(config, state, background)
+    check_used(state)
+    yield state, None
 
 
 def finish(config: IdentifierParameters, state: State, background: Background = INLINE
@@ -429,11 +411,7 @@ def _due_rows(state: State) -> list[int]:
     measured = np.flatnonzero(rows.missing == 0)
     stamps = rows.stamp_ns[measured]
     instants = ((stamps - state.first_ns) * config.publish_rate * 1e-9 + ROUNDING).astype(np.int64)
-    if not len(instants) or instants[-1] <= state.published:
-        return []
-    new = np.empty(len(instants), dtype=np.bool_)
-    new[0] = instants[0] > state.published
-    new[1:] = instants[1:] > instants[:-1]
+    new = np.diff(instants, prepend=state.published) > 0
     return [int(row) for row in measured[new] + cursor]
 
 

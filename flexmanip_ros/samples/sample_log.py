@@ -7,7 +7,7 @@ read slices.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple, TypeVar
 
@@ -109,7 +109,7 @@ class SampleLog:
         """Return the log with one more waiting row, whose inputs are its own (no ``delay``)."""
         log = self.append(np.array([raw.stamp_ns]), raw.u[None], raw.y[None], raw.angles[None],
                           np.zeros(1, dtype=np.bool_), rates=raw.rates[None])
-        return SampleLog(self.width, self.start, self.end, self.waiting + 1, log._buffer)
+        return replace(log, end=self.end, waiting=self.waiting + 1)
 
     def waiting_rows(self) -> Rows:
         """Return the waiting rows."""
@@ -122,13 +122,11 @@ class SampleLog:
 
     def without_waiting(self) -> SampleLog:
         """Return the log without the waiting rows."""
-        return SampleLog(self.width, self.start, self.end, 0, self._buffer) if self.waiting else self
+        return replace(self, waiting=0)
 
     def from_row(self, first: int) -> SampleLog:
         """Return the log without the rows before ``first``; their memory is freed with the next buffer."""
-        if first <= self.start:
-            return self
-        return SampleLog(self.width, min(first, self.end), self.end, self.waiting, self._buffer)
+        return replace(self, start=min(max(first, self.start), self.end))
 
     def _with_room(self, count: int) -> _Buffer:
         """Return a buffer that may be written after the last row, with room for ``count`` rows."""
@@ -140,12 +138,8 @@ class SampleLog:
         new = _Buffer(self.start, last, np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int64),
                       np.zeros((size, sum(self.width))), np.zeros(size, dtype=np.bool_), np.zeros(size, dtype=np.int64))
         if old is not None and kept:
-            a, b = self.start - old.first, last - old.first
-            new.stamp_ns[:kept] = old.stamp_ns[a:b]
-            new.time_ns[:kept] = old.time_ns[a:b]
-            new.values[:kept] = old.values[a:b]
-            new.gap[:kept] = old.gap[a:b]
-            new.missing[:kept] = old.missing[a:b]
+            for name in ('stamp_ns', 'time_ns', 'values', 'gap', 'missing'):
+                getattr(new, name)[:kept] = getattr(old, name)[self.start - old.first:last - old.first]
         return new
 
 

@@ -68,13 +68,9 @@ class Counters(NamedTuple):
         return (self.repeated_stamp + self.late_stamp + self.missing_signal + self.unequal_sizes
                 + self.not_finite)
 
-    def plus(self, name: str) -> Counters:
-        """Return the counters with one of them raised by one."""
-        return self._replace(**{name: getattr(self, name) + 1})
-
-    def received_and(self, name: str, count: int = 1) -> Counters:
-        """Return the counters after one message, or ``count`` of them, with this outcome."""
-        return self._replace(**{'received': self.received + count, name: getattr(self, name) + count})
+    def plus(self, *names: str, count: int = 1) -> Counters:
+        """Return the counters with those of these names raised by ``count``."""
+        return self._replace(**{name: getattr(self, name) + count for name in names})
 
 
 class Clock(NamedTuple):
@@ -161,19 +157,18 @@ def push_block(config: IdentifierParameters, clock: Clock, log: SampleLog, block
         now, why = sampled.clock, sampled.clock.rejection
         if why is None or why is clock.rejection or why.reason not in OF_LAYOUT:
             return sampled, 1
-        return sampled._replace(clock=now._replace(counters=now.counters.received_and(why.reason, left))), 1 + left
+        counters = now.counters.plus('received', why.reason, count=left)
+        return sampled._replace(clock=now._replace(counters=counters)), 1 + left
     channels = clock.channels
     assert channels is not None
     taken = slice(first, first + regular)
     u, y, angles = (columns(block, places, taken) for places in (channels.u, channels.y, channels.angles))
     rates = joint_rates(channels, block, taken)
     last = int(block.stamp_ns[taken][-1])
-    counters = clock.counters
     latest = Sample(last, u[-1].copy(), y[-1].copy(), angles[-1].copy(), rates[-1].copy())
     clock = advanced._replace(
         last_ns=last, latest=latest, peak=_peak(clock, np.abs(u).max(axis=0)), irregular=0,
-        counters=counters._replace(received=counters.received + regular,
-                                   accepted=counters.accepted + regular))
+        counters=clock.counters.plus('received', 'accepted', count=regular))
     before = log.end
     log = log.append(block.stamp_ns[taken], u, y, angles, np.zeros(regular, dtype=np.bool_), config.arm.effort_delay,
                      rates=rates, time_ns=times)
@@ -196,13 +191,6 @@ def _first_of_clock(config: IdentifierParameters, stamps: NDArray[np.int64]) -> 
     usual = np.sort(intervals)[intervals.size // 2] if intervals.size else 0.0
     jumps = np.flatnonzero(intervals > max(config.max_time_jump, FAR * usual))
     return int(jumps[-1]) + 1 if jumps.size else 0
-
-
-def _is_expected(clock: Clock, message: JointBlock) -> bool:
-    """Whether the sample time is known, no stamp is in doubt, and messages have the layout of the last one."""
-    channels = clock.channels
-    return (channels is not None and clock.interval_count > 0 and clock.jump_candidate is None
-            and channels.names == message.names and _fault(channels, message) is None)
 
 
 def _is_on_time(config: IdentifierParameters, interval_ns: int, clock: Clock) -> bool:
@@ -231,18 +219,17 @@ def _regular(config: IdentifierParameters, clock: Clock, log: SampleLog, block: 
 
     The clock has their intervals alone.
     """
-    none = np.zeros(0, dtype=np.int64)
-    if not _is_expected(clock, block):
-        return none, clock
-    assert clock.last_ns is not None
-    assert clock.channels is not None
+    channels = clock.channels
+    if (channels is None or clock.last_ns is None or clock.interval_count == 0 or clock.jump_candidate is not None
+            or channels.names != block.names or _fault(channels, block) is not None):
+        return np.zeros(0, dtype=np.int64), clock  # sample time or stamp in doubt, or another layout than before
     # with jitter at most ``REGRESSED`` rows are taken at once, and no more are looked at
     taken = slice(first, len(block.stamp_ns) if clock.jitter.is_sharp else min(first + REGRESSED, len(block.stamp_ns)))
     stamps = block.stamp_ns[taken]
     intervals = np.diff(stamps, prepend=np.int64(clock.last_ns))
     finite = np.logical_and.reduce([
         np.isfinite(columns(block, places, taken)).all(axis=1)
-        for places in (clock.channels.u, clock.channels.y, clock.channels.angles)])
+        for places in (channels.u, channels.y, channels.angles)])
     usable = finite & (intervals > 0) & (intervals * 1e-9 <= config.max_time_jump)  # no far jump
     count = len(stamps) if usable.all() else int(np.argmin(usable))
     if clock.jitter.square == 0.0:  # equal intervals leave the clock as it is but for its sums
@@ -289,10 +276,9 @@ def collect(config: IdentifierParameters, items: Iterable[JointRecord | JointBlo
     """Return the signals of a whole recording."""
     clock, log = Clock(), EMPTY
     for item in items:
-        if isinstance(item, JointBlock):
-            clock, log, _ = push_whole(config, clock, log, item)
-        elif isinstance(item, JointRecord):
-            clock, log, _ = push(config, clock, log, item)
+        if not isinstance(item, CaptureEvent):
+            block = item if isinstance(item, JointBlock) else JointBlock.of(item)
+            clock, log, _ = push_whole(config, clock, log, block)
     clock, log, _ = flush(config, clock, log)
     return signals(config, clock, log)
 
@@ -306,7 +292,7 @@ _AHEAD = Rejection('late_stamp', 'one header stamp was far ahead of those before
 
 
 def _reject(clock: Clock, rejection: Rejection) -> Clock:
-    return clock._replace(counters=clock.counters.received_and(rejection.reason), rejection=rejection)
+    return clock._replace(counters=clock.counters.plus('received', rejection.reason), rejection=rejection)
 
 
 def _fault(channels: Channels, record: JointRecord | JointBlock) -> Rejection | None:
@@ -353,11 +339,11 @@ def _placed(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sam
             return _restart(clock, log, raw)
         return Sampled(_reject(clock, _LATE), log)
     if clock.interval_count == 0:
-        clock = clock._replace(last_ns=raw.stamp_ns, counters=clock.counters.received_and('accepted'))
+        clock = clock._replace(last_ns=raw.stamp_ns, counters=clock.counters.plus('received', 'accepted'))
         log = log.wait(raw)
         return _learned(config, clock, log) if log.waiting > LEARNING else Sampled(clock, log)
     before = clock.counters
-    clock, log = _next(config, clock._replace(counters=before.received_and('accepted')), log, raw)
+    clock, log = _next(config, clock._replace(counters=before.plus('received', 'accepted')), log, raw)
     if clock.irregular >= RELEARN:
         return _restart(clock._replace(counters=before.plus('gaps')), log, raw)
     return Sampled(clock, log)
@@ -365,7 +351,7 @@ def _placed(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sam
 
 def _restart(clock: Clock, log: SampleLog, raw: Sample) -> Sampled:
     """Begin a new clock and a new log at ``raw``: the stamps went back, or the rate changed for good."""
-    counters = clock.counters.plus('resets').received_and('accepted')
+    counters = clock.counters.plus('resets', 'received', 'accepted')
     fresh = Clock(channels=clock.channels, outputs=clock.outputs, counters=counters, last_ns=raw.stamp_ns)
     return Sampled(fresh, SampleLog(log.width).wait(raw), reset=True)
 
@@ -431,41 +417,26 @@ def _after_gap(config: IdentifierParameters, log: SampleLog, clock: Clock, raw: 
                ) -> tuple[SampleLog, Clock, bool]:
     """Return log and clock where messages before ``raw`` were lost or it came too early.
 
-    Return as well whether motion or torques just before it are unknown.
+    The rows of the lost ones are interpolated. Return as well whether motion or torques just before ``raw`` are
+    unknown. That is so too where a torque changed so much while messages were missing that the motion depends on when
+    it did.
     """
-    assert clock.last_ns is not None
-    counters = clock.counters.plus('gaps')
-    interval = raw.stamp_ns - clock.last_ns
-    if clock.latest is None or interval * 1e-9 > config.max_gap or not 0 < lost <= MOST_MISSING:
+    before, counters = clock.latest, clock.counters.plus('gaps')
+    interval = 0 if before is None else raw.stamp_ns - before.stamp_ns
+    if before is None or interval * 1e-9 > config.max_gap or not 0 < lost <= MOST_MISSING:
         return log.without_waiting(), clock._replace(counters=counters, jitter=clock.jitter.restarted()), True
     after = clock._replace(counters=counters).after(interval, lost + 1)
-    log = _filled(log, clock, raw, lost, config.arm.effort_delay, after.jitter.correction_ns)
-    return log, after, _is_torque_unknown(clock, raw, lost)
+    number = np.arange(1, lost + 1)
+    share = (number / (lost + 1))[:, None]
+    stamps = before.stamp_ns + interval * number // (lost + 1)
+    u, y, angles, rates = (np.asarray(a + share * (b - a)) for a, b in zip(before[1:], raw[1:], strict=True))
+    correction = clock.jitter.correction_ns
+    late = correction + share[:, 0] * (after.jitter.correction_ns - correction)
+    log = log.append(stamps, u, y, angles, np.zeros(lost, dtype=np.bool_), config.arm.effort_delay, number, rates,
+                     stamps - np.round(late).astype(np.int64))
+    change, peak = np.abs(raw.u - before.u), np.maximum(clock.peak, np.abs(raw.u))
+    return log, after, bool(np.any(lost * change > UNKNOWN_TORQUE * peak))
 
 
 def _peak(clock: Clock, size: Array) -> Array:
     return np.maximum(clock.peak, size) if clock.peak.size else np.array(size, dtype=np.float64)
-
-
-def _is_torque_unknown(clock: Clock, raw: Sample, absent: int) -> bool:
-    """Whether the torque changed so much while samples were missing that the motion depends on when it did."""
-    assert clock.latest is not None
-    change = np.abs(raw.u - clock.latest.u)
-    return bool(np.any(absent * change > UNKNOWN_TORQUE * np.maximum(clock.peak, np.abs(raw.u))))
-
-
-def _filled(log: SampleLog, clock: Clock, raw: Sample, absent: int, delay: int, correction_ns: float
-            ) -> SampleLog:
-    """Append the rows of samples that never came, interpolated between the one before and ``raw``.
-
-    correction_ns: by how much the stamp of ``raw`` is later than its sample [ns].
-    """
-    before = clock.latest
-    assert before is not None
-    number = np.arange(1, absent + 1)
-    share = (number / (absent + 1))[:, None]
-    stamps = before.stamp_ns + (raw.stamp_ns - before.stamp_ns) * number // (absent + 1)
-    u, y, angles, rates = (np.asarray(a + share * (b - a)) for a, b in zip(before[1:], raw[1:], strict=True))
-    late = clock.jitter.correction_ns + share[:, 0] * (correction_ns - clock.jitter.correction_ns)
-    return log.append(stamps, u, y, angles, np.zeros(absent, dtype=np.bool_), delay, number, rates,
-                      stamps - np.round(late).astype(np.int64))

@@ -16,3 +16,12 @@ def one_a_stamp(estimates: Iterable[Estimate]) -> list[Estimate]:
         arms = (one.arm_parameters for one in (last, *before))
         found.append(last._replace(payload_is_new=True, arm_parameters=next(filter(None, arms), ())))
     return found
+
+
+def bits(estimate: Estimate | None) -> tuple[object, ...]:
+    """All that an estimate says, to the bit."""
+    if estimate is None:
+        return ()
+    parts = () if estimate.model is None else tuple(
+        getattr(estimate.model, name).tobytes() for name in ('A', 'B', 'C', 'D', 'K'))
+    return estimate.stamp_ns, estimate.status, parts, repr(estimate.modes), repr(estimate.payload)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from estimates import one_a_stamp
+from estimates import bits, one_a_stamp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -44,12 +44,6 @@ def step_through(items: Sequence[JointRecord | CaptureEvent], config: Identifier
         state, ready = pipeline.step(config, state, item)
         out.extend(ready)
     return state, one_a_stamp(out)
-
-
-def bits(estimate: Estimate) -> tuple[object, ...]:
-    model = estimate.model
-    parts = () if model is None else (model.A, model.B, model.C, model.D, model.K)
-    return (estimate.stamp_ns, estimate.status, *(part.tobytes() for part in parts), repr(estimate.modes))
 
 
 def same(a: Sequence[Estimate], b: Sequence[Estimate]) -> bool:
@@ -103,7 +97,6 @@ def test_of_two_events_of_one_stamp_the_release_comes_first() -> None:
         step_through([*items[:150], *pair, *items[150:]], config)
         for pair in ((capture, release), (release, capture)))
     assert same(one, two)
-    assert [repr(e.payload) for e in one] == [repr(e.payload) for e in two]
 
 
 def test_an_event_too_old_to_go_back_for_is_applied_at_once_and_counted() -> None:

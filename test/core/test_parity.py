@@ -6,7 +6,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from estimates import one_a_stamp
+from estimates import bits, one_a_stamp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -14,7 +14,7 @@ from flexmanip_ros import pipeline
 from flexmanip_ros.numerics.background import Threads
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord
+from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, JointRecord
 
 Item = JointRecord | CaptureEvent
 MS = 1_000_000
@@ -55,14 +55,6 @@ def _arrivals(bad: list[tuple[int, str]], events: list[tuple[int, int, EventKind
     return [item for group in items for item in group]
 
 
-def _bits(estimate: Estimate | None) -> tuple[object, ...]:
-    if estimate is None:
-        return ()
-    parts = () if estimate.model is None else tuple(
-        getattr(estimate.model, name).tobytes() for name in ('A', 'B', 'C', 'D', 'K'))
-    return (estimate.stamp_ns, estimate.status, parts, repr(estimate.modes), repr(estimate.payload))
-
-
 @settings(max_examples=8, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(faults, announced)
 def test_message_by_message_is_the_replay_bit_for_bit(bad: list[tuple[int, str]],
@@ -78,10 +70,10 @@ def test_message_by_message_is_the_replay_bit_for_bit(bad: list[tuple[int, str]]
         last = now
         if estimate is not None:
             replayed.append(estimate)
-    assert [_bits(e) for e in live] == [_bits(e) for e in replayed]
+    assert [bits(e) for e in live] == [bits(e) for e in replayed]
     assert live[-1].payload is not None
     assert last.counters == state.counters
-    assert _bits(pipeline.current(state)) == _bits(pipeline.current(last))
+    assert bits(pipeline.current(state)) == bits(pipeline.current(last))
 
 
 def _in_blocks(items: list[Item], size: int) -> list[Item | JointBlock]:
@@ -113,11 +105,11 @@ def test_blocks_of_messages_give_the_bits_of_single_messages(
     config = configure(IdentifierParameters, {'publish_rate': 40.0, 'rewind_time': 0.1, 'arm.effort_delay': delay})
     single = list(pipeline.replay(config, items))
     blocks = list(pipeline.replay(config, _in_blocks(items, size)))
-    assert [_bits(e) for _, e in single] == [_bits(e) for _, e in blocks]
+    assert [bits(e) for _, e in single] == [bits(e) for _, e in blocks]
     *_, ended = pipeline.absorb(config, _in_blocks(items, size))  # no estimate is made on the way
     for last in (blocks[-1][0], ended):
         assert single[-1][0].counters == last.counters
-        assert _bits(pipeline.current(single[-1][0])) == _bits(pipeline.current(last))
+        assert bits(pipeline.current(single[-1][0])) == bits(pipeline.current(last))
 
 
 @pytest.mark.parametrize('again', [False, True], ids=['once', 'and anew: its stamps jump back'])
@@ -134,7 +126,7 @@ def test_what_is_read_while_the_payload_takes_its_rows_changes_no_bit(
         *_, ended = pipeline.absorb(CONFIG, _in_blocks(items, 25), beside)
     assert last.counters == ended.counters
     assert last.counters.resets == again
-    assert _bits(pipeline.current(last)) == _bits(pipeline.current(ended))
+    assert bits(pipeline.current(last)) == bits(pipeline.current(ended))
 
 
 def test_every_fit_after_a_capture_gives_the_same_bits_live_and_replayed() -> None:
@@ -151,10 +143,10 @@ def test_every_fit_after_a_capture_gives_the_same_bits_live_and_replayed() -> No
         live = one_a_stamp(live)
         ballast = [np.empty(3 * k + 1) for k in range(50)]  # other places in memory, the same numbers
         replayed = list(pipeline.run(config, items))
-        assert [_bits(one) for one in live] == [_bits(one) for one in replayed], len(ballast)
+        assert [bits(one) for one in live] == [bits(one) for one in replayed], len(ballast)
         assert sum(one.model_is_new for one in live) > 30
         with closing(Threads()) as beside:  # payload, models and fits on threads of their own
             threaded = [one for _, one in pipeline.replay(config, _in_blocks(items, 1000), beside) if one is not None]
             *_, ended = pipeline.absorb(config, _in_blocks(items, 1000), beside)
-        assert [_bits(one) for one in live] == [_bits(one) for one in threaded]
-        assert _bits(pipeline.current(ended)) == _bits(pipeline.current(state))
+        assert [bits(one) for one in live] == [bits(one) for one in threaded]
+        assert bits(pipeline.current(ended)) == bits(pipeline.current(state))
