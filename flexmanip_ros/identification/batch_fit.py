@@ -346,8 +346,7 @@ def _gain_alone(U: Array, Y: Array, theta: Theta, begin: Array, structure: Struc
 def arrive(root: Array, arrival: Array) -> Array:
     """Covariance root of [coordinates; state at the end] from that of [coordinates; state at the start]."""
     n = arrival.shape[0]
-    moved_root: Array = np.vstack([root[:root.shape[0] - n], arrival @ root])
-    return moved_root
+    return np.vstack([root[:root.shape[0] - n], arrival @ root])
 
 
 def _gain_asked_for(U: Array, Y: Array, fit: Fit, structure: Structure, penalty: float) -> bool:

@@ -16,7 +16,6 @@ TAPS = 8
 LAG = TAPS // 2
 """Delay of the filter in kept sample times, from the instant of a filtered sample to the last sample it depends on."""
 
-
 Missing = NDArray[np.int64]
 """See ``Rows.missing``."""
 
@@ -46,11 +45,6 @@ def colour(factor: int) -> float:
     """
     taps = start(factor, 0).taps
     return 1.0 if factor == 1 else float((factor * taps @ taps) ** -0.5)
-
-
-def restart(decimator: Decimator) -> Decimator:
-    """Empty the filter, so that no filtered sample depends on samples from before a gap or an event."""
-    return decimator._replace(seen=0)
 
 
 def decimate(decimator: Decimator, samples: Array, missing: Missing, factor: int

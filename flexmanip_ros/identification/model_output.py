@@ -152,16 +152,20 @@ def publish(
     if not realized.residual.any():  # the moments of the paper's recursion are those that it explains
         total += variance
     unexplained = float(np.min(np.diag(covariance) / np.where(total > 0.0, total, np.inf)))
-    status = judge(used, d, condition, unexplained, too_low)
-    reasons = {
-        Status.WARMING_UP: f'{used} samples were learned of the {2 * d} that {d} regressors need',
-        Status.POORLY_EXCITED: 'one step ahead the model explains less than a tenth of every output',
-        Status.ORDER_TOO_LOW: f'the order adds {100.0 * float(realized.neglected.max()):.2g} % to the variance of an '
-                              'innovation'}
+    status, reason = Status.TRACKING, ''
+    if used < 2 * d:
+        status, reason = Status.WARMING_UP, f'{used} samples were learned of the {2 * d} that {d} regressors need'
+    elif not condition < WORST_CONDITION:
+        status = Status.ILL_CONDITIONED
+    elif unexplained > UNEXPLAINED:
+        status, reason = Status.POORLY_EXCITED, 'one step ahead the model explains less than a tenth of every output'
+    elif too_low:
+        added = 100.0 * float(realized.neglected.max())
+        status, reason = Status.ORDER_TOO_LOW, f'the order adds {added:.2g} % to the variance of an innovation'
     return Identified(
         model=model, spread=spread, singular_values=realized.singular_values,
         excitation=excitation(realized.regression), condition=condition, innovation_power=power,
-        status=status, samples=float(effective), reason=reasons.get(status, ''))
+        status=status, samples=float(effective), reason=reason)
 
 
 def raw_model(config: IdentifierParameters, realized: Realized, scale: Array, dt: float
@@ -202,19 +206,6 @@ def based(model: StateSpace, along: Tangent | None, stable: bool = False) -> tup
         dW = uncertainty.known_basis_tangent(model, along) if known else None
         along = uncertainty.move(model, along, W, dW)
     return moved, along, W
-
-
-def judge(used: int, parameters: int, condition: float, unexplained: float, too_low: bool) -> Status:
-    """Return the status of the model."""
-    if used < 2 * parameters:
-        return Status.WARMING_UP
-    if not condition < WORST_CONDITION:
-        return Status.ILL_CONDITIONED
-    if unexplained > UNEXPLAINED:
-        return Status.POORLY_EXCITED
-    if too_low:
-        return Status.ORDER_TOO_LOW
-    return Status.TRACKING
 
 
 def excitation(regression: Array) -> float:

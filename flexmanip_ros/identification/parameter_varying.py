@@ -283,32 +283,23 @@ def _entries(h: int, r: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDAr
     The weights are those of the functions of c, of their derivatives, of ``rates``, and of the functions with the sine,
     then 1. Last come three row numbers: the first rows of the local E, of the local Q and of the state.
     """
-    places, found = {name: where.start for name, (where, _) in parts(h, r).items()}, []
-    a, b, q, d, t = h * h, h * r, 2 * r + 1, 2 * pairs(h), triples(h)
-
-    def put(row: int, entries: int, name: str, weight: int, width: int = 1, stride: int = 1) -> None:
-        """Give each entry of a part one row, from ``row`` on; ``width`` of them stand in each ``stride`` rows."""
-        j = np.arange(entries)
-        functions = parts(h, r)[name][1][0] if weight < 4 * FUNCTIONS else 1
-        for i in range(functions):
-            found.append((row + j // width * stride + j % width, places[name] + i * entries + j,
-                          np.full(entries, weight + i)))
-
-    direct, products = 3 * a + 2 * b, 3 * a + 4 * b + h
-    put(0, a, 'G', 0)
-    put(a, a, 'G', FUNCTIONS)
-    put(2 * a, b, 'H', 0)
-    put(2 * a + b, b, 'H', FUNCTIONS)
-    put(2 * a + 2 * b, a, 'D', 2 * FUNCTIONS)
-    put(direct, b, 'E', 0, r, q)
-    put(direct + r, b, 'F', 4 * FUNCTIONS, r, q)
-    put(direct + 2 * r, h, 'b', 4 * FUNCTIONS, 1, q)
-    put(products, h * d, 'Q', 3 * FUNCTIONS, d, d + t)
-    put(products + d, h * t, 'R', 4 * FUNCTIONS, t, d + t)
-    state, end = np.arange(2 * h), products + h * (d + t)
-    found.append((end + state, places['zeta'] + 1 + state, np.full(2 * h, 4 * FUNCTIONS)))
-    row, column, weight = (np.concatenate(one) for one in zip(*found, strict=True))
-    return row, column, weight, (direct, products, end)
+    where = parts(h, r)
+    size = where['zeta'][0].stop
+    column, one, found = np.arange(size), 4 * FUNCTIONS, []
+    F, b, R = (part(column, name, h, r) for name in 'FbR')
+    for i in range(FUNCTIONS):
+        G, H, D, E, Q = (part(column, name, h, r)[i] for name in 'GHDEQ')
+        columns = G, G, H, H, D, np.hstack([E, F, b[:, None]]), np.hstack([Q, R])
+        weights = i, FUNCTIONS + i, i, FUNCTIONS + i, 2 * FUNCTIONS + i, i, 3 * FUNCTIONS + i
+        entries = np.concatenate([block.ravel() for block in columns])
+        weight = np.concatenate([np.full(block.size, number) for block, number in zip(columns, weights, strict=True)])
+        weight[np.isin(entries, np.concatenate([F.ravel(), b, R.ravel()]))] = one
+        found.append((np.arange(len(entries)), entries, weight))
+    end, product = len(entries), columns[-1].size
+    state = np.arange(2 * h)
+    found.append((end + state, size + state, np.full(2 * h, one)))
+    rows, all_columns, all_weights = (np.concatenate(some) for some in zip(*found, strict=True))
+    return rows, all_columns, all_weights, (end - product - columns[-2].size, end - product, end)
 
 
 def _filter(v: Varying) -> tuple[Array, Array, Array]:

@@ -60,12 +60,9 @@ def to_discrete(Ac: Array, Bc: Array, dt: float) -> tuple[Array, Array]:
 def continuous_state_matrix(A: Array, dt: float) -> Array | None:
     """log(A) / dt by eigenvectors, fast; None where it is not real or the eigenvectors are unusable."""
     poles, vectors = np.linalg.eig(A)
-    if _outside_log(poles):
+    if _outside_log(poles) or np.linalg.cond(vectors) > WORST_BASIS:
         return None
-    if np.linalg.cond(vectors) > WORST_BASIS:
-        return None
-    log: Array = np.real(np.linalg.solve(vectors.T, (vectors * np.log(poles)).T).T) / dt
-    return log
+    return np.asarray(np.real(np.linalg.solve(vectors.T, (vectors * np.log(poles)).T).T) / dt)
 
 
 def stabilized(A: Array) -> Array:
@@ -162,18 +159,16 @@ def balancing(model: StateSpace) -> Array:
     C = np.linalg.solve(W.T, model.C.T).T
     first = np.argmax(np.abs(C) > 0.1 * np.abs(C).max(axis=0), axis=0)
     sign = np.where(C[first, np.arange(n)] < 0.0, -1.0, 1.0)
-    balanced: Array = sign[:, None] * W
-    return balanced
+    return np.asarray(sign[:, None] * W)
 
 
 def markov(model: StateSpace, count: int) -> Array:
     """(count, m, r): impulse response D, C B, C A B, ..."""
     out = np.empty((count, *model.D.shape))
-    state = model.B
-    for k in range(count):
-        out[k] = model.D if k == 0 else model.C @ state
-        if k > 0:
-            state = model.A @ state
+    out[0], state = model.D, model.B
+    for k in range(1, count):
+        out[k] = model.C @ state
+        state = model.A @ state
     return out
 
 

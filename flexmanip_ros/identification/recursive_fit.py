@@ -72,8 +72,16 @@ class FitRequest:
 
     def solve(self) -> FitResult:
         """Make the fit without warnings: numbers that are not finite are detected where the result is checked."""
-        with np.errstate(over='ignore', invalid='ignore'):
-            return solve(self)
+        try:
+            with np.errstate(over='ignore', invalid='ignore'):
+                if self.R is not None and self.scale is not None:
+                    return _stretch(self, self.R, self.scale)
+                if self.varying is not None:
+                    return FitResult(self.old, varying=parameter_varying.advance(self.config, self.varying, self.rows))
+                assert self.old is not None
+                return FitResult(_block(self.old, samples_of(self.rows)))
+        except np.linalg.LinAlgError:
+            return FitResult(None, failed=True)
 
 
 class FitResult(NamedTuple):
@@ -117,9 +125,9 @@ class Refined(NamedTuple):
         return self.begin + self.total // CHUNK * CHUNK
 
 
-def start(row: int, before: Recursion | None = None, varying_before: Varying | None = None) -> Refined:
-    """Begin without a fit at a row of the sample log."""
-    return Refined(row, row, row, before=before, varying_before=varying_before)
+def start(row: int, before: Recursion | None = None, varying_before: Varying | None = None, pause: int = 0) -> Refined:
+    """Begin without a fit at a row of the sample log, or ``pause`` rows later."""
+    return Refined(row + pause, row, row + pause, before=before, varying_before=varying_before)
 
 
 def restart(refined: Refined) -> Refined:
@@ -235,28 +243,14 @@ def delivered(refined: Refined, background: Background) -> Refined:
     refined = refined._replace(request=None)
     if result.failed:  # the subspace model is published, and a new stretch begins
         return start(refined.end)
-    if request.R is None:
-        if request.varying is not None and result.varying is None:  # that fit has ended: a new stretch begins
-            return start(refined.end, result.recursion)
-        if result.recursion is None and result.varying is None and not refined.batch:
-            return give_up(refined)
-        return refined._replace(recursion=result.recursion, varying=result.varying, seen=refined.seen + BLOCK)
-    count = len(request.rows)
-    if result.recursion is None and result.varying is None and count >= LONGEST:
-        return give_up(refined)
-    return refined._replace(recursion=result.recursion, varying=result.varying, batch=count < LONGEST,
-                            seen=refined.begin + count)
-
-
-def give_up(refined: Refined) -> Refined:
-    """Drop a fit that fails, and pause before the next stretch: the model may not suit the plant at all."""
-    later = refined.end + PAUSE
-    return Refined(later, refined.end, later)
-
-
-def skip(refined: Refined) -> Refined:
-    """Pass over one row before the stretch begins."""
-    return refined._replace(begin=refined.begin + 1, end=refined.end + 1, seen=refined.seen + 1)
+    count, whole = len(request.rows), request.R is not None
+    if request.varying is not None and result.varying is None and not whole:  # that fit has ended: a new stretch begins
+        return start(refined.end, result.recursion)
+    batch = count < LONGEST if whole else refined.batch
+    if result.recursion is None and result.varying is None and not batch:  # the model may not suit the plant at all
+        return start(refined.end, pause=PAUSE)
+    return refined._replace(recursion=result.recursion, varying=result.varying, batch=batch,
+                            seen=(refined.begin if whole else refined.seen) + count)
 
 
 def broken(refined: Refined, background: Background) -> Refined:
@@ -274,8 +268,7 @@ def broken(refined: Refined, background: Background) -> Refined:
         return fresh._replace(batch=False, recursion=old, varying=parameter_varying.lost(refined.varying))
     if old is None:
         return fresh
-    n = old.theta.A.shape[0]
-    k = old.root.shape[0]
+    n, k = old.theta.A.shape[0], old.root.shape[0]
     root = np.zeros((k, k))
     root[:k - n, :k - n] = triangle(old.root[:k - n].T).T[:, :k - n]
     root[k - n:, k - n:] = 10.0 * np.eye(n)  # deviation 10 of an unknown state: signals have unit power
@@ -295,21 +288,6 @@ CHANCE = 2.0
 """Excess, in standard deviations, up to which larger residuals or a trend of the parameters count as chance."""
 LARGEST_DRIFT = 1.4
 """Logarithm of the largest factor by which one block may raise the prior variances."""
-
-
-def solve(request: FitRequest) -> FitResult:
-    """Make the fit of a request."""
-    try:
-        if request.R is not None and request.scale is not None:
-            found = _stretch(request, request.R, request.scale)
-            return FitResult(found, varying=_varying(request, found))
-        if request.varying is not None:
-            return FitResult(request.old, varying=parameter_varying.advance(
-                request.config, request.varying, request.rows))
-        assert request.old is not None
-        return FitResult(_block(request.old, samples_of(request.rows)))
-    except np.linalg.LinAlgError:
-        return FitResult(None, failed=True)
 
 
 def samples_of(rows: Rows) -> Array:
@@ -339,26 +317,22 @@ def whole_fit(config: IdentifierParameters, samples: Array, R: Array, scale: Arr
     return found._replace(widening=max(found.widening, decimation.colour(config.decimation)))
 
 
-def _stretch(request: FitRequest, R: Array, scale: Array) -> Recursion | None:
-    """Fit the whole stretch."""
-    found = whole_fit(request.config, samples_of(request.rows), R, scale,
-                      'sensor' if request.config.refinement == 'output_error' else 'any',
-                      [fit for fit in (request.old, request.older) if fit is not None])
-    if found is None or found.trend_share == 0.0:
-        return found
-    return found._replace(trend_lag=request.later / BLOCK + 1.0)  # the arm drifts on until the result is read
+def _stretch(request: FitRequest, R: Array, scale: Array) -> FitResult:
+    """Fit the whole stretch with a model of one configuration, and from it with a parameter-varying one.
 
-
-def _varying(request: FitRequest, found: Recursion | None) -> Varying | None:
-    """Fit the whole stretch with a parameter-varying model, once from that before the event and once from ``found``.
-
-    found: the fit of one configuration. The better of the two is returned.
+    The parameter-varying model is also fitted from that before the event; the better of the two is returned.
     """
-    tried = [varying_start.start(request.config, request.rows, None, request.varying)]
+    config = request.config
+    found = whole_fit(config, samples_of(request.rows), R, scale,
+                      'sensor' if config.refinement == 'output_error' else 'any',
+                      [fit for fit in (request.old, request.older) if fit is not None])
+    if found is not None and found.trend_share > 0.0:  # the arm drifts on until the result is read
+        found = found._replace(trend_lag=request.later / BLOCK + 1.0)
+    tried = [varying_start.start(config, request.rows, None, request.varying)]
     if found is not None and len(request.rows) >= varying_start.WINDOW:
-        tried.append(varying_start.start(request.config, request.rows, found, None))
+        tried.append(varying_start.start(config, request.rows, found, None))
     good = [one for one in tried if one is not None and float(one.share.max()) ** 2 < UNEXPLAINED]
-    return min(good, key=lambda one: float(one.share.max())) if good else None
+    return FitResult(found, varying=min(good, key=lambda one: float(one.share.max()), default=None))
 
 
 def _block(old: Recursion, samples: Array) -> Recursion | None:
@@ -473,7 +447,8 @@ def refine(config: IdentifierParameters, refined: Refined, rows: Rows, outcome: 
     for k in np.flatnonzero(outcome):
         row = rows.first + int(k)
         refined = take(refined, rows.between(first, row)) if row > first else refined
-        refined = skip(broken(refined, background))
+        refined = broken(refined, background)  # the next stretch begins after this row
+        refined = refined._replace(begin=refined.begin + 1, end=refined.end + 1, seen=refined.seen + 1)
         first = row + 1
     if first == rows.until:
         return refined

@@ -32,10 +32,7 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Rows, SampleLog, Width
 from flexmanip_ros.types import Array, Status
 
-MODES = {
-    'constant': factor.CONSTANT, 'excitation': factor.EXCITATION,
-    'innovation': factor.INNOVATION,
-}
+MODES = {'constant': factor.CONSTANT, 'excitation': factor.EXCITATION, 'innovation': factor.INNOVATION}
 FRESH = 3.0
 """Largest ratio of the samples behind the subspace model to those behind a fit at which the fit is published."""
 
@@ -252,7 +249,7 @@ def window_restart(config: IdentifierParameters, state: RpbsidState, background:
     if config.estimator == 'paper':
         new.memory[-1][-1] = 0.0
     if new.decimator is not None:
-        new = new._replace(decimator=decimation.restart(new.decimator))
+        new = new._replace(decimator=new.decimator._replace(seen=0))  # no filtered sample depends on older ones
     if new.refined is not None:
         new = new._replace(refined=recursive_fit.broken(new.refined, background))
     return new

@@ -131,8 +131,7 @@ def _combine(left: list[Array], right: Array) -> Array:
     terms = right.reshape(d, len(left), -1)
     columns = terms.shape[2]
     joint = np.stack(left).reshape(len(left), -1).T @ terms.transpose(1, 0, 2).reshape(len(left), -1)
-    whole: Array = joint.reshape(rows, a, d, columns).transpose(1, 2, 0, 3).reshape(a * d, rows, columns)
-    return whole
+    return joint.reshape(rows, a, d, columns).transpose(1, 2, 0, 3).reshape(a * d, rows, columns)
 
 
 def move(model: StateSpace, along: Tangent, W: Array, dW: Array | None) -> Tangent:
