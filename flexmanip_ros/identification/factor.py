@@ -44,28 +44,24 @@ def accept(u: Array, y: Array, new: Array, scale: Array, mean: Array, counts: Ar
     """
     r = u.shape[0]
     counts[SEEN] += 1
-    odd = False
+    rejected, odd = False, False
     for i in range(new.shape[0]):
         value = u[i] if i < r else y[i - r]
-        if not math.isfinite(value):
-            counts[FILLED] = 0
-            counts[REJECTED] += 1
-            return False
-        if scale[i] == 0.0 and value != 0.0:
+        if scale[i] == 0.0 and value != 0.0 and math.isfinite(value):
             exponent = math.frexp(value)[1]
             scale[i] = math.ldexp(1.0, -max(min(exponent, 1000), -1000))
         new[i] = value * scale[i]
-        if abs(new[i]) > LARGEST:
-            counts[FILLED] = 0
-            counts[REJECTED] += 1
-            return False
+        rejected = not abs(new[i]) <= LARGEST  # also where the value is not finite
+        if rejected:
+            break
         odd = odd or (mean[1, i] > 0.0 and abs(new[i]) > OUTLIER * mean[1, i])
-    counts[ODD] = counts[ODD] + 1 if odd and counts[USED] >= SETTLED else 0
-    if 0 < counts[ODD] <= PATIENCE:
+    if not rejected:
+        counts[ODD] = counts[ODD] + 1 if odd and counts[USED] >= SETTLED else 0
+        rejected = 0 < counts[ODD] <= PATIENCE
+    if rejected:
         counts[FILLED] = 0
         counts[REJECTED] += 1
-        return False
-    return True
+    return not rejected
 
 
 @library
@@ -238,13 +234,11 @@ def advance_factor(
             outcome[k] = REJECTED_ROW
             continue
         remember(new, mean, scalars, counts, p)
-        if counts[FILLED] >= p:
-            b = memory(scalars, counts, beta, mode)
-            if scalars[OPEN] == 0.0:
-                outcome[k] = QUIET_ROW
-                push(z, new)
-                counts[FILLED] += 1
-                continue
+        is_full = counts[FILLED] >= p
+        b = memory(scalars, counts, beta, mode) if is_full else 1.0
+        if is_full and scalars[OPEN] == 0.0:
+            outcome[k] = QUIET_ROW
+        elif is_full:
             for i in range(past):
                 row[i] = z[i]
             for i in range(width):

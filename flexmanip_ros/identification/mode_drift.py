@@ -101,8 +101,7 @@ def drifting(U: Array, Y: Array, fit: Fit, structure: Structure, widening: float
     end, X = theta.x.copy(), np.zeros((len(moving), n))
     E, S = np.empty(Y.shape), np.empty((len(moving), *Y.shape))
     sway(U, Y, *theta[:4], moving, end, X, E, S)
-    absent = np.isnan(Y[:, 0])
-    E[absent], S[:, absent] = 0.0, 0.0
+    S[:, np.isnan(Y[:, 0])] = 0.0  # such rows were not measured
     lower = np.linalg.cholesky(fit.covariance)
     e, *s = (scipy.linalg.solve_triangular(lower, part.T, lower=True, check_finite=False).ravel() for part in (E, *S))
     own = np.array(s)

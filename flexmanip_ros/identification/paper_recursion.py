@@ -166,17 +166,14 @@ def advance_paper(
     for i in range(n):
         prior2[i, i] = 1.0
     for k in range(U.shape[0]):
+        follows = last[n + width] != 0.0
+        last[n + width] = 0.0
         if not accept(U[k], Y[k], new, scale, mean, counts):
-            last[n + width] = 0.0
             continue
         remember(new, mean, scalars, counts, p)
-        if counts[FILLED] >= p:
-            b = memory(scalars, counts, beta[0], mode)
-            if scalars[OPEN] == 0.0:
-                last[n + width] = 0.0
-                push(z, new)
-                counts[FILLED] += 1
-                continue
+        is_full = counts[FILLED] >= p
+        b = memory(scalars, counts, beta[0], mode) if is_full else 1.0
+        if is_full and scalars[OPEN] != 0.0:
             share = (1.0 - b) / (1.0 - beta[0]) if beta[0] < 1.0 else 1.0
             for i in range(past):
                 phi1[i] = z[i]
@@ -198,13 +195,11 @@ def advance_paper(
                 for i in range(h.shape[0]):  # tracking depends on the scale: scale to unit peak
                     peak = mean[1, r + i % m]
                     h[i] = h[i] / peak if peak > 0.0 else 0.0
-                if counts[USED] > 2 * d1:  # before that the parameters have not converged
-                    track(W, P, h, x, 1.0 - (1.0 - beta[0]) * share)
-                else:
-                    select(W, h, x)
+            if tracked and counts[USED] > 2 * d1:  # before that the parameters have not converged
+                track(W, P, h, x, 1.0 - (1.0 - beta[0]) * share)
             else:
                 select(W, h, x)
-            if last[n + width] != 0.0:
+            if follows:
                 least_squares(S2, theta_x, prior2, peaks2, last[:n + width], x, unit2, f2, e2, alpha[1],
                               1.0 - (1.0 - beta[1]) * share, weight)
             for i in range(n):
@@ -225,7 +220,5 @@ def advance_paper(
                 last[n + r + i] = left
             last[n + width] = 1.0
             counts[USED] += 1
-        else:
-            last[n + width] = 0.0
         push(z, new)
         counts[FILLED] += 1

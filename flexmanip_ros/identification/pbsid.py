@@ -6,21 +6,11 @@ states are computed sample by sample, and the matrices are regressed on them.
 """
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.numerics.compiled import library
 from flexmanip_ros.types import Array, StateSpace
-
-
-def past_windows(U: Array, Y: Array, p: int) -> Array:
-    """(N - p + 1, p (r + m)): row k holds [u; y] of samples k..k+p-1, oldest first (eqs. 24-25).
-
-    The last row is the window after the last sample.
-    """
-    joint = np.hstack([U, Y])
-    count = max(joint.shape[0] - p + 1, 0)
-    columns = [joint[i:i + count] for i in range(p)]
-    return np.hstack(columns) if columns else np.zeros((count, 0))
 
 
 @library
@@ -72,19 +62,18 @@ def pbsid(
     basis of its state, and the singular values.
     Raises ModelError when the record is shorter than the window or carries fewer than n states.
     """
-    r, m = U.shape[1], Y.shape[1]
-    windows = past_windows(U, Y, p)
-    z = windows[:-1]
-    count = z.shape[0]
+    r, m, count = U.shape[1], Y.shape[1], len(U) - p
     if count < n + r + m + 1:
-        raise ModelError(f'{U.shape[0]} samples are too few for a past window of {p}', 'give a longer record')
+        raise ModelError(f'{len(U)} samples are too few for a past window of {p}', 'give a longer record')
+    # row k holds [u; y] of samples k to k + p - 1 (eqs. 24-25), the last one of those after which nothing follows
+    windows = sliding_window_view(np.hstack([U, Y]), p, axis=0).transpose(0, 2, 1).reshape(count + 1, -1)
     root = np.sqrt(forgetting) ** np.arange(count - 1, -1, -1.0)[:, None]
     weights = (root / np.linalg.norm(root)) ** 2
 
     def about(signal: Array) -> Array:
         return signal - np.sum(weights * signal, axis=0) if centred else signal
 
-    z, u, y = about(z), about(U[p:]), about(Y[p:])
+    z, u, y = about(windows[:-1]), about(U[p:]), about(Y[p:])
     d = z.shape[1]
     stacked = np.vstack([root * z, np.sqrt(regularization) * np.eye(d)])
     target = np.vstack([root * y, np.zeros((d, m))])

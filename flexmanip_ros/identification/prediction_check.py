@@ -77,8 +77,12 @@ def length(dt: float, order: int = 0) -> int:
 
 def white_noise(Y: Array) -> Array:
     """(m,) variance of the white noise in Y (N, m), N > 4, from the median of absolute fourth differences."""
-    found: Array = (np.median(np.abs(np.diff(Y, 4, axis=0)), axis=0) / FOURTH) ** 2
-    return found
+    return np.asarray((np.median(np.abs(np.diff(Y, 4, axis=0)), axis=0) / FOURTH) ** 2)
+
+
+def to_unit(power: Array) -> Array:
+    """(m,) factors that bring outputs of this power (m,) to unit power; 1 for an output of none."""
+    return np.asarray(1.0 / np.sqrt(np.where(power > 0.0, power, 1.0)))
 
 
 def free_motion(model: StateSpace, count: int) -> Array:
@@ -89,28 +93,27 @@ def free_motion(model: StateSpace, count: int) -> Array:
     return free[:count]
 
 
-def missed(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np.bool_] | None = None) -> Array:
+def missed(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np.bool_]) -> Array:
     """(m,) share of the power of Y (N, m) that predictions ``horizon`` samples ahead miss.
 
     Each prediction starts from the state that fits the ``horizon`` samples (at least 2 n) before it best, with outputs
-    scaled to unit power; it uses no later output. seen: (N,) rows that were measured, all of them by default. nan where
-    an output is silent (``SILENT``).
+    scaled to unit power; it uses no later output. seen: (N,) rows that were measured. nan where an output is silent
+    (``SILENT``).
     """
     n, m = model.order, model.C.shape[0]
     before = max(horizon, 2 * n)
     free = free_motion(model, before + horizon)
     power, white = np.var(Y, axis=0), white_noise(Y)
-    unit = 1.0 / np.sqrt(np.where(power > 0.0, power, 1.0))
+    unit = to_unit(power)
     free = free * unit[:, None]
     left = (Y - simulate(model, U)) * unit  # of a right model: its free motion and noise
     if not np.all(np.isfinite(free)) or not np.all(np.isfinite(left)):  # a model that diverges
         return np.full(m, np.inf)
-    known = np.ones(len(Y), dtype=np.bool_) if seen is None else seen
     back = np.linalg.pinv(free[:before].reshape(-1, n), rcond=1e-9)
     errors = []
     for first in range(before, len(Y) - horizon + 1, max(1, horizon // INSTANTS)):
-        used, at = known[first - before:first], first + horizon - 1
-        if not known[at] or np.count_nonzero(used) < before // 2:
+        used, at = seen[first - before:first], first + horizon - 1
+        if not seen[at] or np.count_nonzero(used) < before // 2:
             continue
         y = left[first - before:first]
         x = back @ y.ravel() if used.all() else np.linalg.lstsq(
@@ -150,7 +153,7 @@ def light_modes(values: Complex) -> tuple[Complex, list[int]]:
     return logs, sorted(np.flatnonzero(swings).tolist(), key=lambda k: float(logs[k].imag))[:MOST_MODES]
 
 
-def frequency_errors(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np.bool_] | None = None
+def frequency_errors(model: StateSpace, U: Array, Y: Array, horizon: int, seen: NDArray[np.bool_]
                      ) -> tuple[Array, Array]:
     """Relative errors (g,) of the model's lowest frequencies that the samples show, and half their 95 % intervals.
 
@@ -166,7 +169,7 @@ def frequency_errors(model: StateSpace, U: Array, Y: Array, horizon: int, seen: 
     if not g or not np.linalg.cond(right) < MOST_SKEW:
         return np.zeros(0), np.zeros(0)
     left, power = np.linalg.inv(right), np.var(Y, axis=0)
-    unit = 1.0 / np.sqrt(np.where(power > 0.0, power, 1.0))
+    unit = to_unit(power)
     shape, turns = (model.C @ right) * unit[:, None], np.asarray(1j * logs.imag, dtype=np.complex128)
     Z, S = np.empty((2, len(Y), n), dtype=np.complex128)
     swing(values, turns, left @ (model.B + 0j), np.ascontiguousarray(U), Z, S)
@@ -179,11 +182,10 @@ def frequency_errors(model: StateSpace, U: Array, Y: Array, horizon: int, seen: 
     if not np.all(np.isfinite(rest)) or not np.all(np.isfinite(free)):
         return np.full(g, np.nan), np.full(g, np.nan)
     whole = np.linalg.svd(free.reshape(-1, n), full_matrices=False)
-    known = np.ones(len(Y), dtype=np.bool_) if seen is None else seen
     scores, informations = [], []
     for first in range(len(Y) % horizon, len(Y) - horizon + 1, horizon):
         at = slice(first, first + horizon)
-        used = known[at]
+        used = seen[at]
         if np.count_nonzero(used) < max(horizon // 2, n):
             continue
         basis, size, back = whole if used.all() else np.linalg.svd(free[used].reshape(-1, n), full_matrices=False)
@@ -212,7 +214,7 @@ def unfitted(model: StateSpace, U: Array, Y: Array, seen: NDArray[np.bool_]) -> 
     """
     power, white = np.var(Y, axis=0), white_noise(Y)
     heard = power > SILENT * white
-    unit = 1.0 / np.sqrt(np.where(power > 0.0, power, 1.0))
+    unit = to_unit(power)
     free = (free_motion(model, len(Y)) * unit[:, None])[seen]
     left = ((Y - simulate(model, U)) * unit)[seen]
     if not heard.any() or not np.all(np.isfinite(free)) or not np.all(np.isfinite(left)):

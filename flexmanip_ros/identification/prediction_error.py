@@ -17,15 +17,23 @@ GATHERED = 64
 
 
 @library
-def innovation(u: Array, y: Array, C: Array, D: Array, x: Array, e: Array) -> None:
-    """Fill e (m,) = y - C x - D u; inputs beyond the columns of D have no direct term."""
+def innovation(u: Array, y: Array, C: Array, D: Array, x: Array, e: Array) -> bool:
+    """Fill e (m,) = y - C x - D u; inputs beyond the columns of D have no direct term.
+
+    A row that was not measured is NaN: its e is 0. Return whether it is one.
+    """
+    absent = bool(y[0] != y[0])
     for o in range(e.size):
+        if absent:
+            e[o] = 0.0
+            continue
         total = y[o]
         for i in range(x.size):
             total -= C[o, i] * x[i]
         for i in range(D.shape[1]):
             total -= D[o, i] * u[i]
         e[o] = total
+    return absent
 
 
 @library
@@ -50,7 +58,7 @@ def linearize(
 ) -> None:
     """Run the predictor x+ = A x + B u + K e, e = y - C x - D u over (L, r), (L, m), and its derivatives.
 
-    A row of Y that is NaN was not measured: e = 0 there, and the row adds nothing to N and g.
+    A row of Y that is NaN was not measured, and adds nothing to N and g.
 
     Parameters in order: A, B row-major if free_system, K if free_gain, C if free_output, D if free_direct, then x at
     the start. whiten: (m, m), whiten' whiten = inverse innovation covariance. On return x is the state after the last
@@ -69,12 +77,7 @@ def linearize(
     e, after, moved = np.empty(m), np.empty(n), np.empty((n, d))
     filled = 0
     for k in range(U.shape[0]):
-        absent = Y[k, 0] != Y[k, 0]
-        if absent:  # the prediction goes on without the row
-            for o in range(m):
-                e[o] = 0.0
-        else:
-            innovation(U[k], Y[k], C, D, x, e)
+        absent = innovation(U[k], Y[k], C, D, x, e)  # the prediction goes on without such a row
         for o in range(0 if absent else m):
             row = J[filled + o]
             for j in range(d):
@@ -136,11 +139,7 @@ def residual_moments(
     e = np.empty(m)
     after = np.empty(n)
     for k in range(U.shape[0]):
-        if Y[k, 0] != Y[k, 0]:
-            for o in range(m):
-                e[o] = 0.0
-        else:
-            innovation(U[k], Y[k], C, D, x, e)
+        innovation(U[k], Y[k], C, D, x, e)
         following(U[k], A, B, K, x, e, after)
         for i in range(n):
             x[i] = after[i]
@@ -386,8 +385,7 @@ def covariance_root(information: Array) -> Array:
     size[size == 0.0] = 1.0
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
     values = np.maximum(values, 1e-11 * max(float(values[-1]), 1e-300))
-    root: Array = (vectors / np.sqrt(values)) / size[:, None]
-    return root
+    return np.asarray((vectors / np.sqrt(values)) / size[:, None])
 
 
 ROWS, PAST, RIDGE = 128, 8, 1e-3
@@ -408,12 +406,13 @@ def candidate(model: StateSpace, feedthrough: bool, means: tuple[Array, Array] |
         shift = np.asarray(np.linalg.lstsq(model.C, y - model.D @ u, rcond=None)[0], dtype=np.float64)
         B = np.column_stack([B, shift - model.A @ shift - B @ u])
     theta = Theta(model.A, B, model.C, model.D, model.K, shift)
-    if n == m and np.linalg.cond(model.C) < 1e6:
+    holds_output = n == m and bool(np.linalg.cond(model.C) < 1e6)
+    if holds_output:
         W = model.C
         A = np.asarray(np.linalg.solve(W.T, (W @ model.A).T).T, dtype=np.float64)
         theta = Theta(A, W @ B, np.eye(n), model.D, W @ model.K, W @ shift)
-        return _dense(theta), Structure(False, feedthrough, False)
-    return _dense(theta), Structure(True, feedthrough, False)
+    dense = Theta(*(np.ascontiguousarray(part) for part in theta))
+    return dense, Structure(free_output=not holds_output, free_direct=feedthrough, free_gain=False)
 
 
 def averaged(U: Array, Y: Array, n: int, centred: bool) -> StateSpace | None:
@@ -432,7 +431,3 @@ def averaged(U: Array, Y: Array, n: int, centred: bool) -> StateSpace | None:
         return None
     found = StateSpace(A, B, model.C, np.zeros_like(model.D), np.zeros((n, Y.shape[1])), 1.0)
     return found if all(np.all(np.isfinite(part)) for part in (A, B, model.C)) else None
-
-
-def _dense(theta: Theta) -> Theta:
-    return Theta(*(np.ascontiguousarray(part) for part in theta))

@@ -61,8 +61,7 @@ def _states(model: StateSpace, U: Array, Y: Array | None, x0: Array | None) -> A
 
 
 def _outputs(model: StateSpace, U: Array, X: Array) -> Array:
-    found: Array = X[:-1] @ model.C.T + U @ model.D.T
-    return found
+    return np.asarray(X[:-1] @ model.C.T + U @ model.D.T)
 
 
 def simulate(model: StateSpace, U: Array, x0: Array | None = None) -> Array:
@@ -113,5 +112,4 @@ def state_at_end(model: StateSpace, U: Array, Y: Array) -> Array:
         forced = A @ forced + B @ u
         power = A @ power
     x0 = np.linalg.lstsq(np.vstack(rows), np.concatenate(target), rcond=None)[0] if rows else np.zeros(n)
-    end: Array = power @ x0 + forced
-    return end
+    return np.asarray(power @ x0 + forced)
