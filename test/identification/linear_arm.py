@@ -12,6 +12,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from flexmanip_ros.identification import rpbsid
+from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.numerics.background import INLINE, Background
 from flexmanip_ros.parameters import IdentifierParameters, configure
 from flexmanip_ros.samples.sample_log import SampleLog, Width
@@ -70,6 +71,13 @@ def start(config: IdentifierParameters) -> Run:
 def run(config: IdentifierParameters, u: np.ndarray, y: np.ndarray, stamp_ns: np.ndarray | None = None) -> Run:
     """The identifier after a whole record."""
     return start(config).feed(u, y, stamp_ns)
+
+
+def identified(config: IdentifierParameters, state: rpbsid.RpbsidState, dt: float) -> Identified:
+    """The model that is there after enough samples."""
+    found = rpbsid.identified(config, state, dt)
+    assert found is not None
+    return found
 
 
 def observer(A: np.ndarray, C: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from linear_arm import Run, configuration, start
+from linear_arm import Run, configuration, identified, start
 
 from flexmanip_ros.identification import held_back, rpbsid
 from flexmanip_ros.identification.held_back import LONGEST, STRETCH_NS
@@ -44,8 +44,7 @@ def held(run: Run) -> held_back.HeldBack:
 
 
 def said(run: Run, early: bool = False) -> Status:
-    found = rpbsid.identified(run.config, run.state, 1e-3)
-    assert found is not None
+    found = identified(run.config, run.state, 1e-3)
     return held_back.judged(found._replace(status=Status.TRACKING), held(run), run.config.outputs, early).status
 
 
@@ -66,16 +65,14 @@ def test_a_model_whose_forerunner_missed_what_followed_is_not_tracking() -> None
 
 def test_the_reason_names_the_output() -> None:
     run = fed(CONFIG, *signals(4000, 3000))
-    found = rpbsid.identified(run.config, run.state, 1e-3)
-    assert found is not None
+    found = identified(run.config, run.state, 1e-3)
     verdict = held_back.judged(found._replace(status=Status.TRACKING), held(run), run.config.outputs, early=False)
     assert verdict.reason == 'models of earlier samples missed over half of what out0/position did next'
 
 
 def test_a_refined_model_is_judged_by_other_samples_than_those_of_its_fit_anyway() -> None:
     run = fed(CONFIG, *signals(4000, 3000))
-    found = rpbsid.identified(run.config, run.state, 1e-3)
-    assert found is not None
+    found = identified(run.config, run.state, 1e-3)
     refined = found._replace(status=Status.TRACKING, refined=True)
     assert held_back.judged(refined, held(run), run.config.outputs, early=False) is refined
 

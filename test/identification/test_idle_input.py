@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from linear_arm import Run, configuration, start
+from linear_arm import Run, configuration, identified, start
 
-from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.realization import markov
 from flexmanip_ros.identification.validation import simulate
 from flexmanip_ros.types import Array, StateSpace, Status
@@ -45,8 +44,7 @@ def fed(outputs: int, until: int) -> Run:
 @pytest.mark.parametrize('until', [1000, 2000, 3000])
 def test_the_effect_of_an_idle_input_is_unknown_and_the_rest_is_right(outputs: int, until: int) -> None:
     run = fed(outputs, until)
-    found = rpbsid.identified(run.config, run.state, 1e-3)
-    assert found is not None
+    found = identified(run.config, run.state, 1e-3)
     assert found.refined
     assert found.status is Status.TRACKING
     assert errors(found.model, machine(outputs))[0] < 0.01
@@ -59,7 +57,6 @@ def test_the_effect_of_an_idle_input_is_unknown_and_the_rest_is_right(outputs: i
 @pytest.mark.parametrize('outputs', [2, 4])
 def test_an_input_that_begins_to_act_is_learned(outputs: int) -> None:
     run = fed(outputs, COUNT)
-    found = rpbsid.identified(run.config, run.state, 1e-3)
-    assert found is not None
+    found = identified(run.config, run.state, 1e-3)
     assert found.refined
     assert np.all(errors(found.model, machine(outputs)) < 0.02)

@@ -4,7 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from linear_arm import benchmark, configuration, random_system, record, run, shared_data, sorted_poles, start
+from linear_arm import (
+    benchmark,
+    configuration,
+    identified,
+    random_system,
+    record,
+    run,
+    shared_data,
+    sorted_poles,
+    start,
+)
 
 from flexmanip_ros.identification import decimation, recursive_fit, rpbsid, validation
 from flexmanip_ros.identification.factor import REJECTED, USED
@@ -33,8 +43,7 @@ def test_stable_model_is_published_when_asked_for():
         config = configuration(
             1, 1, order=2, past_window=6, future_window=4, stable_model=stable, refinement='none',
             regularization=[1e-9] * 3)
-        found = rpbsid.identified(config, run(config, u, y).state, 0.01)
-        assert found is not None
+        found = identified(config, run(config, u, y).state, 0.01)
         assert (np.abs(np.linalg.eigvals(found.model.A)).max() <= 1.0) == stable
 
 
@@ -43,8 +52,7 @@ def test_suggested_order_is_the_order_of_the_plant():
     for n in (2, 4):
         u, y = record(random_system(n, 2, 2, rng), 4000, 1e-3, rng)
         config = configuration(2, 2, order=3, past_window=8, future_window=6, refinement='none')
-        found = rpbsid.identified(config, run(config, u, y).state, 0.01)
-        assert found is not None
+        found = identified(config, run(config, u, y).state, 0.01)
         assert suggested_order(found.singular_values) == n
 
 
@@ -53,8 +61,7 @@ def test_decimated_identification_finds_the_slow_poles():
     u, y = study.response(20.0, (60.0, 45.0), 'paper', 40.0, 0, capture=0, samples=3000)
     config = configuration(2, 4, order=4, decimation=8, direct_feedthrough=True, regularization=[1e-6] * 3)
     state = run(config, u, y).state
-    found = rpbsid.identified(config, state, 1e-3)
-    assert found is not None
+    found = identified(config, state, 1e-3)
     assert found.model.dt == pytest.approx(8e-3)
     hertz = np.sort(np.abs(np.angle(np.linalg.eigvals(found.model.A)))[::2]) / (2 * np.pi * 8e-3)
     assert np.allclose(hertz, [5.63428, 6.55037], rtol=2e-3)
@@ -149,14 +156,12 @@ def test_long_fit_recursion_tracks_and_an_event_restarts_it():
     assert not state.refined.batch
     assert state.refined.recursion is not None
     assert state.refined.recursion.weight > 3000
-    found = rpbsid.identified(config, state, 0.01)
-    assert found is not None
+    found = identified(config, state, 0.01)
     assert np.abs(sorted_poles(found.model.A) - sorted_poles(system.A)).max() < 0.01
     gap = whole._replace(state=rpbsid.window_restart(config, state)).feed(u[:600], y[:600]).state
     assert gap.refined is not None
     assert gap.refined.recursion is not None
-    found = rpbsid.identified(config, gap, 0.01)
-    assert found is not None
+    found = identified(config, gap, 0.01)
     assert np.abs(sorted_poles(found.model.A) - sorted_poles(system.A)).max() < 0.01
     restarted = rpbsid.restart(config, state)
     assert restarted.refined is not None
@@ -174,6 +179,5 @@ def test_a_fit_is_published_however_long_the_machine_runs():
     state.counts[USED] = 3_600_000  # an hour at 1 kHz, in which the weight of the fit has reached its limit
     for weight, refined in ((recursive_fit.MEMORY, True), (0.1 * recursive_fit.MEMORY, False)):
         fit = state.refined._replace(recursion=state.refined.recursion._replace(weight=weight))
-        found = rpbsid.identified(config, state._replace(refined=fit), 0.01)
-        assert found is not None
+        found = identified(config, state._replace(refined=fit), 0.01)
         assert found.refined == refined

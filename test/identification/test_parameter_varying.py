@@ -13,17 +13,15 @@ from scipy.integrate import solve_ivp
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm import linearization
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.identification import parameter_varying, prediction_check, rpbsid, validation
-from flexmanip_ros.identification.realization import to_discrete
+from flexmanip_ros.identification import parameter_varying, rpbsid
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.identification.varying_kernel import basis, simulate_block
 from flexmanip_ros.identification.varying_model import Configurations
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.samples import sampling
-from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.studies import whole_recording
-from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, StateSpace, Status
+from flexmanip_ros.types import Array, CaptureEvent, Estimate, EventKind, JointBlock, Status
 
 CAPTURE_S, DURATION_S, SETTLED_S = 3.0, 16.0, 6.0
 PAYLOAD = 20.0
@@ -55,6 +53,11 @@ def blocks(trajectory: simulator.Trajectory, size: int) -> list[JointBlock]:
     return [JointBlock(NAMES, trajectory.stamp_ns[at:at + size], trajectory.position[at:at + size],
                        trajectory.velocity[at:at + size], effort[at:at + size])
             for at in range(0, len(trajectory.stamp_ns), size)]
+
+
+def some_of(trajectory: simulator.Trajectory, kept: slice | Array) -> simulator.Trajectory:
+    return trajectory._replace(**{name: getattr(trajectory, name)[kept]
+                                  for name in ('stamp_ns', 'position', 'velocity', 'effort')})
 
 
 def identify(trajectory: simulator.Trajectory, event: CaptureEvent, size: int) -> tuple[list[Estimate], pipeline.State]:
@@ -194,8 +197,7 @@ def test_deviations_of_frequencies_are_the_derivatives_of_the_matrices(run: Run)
 @pytest.mark.parametrize(('order', 'outputs'), [(6, 4), (12, 4), (5, 2)])
 def test_an_order_above_twice_the_displacements_follows_the_arm_as_well(order: int, outputs: int) -> None:
     trajectory, _, chords = record()
-    short = trajectory._replace(**{name: getattr(trajectory, name)[:2000]
-                                   for name in ('stamp_ns', 'position', 'velocity', 'effort')})
+    short = some_of(trajectory, slice(2000))
     config = replace(CONFIG, order=order, outputs=CONFIG.outputs[:outputs], future_window=10)
     found = [one for one in pipeline.run(config, blocks(short, 2000)) if one.model_is_new and one.stamp_ns > 1.5e9]
     assert found
@@ -247,8 +249,7 @@ def test_after_a_gap_the_model_is_that_of_the_configuration_after_it() -> None:
     """In the gap the angle between the links changes by 1.3 degrees, which is 0.5 % of the second frequency."""
     trajectory, event, chords = record()
     kept = np.r_[:9000, 10500:11000]
-    parts = trajectory._replace(**{name: getattr(trajectory, name)[kept]
-                                   for name in ('stamp_ns', 'position', 'velocity', 'effort')})
+    parts = some_of(trajectory, kept)
     config = replace(CONFIG, model_rate=50.0)
     after = [one for one in pipeline.run(config, [event, *blocks(parts, 500)])
              if one.model_is_new and one.stamp_ns >= 10_500_000_000]
@@ -273,8 +274,7 @@ def test_a_model_is_not_trusted_while_the_links_swing_by_a_quarter_of_a_radian(r
 
 def test_a_replay_in_blocks_gives_the_bits_of_another_one() -> None:
     trajectory, event, _ = record()
-    short = trajectory._replace(**{name: getattr(trajectory, name)[:5200]
-                                   for name in ('stamp_ns', 'position', 'velocity', 'effort')})
+    short = some_of(trajectory, slice(5200))
     (one, _), (other, _) = identify(short, event, 5200), identify(short, event, 7)
     assert len(one) == len(other) > 10
     for a, b in zip(one, other, strict=True):
@@ -334,124 +334,6 @@ def test_only_displacements_and_their_rates_beside_angles_have_a_model_of_every_
     assert parameter_varying.roles(turned) == ((1, 2), (2, 0, 1, 3))
 
 
-def test_a_prediction_is_judged_against_white_noise_and_not_against_its_own_residuals(run: Run) -> None:
-    model = identified(run).model
-    rng = np.random.default_rng(0)
-    u, x = np.repeat(rng.standard_normal((10, 2)), 100, axis=0), np.zeros(4)
-    y = np.empty((1000, 4))
-    for k in range(len(u)):
-        y[k] = model.C @ x + model.D @ u[k]
-        x = model.A @ x + model.B @ u[k]
-    y += 0.01 * y.std(axis=0) * rng.standard_normal(y.shape)
-    assert np.nanmax(prediction_check.missed(model, u, y, 45)) < 0.05
-    wrong = replace(model, A=model.A @ model.A, B=2.0 * model.B)
-    assert np.nanmax(prediction_check.missed(wrong, u, y, 45)) > 0.5
-    np.testing.assert_allclose(np.sqrt(prediction_check.white_noise(y)), 0.01 * y.std(axis=0), rtol=0.2)
-
-
-def swinging(frequencies: tuple[float, float], u: Array | None = None, damping: float = 0.005
-             ) -> tuple[StateSpace, Array]:
-    """Two modes that two displacements see, and what they do under torques (N, 2), with 2 % of noise.
-
-    damping: damping ratio of the second mode.
-    """
-    A, B = np.zeros((4, 4)), np.zeros((4, 2))
-    for i, (frequency, ratio) in enumerate(zip(frequencies, (0.005, damping), strict=True)):
-        at = slice(2 * i, 2 * i + 2)
-        A[at, at] = [[0.0, 1.0], [-(2.0 * np.pi * frequency) ** 2, -2.0 * ratio * 2.0 * np.pi * frequency]]
-        B[2 * i + 1] = [1.0, -0.7 + i]
-    model = StateSpace(*to_discrete(A, B, 1e-3), np.array([[1.0, 0.0, 0.6, 0.0], [-0.8, 0.0, 1.0, 0.0]]),
-                       np.zeros((2, 2)), np.zeros((4, 2)), 1e-3)
-    y = validation.simulate(model, u) if u is not None else np.zeros((0, 2))
-    return model, y + 0.02 * y.std(axis=0) * np.random.default_rng(1).standard_normal(y.shape) if len(y) else y
-
-
-@pytest.mark.parametrize('lost', [False, True])
-def test_a_frequency_that_is_three_per_cent_off_is_found_out_though_it_predicts(lost: bool) -> None:
-    u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
-    right, y = swinging((5.6, 6.1), u)
-    rows = log_of(u, y).rows(0, len(u))
-    seen = np.random.default_rng(2).random(len(u)) > 0.05 if lost else None
-    for frequencies in ((5.6, 6.1), (5.6 * 1.03, 6.1), (5.6, 6.1 * 0.97)):
-        model, _ = swinging(frequencies)
-        error, chance = prediction_check.frequency_errors(model, u, y, 250, seen)
-        known = np.array([5.6, 6.1]) / frequencies - 1.0
-        assert np.all(np.abs(error - known) < 0.006)
-        assert np.all(chance < 0.0102)
-        assert np.nanmax(prediction_check.missed(model, u, y, 250)) < prediction_check.MISSED
-        found = Identified(model, np.zeros((44, 1)), np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING)
-        said = prediction_check.judged(found, rows, ('a/position', 'b/position')).status
-        assert said is (Status.TRACKING if frequencies == (5.6, 6.1) else Status.INCONSISTENT)
-    assert right.order == 4
-
-
-def test_two_modes_that_a_fit_of_three_periods_takes_for_one_are_not_tracking() -> None:
-    u = np.repeat(np.random.default_rng(0).standard_normal((6, 2)), 100, axis=0)
-    right, y = swinging((5.6, 6.1), u)
-    rows, known = log_of(u, y).rows(0, len(u)), 1e-6 * np.eye(44, 1)
-    for model, said in ((right, Status.TRACKING), (swinging((5.8, 50.0))[0], Status.WARMING_UP)):
-        found = Identified(model, known, np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=512.0)
-        judged = prediction_check.judged(found, rows, ('a/position', 'b/position'))
-        assert judged.status is said
-        assert (judged.spread is known) == (said is Status.TRACKING)  # white noise widens nothing
-
-
-def test_a_frequency_that_is_not_known_to_one_per_cent_is_not_tracking() -> None:
-    u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
-    model, y = swinging((5.6, 6.1), u)
-    rows, along = log_of(u, y).rows(0, len(u)), np.eye(44, 1)
-    found = Identified(model, along, np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=1e4)
-    largest = max(mode.frequency_std_hz / mode.frequency_hz for mode in modes(found))
-    found = found._replace(spread=0.02 / largest * along)
-    late = prediction_check.judged(found, rows, ('a/position', 'b/position'))
-    assert late.status is Status.POORLY_EXCITED
-    assert late.reason.startswith('the frequency of the mode at ')
-    early = found._replace(samples=1000.0)
-    assert prediction_check.judged(early, rows, ('a/position', 'b/position')).status is Status.WARMING_UP
-
-
-def test_a_mode_that_stays_uncertain_is_said_after_as_many_seconds_at_any_sample_rate() -> None:
-    for dt in (1e-4, 1e-3, 2e-2):
-        model = replace(swinging((5.6, 6.1))[0], dt=dt)
-        found = Identified(model, np.zeros((44, 1)), np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=3.9 / dt)
-        assert prediction_check.is_early(found, 0.0)
-        assert not prediction_check.is_early(found, 4.1 / dt)
-
-
-@pytest.mark.parametrize(('deviation', 'said'), [(0.06, Status.TRACKING), (0.12, Status.POORLY_EXCITED)])
-def test_a_damped_mode_is_tracking_only_if_its_damping_ratio_is_known(deviation: float, said: Status) -> None:
-    u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
-    model, y = swinging((5.6, 6.1), u, damping=0.5)
-    along = np.zeros((44, 1))
-    along[15] = 1.0  # the damping of the second mode
-    found = Identified(model, along, np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=1e4)
-    light, damped = sorted(modes(found), key=lambda mode: mode.damping_ratio)
-    assert light.frequency_std_hz < 1e-9
-    found = found._replace(spread=deviation / damped.damping_ratio_std * along)
-    rows = log_of(u, y).rows(0, len(u))
-    assert prediction_check.judged(found, rows, ('a/position', 'b/position')).status is said
-    early = prediction_check.judged(found._replace(samples=1000.0), rows, ('a/position', 'b/position')).status
-    assert early is (said if said is Status.TRACKING else Status.WARMING_UP)
-    resting = prediction_check.judged(found._replace(samples=1000.0), rows, ('a/position', 'b/position'), since=9000.0)
-    assert resting.status is said  # it is no longer warming up: no later sample told anything
-
-
-def test_a_mode_that_the_last_samples_do_not_show_is_not_tracking() -> None:
-    u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
-    model, _ = swinging((5.6, 8.2), damping=0.28)
-    model = replace(model, C=model.C * [1.0, 1.0, 0.002, 0.002])
-    clean = validation.simulate(model, u)
-    y = clean + 0.02 * clean.std(axis=0) * np.random.default_rng(1).standard_normal(clean.shape)
-    rows = log_of(u, y).rows(0, len(u))
-    error, chance = prediction_check.frequency_errors(model, u, y, 250)
-    assert np.all(np.abs(error) - chance < prediction_check.OFF)  # so nothing speaks against the frequencies
-    assert chance[0] < 0.01
-    assert chance[1] > 0.2
-    for samples, said in ((1000.0, Status.WARMING_UP), (1e4, Status.POORLY_EXCITED)):
-        found = Identified(model, 1e-6 * np.eye(44, 1), np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=samples)
-        assert prediction_check.judged(found, rows, ('a/position', 'b/position')).status is said
-
-
 @pytest.mark.parametrize('seed', [3, 5])
 def test_a_burst_of_lost_samples_each_second_leaves_both_frequencies_known(seed: int) -> None:
     trajectory, event, chords = record()
@@ -462,8 +344,7 @@ def test_a_burst_of_lost_samples_each_second_leaves_both_frequencies_known(seed:
         length = int(rng.integers(10, 101))
         begin = 1000 * second + int(rng.integers(0, 1000 - length))
         kept[begin:begin + length] = False
-    thin = trajectory._replace(**{name: getattr(trajectory, name)[kept]
-                                  for name in ('stamp_ns', 'position', 'velocity', 'effort')})
+    thin = some_of(trajectory, kept)
     estimates, state = identify(thin, event, 1000)
     run = Run(estimates, state, chords)
     late = [one for one in estimates if one.stamp_ns > (CAPTURE_S + 1.4) * 1e9]
@@ -478,8 +359,7 @@ def test_missing_samples_cost_no_more_than_the_blocks_they_are_in() -> None:
     trajectory, event, chords = record()
     kept = np.ones(len(trajectory.stamp_ns), dtype=np.bool_)
     kept[8000:8003] = kept[9500] = kept[11000:11200] = False
-    thin = trajectory._replace(**{name: getattr(trajectory, name)[kept]
-                                  for name in ('stamp_ns', 'position', 'velocity', 'effort')})
+    thin = some_of(trajectory, kept)
     estimates, state = identify(thin, event, 1000)
     run = Run(estimates, state, chords)
     late = [one for one in estimates if one.stamp_ns > 12e9]
@@ -487,38 +367,3 @@ def test_missing_samples_cost_no_more_than_the_blocks_they_are_in() -> None:
     for one in late:
         assert np.all(np.abs([mode.frequency_hz for mode in one.modes] / truth(run, one) - 1.0) < 0.015)
         assert all(mode.frequency_std_hz < 0.01 * mode.frequency_hz for mode in one.modes)
-
-
-def test_a_frequency_error_that_the_last_samples_show_is_within_the_band() -> None:
-    u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
-    _, y = swinging((5.6, 6.1), u)
-    rows, model = log_of(u, y).rows(0, len(u)), swinging((5.6, 6.1 * 1.012))[0]
-    found = Identified(model, 1e-6 * np.eye(44, 1), np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=512.0)
-    judged = prediction_check.judged(found, rows, ('a/position', 'b/position'))
-    assert judged.status is Status.TRACKING
-    for mode, known in zip(modes(judged), (5.6, 6.1), strict=True):
-        assert abs(mode.frequency_hz - known) < 1.96 * mode.frequency_std_hz < 0.02 * known
-
-
-@pytest.mark.parametrize(('damping', 'bends', 'turned', 'said'), [
-    (0.005, 2, 0.1, Status.TRACKING), (0.005, 2, 0.3, Status.POORLY_EXCITED), (0.005, 0, 0.3, Status.TRACKING),
-    (0.5, 2, 0.1, Status.POORLY_EXCITED), (0.5, 0, 0.1, Status.TRACKING)])
-def test_a_model_of_one_configuration_shows_each_bend_s_mode_and_holds_until_the_arm_turns(
-        damping: float, bends: int, turned: float, said: Status) -> None:
-    u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
-    model, y = swinging((5.6, 6.1), u, damping)
-    found = Identified(model, 1e-6 * np.eye(44, 1), np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=1e4)
-    rows = log_of(u, y).rows(0, len(u))
-    assert prediction_check.judged(found, rows, ('a/position', 'b/position'), bends, turned).status is said
-
-
-def test_samples_that_show_no_frequency_leave_the_band_of_a_model_as_it_is() -> None:
-    u = np.repeat(np.random.default_rng(0).standard_normal((15, 2)), 100, axis=0)
-    model, y = swinging((5.6, 6.1), u)
-    missing = np.zeros(len(u), dtype=np.int64)
-    missing[:len(u) // 2 + 250] = 1  # two stretches of 250 samples are left, and three are needed
-    rows = log_of(u, y, missing=missing).rows(0, len(u))
-    found = Identified(model, 1e-6 * np.eye(44, 1), np.ones(4), 1.0, 1.0, 1.0, Status.TRACKING, samples=1e4)
-    assert np.isnan(prediction_check.frequency_errors(model, u, y, 250, missing == 0)[0]).all()
-    judged = prediction_check.judged(found, rows, ('a/position', 'b/position'), 2, 0.1)
-    assert np.isfinite(judged.spread).all()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from linear_arm import configuration, random_system, record, run, sorted_poles, start
+from linear_arm import configuration, identified, random_system, record, run, sorted_poles, start
 
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.identification import rpbsid, validation
@@ -65,8 +65,7 @@ def test_recursion_equals_batch(n, r, m, beta):
     config = configuration(
         r, m, order=n, past_window=7, future_window=5, forgetting_factor=[beta] * 3, forgetting='constant',
         regularization=[1e-12] * 3, state_basis='fixed', kalman_gain='regression')
-    found = rpbsid.identified(config, run(config, u, y).state, 0.01)
-    assert found is not None
+    found = identified(config, run(config, u, y).state, 0.01)
     batch, _ = pbsid(u, y, n=n, p=7, f=5, dt=0.01, weighted=True, fixed=True, forgetting=beta)
     assert np.abs(sorted_poles(found.model.A) - sorted_poles(batch.A)).max() < 1e-5
     size = np.abs(markov(batch, 10)).max()
@@ -83,10 +82,8 @@ def test_offsets_of_sensors_and_torques_change_no_model(offsets: list[float]):
     size = np.concatenate([u.std(axis=0), y.std(axis=0)]) * offsets
     config = configuration(2, 3, order=3, past_window=6, future_window=3)
     plain, moved = (
-        rpbsid.identified(config, rpbsid.finish(config, run(config, u + du, y + dy).state), 0.01)
+        identified(config, rpbsid.finish(config, run(config, u + du, y + dy).state), 0.01)
         for du, dy in ((0.0, 0.0), (size[:2], size[2:])))
-    assert plain is not None
-    assert moved is not None
     response = markov(plain.model, 10)
     assert np.abs(markov(moved.model, 10) - response).max() < 2e-3 * np.abs(response).max()  # a parameter more
     wider, U = validation.affine(moved.model, moved.constant, u + size[:2])
@@ -102,8 +99,7 @@ def test_estimators_agree_on_long_clean_records():
     for choice in ESTIMATORS:
         config = configuration(
             2, 3, order=3, past_window=8, future_window=4, forgetting_factor=[0.999] * 3, **choice)
-        found = rpbsid.identified(config, run(config, u, y).state, 0.01)
-        assert found is not None
+        found = identified(config, run(config, u, y).state, 0.01)
         assert np.abs(sorted_poles(found.model.A) - sorted_poles(system.A)).max() < 5e-3, choice
 
 
@@ -129,14 +125,12 @@ def test_restart_keeps_the_parameters_and_drops_the_confidence(choice):
                            regularization=[1e-2] * 3, **choice)
     whole = run(config, u, y)
     state = whole.state
-    before = rpbsid.identified(config, state, 0.01)
+    before = identified(config, state, 0.01)
     restarted = rpbsid.restart(config, state)
     assert restarted.counts[USED] == 0
     assert restarted.counts[FILLED] == 0
     assert rpbsid.identified(config, restarted, 0.01) is None
-    after = rpbsid.identified(config, whole._replace(state=restarted).feed(u[:40], y[:40]).state, 0.01)
-    assert before is not None
-    assert after is not None
+    after = identified(config, whole._replace(state=restarted).feed(u[:40], y[:40]).state, 0.01)
     assert np.linalg.norm(after.spread) > 1.3 * np.linalg.norm(before.spread)
     kept = dataclasses.replace(config, restart_on_event=False)
     assert rpbsid.restart(kept, state).counts[USED] == state.counts[USED]
@@ -162,6 +156,5 @@ def test_a_model_that_leaves_dynamics_out_says_so(order, status):
     rng = np.random.default_rng(5)
     u, y = record(random_system(4, 2, 2, rng), 3000, 0.1, rng)
     config = configuration(2, 2, order=order, refinement='none')
-    found = rpbsid.identified(config, run(config, u, y).state, 0.01)
-    assert found is not None
+    found = identified(config, run(config, u, y).state, 0.01)
     assert found.status is status

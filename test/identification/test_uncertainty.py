@@ -4,9 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from linear_arm import benchmark, configuration, random_system, record, run
+from linear_arm import benchmark, configuration, identified, random_system, record, run
 
-from flexmanip_ros.identification import rpbsid
 from flexmanip_ros.identification.model_output import based, from_factor
 from flexmanip_ros.identification.moments import realize_orders
 from flexmanip_ros.identification.uncertainty import Tangent, modes, tangent
@@ -77,9 +76,9 @@ def test_deviations_of_A_and_B_are_the_scatter_of_many_runs(estimator, feedthrou
                            direct_feedthrough=feedthrough)
     system = random_system(2, 1, 2, np.random.default_rng(0))
     records = [record(system, 2000, 0.05, np.random.default_rng(seed)) for seed in range(40)]
-    found = [rpbsid.identified(config, run(config, u, y).state, 0.01) for u, y in records]
-    scatter = np.std([np.append(one.model.A, one.model.B) for one in found if one is not None], axis=0)
-    claimed = np.median([np.linalg.norm(one.spread[:6], axis=1) for one in found if one is not None], axis=0)
+    found = [identified(config, run(config, u, y).state, 0.01) for u, y in records]
+    scatter = np.std([np.append(one.model.A, one.model.B) for one in found], axis=0)
+    claimed = np.median([np.linalg.norm(one.spread[:6], axis=1) for one in found], axis=0)
     np.testing.assert_allclose(claimed / scatter, 1.0, atol=0.5)
 
 
@@ -92,8 +91,7 @@ def test_deviations_of_a_decimated_model_are_the_scatter_of_many_runs(factor):
     values, deviations = [], []
     for seed in range(30):
         noise = np.random.default_rng(seed).standard_normal(clean.shape)
-        found = rpbsid.identified(config, run(config, u, clean + 0.01 * clean.std(axis=0) * noise).state, study.DT)
-        assert found is not None
+        found = identified(config, run(config, u, clean + 0.01 * clean.std(axis=0) * noise).state, study.DT)
         both = modes(found)
         values.append([(one.frequency_hz, one.damping_ratio) for one in both])
         deviations.append([(one.frequency_std_hz, one.damping_ratio_std) for one in both])
@@ -107,8 +105,7 @@ def test_a_model_that_explains_more_than_a_tenth_is_not_poorly_excited(estimator
     config = configuration(1, 1, order=2, past_window=6, future_window=4, estimator=estimator, refinement='none',
                            forgetting='constant', forgetting_factor=[0.9995] * 3)
     u, y = record(random_system(2, 1, 1, np.random.default_rng(1)), 4000, noise, np.random.default_rng(3))
-    found = rpbsid.identified(config, run(config, u, y).state, 0.01)
-    assert found is not None
+    found = identified(config, run(config, u, y).state, 0.01)
     assert found.status is status
 
 
@@ -129,8 +126,7 @@ def test_modes_of_a_known_model():
     rng = np.random.default_rng(0)
     u, y = record(random_system(2, 1, 2, rng), 500, 0.05, rng)
     config = configuration(1, 2, order=2, past_window=4, future_window=2)
-    found = rpbsid.identified(config, run(config, u, y).state, dt)
-    assert found is not None
+    found = identified(config, run(config, u, y).state, dt)
     (mode,) = modes(found._replace(model=dataclasses.replace(found.model, A=A)))
     assert mode.frequency_hz == pytest.approx(6.0 * np.sqrt(1 - zeta ** 2))
     assert mode.damping_ratio == pytest.approx(zeta)
