@@ -32,15 +32,12 @@ def sensor_matrix(config: IdentifierParameters, kappa: int | None) -> tuple[Arra
     known = signals(config)
     if known is None or not known.torques:
         return None
-    links = len(config.arm.link_length)
-    seen = manipulator(config.arm, kappa).output[links:, links:]
-    rows = []
-    for role in known.outputs:
-        if role.quantity not in (Quantity.BEND, Quantity.BEND_RATE):
-            return None
-        rows.append(seen[role.link, :links * manipulator(config.arm, kappa).kappa])
-    return np.array(rows).reshape(len(rows), -1), tuple(
-        role.quantity is Quantity.BEND_RATE for role in known.outputs)
+    if not {role.quantity for role in known.outputs} <= {Quantity.BEND, Quantity.BEND_RATE}:
+        return None
+    arm, links = manipulator(config.arm, kappa), len(config.arm.link_length)
+    seen = arm.output[links:, links:links * (1 + arm.kappa)]
+    return (seen[[role.link for role in known.outputs]],
+            tuple(role.quantity is Quantity.BEND_RATE for role in known.outputs))
 
 
 def to_modal(Ac: Array, Bc: Array, C: Array, S: Array, rates: tuple[bool, ...]) -> tuple[Array, Array]:

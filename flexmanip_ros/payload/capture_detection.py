@@ -78,7 +78,8 @@ def advance(
             state = _start(config, state, one)
             rows = rows.since(one.until)
         elif rows.gap[0]:
-            state = _resume(state, one)
+            filtered = structured.advance(state.identifier, state.filter, one)
+            state = replace(state, filter=filtered, glr=_quiet(state.glr), since=one.first)
             rows = rows.since(one.until)
         else:
             state, event = _watch(state, rows.stretches()[0])
@@ -173,23 +174,9 @@ def _watch(state: DetectionState, rows: Rows) -> tuple[DetectionState, CaptureEv
     lag = round(onset(glr, np.maximum(m.noise[:, mem.WHITE], m.noise[:, mem.FLOOR]), part.until - 1 - state.since))
     kind = EventKind.RELEASE if m.counts[mem.HELD] else EventKind.CAPTURE
     event = CaptureEvent(int(rows.between(part.until - 1 - lag, part.until).stamp_ns[0]), kind, DATING_STD_S)
-    return _after(state, event), event
-
-
-def _after(state: DetectionState, event: CaptureEvent) -> DetectionState:
-    """Apply the event to the filter, and restart its motion, which the samples since the onset made wrong."""
-    assert state.glr is not None
-    now = event._replace(stamp_ns=state.filter.last_ns)
-    filtered = structured.event(state.identifier, state.filter, now)
-    filtered = structured.reopen(state.identifier, filtered)
-    return replace(state, filter=filtered, glr=_quiet(state.glr))
-
-
-def _resume(state: DetectionState, row: Rows) -> DetectionState:
-    """After a gap: restart the motion of the filter, and the test."""
-    assert state.glr is not None
-    filtered = structured.advance(state.identifier, state.filter, row)
-    return replace(state, filter=filtered, glr=_quiet(state.glr), since=row.first)
+    changed = structured.event(state.identifier, after, event._replace(stamp_ns=after.last_ns))
+    changed = structured.reopen(state.identifier, changed)  # the samples since the onset made its motion wrong
+    return replace(state, filter=changed, glr=_quiet(glr)), event
 
 
 def _quiet(glr: kernel.GlrState) -> kernel.GlrState:

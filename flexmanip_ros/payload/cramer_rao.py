@@ -7,7 +7,7 @@ from them by the block extraction, so the bound belongs to that formula (name it
 is unknown of arm and object, from before the capture on, are in benchmarks/parts/all_bounds.py.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -39,18 +39,7 @@ def structure_known(
         for change in (step, 0.0, max(-step, -payload)))
     width = step + min(step, payload)
     driven = (states @ (A_up - A_down).T + efforts @ (B_up - B_down).T) / width
-    n = states.shape[1]
-    S = np.hstack([np.zeros((n, 1)), np.eye(n)])
-    information = np.zeros((n + 1, n + 1))
-    found = []
-    for k in range(max(counts)):
-        rows = S / noise_std[:, None]
-        information += rows.T @ rows
-        S = A @ S
-        S[:, 0] += driven[k]
-        if k + 1 in counts:
-            found.append(_deviation(information, np.eye(n + 1)[0]))
-    return np.array(found)
+    return _linear(A, lambda k: driven[k, :, None], np.ones(1), noise_std, counts)
 
 
 def structure_unknown(
@@ -63,21 +52,33 @@ def structure_unknown(
     """
     kappa = noise_std.size // 4
     A, B = discretize(*vibration_model(arm, theta, payload, kappa), dt)
-    n, r = B.shape
-    size = n * (n + r)
-    S = np.hstack([np.zeros((n, size)), np.eye(n)])
-    gradient = np.append(_extraction_gradient(arm, theta, A, B, dt, kappa, known_mb), np.zeros(n))
-    information = np.zeros((size + n, size + n))
+    one = np.eye(len(A))
+
+    def driven(k: int) -> Array:  # element i of A x + B u changes with row i of A by x, and with row i of B by u
+        return np.hstack([np.kron(one, states[k]), np.kron(one, efforts[k])])
+
+    return _linear(A, driven, _extraction_gradient(arm, theta, A, B, dt, kappa, known_mb), noise_std, counts)
+
+
+def _linear(
+    A: Array, driven: Callable[[int], Array], gradient: Array, noise_std: Array, counts: Sequence[int],
+) -> Array:
+    """Return the bound after each of ``counts`` samples of a plant with the state matrix A, all states measured.
+
+    The bound is that of a quantity with the derivative ``gradient`` (c,) by the unknown parameters of the plant; the
+    first state is unknown as well. driven(k): derivative (n, c) of state k + 1 by the parameters at fixed state k.
+    """
+    n, c = len(A), gradient.size
+    S = np.hstack([np.zeros((n, c)), np.eye(n)])
+    information = np.zeros((c + n, c + n))
     found = []
     for k in range(max(counts)):
         rows = S / noise_std[:, None]
         information += rows.T @ rows
         S = A @ S
-        for i in range(n):
-            S[i, i * n:(i + 1) * n] += states[k]
-            S[i, n * n + i * r:n * n + (i + 1) * r] += efforts[k]
+        S[:, :c] += driven(k)
         if k + 1 in counts:
-            found.append(_deviation(information, gradient))
+            found.append(_deviation(information, np.append(gradient, np.zeros(n))))
     return np.array(found)
 
 

@@ -3,9 +3,7 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flexmanip_ros.numerics.compiled import kernel
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured_model
@@ -218,29 +216,19 @@ def friction_error(model: Model, m: mem.FilterState, peak: Array) -> float:
 
 
 def innovation_power(sensors: MeasurementModel, m: mem.FilterState) -> tuple[float, float]:
-    """Return the innovation power over white noise, and the share of ``model_error``; see ``figures``.
+    """Return the innovation power over white noise, and the share of ``model_error`` that the interval carries, 0 to 1.
 
-    Of the displacements it is the median before a sensor tells of the payload.
+    Before a sensor tells of the payload, the power is the median of those of the displacements. The share grows
+    linearly with the innovation power over white noise of the sensor with the most. It is 0 up to what chance explains
+    if the samples are independent, and 1 from what chance explains if only blocks are independent.
     """
-    power, share = figures(m.noise, sensors.rate, m.counts, sensors.block)
+    power = misfit(m.noise, sensors.rate, mem.LEVEL)
     if math.isnan(power):
         power = float(np.median([sensor[mem.POWER] / white_variance(sensor, mem.LEVEL)
                                  for sensor in m.noise[~sensors.rate]]))
-    return power, share
-
-
-@kernel
-def figures(noise: Array, rate: NDArray[np.bool_], counts: NDArray[np.int64], block: int) -> tuple[float, float]:
-    """Return the misfit, and the share of ``model_error`` that the interval carries, 0 to 1; block: samples in a block.
-
-    The share grows linearly with the innovation power over white noise of the sensor with the most. It is 0 up to what
-    chance explains if the samples are independent, and 1 from what chance explains if only blocks are independent.
-    """
     # a mean of N squares scatters by sqrt(2 / N); 2.5 times that is exceeded by chance in 0.6 % of the blocks
-    blocks, of_white = max(counts[mem.BLOCKS], 1), 2.0 * OVERLAP / max(counts[mem.SEEN], 1)
+    blocks, of_white = max(m.counts[mem.BLOCKS], 1), 2.0 * OVERLAP / max(m.counts[mem.SEEN], 1)
     most = 2.5 * math.sqrt(2.0 / blocks + of_white)
-    least = 2.5 * math.sqrt(2.0 / (blocks * block) + of_white)
-    excess = 0.0
-    for i in range(noise.shape[0]):
-        excess = max(excess, noise[i, mem.EFFECTIVE] / white_variance(noise[i], mem.LEVEL) - 1.0)
-    return misfit(noise, rate, mem.LEVEL), min(max((excess - least) / (most - least), 0.0), 1.0)
+    least = 2.5 * math.sqrt(2.0 / (blocks * sensors.block) + of_white)
+    excess = max(sensor[mem.EFFECTIVE] / white_variance(sensor, mem.LEVEL) - 1.0 for sensor in m.noise.tolist())
+    return power, float(min(max((excess - least) / (most - least), 0.0), 1.0))

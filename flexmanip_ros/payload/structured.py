@@ -32,6 +32,8 @@ UNTAUGHT = 100
 """Samples within which a capture comes too early to learn the empty arm, which then keeps its given parameters."""
 LONGEST_S = 10.0
 """Longest time from the last sample to an event over which the motion is predicted [s]; beyond it is unknown anyway."""
+TAKEN_FOR_NOISE = [mem.EFFECTIVE, mem.POWER, mem.SLOW]
+"""Columns of the noise in which residuals of a wrong fit are."""
 
 
 class StructuredState(NamedTuple):
@@ -265,12 +267,17 @@ def _open_body(config: IdentifierParameters, model: Model, m: mem.FilterState) -
         aim[model.payload + 1:model.payload + 3] = -there[model.payload + 1:model.payload + 3]
         _fit_from(m, aim)
         return
-    opened = np.zeros((m.x.size, model.body))
-    opened[body] = np.diag(structured_model.body_std(config, model))
-    m.S0[body] = 0.0
-    m.S0[:] = structured_model.widen(m.S0, opened)
-    m.x0[body] = structured_model.body_mean(config, model)
+    m.S0[:] = structured_model.widen(m.S0, _unknown_body(config, model, m.x0, m.S0))
     _refit(m)
+
+
+def _unknown_body(config: IdentifierParameters, model: Model, x: Array, S: Array) -> Array:
+    """Set the body in the state x (nx,) to its prior mean, known exactly; return the columns (nx, b) of its prior."""
+    body = slice(model.payload, model.payload + model.body)
+    x[body], S[body] = structured_model.body_mean(config, model)[:model.body], 0.0
+    columns = np.zeros((x.size, model.body))
+    columns[body] = np.diag(structured_model.body_std(config, model)[:model.body])
+    return columns
 
 
 def _fit_from(m: mem.FilterState, start: Array) -> None:
@@ -318,9 +325,8 @@ def _refit(m: mem.FilterState) -> None:
     """Begin the iterations of the fit again, at the first samples of the horizon."""
     m.counts[mem.USED] = int(m.S0.any(axis=1).sum())
     m.xi[:] = 0.0
-    for counter in (mem.ITERATED, mem.ITERATING, mem.SINCE_NOISE, mem.IN_BATCH, mem.BEFORE, mem.REJECTED, mem.AGAIN,
-                    mem.TRIED):
-        m.counts[counter] = 0
+    m.counts[[mem.ITERATED, mem.ITERATING, mem.SINCE_NOISE, mem.IN_BATCH, mem.BEFORE, mem.REJECTED, mem.AGAIN,
+              mem.TRIED]] = 0
     if m.counts[mem.EFFORTS] == mem.COMPARED:
         m.counts[mem.EFFORTS] = mem.NOISY
     m.score[mem.LAMBDA] = 0.0
@@ -450,14 +456,18 @@ def reopen(
 ) -> StructuredState:
     """Start the motion again from measurements y (m,), and keep what is known of arm, payload and noise."""
     model, m = state.running.model, mem.copy(state.running.memory)
-    payload = model.payload
-    parameters, spread = m.x[payload:].copy(), m.S[payload:].copy()
-    structured_model.first(config, model, m, m.recent[:, 0] if y is None else y)
-    m.x[payload:] = parameters
-    m.S[payload:] = 0.0
-    m.S[:] = structured_model.widen(m.S, np.vstack([np.zeros((payload, spread.shape[1])), spread]))
+    _start_motion(config, model, m, m.recent[:, 0] if y is None else y, m.S)
     _set_arrival_cost(model, m)
     return state._replace(memory=m, horizon=state.here)
+
+
+def _start_motion(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Array, spread: Array) -> None:
+    """Start the motion from measurements y (m,); keep the mean of payload and arm, take their rows of ``spread``."""
+    payload = model.payload
+    parameters, spread = m.x[payload:].copy(), spread.copy()
+    structured_model.first(config, model, m, y)
+    m.x[payload:], m.S[payload:], spread[:payload] = parameters, 0.0, 0.0
+    m.S[:] = structured_model.widen(m.S, spread)
 
 
 def _run(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
@@ -484,9 +494,7 @@ def after_rows(state: StructuredState, m: mem.FilterState, taken: Rows, table: A
     """Return the state once the filter, now with memory m, took these rows, the last of the table."""
     links = taken.u.shape[1]
     efforts = latest(state.running.sensors, taken.u[-1:], table[:, 1:1 + links])
-    slope, peak = state.slope, np.abs(taken.u).max(axis=0)
-    if state.peak.size:
-        peak = np.maximum(peak, state.peak)
+    slope = state.slope
     measured = np.flatnonzero(taken.missing == 0)
     if len(measured):
         last = int(measured[-1])
@@ -494,7 +502,7 @@ def after_rows(state: StructuredState, m: mem.FilterState, taken: Rows, table: A
     return state._replace(memory=m, cursor=taken.until, last_ns=int(taken.stamp_ns[-1]),
                           time_ns=int(taken.time_ns[-1]), efforts=efforts,
                           rates=table[-1, 1 + 2 * links:1 + 3 * links].copy(), slope=slope,
-                          missing=int(taken.missing[-1]), peak=peak)
+                          missing=int(taken.missing[-1]), peak=_peaks(state, taken)[-1].copy())
 
 
 def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
@@ -560,20 +568,10 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
     if m.counts[mem.HELD] and m.counts[mem.LEARNED] and np.isfinite(m.S0).all() and not at_once:
         m = mem.copy(m)
         m.x[:], m.S[:] = m.x0, m.S0
-        payload = model.payload
-        parameters, spread = m.x[payload:].copy(), m.S[payload:].copy()
-        structured_model.first(config, model, m, y)
-        body = slice(payload, payload + model.body)
-        spread[:model.body] = 0.0
-        m.x[payload:], m.S[payload:] = parameters, 0.0
-        m.x[body] = structured_model.body_mean(config, model)[:model.body]
-        opened = np.zeros((m.x.size, model.body))
-        opened[body] = np.diag(structured_model.body_std(config, model)[:model.body])
-        m.S[:] = structured_model.widen(m.S, np.hstack([np.vstack([np.zeros((payload, spread.shape[1])), spread]),
-                                                        opened]))
+        opened = _unknown_body(config, model, m.x, m.S)
+        _start_motion(config, model, m, y, np.hstack([m.S, opened]))
         m.counts[mem.REFITS] = refits
-        for column in (mem.EFFECTIVE, mem.POWER, mem.SLOW):  # what did not fit was taken for noise
-            m.noise[:, column] = m.noise[:, mem.AT_EVENT]
+        m.noise[:, TAKEN_FOR_NOISE] = m.noise[:, [mem.AT_EVENT]]
         _set_arrival_cost(model, m)
         return state._replace(memory=m, horizon=state.here)
     fresh = StructuredState(model, restarts=state.restarts + (not unfit), cursor=state.cursor, refits=refits,
@@ -610,8 +608,7 @@ def _begin_to_move(state: StructuredState) -> StructuredState:
     m.x[:], m.S[:], m.ringing[0] = x, S, ringing
     m.counts[[mem.STORED, mem.SINCE_EVENT]] = state.cursor - horizon.row
     if state.next is not None:
-        for column in (mem.EFFECTIVE, mem.POWER, mem.SLOW):  # what did not fit was taken for noise
-            m.noise[:, column] = state.next.noise[:, column]
+        m.noise[:, TAKEN_FOR_NOISE] = state.next.noise[:, TAKEN_FOR_NOISE]
     return state._replace(memory=m, next=None)
 
 

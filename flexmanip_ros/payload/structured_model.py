@@ -127,7 +127,6 @@ def _in_order_of_links(names: tuple[str, ...], links: int) -> tuple[str, ...] | 
     return names if not names else None
 
 
-
 class Model(NamedTuple):
     """Constants of the estimator. Its scratch arrays hold nothing between calls, but see ``freeze``."""
 
@@ -483,19 +482,15 @@ def expect_rotors_and_friction(model: Model, m: mem.FilterState) -> None:
 
     From a rotor of zero the effect of one is steep and soon saturates, so a fit may end in a minimum without it.
     """
-    n = model.motion.arm.stiffness.size
-    for c, kind in enumerate(model.motion.kind):
-        if kind in (Kind.VISCOUS, Kind.COULOMB, Kind.ROTOR):
-            m.x[2 * n + c] += model.motion.prior[c]
+    raised = np.isin(model.motion.kind, (Kind.VISCOUS, Kind.COULOMB, Kind.ROTOR))
+    m.x[model.payload:][raised] += model.motion.prior[raised]
 
 
 def take_as_known(model: Model, m: mem.FilterState, beyond: Kind = Kind.DAMPING) -> None:
     """Take the entries of p beyond a kind as given, where an unknown object hides them; modes stay uncertain."""
-    n = model.motion.arm.stiffness.size
-    for c, kind in enumerate(model.motion.kind):
-        if kind > beyond and kind != Kind.MODE:
-            m.x[2 * n + c] = model.motion.given[c]
-            m.S[2 * n + c] = 0.0
+    taken = (model.motion.kind > beyond) & (model.motion.kind != Kind.MODE)
+    m.x[model.payload:][taken] = model.motion.given[taken]
+    m.S[model.payload:][taken] = 0.0
 
 
 def working_point(config: IdentifierParameters, angles: Array) -> Array:

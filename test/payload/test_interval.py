@@ -14,7 +14,6 @@ from flexmanip_ros.arm.linearization import mass_matrix
 from flexmanip_ros.arm.manipulator import manipulator
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.payload import filter_state as mem
-from flexmanip_ros.payload.filter_state import memory
 from flexmanip_ros.payload.interval import SHARE_ERROR, by_rotors, friction_error, judge
 from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.payload.structured_model import ROTOR_ERROR, build, sensors, too_noisy
@@ -28,11 +27,14 @@ ROTORS = MODEL.payload + np.flatnonzero(MODEL.motion.kind == Kind.ROTOR)
 FRICTION = MODEL.payload + np.flatnonzero(MODEL.motion.kind == Kind.COULOMB)
 
 
+def nothing_known() -> mem.FilterState:
+    return mem.memory(MODEL.payload + MODEL.motion.kind.size, len(MODEL.roles), 2)
+
+
 @settings(max_examples=30)
 @given(seed=st.integers(0, 2 ** 32 - 1))
 def test_a_bias_of_a_rotor_moves_the_body_as_a_gaussian_conditioned_on_that_rotor(seed: int) -> None:
-    assert MODEL is not None
-    m = memory(2 * MODEL.motion.arm.stiffness.size + MODEL.motion.kind.size, len(MODEL.roles), 2)
+    m = nothing_known()
     m.S[:] = np.random.default_rng(seed).standard_normal(m.S.shape)
     P = m.S @ m.S.T
     for rotor, error, moved in zip(ROTORS, MODEL.rotor_error, by_rotors(MODEL, m).T, strict=True):
@@ -43,8 +45,7 @@ def test_a_bias_of_a_rotor_moves_the_body_as_a_gaussian_conditioned_on_that_roto
 
 
 def test_rotors_that_are_taken_as_known_have_no_bias() -> None:
-    assert MODEL is not None
-    m = memory(2 * MODEL.motion.arm.stiffness.size + MODEL.motion.kind.size, len(MODEL.roles), 2)
+    m = nothing_known()
     m.S[:] = np.eye(len(m.S))
     m.S[ROTORS] = 0.0
     assert not by_rotors(MODEL, m).any()
@@ -63,9 +64,8 @@ def test_the_bias_is_of_the_links_alone_however_large_hub_and_rotor_are() -> Non
 def test_what_weighs_no_more_than_its_deviation_has_the_centre_of_mass_of_an_unknown_object(mass: float) -> None:
     """It was h / m with m at least 1e-9 kg: some 1e7 m."""
     config, dt = IdentifierParameters(), 1e-3
-    assert MODEL is not None
     seen = sensors(config, MODEL, dt, np.zeros(2))
-    m = memory(2 * MODEL.motion.arm.stiffness.size + MODEL.motion.kind.size, len(MODEL.roles), 2)
+    m = nothing_known()
     m.x[BODY] = mass, 0.01, 0.02, 0.05
     m.S[np.ix_(BODY, BODY)] = np.diag([0.03, 0.005, 0.005, 0.01])
     m.counts[[mem.HELD, mem.SEEN, mem.SINCE_EVENT, mem.BLOCKS]] = 1, 2000, 5000, 100
@@ -86,8 +86,7 @@ def test_what_weighs_no_more_than_its_deviation_has_the_centre_of_mass_of_an_unk
     ((1.0, 0.4), (10.0, 5.0), 0.1 * SHARE_ERROR), ((0.2, 0.5), (10.0, 5.0), 0.1 * SHARE_ERROR),
     ((0.0, 0.0), (10.0, 5.0), 0.0), ((-0.1, 0.0), (10.0, 5.0), 0.0), ((0.3, 0.2), (0.0, 0.0), 0.0)])
 def test_the_form_of_the_friction_is_an_error_in_proportion_to_friction_over_torque(friction, torques, error) -> None:
-    assert MODEL is not None
-    m = memory(2 * MODEL.motion.arm.stiffness.size + MODEL.motion.kind.size, len(MODEL.roles), 2)
+    m = nothing_known()
     m.x[FRICTION] = friction
     assert friction_error(MODEL, m, np.array(torques)) == pytest.approx(error)
 

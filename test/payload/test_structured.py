@@ -280,16 +280,6 @@ def test_a_linear_plant_is_told_to_have_no_floating_base():
         config(replace(ARM, base_mass=100.0), payload=PayloadParameters(dynamics='linear'))
 
 
-def test_a_linear_plant_that_is_fitted_again_stays_where_it_was_first_seen():
-    settings = config(payload=PayloadParameters(dynamics='linear'))
-    samples = record(0.3)
-    state = run(settings, samples)
-    later = altered(samples, angles=samples.angles + np.array([0.0, 0.1]))
-    again = structured.restart(settings, state, state._replace(cursor=0), later.between(0, 1))
-    again = structured.advance(settings, again, later.since(1))
-    np.testing.assert_array_equal(again.model.motion.M0, state.model.motion.M0)
-
-
 def test_at_its_working_point_a_linear_plant_with_learned_rotors_jumps_as_the_moving_arm_does():
     """By an impulse at the tip, and by a torque that changed at an unknown time."""
     found = []
@@ -541,13 +531,6 @@ def test_a_point_is_known_as_well_as_if_it_were_told_to_be_one():
     assert found.std < 2.0 * told.std
     assert abs(found.mass - 20.0) < 3.0 * found.std
     assert np.hypot(*found.com[:2]) < 1e-3
-
-
-def test_no_samples_are_a_table_without_rows() -> None:
-    model = structured.init(config()).model
-    assert model is not None
-    rows = log_of(np.zeros((0, 2)), np.zeros((0, 4)), np.zeros((0, 2))).rows(0, 0)
-    assert structured.measurements(model, rows).shape == (0, len(model.roles))
 
 
 def test_where_no_rate_was_measured_friction_follows_the_model() -> None:
