@@ -10,6 +10,7 @@ import numpy as np
 
 from flexmanip_ros.arm.manipulator import Manipulator, Workspace
 from flexmanip_ros.numerics.compiled import inlined, inner
+from flexmanip_ros.numerics.square_root import ordered_dot
 from flexmanip_ros.types import Array
 
 STICTION_RATE = 2e-3
@@ -20,8 +21,7 @@ STICTION_RATE = 2e-3
 def shortening_gradient(G: Array, eta: Array, product: Array) -> None:
     """Fill product (P, k) with G eta, the gradient of the shortening up to each point; G: (k, P, k), eta: (k,)."""
     rows, found = G.reshape((eta.size, product.size)), product.reshape(product.size)
-    for c in range(found.size):
-        found[c] = 0.0
+    found[:] = 0.0
     for j in range(eta.size):
         row, amplitude = rows[j], eta[j]
         for c in range(found.size):
@@ -43,11 +43,8 @@ def assemble_link(
     Je, Jn, Se, Sn, own = work.own[0], work.own[1], work.own[2], work.own[3], work.own[4]
     block = work.block
     eta, etad, G, phi, shortened = q[o:o + k], qd[o:o + k], arm.G[i], arm.phi[i], arm.tip_shortening[i]
-    for r in range(k + 1):
-        Se[r], Sn[r], own[r] = 0.0, 0.0, 0.0
-        for t in range(k + 1):
-            block[r, t] = 0.0
-    total, fe, fn = 0.0, 0.0, 0.0
+    Se[:], Sn[:], own[:], block[:] = 0.0, 0.0, 0.0, 0.0
+    mass, fe, fn = 0.0, 0.0, 0.0
     shortening_gradient(G, eta, work.gradient[0])
     shortening_gradient(G, etad, work.gradient[1])
     for p in range(arm.mass.shape[1]):
@@ -66,7 +63,7 @@ def assemble_link(
         Jn[0] = x
         Ae = m * (xdd - 2.0 * yd * w - x * w * w + re)
         An = m * (2.0 * xd * w - y * w * w + rn)
-        total += m
+        mass += m
         fe += Ae
         fn += An
         for r in range(k + 1):
@@ -77,9 +74,7 @@ def assemble_link(
             for t in range(r + 1):
                 block[r, t] += me * Je[t] + mn * Jn[t]
     S = work.first[i]
-    for r in range(n):
-        S[0, r] = 0.0
-        S[1, r] = 0.0
+    S[:] = 0.0
     for r in range(k + 1):
         row = i if r == 0 else o + r - 1
         S[0, row] = c * Se[r] - s * Sn[r]
@@ -91,24 +86,21 @@ def assemble_link(
     for r in range(n if i > 0 or arm.floating else 0):  # J = 0 where joint 1 is pinned
         E[r] += J[0, r] * fx + J[1, r] * fy
         for t in range(r + 1):
-            M[r, t] += (total * (J[0, r] * J[0, t] + J[1, r] * J[1, t])
+            M[r, t] += (mass * (J[0, r] * J[0, t] + J[1, r] * J[1, t])
                         + J[0, r] * S[0, t] + J[1, r] * S[1, t] + S[0, r] * J[0, t] + S[1, r] * J[1, t])
     for r in range(n):
-        work.P[0, r] += total * J[0, r] + S[0, r]
-        work.P[1, r] += total * J[1, r] + S[1, r]
+        work.P[0, r] += mass * J[0, r] + S[0, r]
+        work.P[1, r] += mass * J[1, r] + S[1, r]
     work.F[0] += fx
     work.F[1] += fy
-    work.F[2] += total
+    work.F[2] += mass
     x, xd, xdd = arm.length[i], 0.0, 0.0
     tip, b = work.J[i + 1], work.a[i + 1]
     for r in range(n):
         tip[0, r] = J[0, r]
         tip[1, r] = J[1, r]
     for j in range(k):
-        g, h = 0.0, 0.0
-        for t in range(k):
-            g += shortened[j, t] * eta[t]
-            h += shortened[j, t] * etad[t]
+        g, h = ordered_dot(shortened[j], eta), ordered_dot(shortened[j], etad)
         x -= 0.5 * g * eta[j]
         xd -= g * etad[j]
         xdd -= h * etad[j]
@@ -132,8 +124,7 @@ def assemble_payload(arm: Manipulator, payload: Array, q: Array, qd: Array, M: A
     o = links + last * k
     turn, spin = q[last], qd[last]
     g = work.turn
-    for r in range(n):
-        g[r] = 0.0
+    g[:] = 0.0
     g[last] = 1.0
     for j in range(k):
         g[o + j] = arm.tip_slope[last, j]
@@ -167,13 +158,10 @@ def assemble(
     payload: (4,) inertial parameters. A floating base may still translate here: see ``eliminate_translation``.
     """
     n = q.size
+    E[:], work.J[0], work.P[:] = 0.0, 0.0, 0.0
     for r in range(n):
-        E[r] = 0.0
         for t in range(r + 1):
             M[r, t] = arm.rotary[r, t]
-        for side in range(2):
-            work.J[0, side, r] = 0.0
-            work.P[side, r] = 0.0
     work.F[0], work.F[1], work.F[2] = 0.0, 0.0, arm.base[0]
     work.a[0, 0], work.a[0, 1] = -arm.gravity[0], -arm.gravity[1]
     if arm.floating:
@@ -211,11 +199,7 @@ def inertial_forces(arm: Manipulator, payload: Array, q: Array, qd: Array, work:
 @inner
 def curvature_and_slope(curvature: Array, slopes: Array, eta: Array) -> tuple[float, float]:
     """Return curvature w'' and slope w' of a link at a point, from phi'' and phi' (k,) at that point and eta (k,)."""
-    bend, slope = 0.0, 0.0
-    for j in range(eta.size):
-        bend += curvature[j] * eta[j]
-        slope += slopes[j] * eta[j]
-    return bend, slope
+    return ordered_dot(curvature, eta), ordered_dot(slopes, eta)
 
 
 @inner
@@ -288,22 +272,14 @@ def hold(L: Array, held: Array, qdd: Array, columns: Array) -> None:
     held: (m, n) constant rows, m at most 2; L from ``factor``; columns: (2, n) scratch.
     """
     rows, n = held.shape
-    a, b, d = 0.0, 0.0, 1.0
-    x, y = 0.0, 0.0
+    b, d, y = 0.0, 1.0, 0.0
     for i in range(rows):
         for c in range(n):
             columns[i, c] = held[i, c]
         solve(L, columns[i])
-    for c in range(n):
-        a += held[0, c] * columns[0, c]
-        x += held[0, c] * qdd[c]
-        if rows == 2:
-            b += held[0, c] * columns[1, c]
-            y += held[1, c] * qdd[c]
+    a, x = ordered_dot(held[0], columns[0]), ordered_dot(held[0], qdd)
     if rows == 2:
-        d = 0.0
-        for c in range(n):
-            d += held[1, c] * columns[1, c]
+        b, d, y = ordered_dot(held[0], columns[1]), ordered_dot(held[1], columns[1]), ordered_dot(held[1], qdd)
     determinant = a * d - b * b
     first = (d * x - b * y) / determinant
     second = (a * y - b * x) / determinant
@@ -317,9 +293,7 @@ def hold(L: Array, held: Array, qdd: Array, columns: Array) -> None:
 def net_torques(B: Array, arm: Manipulator, qd: Array, effort: Array, net: Array) -> None:
     """Fill net (3, L): joint torques less friction, joint rates, derivative of the friction by the rates; B: (n, L)."""
     for i in range(arm.length.size):
-        rate = 0.0
-        for r in range(qd.size):
-            rate += B[r, i] * qd[r]
+        rate = ordered_dot(B[:, i], qd)
         share = np.tanh(rate / STICTION_RATE)
         net[0, i] = effort[i] - arm.viscous[i] * rate - arm.coulomb[i] * share
         net[1, i] = rate
@@ -342,10 +316,7 @@ def torque_matrix(arm: Manipulator, q: Array, B: Array) -> None:
         return
     for i in range(links):
         o = links + i * k
-        root, tip = 0.0, 0.0
-        for j in range(k):
-            root += arm.root_slope[i, j] * q[o + j]
-            tip += arm.tip_slope[i, j] * q[o + j]
+        root, tip = ordered_dot(arm.root_slope[i], q[o:o + k]), ordered_dot(arm.tip_slope[i], q[o:o + k])
         for j in range(k):
             B[o + j, i] *= 1.0 + 0.5 * root * root
             if i + 1 < links:

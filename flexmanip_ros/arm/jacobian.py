@@ -10,6 +10,7 @@ import numpy as np
 from flexmanip_ros.arm.equations_of_motion import curvature_and_slope, shortening_gradient
 from flexmanip_ros.arm.manipulator import Manipulator, Workspace
 from flexmanip_ros.numerics.compiled import inner
+from flexmanip_ros.numerics.square_root import ordered_dot
 from flexmanip_ros.types import Array
 
 
@@ -27,11 +28,8 @@ def move_station(arm: Manipulator, i: int, q: Array, qd: Array, qdd: Array, work
     x, xd, xdd = arm.length[i], 0.0, 0.0
     eta, etad, etadd = q[o:o + k], qd[o:o + k], qdd[o:o + k]
     for j in range(k):
-        g, h, gdd = 0.0, 0.0, 0.0
-        for t in range(k):
-            g += arm.tip_shortening[i, j, t] * eta[t]
-            h += arm.tip_shortening[i, j, t] * etad[t]
-            gdd += arm.tip_shortening[i, j, t] * etadd[t]
+        shortened = arm.tip_shortening[i, j]
+        g, h, gdd = ordered_dot(shortened, eta), ordered_dot(shortened, etad), ordered_dot(shortened, etadd)
         x -= 0.5 * g * eta[j]
         xd -= g * etad[j]
         xdd -= h * etad[j] + g * etadd[j]
@@ -65,8 +63,7 @@ def payload_jacobian(
     m, hx, hy = payload[0], payload[1], payload[2]
     turn, spin, accelerated = q[last], qd[last], qdd[last]
     g = work.turn
-    for r in range(n):
-        g[r] = 0.0
+    g[:] = 0.0
     g[last] = 1.0
     for j in range(k):
         g[o + j] = arm.tip_slope[last, j]
@@ -153,9 +150,7 @@ def tip_load_jacobian(arm: Manipulator, i: int, q: Array, left: Array, right: Ar
     x = arm.length[i]
     G = work.own[0]
     for j in range(k):
-        g = 0.0
-        for t in range(k):
-            g += arm.tip_shortening[i, j, t] * q[o + t]
+        g = ordered_dot(arm.tip_shortening[i, j], q[o:o + k])
         x -= 0.5 * g * q[o + j]
         G[j] = g
     for r in range(q.size):
@@ -194,10 +189,9 @@ def link_jacobian(
     feq, fnq, fev, fnv = work.own[8], work.own[9], work.own[10], work.own[11]
     eta, etad, etadd = q[o:o + k], qd[o:o + k], qdd[o:o + k]
     shortening, phi, turned, turning = arm.G[i], arm.phi[i], left[i, o:o + k], right[i, o:o + k]
-    for r in range(k + 1):
-        Se[r], Sn[r] = 0.0, 0.0
-        feq[r], fnq[r], fev[r], fnv[r] = 0.0, 0.0, 0.0, 0.0
-    total, fe, fn = 0.0, 0.0, 0.0
+    Se[:], Sn[:] = 0.0, 0.0
+    work.own[8:] = 0.0
+    mass, fe, fn = 0.0, 0.0, 0.0
     shortening_gradient(shortening, eta, work.gradient[0])
     shortening_gradient(shortening, etad, work.gradient[1])
     shortening_gradient(shortening, etadd, work.gradient[2])
@@ -223,7 +217,7 @@ def link_jacobian(
         nv[0] = m * (2.0 * xd - 2.0 * y * w)
         Ae = m * (xdd - 2.0 * yd * w - y * wd - x * w * w)
         An = m * (ydd + 2.0 * xd * w + x * wd - y * w * w)
-        total += m
+        mass += m
         fe += Ae
         fn += An
         Ae += m * re
@@ -268,8 +262,8 @@ def link_jacobian(
         for j in range(k):
             right[o + j, r] += Se[1 + j] * e + Sn[1 + j] * f
         for side in range(2):
-            work.Fq[side, r] += total * Aq[side, r]
-            work.Fv[side, r] += total * Av[side, r]
+            work.Fq[side, r] += mass * Aq[side, r]
+            work.Fv[side, r] += mass * Av[side, r]
     feq[0], fnq[0] = -fn, fe  # the link's frame turns with q[i]
     for r in range(k + 1):
         row = i if r == 0 else o + r - 1
@@ -277,8 +271,8 @@ def link_jacobian(
         work.Fq[1, row] += s * feq[r] + c * fnq[r]
         work.Fv[0, row] += c * fev[r] - s * fnv[r]
         work.Fv[1, row] += s * fev[r] + c * fnv[r]
-    fe += total * re
-    fn += total * rn
+    fe += mass * re
+    fn += mass * rn
     work.F[0] += c * fe - s * fn
     work.F[1] += s * fe + c * fn
 
@@ -294,14 +288,8 @@ def force_jacobian(
     """
     n = q.size
     links = arm.length.size
-    total = work.F[2]
-    for r in range(n):
-        for t in range(n):
-            left[r, t] = 0.0
-            right[r, t] = 0.0
-        for side in range(2):
-            work.Aq[0, side, r] = 0.0
-            work.Av[0, side, r] = 0.0
+    mass = work.F[2]
+    left[:], right[:], work.Aq[0], work.Av[0] = 0.0, 0.0, 0.0, 0.0
     work.A[0, 0], work.A[0, 1] = work.a[0, 0], work.a[0, 1]
     x, y, along, across = 0.0, 0.0, 0.0, 0.0
     if arm.floating:
@@ -311,10 +299,10 @@ def force_jacobian(
         work.Aq[0, 0, n - 1], work.Aq[0, 1, n - 1] = -across, along
         work.Av[0, 0, n - 1], work.Av[0, 1, n - 1] = -2.0 * x * spin, -2.0 * y * spin
         # the translation of the base, from conservation of momentum
-        tx, ty = -work.F[0] / total, -work.F[1] / total
+        tx, ty = -work.F[0] / mass, -work.F[1] / mass
         for r in range(n):
-            tx -= work.P[0, r] * qdd[r] / total
-            ty -= work.P[1, r] * qdd[r] / total
+            tx -= work.P[0, r] * qdd[r] / mass
+            ty -= work.P[1, r] * qdd[r] / mass
         work.A[0, 0], work.A[0, 1] = along + tx, across + ty
     for i in range(links):
         move_station(arm, i, q, qd, qdd, work)
@@ -329,7 +317,7 @@ def force_jacobian(
             left[n - 1, r] += x * work.Fq[1, r] - y * work.Fq[0, r]
             right[n - 1, r] += x * work.Fv[1, r] - y * work.Fv[0, r]
         for r in range(n):
-            a, b = work.P[0, r] / total, work.P[1, r] / total
+            a, b = work.P[0, r] / mass, work.P[1, r] / mass
             for t in range(n):
                 left[r, t] -= a * work.Fq[0, t] + b * work.Fq[1, t]
                 right[r, t] -= a * work.Fv[0, t] + b * work.Fv[1, t]
@@ -375,10 +363,7 @@ def torque_jacobian(arm: Manipulator, q: Array, qd: Array, work: Workspace, dq: 
             if joint == links:
                 continue
             slopes = arm.root_slope[i] if end == 0 else arm.tip_slope[i]
-            slope, rate = 0.0, 0.0
-            for j in range(k):
-                slope += slopes[j] * q[o + j]
-                rate += arm.torque[o + j, joint] * qd[o + j]
+            slope, rate = ordered_dot(slopes, q[o:o + k]), ordered_dot(arm.torque[o:o + k, joint], qd[o:o + k])
             for t in range(k):
                 # B depends on the slope: so do the generalized force and, through B^T q', the joint rate and friction
                 turned = slope * slopes[t]
@@ -399,9 +384,7 @@ def elastic_jacobian(arm: Manipulator, q: Array, dq: Array, work: Workspace) -> 
         o = links + i * k
         EI = arm.stiffness[o] / arm.unit_stiffness[o]
         eta, tangent, curvature, slopes = q[o:o + k], work.tangent, arm.curvature[i], arm.slope[i]
-        for j in range(k):
-            for t in range(k):
-                tangent[j, t] = 0.0
+        tangent[:] = 0.0
         for p in range(arm.along.shape[1]):
             weight = EI * arm.along[i, p]
             if weight == 0.0:

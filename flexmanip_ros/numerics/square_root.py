@@ -19,8 +19,7 @@ def multiply(A: Array, B: Array, product: Array) -> None:
 def project(x: Array, S: Array, H: Array, offset: int, f: Array) -> float:
     """Return H x[offset:] and fill f = S[offset:, :f.size]' H'; f'f is the variance of H x[offset:]."""
     value = 0.0
-    for c in range(f.size):
-        f[c] = 0.0
+    f[:] = 0.0
     for i in range(H.size):
         if H[i] != 0.0:
             value += H[i] * x[offset + i]
@@ -42,6 +41,15 @@ def dot(a: Array, b: Array) -> float:
     for c in range(n, a.size):
         first += a[c] * b[c]
     return (first + second) + (third + fourth)
+
+
+@inner
+def ordered_dot(a: Array, b: Array) -> float:
+    """Return a . b, summed in the order of the elements: for short vectors, where ``dot`` gains nothing."""
+    value = 0.0
+    for c in range(a.size):
+        value += a[c] * b[c]
+    return value
 
 
 @inner
@@ -219,8 +227,8 @@ def least_distance(bounds: Bounds, count: int) -> bool:
             break
         forward(L[:count, :count], z[:count])
         backward(L[:count, :count], z[:count])
+    u[:] = 0.0
     for c in range(u.size):
-        u[c] = 0.0
         for i in range(count if found else 0):
             u[c] += z[i] * rows[i, c]
     return found

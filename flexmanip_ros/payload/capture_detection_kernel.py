@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flexmanip_ros.arm.equations_of_motion import solve
 from flexmanip_ros.numerics.compiled import inner, kernel, separate
-from flexmanip_ros.numerics.square_root import factor_information, forward
+from flexmanip_ros.numerics.square_root import factor_information, forward, ordered_dot
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.gauss_newton import UNFIT
 from flexmanip_ros.payload.measurement_update import MeasurementModel
@@ -109,10 +109,7 @@ def transition(motion: ProcessModel, flow: Array, state: Array, dt: float) -> No
                 motion.X[i, c] = flow[i, c]
         for i in range(2 * n):
             for c in range(2 * n):
-                value = 0.0
-                for j in range(2 * n):
-                    value += motion.X[i, j] * motion.X[j, c]
-                flow[i, c] = value
+                flow[i, c] = ordered_dot(motion.X[i], motion.X[:, c])
 
 
 @separate
@@ -140,10 +137,8 @@ def traces(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, 
         for i in range(sensors_count):
             offset = n if sensors.rate[i] else 0
             for c in range(DIRECTIONS):
-                value = 0.0
-                for j in range(n):
-                    value += sensors.H[i, j] * state[0, offset + j, c]
-                glr.trace[lag, i, 3 * c] = value * prior[0, c]
+                impulse = ordered_dot(sensors.H[i], state[0, offset:offset + n, c])
+                glr.trace[lag, i, 3 * c] = impulse * prior[0, c]
                 for order in range(1, 3):  # a step is the integral of an impulse, a ramp that of a step
                     a = 3 * c + order
                     value = 0.0
@@ -153,10 +148,7 @@ def traces(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, 
                     glr.trace[lag, i, a] = value * prior[order, c]
         for i in range(2 * n):
             for c in range(DIRECTIONS):
-                value = 0.0
-                for j in range(2 * n):
-                    value += flow[i, j] * state[0, j, c]
-                state[1, i, c] = value
+                state[1, i, c] = ordered_dot(flow[i], state[0, :, c])
         for i in range(2 * n):
             for c in range(DIRECTIONS):
                 state[0, i, c] = state[1, i, c]
@@ -172,8 +164,7 @@ def rescore(glr: GlrState) -> None:
     for lag in range(glr.clock[FILLED]):
         onset = (newest - lag) % w
         score = glr.scores[onset]
-        for a in range(TESTED):
-            score[a] = 0.0
+        score[:] = 0.0
         for since in range(lag + 1):
             for i in range(glr.trace.shape[1]):
                 e = glr.past[(onset + since) % w, i]
@@ -190,17 +181,13 @@ def information(m: mem.FilterState, glr: GlrState) -> None:
                 value = 0.0
                 for i in range(glr.trace.shape[1]):
                     value += glr.trace[lag, i, a] * glr.trace[lag, i, b] / m.noise[i, mem.EFFECTIVE]
-                glr.factors[lag, a, b] = value
-    # sums over the lags, then factors: the sums would be lost if each were factored at once
-    for lag in range(1, glr.trace.shape[0]):
-        for a in range(TESTED):
-            for b in range(a + 1):
-                glr.factors[lag, a, b] += glr.factors[lag - 1, a, b]
+                glr.factors[lag, a, b] = value + glr.factors[lag - 1, a, b] if lag > 0 else value
+    # factors after all sums over the lags, which would be lost if each were factored at once
     for lag in range(glr.trace.shape[0]):
         if not factor_information(glr.factors[lag]):  # no real arm: no onset can be found
+            glr.factors[lag] = 0.0
             for a in range(TESTED):
-                for b in range(a + 1):
-                    glr.factors[lag, a, b] = 1e150 if a == b else 0.0
+                glr.factors[lag, a, a] = 1e150
 
 
 @inner
@@ -210,8 +197,7 @@ def update_glr(m: mem.FilterState, glr: GlrState, scratch: Array) -> None:
     clock = glr.clock
     clock[NEWEST] = (clock[NEWEST] + 1) % w
     clock[FILLED] = min(clock[FILLED] + 1, w)
-    for a in range(TESTED):
-        glr.scores[clock[NEWEST], a] = 0.0
+    glr.scores[clock[NEWEST]] = 0.0
     for i in range(glr.trace.shape[1]):
         variance = max(m.innovation[i, 1], m.noise[i, mem.EFFECTIVE])
         most = 5.0 * np.sqrt(variance)
@@ -230,10 +216,7 @@ def update_glr(m: mem.FilterState, glr: GlrState, scratch: Array) -> None:
         for a in range(TESTED):
             scratch[a] = score[a]
         forward(glr.factors[lag], scratch)
-        statistic = 0.0
-        for a in range(TESTED):
-            statistic += scratch[a] * scratch[a]
-        best = max(best, statistic)
+        best = max(best, ordered_dot(scratch, scratch))
     glr.level[STATISTIC] = best
 
 

@@ -90,13 +90,12 @@ def begin_iteration(motion: ProcessModel, m: mem.FilterState) -> None:
     m.score[mem.COST] = 0.0
     m.score[mem.LOG_DETERMINANT] = 0.0
     m.counts[mem.LINEARIZED] = has_torque_noise(motion, m)
+    m.torque_noise[1], m.noise[:, mem.FIT] = 0.0, 0.0
+    m.g[:], m.batch[:], m.N[:], m.B[:] = 0.0, 0.0, 0.0, 0.0
     for i in range(motion.effort.size):
-        m.torque_noise[1, i] = 0.0
         for part in range(3):
             m.ringing[2, part, i] = m.ringing[1, part, i]
     for i in range(nx):
-        m.g[i] = 0.0
-        m.batch[i] = 0.0
         departure = dot(m.S0[i], m.xi)
         m.xr[i] = m.x0[i] + departure
         m.score[mem.COST] += m.xi[i] * m.xi[i]
@@ -104,11 +103,6 @@ def begin_iteration(motion: ProcessModel, m: mem.FilterState) -> None:
             m.Sr[i, c] = m.S0[i, c]
             m.Sr[i, used + c] = m.S0[i, c]
         m.Sr[i, 2 * used] = -departure
-        for c in range(nx):
-            m.N[i, c] = 0.0
-            m.B[i, c] = 0.0
-    for i in range(m.noise.shape[0]):
-        m.noise[i, mem.FIT] = 0.0
     expect_noise(m)
     m.counts[mem.ITERATED] = 0
     m.counts[mem.MEASURED] = 0
@@ -287,8 +281,6 @@ def widen_by_empty_arm(sensors: MeasurementModel, m: mem.FilterState) -> None:
     if root == 0.0:
         return
     for i in range(nx):
-        for c in range(sensors.noise.shape[1]):
-            sensors.noise[i, c] = 0.0
         for c in range(nx):
             sensors.f[c] = m.Sr[i, c] if c < m.counts[mem.USED] else 0.0
         backward(m.N, sensors.f)
@@ -304,10 +296,7 @@ def evidence_against_delays(motion: ProcessModel, sensors: MeasurementModel, m: 
     It is the density of the given delays after the samples over that before (Savage and Dickey). 0: all are known.
     """
     L, departure, first = sensors.L, sensors.f, m.x.size - motion.kind.size
-    for i in range(m.x.size):
-        departure[i] = 0.0
-        for c in range(i + 1):
-            L[i, c] = 0.0
+    L[:], departure[:] = 0.0, 0.0
     for a in range(motion.kind.size):
         if motion.kind[a] > MODE and dot(m.S[first + a], m.S[first + a]) > 0.0:
             departure[a] = (m.x[first + a] - motion.given[a]) / motion.prior[a]
@@ -337,8 +326,7 @@ def condition(x: Array, S: Array, row: int, value: float, f: Array) -> None:
         for c in range(f.size):
             S[i, c] -= gain * f[c]
     x[row] = value
-    for c in range(f.size):
-        S[row, c] = 0.0
+    S[row] = 0.0
 
 
 @separate

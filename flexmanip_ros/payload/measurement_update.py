@@ -221,9 +221,7 @@ def take_spectrum(m: mem.FilterState, i: int, difference: float) -> None:
     first, second, power = m.spectrum[i, 0], m.spectrum[i, 1], m.spectrum[i, 2]
     k = m.counts[mem.IN_SPECTRUM]
     if k == 0:
-        for j in range(mem.TONES):
-            first[j] = 0.0
-            second[j] = 0.0
+        first[:], second[:] = 0.0, 0.0
     windowed = HANN[k] * difference
     for j in range(mem.TONES):
         now = windowed + TURN[j] * first[j] - second[j]
@@ -268,9 +266,8 @@ def learn_noise(sensors: MeasurementModel, m: mem.FilterState) -> None:
     m.counts[mem.IN_BLOCK] += 1
     if m.counts[mem.STORED] < mem.HORIZON:
         m.counts[mem.IN_BLOCK] = 0
-        for i in range(m.noise.shape[0]):
-            m.noise[i, mem.BLOCK_SUM] = 0.0
-            m.noise[i, mem.BLOCK_POWER] = 0.0
+        m.noise[:, mem.BLOCK_SUM] = 0.0
+        m.noise[:, mem.BLOCK_POWER] = 0.0
     if m.counts[mem.IN_BLOCK] < sensors.block:
         return
     m.counts[mem.IN_BLOCK] = 0

@@ -158,10 +158,8 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: mem.Filte
             diffuse_linearized(motion, sensors, m)
     if measured and m.counts[mem.HELD] == 0 and m.counts[mem.MEASURED] % (BATCH * sensors.block) == 0:
         for a in range(used):
-            m.batch[a] = m.g[a] - m.batch[a]
-        for a in range(used):
             for b in range(a + 1):
-                m.B[a, b] += m.batch[a] * m.batch[b]
+                m.B[a, b] += (m.g[a] - m.batch[a]) * (m.g[b] - m.batch[b])
         for a in range(used):
             m.batch[a] = m.g[a]
     if not m.score[mem.COST] < LOST * (nx + m.noise.shape[0] * m.counts[mem.ITERATED]):
@@ -450,10 +448,9 @@ def diffuse(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState,
     m.score[mem.NOW] += duration
     if m.counts[mem.STORED] < mem.HORIZON or m.counts[mem.SINCE_NOISE] < sensors.noise_every:
         return
-    root, nx = np.sqrt(m.score[mem.NOW]), m.x.size
-    for i in range(nx):
-        for c in range(nx):
-            sensors.noise[i, c] = 0.0
+    root = np.sqrt(m.score[mem.NOW])
+    sensors.noise[:] = 0.0
+    for i in range(m.x.size):
         if dot(m.S[i], m.S[i]) > 0.0:  # what is taken as known stays
             sensors.noise[i, i] = sensors.diffusion[i] * root
         m.moved[i, 1] += sensors.noise[i, i] * sensors.noise[i, i]
@@ -483,8 +480,7 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, ta
         learn_noise(sensors, m)
     else:
         m.counts[mem.IN_A_ROW] = 0
-        for i in range(y.size):
-            m.innovation[i, 0] = 0.0
+        m.innovation[:, 0] = 0.0
     m.counts[mem.SINCE_NOISE] += 1
     gather_torque_noise(motion, m, m.torque_noise[0], m.counts[mem.EFFORTS] != mem.EXACT)
     # before that an empty arm's friction may be anything

@@ -16,7 +16,7 @@ from flexmanip_ros.arm.jacobian import add_body_forces, complete_jacobian, force
 from flexmanip_ros.arm.late_torque import late_torque
 from flexmanip_ros.arm.manipulator import Manipulator, Workspace
 from flexmanip_ros.numerics.compiled import inner, kernel, separate
-from flexmanip_ros.numerics.square_root import Bounds, dot, multiply
+from flexmanip_ros.numerics.square_root import Bounds, dot, multiply, ordered_dot
 from flexmanip_ros.types import Array
 
 SERIES = 12
@@ -177,10 +177,7 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
     arm, payload = motion.arm, motion.payload
     n = arm.stiffness.size
     k, links = arm.kappa, arm.length.size
-    for c in range(4):
-        payload[c] = 0.0
-    for i in range(links):
-        motion.gain[i] = 1.0
+    payload[:], motion.gain[:] = 0.0, 1.0
     first_rotor = True
     for c in range(motion.kind.size):
         value, kind, i = x[2 * n + c], motion.kind[c], motion.link[c]
@@ -212,8 +209,7 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
         elif kind == MODE:
             arm.stiffness[links + i] *= np.exp(value)
         elif kind == TORQUE_DELAY:
-            for joint in range(links):
-                motion.late[joint, 0] = value
+            motion.late[:, 0] = value
         elif kind == TORQUE_LAG:
             motion.late[i, 1] = value
 
@@ -350,17 +346,11 @@ def accelerate(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> bool:
 
 
 @inner
-def constant_mass_jacobian(motion: ProcessModel, qdd: Array) -> None:
-    """Do what ``force_jacobian`` does, for the mass matrix of the working point."""
-    motion.dq[:], motion.dqd[:], motion.dp[:] = 0.0, 0.0, 0.0
-    add_payload_columns(motion, qdd)
-
-
-@inner
 def linearize(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> None:
     """Fill motion.F (n, 2 n), the derivatives of the accelerations by q and q', right after ``accelerate`` there."""
-    if motion.frozen:
-        constant_mass_jacobian(motion, qdd)
+    if motion.frozen:  # forces on a constant mass matrix depend on neither q nor q'
+        motion.dq[:], motion.dqd[:], motion.dp[:] = 0.0, 0.0, 0.0
+        add_payload_columns(motion, qdd)
     else:
         force_jacobian(motion.arm, motion.payload, q, qd, qdd, motion.dq, motion.dqd, motion.dp, motion.work)
     complete_jacobian(motion.arm, q, qd, motion.dq, motion.dqd, motion.F, motion.work)
@@ -370,8 +360,8 @@ def linearize(motion: ProcessModel, q: Array, qd: Array, qdd: Array) -> None:
 def differentiate(motion: ProcessModel, qd: Array, qdd: Array, jerk: Array) -> None:
     """Fill jerk (n,) with the time derivative of the accelerations, by the linearization motion.F."""
     n = qd.size
+    jerk[:] = 0.0
     for r in range(n):
-        jerk[r] = 0.0
         for j in range(n):
             jerk[r] += motion.F[r, j] * qd[j] + motion.F[r, n + j] * qdd[j]
 
@@ -405,14 +395,12 @@ def parameter_columns(motion: ProcessModel, h: float) -> None:
     turns by a radian in a sample. Of Coulomb friction the mean alone is taken. ``linearize`` was just called at the
     mean state.
     """
-    n, opened = motion.arm.stiffness.size, motion.opened[0]
+    opened = motion.opened[0]
     if opened == 0:
         return
     within_step(motion, h)
     balance_columns(motion, motion.k[16], motion.k[17], motion.k[8], 0)
-    for r in range(n):
-        for p in range(4):
-            motion.dp[r, p] = 0.0
+    motion.dp[:] = 0.0
     add_payload_columns(motion, motion.k[6])
     balance_columns(motion, motion.k[4], motion.k[5], motion.k[6], opened)
     solve_columns(motion.work.M, motion.G, 2 * opened)
@@ -442,8 +430,7 @@ def balance_columns(motion: ProcessModel, q: Array, qd: Array, qdd: Array, first
     for c in range(motion.opened[0]):
         kind, i = motion.kind[motion.opened[1 + c]], motion.link[motion.opened[1 + c]]
         o, at = links + i * k, first + c
-        for r in range(n):
-            G[r, at] = 0.0
+        G[:, at] = 0.0
         if kind <= INERTIA:
             for r in range(n):
                 G[r, at] = motion.dp[r, kind]
@@ -460,15 +447,11 @@ def balance_columns(motion: ProcessModel, q: Array, qd: Array, qdd: Array, first
         elif kind == MODE:
             G[links + i, at] = arm.stiffness[links + i] * q[links + i]
         elif kind == ROTOR:
-            turn = 0.0
-            for r in range(n):
-                turn += arm.joint[i, r] * qdd[r]
+            turn = ordered_dot(arm.joint[i], qdd)
             for r in range(n):
                 G[r, at] = arm.joint[i, r] * turn
         elif kind == VISCOUS:
-            rate = 0.0
-            for r in range(n):
-                rate += motion.work.B[r, i] * qd[r]
+            rate = ordered_dot(motion.work.B[:, i], qd)
             for r in range(n):
                 G[r, at] = rate * motion.work.B[r, i]
         elif first > 0:
@@ -504,17 +487,12 @@ def friction_step(motion: ProcessModel, duration: float) -> float:
     for i in range(arm.length.size):
         if arm.coulomb[i] == 0.0:
             continue
-        change = 0.0
-        for r in range(qdd.size):
-            change += arm.joint[i, r] * qdd[r]
-        if abs(work.net[1, i]) >= 3.0 * STICTION_RATE + duration * abs(change):
+        if abs(work.net[1, i]) >= 3.0 * STICTION_RATE + duration * abs(ordered_dot(arm.joint[i], qdd)):
             continue
         for r in range(qdd.size):
             column[r] = work.B[r, i]
         solve(work.M, column)
-        mobility = 0.0
-        for r in range(qdd.size):
-            mobility += work.B[r, i] * column[r]
+        mobility = ordered_dot(work.B[:, i], column)
         step = min(step, 0.5 * motion.substeps, STIFF_STEP / max(work.net[2, i] * mobility, 1e-9))
     return step
 
@@ -617,9 +595,7 @@ def average(motion: ProcessModel, x: Array, h: float) -> None:
             force[r] = -arm.stiffness[r] * place[r] - arm.damping[r] * rate[r]
         for i in range(arm.length.size):
             if work.net[2, i] != 0.0:
-                turned = 0.0
-                for r in range(n):
-                    turned += work.B[r, i] * rate[r]
+                turned = ordered_dot(work.B[:, i], rate)
                 for r in range(n):
                     force[r] -= work.net[2, i] * turned * work.B[r, i]
         solve(work.M, force)
@@ -662,9 +638,9 @@ def lead(motion: ProcessModel, x: Array, h: float, turn: float) -> None:
         for j in range(n):  # by columns, which ``series`` reads in a row
             motion.X[j, i], motion.Y[j, i] = motion.F[i, j], motion.F[i, n + j]
     remainder(motion, x[:n], x[n:2 * n], qdd, first)
+    difference[:] = 0.0
     for i in range(n):
         place[i], rate[i] = x[n + i], qdd[i] - first[i]
-        difference[i] = 0.0
     series(motion, h, terms(turn, MOTION_ERROR), even_part(0.5 * STEP_ANGLE / motion.substeps * h))
     end, ending = motion.k[18], motion.k[19]
     for i in range(n):
@@ -681,7 +657,7 @@ def arrive(motion: ProcessModel, x: Array, h: float, turn: float) -> bool:
     remainder(motion, end, ending, motion.k[0], difference)
     for i in range(n):
         difference[i] -= first[i]
-        place[i], rate[i], first[i] = 0.0, 0.0, 0.0
+    place[:], rate[:], first[:] = 0.0, 0.0, 0.0
     series(motion, h, terms(turn, MISS_ERROR), even_part(0.5 * STEP_ANGLE / motion.substeps * h))
     largest = 0.0
     for i in range(n):
@@ -723,11 +699,9 @@ def series(motion: ProcessModel, h: float, count: int, part: tuple[float, float]
     weight = h
     for j in range(1, count):
         weight /= j + 1
-    for i in range(n):
-        moved[i], moving[i] = 0.0, 0.0
+    moved[:], moving[:] = 0.0, 0.0
     for j in range(count - 1, -1, -1):
-        for i in range(n):
-            following[i] = 0.0
+        following[:] = 0.0
         if j < count - 1:
             for c in range(n):
                 by_place, by_rate, at, going = motion.X[c], motion.Y[c], moved[c], moving[c]
@@ -772,8 +746,7 @@ def spread(
         for r in range(n):
             for p in range(count_p):
                 columns[r, p] = G[r, part * count_p + p]
-        for c in range(size):
-            product[c] = 0.0
+        product[:] = 0.0
         if count_p > 0:
             multiply(columns, parameters, product.reshape((n, used)))
     place, rate, moved, moving = start[:size], start[size:], now[:size], now[size:]
