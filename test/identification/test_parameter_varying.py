@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm import linearization
 from flexmanip_ros.errors import ModelError
-from flexmanip_ros.identification import parameter_varying, rpbsid
+from flexmanip_ros.identification import parameter_varying, prediction_check, rpbsid
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.identification.varying_kernel import basis, simulate_block
 from flexmanip_ros.identification.varying_model import Configurations
@@ -367,3 +367,19 @@ def test_missing_samples_cost_no_more_than_the_blocks_they_are_in() -> None:
     for one in late:
         assert np.all(np.abs([mode.frequency_hz for mode in one.modes] / truth(run, one) - 1.0) < 0.015)
         assert all(mode.frequency_std_hz < 0.01 * mode.frequency_hz for mode in one.modes)
+
+
+def test_a_prediction_is_judged_against_white_noise_and_not_against_its_own_residuals(run: Run) -> None:
+    model = identified(run).model
+    rng = np.random.default_rng(0)
+    u, x = np.repeat(rng.standard_normal((10, 2)), 100, axis=0), np.zeros(4)
+    y = np.empty((1000, 4))
+    for k in range(len(u)):
+        y[k] = model.C @ x + model.D @ u[k]
+        x = model.A @ x + model.B @ u[k]
+    y += 0.01 * y.std(axis=0) * rng.standard_normal(y.shape)
+    every = np.ones(len(u), dtype=np.bool_)
+    assert np.nanmax(prediction_check.missed(model, u, y, 45, every)) < 0.05
+    wrong = replace(model, A=model.A @ model.A, B=2.0 * model.B)
+    assert np.nanmax(prediction_check.missed(wrong, u, y, 45, every)) > 0.5
+    np.testing.assert_allclose(np.sqrt(prediction_check.white_noise(y)), 0.01 * y.std(axis=0), rtol=0.2)

@@ -49,16 +49,6 @@ def judged(found: Identified, u: Array, y: Array, bends: int = 0, turned: float 
     return prediction_check.judged(found, rows, ('a/position', 'b/position'), bends, turned, since)
 
 
-def test_a_prediction_is_judged_against_white_noise_and_not_against_its_own_residuals() -> None:
-    model, u = two_modes(5.6, 8.2), torques(10)
-    clean, every = validation.simulate(model, u), np.ones(1000, dtype=np.bool_)
-    y = clean + 0.01 * clean.std(axis=0) * np.random.default_rng(1).standard_normal(clean.shape)
-    assert np.nanmax(prediction_check.missed(model, u, y, 45, every)) < 0.05
-    wrong = replace(model, A=model.A @ model.A, B=2.0 * model.B)
-    assert np.nanmax(prediction_check.missed(wrong, u, y, 45, every)) > 0.5
-    np.testing.assert_allclose(np.sqrt(prediction_check.white_noise(y)), 0.01 * y.std(axis=0), rtol=0.2)
-
-
 @pytest.mark.parametrize('lost', [False, True])
 def test_a_frequency_that_is_three_per_cent_off_is_found_out_though_it_predicts(lost: bool) -> None:
     u = torques()
