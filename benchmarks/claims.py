@@ -530,10 +530,22 @@ def claims_of(name: str, result: Any) -> list[Claim]:
     return list(CLAIMS[name](result)) if name in CLAIMS else []
 
 
+def read(name: str) -> Any:
+    """Return what a benchmark measured last; None where there is no result."""
+    path = RESULTS / f'{name}.json'
+    return json.loads(path.read_text(encoding='utf-8')) if path.exists() else None
+
+
 def recorded(name: str) -> list[Claim]:
     """Return the claims of a benchmark with the values that it measured last."""
-    path = RESULTS / f'{name}.json'
-    return claims_of(name, json.loads(path.read_text(encoding='utf-8'))) if path.exists() else []
+    result = read(name)
+    return [] if result is None else claims_of(name, result)
+
+
+def write(name: str, result: Any) -> None:
+    """Write what a benchmark measured."""
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / f'{name}.json').write_text(json.dumps(result, indent=1) + '\n', encoding='utf-8')
 
 
 def digest(name: str) -> str:

@@ -12,10 +12,9 @@ and 15 N m are added until the move. Once more with the mass of the estimate alo
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import Any
 
+import claims
 import numpy as np
 
 from flexmanip_ros import pipeline
@@ -32,7 +31,6 @@ from flexmanip_ros.parameters import (
 from flexmanip_ros.simulation import simulator, waveforms
 from flexmanip_ros.types import CaptureEvent, EventKind
 
-HERE = Path(__file__).resolve().parent
 CAPTURE, MOVE, COUNT = 1000, 4000, 10000
 STEP = np.array([0.1, -0.1])
 BAND = 0.005
@@ -109,9 +107,7 @@ def main() -> None:
         print(f'| {row["mass_kg"]:.0f} | {"yes" if row["body"] else "no"} | {knows} | {row["scheduled"][0]:.2f} | '
               f'{settling} | {row["peak_bend_capture_mm"]:.2f} | {row["peak_bend_move_mm"]:.2f} | '
               f'{row["end_bend_mm"]:.2f} |', flush=True)
-    target = HERE / 'results' / 'control_payload.json'
-    target.parent.mkdir(exist_ok=True)
-    target.write_text(json.dumps(rows, indent=1) + '\n', encoding='utf-8')
+    claims.write('control_payload', rows)
 
 
 if __name__ == '__main__':

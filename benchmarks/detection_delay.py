@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
+import claims
 import numpy as np
 from parts import payload_trials as trials
 
@@ -111,7 +112,7 @@ def main() -> None:
     for row in (delays(arguments.runs), at_rest(max(4, arguments.runs // 4)), false_alarms(arguments.hours)):
         rows.append(row)
         print(row, flush=True)
-    trials.write('detection_delay', rows)
+    claims.write('detection_delay', rows)
 
 
 if __name__ == '__main__':

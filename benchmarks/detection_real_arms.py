@@ -12,8 +12,8 @@ from __future__ import annotations
 import argparse
 from typing import Any, NamedTuple
 
+import claims
 import numpy as np
-from parts import payload_trials as trials
 from parts.real_arms import CAPTURE, CASES, plant_of, simulate, told
 
 from flexmanip_ros import pipeline
@@ -71,7 +71,7 @@ def main() -> None:
         print(row, [f'{run.dated_ms:.0f} ms, {run.others} others, {run.payload.status.name}' for run in done],
               flush=True)
     if given.cases == list(CASES):
-        trials.write('detection_real_arms', rows)
+        claims.write('detection_real_arms', rows)
 
 
 if __name__ == '__main__':

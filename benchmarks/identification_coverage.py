@@ -10,10 +10,9 @@ Use: identification_coverage.py [runs].
 
 from __future__ import annotations
 
-import json
 import sys
-from pathlib import Path
 
+import claims
 import numpy as np
 
 from flexmanip_ros.arm.linearization import blocks, discretize, vibration_model
@@ -26,6 +25,7 @@ from flexmanip_ros.samples.sample_log import log_of
 
 DT, COUNT, MASS = 1e-3, 3000, 20.0
 THETA = np.radians([60.0, 45.0])
+DAMPING = 0.01
 NAMES = ('f1', 'f2', 'damping 1', 'damping 2', 'payload')
 SEEDS = {40.0: 0, 20.0: 1_000_000}
 """First seed of each level."""
@@ -83,10 +83,10 @@ def influence(arm: ArmParameters, u: np.ndarray, clean: np.ndarray, spread: np.n
     return np.asarray(np.linalg.solve(R.T, (gradient / size).T).T @ Q.T)
 
 
-def study(runs: int, snr_db: float, damping: float) -> dict[str, object]:
-    arm = ArmParameters(torque_convention='paper', damping_ratio=damping, modes=1)
+def study(runs: int, snr_db: float) -> dict[str, object]:
+    arm = ArmParameters(torque_convention='paper', damping_ratio=DAMPING, modes=1)
     config = configure(IdentifierParameters, {
-        'arm.torque_convention': 'paper', 'arm.damping_ratio': damping, 'arm.modes': 1,
+        'arm.torque_convention': 'paper', 'arm.damping_ratio': DAMPING, 'arm.modes': 1,
         'payload_method': 'block'})
     u, clean, truth = clean_response(arm)
     spread = np.sqrt(np.mean(clean ** 2, axis=0) * 10.0 ** (-snr_db / 10.0))
@@ -112,7 +112,7 @@ def study(runs: int, snr_db: float, damping: float) -> dict[str, object]:
         deviations.append([*std, held.std])
     cover = np.mean(inside, axis=0)
     return {
-        'snr_db': snr_db, 'damping_ratio': damping, 'runs': runs, 'names': NAMES,
+        'snr_db': snr_db, 'damping_ratio': DAMPING, 'runs': runs, 'names': NAMES,
         'coverage_percent': (100 * cover).tolist(),
         'exact_percent': (100 * np.mean(exact, axis=0)).tolist(),
         'claimed_over_bound': (np.median(deviations, axis=0) / bound).tolist(),
@@ -125,17 +125,14 @@ def main() -> None:
     rows = []
     print(f'{"case":<22}' + ''.join(f'{name:>12}' for name in NAMES))
     for snr_db in (40.0, 20.0):
-        for damping in (0.01,):
-            row = study(runs, snr_db, damping)
-            rows.append(row)
-            label = f'{snr_db:.0f} dB, damping {damping}'
-            print(f'{label:<22}' + ''.join(f'{c:11.1f}%' for c in row['coverage_percent']), flush=True)
-            print(f'  {"exact, same noise":<20}' + ''.join(f'{c:11.1f}%' for c in row['exact_percent']))
-            for what in ('bias', 'scatter', 'claimed', 'claimed_over_bound'):
-                print(f'  {what:<20}' + ''.join(f'{c:12.2e}' for c in row[what]), flush=True)
-    target = Path(__file__).parent / 'results' / 'identification_coverage.json'
-    target.parent.mkdir(exist_ok=True)
-    target.write_text(json.dumps(rows, indent=1) + '\n')
+        row = study(runs, snr_db)
+        rows.append(row)
+        label = f'{snr_db:.0f} dB, damping {DAMPING}'
+        print(f'{label:<22}' + ''.join(f'{c:11.1f}%' for c in row['coverage_percent']), flush=True)
+        print(f'  {"exact, same noise":<20}' + ''.join(f'{c:11.1f}%' for c in row['exact_percent']))
+        for what in ('bias', 'scatter', 'claimed', 'claimed_over_bound'):
+            print(f'  {what:<20}' + ''.join(f'{c:12.2e}' for c in row[what]), flush=True)
+    claims.write('identification_coverage', rows)
 
 
 if __name__ == '__main__':

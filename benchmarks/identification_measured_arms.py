@@ -14,6 +14,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+import claims
 import numpy as np
 
 from flexmanip_ros.identification import rpbsid
@@ -74,8 +75,7 @@ def words(scores: object) -> str:
 
 
 def main() -> None:
-    target = ROOT / 'benchmarks' / 'results' / 'identification_measured_arms.json'
-    recorded = json.loads(target.read_text(encoding='utf-8')) if target.exists() else {}
+    recorded = claims.read('identification_measured_arms') or {}
     table: dict[str, object] = {}
     for name, inputs, share, settings in CASES:
         if not (DATA / name).exists():
@@ -96,8 +96,7 @@ def main() -> None:
         for label, score in others.items():
             print(f'  {label:<48} simulation {words(score)}')
         table[name] = {**rows, **others}
-    target.parent.mkdir(exist_ok=True)
-    target.write_text(json.dumps(recorded | table, indent=1) + '\n')
+    claims.write('identification_measured_arms', recorded | table)
 
 
 if __name__ == '__main__':

@@ -13,9 +13,9 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
+import claims
 import numpy as np
 from identification_moving_arm import frequencies
 from identification_status import LATELY_S, misses, renamed
@@ -164,8 +164,7 @@ def main() -> None:
             ('multisine, 100 Hz', slow, multisine, quiet, 0.0)):
         table.append(row_of(name, arm, run, messages(run, noise, lost, 1)))
         print(json.dumps(table[-1]), flush=True)
-    target = Path(__file__).parent / 'results' / 'identification_missions.json'
-    target.write_text(json.dumps(table, indent=1) + '\n', encoding='utf-8')
+    claims.write('identification_missions', table)
 
 
 if __name__ == '__main__':

@@ -10,10 +10,9 @@ Use: identification_moving_arm.py [seeds]
 from __future__ import annotations
 
 import itertools
-import json
 import sys
-from pathlib import Path
 
+import claims
 import numpy as np
 
 from flexmanip_ros import pipeline
@@ -89,8 +88,7 @@ def main() -> None:
             table.append(row)
             print(f'{label + f", f{i + 1} {name}":<24}'
                   + ''.join(f'{value:13.3f}' for value in list(row.values())[3:]), flush=True)
-    target = Path(__file__).parent / 'results' / 'identification_moving_arm.json'
-    target.write_text(json.dumps(table, indent=1) + '\n')
+    claims.write('identification_moving_arm', table)
 
 
 if __name__ == '__main__':

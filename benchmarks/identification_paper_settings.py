@@ -7,10 +7,9 @@ block extraction averaged over 4-6 s, 20 seeds.
 
 from __future__ import annotations
 
-import json
 import sys
-from pathlib import Path
 
+import claims
 import numpy as np
 
 from flexmanip_ros.arm.linearization import blocks, discretize, vibration_model
@@ -97,9 +96,7 @@ def main() -> None:
         rows.append(row)
         print(f'{name:<52}{row["mean_percent"]:8.2f}%{row["median_percent"]:8.2f}%{row["rms_percent"]:8.2f}%',
               flush=True)
-    target = Path(__file__).parent / 'results' / 'identification_paper_settings.json'
-    target.parent.mkdir(exist_ok=True)
-    target.write_text(json.dumps(rows, indent=1) + '\n')
+    claims.write('identification_paper_settings', rows)
 
 
 if __name__ == '__main__':

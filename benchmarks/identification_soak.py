@@ -7,12 +7,12 @@ Use: identification_soak.py [samples].
 
 from __future__ import annotations
 
-import json
 import resource
 import sys
 import time
 from pathlib import Path
 
+import claims
 import numpy as np
 
 from flexmanip_ros.arm.linearization import discretize, vibration_model
@@ -100,9 +100,7 @@ def main() -> None:
               f'{row["us_per_sample"]:.2f} us, peak {row["peak_memory_mb"]:.0f} MB, '
               f'grown {row["grown_mb"]:.2f} MB', flush=True)
         samples = min(samples, 1_000_000)  # the default in full, the others for comparison
-    target = Path(__file__).parent / 'results' / 'identification_soak.json'
-    target.parent.mkdir(exist_ok=True)
-    target.write_text(json.dumps(rows, indent=1) + '\n')
+    claims.write('identification_soak', rows)
 
 
 if __name__ == '__main__':

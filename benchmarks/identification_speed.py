@@ -6,11 +6,11 @@ the Givens update alone, the paper's recursion, and how all of it grows with p a
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from pathlib import Path
 
+import claims
 import numpy as np
 from numba import njit
 
@@ -146,9 +146,7 @@ def main() -> None:
                 print(f'p = {p:<4} m = {m:<3}{value:10.2f} us', flush=True)
     if growth:
         draw(growth)
-    target = Path(__file__).parent / 'results' / 'identification_speed.json'
-    target.parent.mkdir(exist_ok=True)
-    target.write_text(json.dumps({'microseconds': table, 'growth': growth}, indent=1) + '\n')
+    claims.write('identification_speed', {'microseconds': table, 'growth': growth})
 
 
 if __name__ == '__main__':

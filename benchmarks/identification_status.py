@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import claims
 import numpy as np
 from identification_moving_arm import CONFIGURATIONS, frequencies
 from identification_suggested import CASES
@@ -206,8 +207,7 @@ def main() -> None:
     total = sum(row['readings'] for row in table)
     print(f'{"all":<44}{total:10d}{sum(row["tracking"] for row in table):10d}{sum(row["band"] for row in table):10d}'
           f'{sum(row["prediction"] for row in table):12d}{100 * sum(row["wrong"] for row in table) / total:9.2f}')
-    target = ROOT / 'benchmarks' / 'results' / 'identification_status.json'
-    target.write_text(json.dumps(table, indent=1) + '\n', encoding='utf-8')
+    claims.write('identification_status', table)
 
 
 if __name__ == '__main__':

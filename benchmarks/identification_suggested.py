@@ -10,12 +10,12 @@ half, which the suggestion does not. Records: folder FLEXMANIP_DATA or ../shared
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import time
 from pathlib import Path
 from typing import NamedTuple
 
+import claims
 import numpy as np
 
 from flexmanip_ros.cli.replay import Request, identify
@@ -104,8 +104,7 @@ def grids(u: Array, y: Array, dt: float, half: int) -> tuple[Best, Best]:
 
 
 def main() -> None:
-    target = ROOT / 'benchmarks' / 'results' / 'identification_suggested.json'
-    table = json.loads(target.read_text(encoding='utf-8')) if target.exists() else {}
+    table = claims.read('identification_suggested') or {}
     for name, (inputs, outputs) in CASES.items():
         if not (DATA / name).exists():
             print(f'{name}: not at {DATA}, skipped')
@@ -115,7 +114,7 @@ def main() -> None:
         half = len(signals.stamp_ns) // 2
         half_s, dt = float(signals.time[half]), float(signals.time[1])
         begin = time.perf_counter()
-        place = target.parent / 'suggested.yaml'
+        place = claims.RESULTS / 'suggested.yaml'
         config, _ = suggest(str(DATA / name), str(place), given, bag.Topics(), half_s, HORIZON_S)
         place.unlink()
         took = time.perf_counter() - begin
@@ -133,8 +132,7 @@ def main() -> None:
                        'wide_best': wide.name, 'simulation': summary.vaf_simulation_percent,
                        'gain': float(np.mean(ours)) - best.mean, 'gain_wide': float(np.mean(ours)) - wide.mean,
                        'seconds': took}
-    target.parent.mkdir(exist_ok=True)
-    target.write_text(json.dumps(table, indent=1) + '\n', encoding='utf-8')
+    claims.write('identification_suggested', table)
 
 
 if __name__ == '__main__':

@@ -7,13 +7,12 @@ capture on; truth: the linearized arm at the true chords of the instant. Use: id
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
+import claims
 import numpy as np
 from identification_moving_arm import frequencies
 from identification_status import renamed
@@ -149,8 +148,7 @@ def show(words: str, found: dict[str, Any]) -> None:
 def main() -> None:
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 600.0
     table = [follow(name, seconds) for name in PLANTS]
-    target = Path(__file__).parent / 'results' / 'identification_ten_minutes.json'
-    target.write_text(json.dumps(table, indent=1) + '\n', encoding='utf-8')
+    claims.write('identification_ten_minutes', table)
 
 
 if __name__ == '__main__':

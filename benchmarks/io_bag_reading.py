@@ -6,13 +6,12 @@ written, and the identifier's update on as many samples: microseconds a message,
 
 from __future__ import annotations
 
-import json
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+import claims
 import numpy as np
 from identification_speed import identifier
 from rosbags.rosbag2 import Reader
@@ -38,7 +37,7 @@ def best(work: Callable[[], object]) -> float:
     return 1e6 * min(times) / MESSAGES
 
 
-def main() -> int:
+def main() -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
     rng = np.random.default_rng(1)
     records = [JointRecord(k * 1_000_000, NAMES, *rng.normal(size=(3, 4))) for k in range(MESSAGES)]
@@ -79,12 +78,8 @@ def main() -> int:
         }
     for name, value in rows.items():
         print(f'{name:28s} {value:8.2f} us a message')
-    results = Path(__file__).parent / 'results'
-    results.mkdir(exist_ok=True)
-    (results / 'io_bag_reading.json').write_text(
-        json.dumps({'us_per_message': rows}, indent=1) + '\n', encoding='utf-8')
-    return 0
+    claims.write('io_bag_reading', {'us_per_message': rows})
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

@@ -16,6 +16,7 @@ import argparse
 from dataclasses import replace
 from typing import Any
 
+import claims
 import numpy as np
 from parts import payload_trials as trials
 from parts.all_bounds import everything
@@ -126,7 +127,7 @@ def main() -> None:
             rows.append(row)
             print(f'{name:28}{count:9d}{true[name]:10.4g}' + (f"{row['prior']:10.3g}" if of_arm else ' ' * 10)
                   + f"{row['bound']:10.3g}{rms:10.3g}{row['efficiency']:10.2f}", flush=True)
-    trials.write('payload_bounds', [{'runs': runs, 'tracking': len(tracking)}, *rows])
+    claims.write('payload_bounds', [{'runs': runs, 'tracking': len(tracking)}, *rows])
 
 
 if __name__ == '__main__':

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import claims
 import numpy as np
 from parts import payload_trials as trials
 
@@ -108,7 +109,7 @@ def main() -> None:
         for learned in (False, True):
             rows.append(run(name, learned, **changed))
             print(name, 'learned' if learned else 'told', *list(rows[-1].values())[2:], flush=True)
-    trials.write('payload_combinations', rows)
+    claims.write('payload_combinations', rows)
 
 
 if __name__ == '__main__':

@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import claims
 import numpy as np
 from parts import payload_trials as trials
 
@@ -84,7 +85,7 @@ def main() -> None:
         print(f'{case.name:14}', f'{count} runs, after {MARKS} ms: coverage', row['coverage'])
         print('  rms error %', row['rms_percent'], 'median', row['median_percent'], 'error/std',
               row['rms_normalised'], flush=True)
-    trials.write('payload_coverage', rows)
+    claims.write('payload_coverage', rows)
 
 
 if __name__ == '__main__':

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 
+import claims
 import numpy as np
 from parts import payload_trials as trials
 
@@ -64,7 +65,7 @@ def main() -> None:
         'tracking_and_outside_percent': trials.numbers(100.0 * np.mean(wrong), 2)}
     for name, value in row.items():
         print(f'{name:30}', value)
-    trials.write('payload_elements', [row])
+    claims.write('payload_elements', [row])
 
 
 if __name__ == '__main__':

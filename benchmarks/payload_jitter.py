@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
+import claims
 import numpy as np
 from parts import payload_trials as trials
 from parts.real_arms import CAPTURE, SAMPLES, plant_of, told
@@ -83,7 +84,7 @@ def main() -> None:
                      'within_0.7_percent': int(np.sum(np.array(errors) <= 0.7)),
                      'worst_percent': round(float(max(errors)), 3)})
         print(rows[-1], flush=True)
-    trials.write('payload_jitter', rows)
+    claims.write('payload_jitter', rows)
 
 
 if __name__ == '__main__':

@@ -15,17 +15,17 @@ from __future__ import annotations
 
 import argparse
 
+import claims
 import numpy as np
 from parts import payload_trials as trials
+from payload_block import ARM, states
 
-from flexmanip_ros.arm.linearization import discretize, vibration_model
-from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
+from flexmanip_ros.parameters import ExcitationParameters, PlantParameters
 from flexmanip_ros.parameters.identifier import LEARNABLE
 from flexmanip_ros.payload import cramer_rao
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
 
-ARM = ArmParameters(torque_convention='paper', angle_convention='chord', modes=1)
 MARKS = (250, 1000, 3000)
 LATE = tuple(range(1100, 3001, 100))
 """From 4 to 6 s."""
@@ -35,14 +35,9 @@ LEARNED = {'known': ('',), 'learned': ('stiffness', 'damping'), 'all learned': L
 
 def bound(theta: np.ndarray, payload: float, efforts: np.ndarray) -> np.ndarray:
     """Deviations [%] at the marks, 40 dB of each output's variation."""
-    empty, loaded = (discretize(*vibration_model(ARM, theta, mass, 1), 1e-3) for mass in (0.0, payload))
-    states, x = np.zeros((6000, 4)), np.zeros(4)
-    for k in range(6000):
-        states[k] = x
-        A, B = empty if k < CAPTURE else loaded
-        x = A @ x + B @ efforts[k]
+    X = states(theta, payload, efforts)
     found = cramer_rao.structure_known(
-        ARM, theta, payload, states[CAPTURE:], efforts[CAPTURE:6000], 0.01 * states.std(axis=0), 1e-3, MARKS)
+        ARM, theta, payload, X[CAPTURE:], efforts[CAPTURE:6000], 0.01 * X.std(axis=0), 1e-3, MARKS)
     return 100 * found / payload
 
 
@@ -84,7 +79,7 @@ def main() -> None:
                 rows.append(row)
                 print(f"{degrees!s:14}{payload:6.0f}  {name:12}", row['rms_percent'], row['ratio'],
                       row['mean_relative_percent_4_to_6_s'], row['coverage'], flush=True)
-    trials.write('payload_linear', rows)
+    claims.write('payload_linear', rows)
 
 
 if __name__ == '__main__':

@@ -15,6 +15,7 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from typing import NamedTuple
 
+import claims
 import numpy as np
 from parts import payload_trials as trials
 
@@ -98,7 +99,7 @@ def main() -> None:
             'rms_error_at_the_end_g': round(1e3 * float(trials.rms(last)), 1)}
         rows.append(row)
         print(row, flush=True)
-    trials.write('payload_minute', rows)
+    claims.write('payload_minute', rows)
 
 
 if __name__ == '__main__':

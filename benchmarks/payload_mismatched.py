@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import claims
 import numpy as np
 from parts import payload_trials as trials
 from parts.rigid_chain import Chain, noisy
@@ -135,7 +136,7 @@ def main() -> None:
         rows.append(row)
         print(f'{name:30}', row['worst_percent'], row['half_width_percent'], row['coverage'], row['status'],
               flush=True)
-    trials.write('payload_mismatched', rows)
+    claims.write('payload_mismatched', rows)
 
 
 if __name__ == '__main__':

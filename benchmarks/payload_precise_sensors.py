@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import claims
 import numpy as np
 from parts import payload_trials as trials
 from parts.real_arms import CAPTURE, plant_of, simulate, told
@@ -93,7 +94,7 @@ def main() -> None:
             'worst_error_percent': round(max(abs(row['error_percent']) for row in here), 3),
             'median_half_width_percent': round(float(np.median([row['half_width_percent'] for row in here])), 3)})
         print(rows[-1])
-    trials.write('payload_precise_sensors', rows)
+    claims.write('payload_precise_sensors', rows)
     plot()
 
 

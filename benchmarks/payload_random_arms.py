@@ -18,6 +18,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import claims
 import numpy as np
 from parts import payload_trials as trials
 from parts.real_arms import IDEAL, SINES, told
@@ -146,7 +147,7 @@ def main() -> None:
         'runs_with_more_than_5_percent_wrong': [row['run'] for row in rows if row['wrong'] > 0.05]}
     print(result)
     if given.first == 0:
-        trials.write('payload_random_arms', result)
+        claims.write('payload_random_arms', result)
 
 
 if __name__ == '__main__':

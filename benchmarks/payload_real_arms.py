@@ -13,6 +13,7 @@ import math
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
+import claims
 import numpy as np
 from parts import payload_trials as trials
 from parts.real_arms import CAPTURE, CASES, plant_of, simulate, told
@@ -65,7 +66,7 @@ def main() -> None:
         print(row, [f'{error:.2f} {found.status.name}' for error, (_, found, _) in zip(errors, done, strict=True)],
               flush=True)
     if given.cases == list(CASES):
-        trials.write('payload_real_arms', rows)
+        claims.write('payload_real_arms', rows)
 
 
 if __name__ == '__main__':

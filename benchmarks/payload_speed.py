@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 
+import claims
 import numpy as np
 from parts import payload_trials as trials
 
@@ -50,7 +51,7 @@ def main() -> None:
     rows = [timed(kappa) for kappa in (1, 3, 5)]
     for row in rows:
         print(row)
-    trials.write('payload_speed', rows)
+    claims.write('payload_speed', rows)
 
 
 if __name__ == '__main__':

@@ -9,10 +9,10 @@ Use: python benchmarks/plant_convergence.py
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
+import claims
 import matplotlib as mpl
 import numpy as np
 from scipy.linalg import eigh
@@ -32,7 +32,7 @@ ARM = ArmParameters(damping_ratio=0.01)
 CONFIG = PlantParameters(noise='none', arm=ARM, elements=ELEMENTS)
 
 
-def main() -> int:
+def main() -> None:
     """Compute, print, draw and write."""
     theta = np.array(CONFIG.initial_angles)
     parts = models.chain(ARM, CONFIG.initial_angles, ELEMENTS)
@@ -54,10 +54,7 @@ def main() -> int:
         print(f'kappa {kappa:2}: frequencies ' + ' '.join(f'{value:.1e}' for value in shift).ljust(32)
               + ' joint1 {:.1e} joint2 {:.1e} bend1 {:.1e} bend2 {:.1e}'.format(*gap))
     draw(rows)
-    target = HERE / 'results' / 'plant_convergence.json'
-    target.parent.mkdir(exist_ok=True)
-    target.write_text(json.dumps({'elements': ELEMENTS, 'rows': rows}, indent=1) + '\n', encoding='utf-8')
-    return 0
+    claims.write('plant_convergence', {'elements': ELEMENTS, 'rows': rows})
 
 
 def draw(rows: list[dict]) -> None:
@@ -82,4 +79,4 @@ def draw(rows: list[dict]) -> None:
 
 
 if __name__ == '__main__':
-    raise SystemExit(main())
+    main()

@@ -9,10 +9,10 @@ Use: python benchmarks/plant_hour.py [--minutes N]
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from pathlib import Path
 
+import claims
 import numpy as np
 
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, PlantParameters
@@ -27,7 +27,7 @@ def resident_mb() -> float:
     return pages * 4096 / 1e6
 
 
-def main() -> int:
+def main() -> None:
     """Run, print and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--minutes', type=int, default=60)
@@ -54,14 +54,11 @@ def main() -> int:
     samples = minutes * 60 * RATE
     print(f'{minutes} min simulated in {wall:.0f} s ({wall / samples * 1e6:.1f} us a sample); memory '
           f'{settled[0]:.1f} MB, grown by {grown:.2f} MB; bend up to {1e3 * largest:.1f} mm')
-    target = Path(__file__).parent / 'results' / 'plant_hour.json'
-    target.parent.mkdir(exist_ok=True)
-    target.write_text(json.dumps({
+    claims.write('plant_hour', {
         'minutes': minutes, 'wall_s': wall, 'us_per_sample': wall / samples * 1e6,
         'resident_mb': settled[0], 'grown_mb': grown, 'largest_bend_mm': 1e3 * largest,
-    }, indent=1) + '\n', encoding='utf-8')
-    return 0
+    })
 
 
 if __name__ == '__main__':
-    raise SystemExit(main())
+    main()

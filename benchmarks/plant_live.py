@@ -10,13 +10,12 @@ Use: python benchmarks/plant_live.py [--seconds N]
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import os
 import time
-from pathlib import Path
 from typing import Any
 
+import claims
 import numpy as np
 
 RATE = 1000.0
@@ -99,7 +98,7 @@ def jitter(ticks: np.ndarray) -> dict[str, float]:
     return {name: float(np.percentile(off, p)) for name, p in (('p50', 50), ('p99', 99), ('p99.9', 99.9))}
 
 
-def main() -> int:
+def main() -> None:
     """Measure, print and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seconds', type=float, default=60.0)
@@ -128,11 +127,8 @@ def main() -> int:
         'share_of_a_core_bare_timer': bare_share}
     for name, value in results.items():
         print(f'{name}: {value}')
-    target = Path(__file__).parent / 'results' / 'plant_live.json'
-    target.parent.mkdir(exist_ok=True)
-    target.write_text(json.dumps(results, indent=1) + '\n', encoding='utf-8')
-    return 0
+    claims.write('plant_live', results)
 
 
 if __name__ == '__main__':
-    raise SystemExit(main())
+    main()

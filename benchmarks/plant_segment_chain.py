@@ -13,10 +13,9 @@ Use: python benchmarks/plant_segment_chain.py [--time SECONDS]
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
-from pathlib import Path
 
+import claims
 import mujoco
 import numpy as np
 
@@ -106,7 +105,7 @@ def difference(a: np.ndarray, b: np.ndarray) -> list[float]:
     return (100 * np.sqrt(np.mean((a - b) ** 2, axis=0)) / b.std(axis=0)).tolist()
 
 
-def main() -> int:
+def main() -> None:
     """Run the cases, print and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--time', type=float, default=3.0, help='seconds simulated a case')
@@ -129,11 +128,8 @@ def main() -> int:
             results.append({'case': name, 'shape_functions': shapes, 'second_order': second,
                             'peak_bend_mm': peak,
                             'relative_rms_percent': dict(zip(simulator.joint_names(2), row, strict=True))})
-    target = Path(__file__).parent / 'results' / 'plant_segment_chain.json'
-    target.parent.mkdir(exist_ok=True)
-    target.write_text(json.dumps(results, indent=1) + '\n', encoding='utf-8')
-    return 0
+    claims.write('plant_segment_chain', results)
 
 
 if __name__ == '__main__':
-    raise SystemExit(main())
+    main()

@@ -10,11 +10,10 @@ Use: python benchmarks/plant_speed.py
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
-from pathlib import Path
 
+import claims
 import numpy as np
 from scipy.integrate import solve_ivp
 
@@ -66,7 +65,7 @@ def with_scipy(config: PlantParameters, efforts: np.ndarray) -> np.ndarray:
     return np.vstack(rows)
 
 
-def main() -> int:
+def main() -> None:
     """Measure, print and write the table."""
     efforts = excitation.sequence(ExcitationParameters(), SAMPLES)
     results: list[dict[str, object]] = []
@@ -106,11 +105,8 @@ def main() -> int:
             state, _ = simulator.step(live, state, torque)
 
     report('live interface, kappa 3', best(stepping, repeats=2))
-    target = Path(__file__).parent / 'results' / 'plant_speed.json'
-    target.parent.mkdir(exist_ok=True)
-    target.write_text(json.dumps(results, indent=1) + '\n', encoding='utf-8')
-    return 0
+    claims.write('plant_speed', results)
 
 
 if __name__ == '__main__':
-    raise SystemExit(main())
+    main()

@@ -9,7 +9,6 @@ after the first and after the last tenth of the examples. Use: ros_fuzz.py [EXAM
 from __future__ import annotations
 
 import gc
-import json
 import os
 import sys
 import tempfile
@@ -23,6 +22,7 @@ sys.path.insert(0, str(HERE.parent / 'test' / 'ros'))
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 warnings.simplefilter('ignore', RuntimeWarning)  # numbers out of range have a status
 
+import claims  # noqa: E402
 from fuzz_nodes import SUBJECTS, Bench, fuzz  # noqa: E402
 from ros_harness import Ros  # noqa: E402
 
@@ -69,8 +69,7 @@ def main() -> None:
         print(f'| {row["node"]} | {row["messages"]} | {row["grown_mb"]:.1f} | {row["seconds"]:.0f} | '
               f'{row["problem"]} |')
     if not part:
-        target = HERE / 'results' / 'ros_fuzz.json'
-        target.write_text(json.dumps(rows, indent=1) + '\n', encoding='utf-8')
+        claims.write('ros_fuzz', rows)
     if any(row['problem'] for row in rows):
         sys.exit(1)
 

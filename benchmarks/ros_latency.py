@@ -8,7 +8,6 @@ that of the payload with the same stamp, so the observer's own delays do not cou
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -18,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import claims
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -155,9 +155,7 @@ def main() -> None:
     values = {'seconds a case': seconds, **measure(seconds)}
     for name, value in values.items():
         print(f'{name}: {value:.4g}')
-    target = HERE / 'results' / 'ros_latency.json'
-    target.parent.mkdir(exist_ok=True)
-    target.write_text(json.dumps({'load_average': os.getloadavg(), **values}, indent=1) + '\n', encoding='utf-8')
+    claims.write('ros_latency', {'load_average': os.getloadavg(), **values})
 
 
 if __name__ == '__main__':

@@ -7,7 +7,6 @@ hides a step of the torque is chance, and a run's estimates depend on one anothe
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -17,6 +16,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import claims
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -174,8 +174,7 @@ def main() -> None:
     for row in rows:
         print('  '.join(f'{name} {value:.4g}' if isinstance(value, float) else str(value)
                         for name, value in row.items()))
-    target = HERE / 'results' / 'ros_loss.json'
-    target.write_text(json.dumps(rows, indent=1) + '\n', encoding='utf-8')
+    claims.write('ros_loss', rows)
 
 
 if __name__ == '__main__':

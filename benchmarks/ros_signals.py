@@ -25,10 +25,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+import claims
+
 from flexmanip_ros.errors import BagError, CheckpointError
 from flexmanip_ros.io import bag, checkpoint
 
-HERE = Path(__file__).resolve().parent
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 PATIENCE_S = 30.0
 
@@ -267,13 +268,11 @@ def main() -> None:
               f'{sum(trial.finished for trial in mine)} | '
               f'{", ".join(f"{code}: {count}" for code, count in sorted(codes.items()))} | '
               f'{max(trial.took_s for trial in mine):.2f} | {sum(bool(trial.problem) for trial in mine)} |')
-    target = HERE / 'results' / 'ros_signals.json'
     tried = {trial.program for trial in trials}
-    rows = [row for row in json.loads(target.read_text(encoding='utf-8')) if row['program'] not in tried] \
-        if part and target.exists() else []
-    rows += [trial._asdict() for trial in trials]
+    before = claims.read('ros_signals') or [] if part else []
+    rows = [row for row in before if row['program'] not in tried] + [trial._asdict() for trial in trials]
     if rows:
-        target.write_text(json.dumps(rows, indent=1) + '\n', encoding='utf-8')
+        claims.write('ros_signals', rows)
     if any(trial.problem for trial in trials):
         sys.exit(1)
 

@@ -9,14 +9,14 @@ many workers it can serve.
 from __future__ import annotations
 
 import importlib.util
-import json
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
+import claims
 
 from flexmanip_ros.cli import workers
 from flexmanip_ros.io.outputs import Journal
@@ -75,7 +75,7 @@ def measured(compute: Compute, name: str) -> dict[str, Any]:
     return {'runs_per_second': rates, 'ratio': ratio}
 
 
-def main() -> int:
+def main() -> None:
     """Measure, print a table, write the results."""
     cores = len(os.sched_getaffinity(0))
     print(f'runs a second, {cores} cores\n{"":10s} {"1 worker":>8s} {"2":>8s} {"ratio":>8s}')
@@ -88,11 +88,8 @@ def main() -> int:
     serves = 1.0 / (found['keeping_a_run_s'] * found['processes']['runs_per_second'][1])
     print(f'keeping a run on disk: {1e3 * found["keeping_a_run_s"]:.2f} ms; one collector serves '
           f'{serves:.0f} workers')
-    results = Path(__file__).parent / 'results'
-    results.mkdir(exist_ok=True)
-    (results / 'study_scaling.json').write_text(json.dumps(found, indent=1) + '\n', encoding='utf-8')
-    return 0
+    claims.write('study_scaling', found)
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main()

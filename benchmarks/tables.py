@@ -7,7 +7,6 @@ Use: ``python benchmarks/tables.py`` (``make docs``). The values come from ``ben
 from __future__ import annotations
 
 import inspect
-import json
 import math
 import re
 from pathlib import Path
@@ -65,10 +64,9 @@ def table(found: list[claims.Claim]) -> str:
 
 def readme(text: str) -> str:
     """Return README.md with the shares measured last. Each stands before words that are looked for here."""
-    matched = [share for row in _rows('payload_coverage') if row['runs'] >= ENOUGH for share in row['coverage']]
-    elements = _rows('payload_elements')[0]
-    measured = json.loads((claims.RESULTS / 'identification_measured_arms.json').read_text(encoding='utf-8'))
-    simulated = measured['daisy_robot_arm']['ours order=4']['simulation'][0]
+    matched = [share for row in claims.read('payload_coverage') if row['runs'] >= ENOUGH for share in row['coverage']]
+    elements = claims.read('payload_elements')[0]
+    simulated = claims.read('identification_measured_arms')['daisy_robot_arm']['ours order=4']['simulation'][0]
     second, third = (elements['samples_after_capture'].index(count) for count in (1000, 2990))
     for words, share in (
             ('of the 95 % intervals hold the true mass', _percent(min(matched), max(matched))),
@@ -80,10 +78,6 @@ def readme(text: str) -> str:
         if count != 1:
             raise ValueError(f'README.md has to say once how many % {words}')
     return text
-
-
-def _rows(name: str) -> list[dict[str, object]]:
-    return json.loads((claims.RESULTS / f'{name}.json').read_text(encoding='utf-8'))
 
 
 def _percent(low: float, high: float | None = None) -> str:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +12,6 @@ from flexmanip_ros.payload import structured
 from flexmanip_ros.samples.sample_log import Rows, log_of
 from flexmanip_ros.types import CaptureEvent, EventKind, Payload, Status
 
-RESULTS = Path(__file__).resolve().parents[1] / 'results'
 BENDS = ('link1_bend/position', 'link2_bend/position')
 RATES = ('link1_bend/velocity', 'link2_bend/velocity')
 
@@ -98,9 +95,3 @@ def rms(values: np.ndarray) -> np.ndarray:
 def numbers(values: Any, digits: int = 4) -> list[float]:
     """Rounded, for tables and JSON."""
     return [round(float(value), digits) for value in np.atleast_1d(values)]
-
-
-def write(name: str, rows: list[dict[str, Any]]) -> None:
-    """Write benchmarks/results/<name>.json."""
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / f'{name}.json').write_text(json.dumps(rows, indent=1) + '\n', encoding='utf-8')
