@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexmanip_ros.arm.manipulator import chords, pinned_frequencies
 from flexmanip_ros.numerics.compiled import kernel
@@ -55,14 +57,16 @@ MEMORY_S = 10.0
 """Time after which the weight of a sample is 1/e [s]."""
 
 
-def _rigid_take(config: IdentifierParameters, x: Array, sums: Array, dt: float, efforts: Array, angles: Array,
-                restarted: bool) -> None:
-    if restarted:
-        x[:2], sums[4] = angles[0][:, None] * (1.0, 0.0, 1.0, 0.0), 0.0
-    _rigid_kernel(_arm(config, dt), x, sums, dt, efforts, angles)
+def _rigid_sums(config: IdentifierParameters, dt: float, efforts: Array, angles: Array, begins: NDArray[np.bool_]
+                ) -> Array:
+    """Return the sums (N, 5) after each sample: information, score, residual power, equations, samples."""
+    x, sums = np.zeros((4, 5)), np.empty((len(angles), 5))
+    x[:2] = angles[0][:, None] * (1.0, 0.0, 1.0, 0.0, 0.0)
+    _rigid_kernel(_arm(config, dt), x, sums, dt, efforts, angles, begins)
+    return sums
 
 
-def _rigid_estimate(config: IdentifierParameters, x: Array, sums: Array, dt: float) -> Payload:
+def _rigid_estimate(config: IdentifierParameters, sums: Array, dt: float) -> Payload:
     """Return the payload; the interval takes the residuals as correlated over the filter's memory."""
     information, score, residual, count, _ = sums
     if count < 2 * FEWEST or information <= 0.0:
@@ -81,42 +85,63 @@ def _cutoff(config: IdentifierParameters) -> float:
 def _arm(config: IdentifierParameters, dt: float) -> RigidArm:
     arm = config.arm
     (L1, L2), (rho1, rho2) = arm.link_length, arm.linear_density
+    point = config.payload.working_point
+    is_frozen = config.payload.dynamics == 'linear' and len(point) == 2
     return RigidArm(
         Ma11=rho1 * L1 ** 3 / 3 + (arm.joint_mass + rho2 * L2 + arm.tip_mass) * L1 ** 2,
         Ma22=rho2 * L2 ** 3 / 3 + arm.tip_mass * L2 ** 2, coupling=(rho2 * L2 / 2 + arm.tip_mass) * L1 * L2,
         L1=L1, L2=L2, reaction=1.0 if arm.torque_convention == 'joint' else 0.0, cutoff=_cutoff(config),
-        fade=float(np.exp(-dt / MEMORY_S)), frozen_turn=_frozen_turn(config))
-
-
-def _frozen_turn(config: IdentifierParameters) -> float:
-    """Return the angle between the links at the working point of a linear plant [rad]; nan where none is given."""
-    point = config.payload.working_point
-    frozen = config.payload.dynamics == 'linear' and len(point) == 2
-    return point[1] - point[0] if frozen else float('nan')
+        fade=float(np.exp(-dt / MEMORY_S)), frozen_turn=point[1] - point[0] if is_frozen else math.nan)
 
 
 STILL = 1e-6
 """Motion below which a link gives no information on the payload [rad]."""
 
 
-def _algebraic_take(config: IdentifierParameters, x: Array, sums: Array, dt: float, efforts: Array, angles: Array,
-                    restarted: bool) -> None:
-    if restarted:
-        x[:], sums[:] = 0.0, 0.0
+def _algebraic_sums(config: IdentifierParameters, dt: float, efforts: Array, angles: Array, begins: NDArray[np.bool_]
+                    ) -> Array:
+    """Return the sums (N, 8) after each sample: A11, A12, A22, B1, B2, square of q, samples, time."""
+    starts = np.flatnonzero(begins).tolist()
+    return np.vstack([_algebraic_stretch(config, dt, efforts[a:b, 1], angles[a:b, 1])
+                      for a, b in pairwise([0, *(start for start in starts if start), len(angles)])])
+
+
+def _algebraic_stretch(config: IdentifierParameters, dt: float, torque: Array, a: Array) -> Array:
+    """Return the sums (N, 8) of a stretch without an event; torque (N,) held before each sample, a (N,): angles."""
     arm = config.arm
-    L, rho = arm.link_length[1], arm.linear_density[1]
-    _algebraic_kernel(rho * L ** 3 / 3 + arm.tip_mass * L ** 2, rho * L / 2 + arm.tip_mass, L, -arm.gravity[1], x,
-                      sums, dt, np.ascontiguousarray(angles[:, 1]), np.ascontiguousarray(efforts[:, 1]))
+    L, rho, gravity = arm.link_length[1], arm.linear_density[1], -arm.gravity[1]
+    inertia, moment = rho * L ** 3 / 3 + arm.tip_mass * L ** 2, rho * L / 2 + arm.tip_mass
+    t = np.cumsum(np.append(0.0, np.full(len(a) - 1, dt)))
+    h = np.diff(t, prepend=0.0)
+    before = np.append(0.0, t[:-1])
+
+    def integral(values: Array) -> Array:
+        return np.cumsum(0.5 * h * (np.append(0.0, values[:-1]) + values))
+
+    integral_a, integral_t2_cos = integral(a), integral(t * t * np.cos(a))
+    # the torque is held, so its integrals are exact
+    cube, cube_before = t * (t * t), before * (before * before)
+    once = np.cumsum(torque * (cube - cube_before) / 3.0)
+    twice = np.cumsum(h * np.append(0.0, once[:-1])
+                      + torque * (((t * t) ** 2 - (before * before) ** 2) / 12.0 - cube_before * h / 3.0))
+    weight = integral(integral_t2_cos)
+    integral_ta = integral(t * a)
+    beta = t * t * a - 4.0 * integral_ta + 2.0 * integral(integral_a)
+    eta = integral(t * t * a) - 2.0 * integral(integral_ta)
+    q = twice - inertia * beta - moment * gravity * L * weight
+    row0 = L * L * beta + gravity * L * weight
+    products = (row0 * row0, row0 * eta, eta * eta, row0 * q, eta * q, q * q, np.ones(len(a)))
+    return np.column_stack([*(np.cumsum(product) for product in products), t])
 
 
-def _algebraic_estimate(config: IdentifierParameters, x: Array, sums: Array, dt: float) -> Payload:
+def _algebraic_estimate(config: IdentifierParameters, sums: Array, dt: float) -> Payload:
     """Return the payload; each tenth of the record counts as one independent residual."""
     if sums[6] < FEWEST:
         return _unknown(Status.WARMING_UP)
     A = np.array([[sums[0], sums[1]], [sums[1], sums[2]]])
     b, square = sums[3:5], float(sums[5])
     scale = np.sqrt(np.diag(A))
-    still = STILL * config.arm.link_length[1] ** 2 * x[0] ** 2 * np.sqrt(sums[6])
+    still = STILL * config.arm.link_length[1] ** 2 * sums[7] ** 2 * np.sqrt(sums[6])
     if scale[0] <= still or scale[1] == 0.0 or np.linalg.cond(A / np.outer(scale, scale)) > 1e12:
         return _unknown(Status.POORLY_EXCITED)
     solved = np.linalg.solve(A / np.outer(scale, scale), np.column_stack([b / scale, [1.0 / scale[0], 0.0]]))
@@ -146,122 +171,57 @@ class RigidArm(NamedTuple):
 
 
 @kernel
-def _rigid_kernel(arm: RigidArm, x: Array, sums: Array, dt: float, efforts: Array, chords: Array) -> None:
-    """Take samples into the scalar least squares; efforts (N, 2) held before each sample, chords (N, 2).
+def _rigid_kernel(arm: RigidArm, x: Array, sums: Array, dt: float, efforts: Array, chords: Array,
+                  begins: NDArray[np.bool_]) -> None:
+    """Fill the sums (N, 5) of the scalar least squares; efforts (N, 2) held before each sample, chords (N, 2).
 
-    x: (4, 4) states of the filters, two for angles, two for torques; sums: (5,) information,
-    score, residual power, samples, samples since the start of the filters.
+    x: (4, 5) of each filter, two for angles, two for torques, four states and the acceleration over the last sample;
+    begins (N,): where the sums begin again.
     """
     w = arm.cutoff
+    information = score = residual = equations = samples = 0.0
     for k in range(chords.shape[0]):
-        rate0 = rate1 = acc0 = acc1 = torque0 = torque1 = 0.0
-        for i in range(2):
-            for part in range(2):
-                target = chords[k, i] if part == 0 else efforts[k, i]
-                # twice w^2 / (s + w)^2, critically damped, exact for an input held over the sample
-                acceleration = 0.0
-                for stage in (2, 0):
-                    row = x[i + 2 * part]
-                    level, slope = row[stage] - target, row[stage + 1]
-                    decay = np.exp(-w * dt)
-                    drive = slope + w * level
-                    row[stage] = target + (level + drive * dt) * decay
-                    row[stage + 1] = (slope - w * drive * dt) * decay
-                    # the mean over the sample; the value at its end would show the steps of the held input
-                    acceleration = (row[stage + 1] - slope) / dt if dt > 0.0 else 0.0
-                    target = row[stage]
-                if part == 1:
-                    if i == 0:
-                        torque0 = x[2, 0]
-                    else:
-                        torque1 = x[3, 0]
-                elif i == 0:
-                    rate0, acc0 = x[0, 1], acceleration
-                else:
-                    rate1, acc1 = x[1, 1], acceleration
-        sums[4] += 1.0
-        if sums[4] * dt * w < 12.0:
-            continue  # the filters still depend on their initial state
-        turn = x[1, 0] - x[0, 0]
-        c, s = np.cos(turn), np.sin(turn)
-        if not np.isnan(arm.frozen_turn):
-            c, s = np.cos(arm.frozen_turn), 0.0
-        known0 = arm.Ma11 * acc0 + arm.coupling * (c * acc1 - s * rate1 * rate1)
-        known1 = arm.Ma22 * acc1 + arm.coupling * (c * acc0 + s * rate0 * rate0)
-        cross = arm.L1 * arm.L2
-        row0 = arm.L1 * arm.L1 * acc0 + cross * (c * acc1 - s * rate1 * rate1)
-        row1 = arm.L2 * arm.L2 * acc1 + cross * (c * acc0 + s * rate0 * rate0)
-        left0 = torque0 - arm.reaction * torque1 - known0
-        left1 = torque1 - known1
-        mass = sums[1] / sums[0] if sums[0] > 0.0 else 0.0
-        e0, e1 = left0 - mass * row0, left1 - mass * row1
-        sums[0] = arm.fade * sums[0] + row0 * row0 + row1 * row1
-        sums[1] = arm.fade * sums[1] + row0 * left0 + row1 * left1
-        sums[2] = arm.fade * sums[2] + e0 * e0 + e1 * e1
-        sums[3] = arm.fade * sums[3] + 2.0
+        if begins[k]:
+            information = score = residual = equations = samples = 0.0
+        h = dt if k else 0.0  # no time has passed before the first sample
+        decay = np.exp(-w * h)
+        for i in range(4):
+            target = chords[k, i] if i < 2 else efforts[k, i - 2]
+            # twice w^2 / (s + w)^2, critically damped, exact for an input held over the sample
+            for stage in (2, 0):
+                row = x[i]
+                level, slope = row[stage] - target, row[stage + 1]
+                drive = slope + w * level
+                row[stage] = target + (level + drive * h) * decay
+                row[stage + 1] = (slope - w * drive * h) * decay
+                # the mean over the sample; the value at its end would show the steps of the held input
+                row[4] = (row[stage + 1] - slope) / h if h > 0.0 else 0.0
+                target = row[stage]
+        samples += 1.0
+        if samples * h * w >= 12.0:  # before, the filters still depend on their initial state
+            turn, rate0, rate1, acc0, acc1 = x[1, 0] - x[0, 0], x[0, 1], x[1, 1], x[0, 4], x[1, 4]
+            c, s = np.cos(turn), np.sin(turn)
+            if not np.isnan(arm.frozen_turn):
+                c, s = np.cos(arm.frozen_turn), 0.0
+            known0 = arm.Ma11 * acc0 + arm.coupling * (c * acc1 - s * rate1 * rate1)
+            known1 = arm.Ma22 * acc1 + arm.coupling * (c * acc0 + s * rate0 * rate0)
+            cross = arm.L1 * arm.L2
+            row0 = arm.L1 * arm.L1 * acc0 + cross * (c * acc1 - s * rate1 * rate1)
+            row1 = arm.L2 * arm.L2 * acc1 + cross * (c * acc0 + s * rate0 * rate0)
+            left0 = x[2, 0] - arm.reaction * x[3, 0] - known0
+            left1 = x[3, 0] - known1
+            mass = score / information if information > 0.0 else 0.0
+            e0, e1 = left0 - mass * row0, left1 - mass * row1
+            information = arm.fade * information + row0 * row0 + row1 * row1
+            score = arm.fade * score + row0 * left0 + row1 * left1
+            residual = arm.fade * residual + e0 * e0 + e1 * e1
+            equations = arm.fade * equations + 2.0
+        sums[k] = information, score, residual, equations, samples
 
 
-@kernel
-def _algebraic_kernel(
-    inertia: float, moment: float, L: float, gravity: float, x: Array, normal: Array, dt: float,
-    angles: Array, torques: Array,
-) -> None:
-    """Take samples of one link into the algebraic estimator's normal equations.
-
-    inertia: rho L^3 / 3 + m_o L^2; moment: rho L / 2 + m_o; angles: (N,); torques: (N,) held before each.
-    x: (11,) time, last angle, then int(t a), its integral, int(t^2 a), int(a), its integral, int(t^2 cos a),
-    its integral, int(t^2 torque), its integral; normal: (7,) A11, A12, A22, B1, B2, square of q, samples.
-    """
-    for k in range(angles.shape[0]):
-        t0, t1, a0, a1 = x[0], x[0] + dt, x[1], angles[k]
-        if normal[6] == 0.0:
-            t1 = t0
-        h = t1 - t0
-        # trapezoids; the torque is held, so its integrals are exact
-        moments0 = (t0 * a0, t0 * t0 * a0, a0, t0 * t0 * np.cos(a0))
-        moments1 = (t1 * a1, t1 * t1 * a1, a1, t1 * t1 * np.cos(a1))
-        ta, taa, tc = x[2], x[5], x[7]
-        x[2] += 0.5 * h * (moments0[0] + moments1[0])
-        x[4] += 0.5 * h * (moments0[1] + moments1[1])
-        x[5] += 0.5 * h * (moments0[2] + moments1[2])
-        x[7] += 0.5 * h * (moments0[3] + moments1[3])
-        x[3] += 0.5 * h * (ta + x[2])
-        x[6] += 0.5 * h * (taa + x[5])
-        x[8] += 0.5 * h * (tc + x[7])
-        x[10] += h * x[9] + torques[k] * ((t1 ** 4 - t0 ** 4) / 12.0 - t0 ** 3 * h / 3.0)
-        x[9] += torques[k] * (t1 ** 3 - t0 ** 3) / 3.0
-        x[0], x[1] = t1, a1
-        normal[6] += 1.0
-        beta = t1 * t1 * a1 - 4.0 * x[2] + 2.0 * x[6]
-        eta = x[4] - 2.0 * x[3]
-        q = x[10] - inertia * beta - moment * gravity * L * x[8]
-        row0, row1 = L * L * beta + gravity * L * x[8], eta
-        normal[0] += row0 * row0
-        normal[1] += row0 * row1
-        normal[2] += row1 * row1
-        normal[3] += row0 * q
-        normal[4] += row1 * q
-        normal[5] += q * q
-
-
-class Baseline(NamedTuple):
-    """One of the two methods."""
-
-    x: tuple[int, ...]
-    """Shape of the states of filters or integrals."""
-    sums: int
-    """Number of sums of the least squares."""
-    keeps_filters: bool
-    """Whether an event restarts the sums alone, not the states of filters or integrals."""
-    take: Callable[[IdentifierParameters, Array, Array, float, Array, Array, bool], None]
-    """Take samples into states and sums: efforts (N, 2), chord angles (N, 2), whether a gap comes before them."""
-    fitted: Callable[[IdentifierParameters, Array, Array, float], Payload]
-    """Return the payload of states and sums."""
-
-
-BASELINES: Mapping[str, Baseline] = {
-    'rigid_rls': Baseline((4, 4), 5, True, _rigid_take, _rigid_estimate),
-    'algebraic': Baseline((11,), 7, False, _algebraic_take, _algebraic_estimate)}
+BASELINES: Mapping[str, tuple[Callable[..., Array], Callable[..., Payload]]] = {
+    'rigid_rls': (_rigid_sums, _rigid_estimate), 'algebraic': (_algebraic_sums, _algebraic_estimate)}
+"""The sums after each sample, and the payload that they give."""
 
 
 class Recorded(NamedTuple):
@@ -290,25 +250,19 @@ def run(name: str, config: IdentifierParameters, recorded: Recorded) -> Iterator
     The least squares begin again at an event. Without a captured object the payload is exactly 0, as these methods do
     not test for one.
     """
-    method, (rows, given) = BASELINES[name], recorded
-    stamps = rows.stamp_ns
+    (sums_of, fitted), (rows, events) = BASELINES[name], recorded
+    count, stamps = len(rows), rows.stamp_ns
     instants = ((stamps - stamps[0]) * config.publish_rate * 1e-9 + 1e-6).astype(np.int64)
-    due = {*(np.flatnonzero(np.diff(instants, prepend=-1) > 0) + 1).tolist(), len(rows)}
-    events = [(rows.log.row_at(event.stamp_ns, rows.first) - rows.first, event) for event in given]
+    due = sorted({*np.flatnonzero(np.diff(instants, prepend=-1) > 0).tolist(), count - 1})
+    begins, held = np.zeros((2, count), dtype=np.bool_)
+    for event in events:
+        row = rows.log.row_at(event.stamp_ns, rows.first) - rows.first
+        begins[row:row + 1] = True
+        held[row:] = event.kind is EventKind.CAPTURE
     efforts = np.vstack([rows.u[:1], rows.u[:-1]])  # held before each sample
     angles = np.array([chords(config.arm, measured) for measured in rows.angles])
     dt = float(np.median(np.diff(stamps))) * 1e-9
-    x, sums, held, cursor = np.zeros(method.x), np.zeros(method.sums), False, 0
-    for until in sorted(due | {row for row, _ in events if row > 0}):
-        while events and events[0][0] == cursor:
-            held = events.pop(0)[1].kind is EventKind.CAPTURE
-            sums[:] = 0.0
-            if not method.keeps_filters:
-                x[:] = 0.0
-        # no time has passed before the first sample, which is a piece of its own
-        method.take(config, x, sums, dt if cursor else 0.0, efforts[cursor:until], angles[cursor:until],
-                    cursor == 0 or bool(rows.gap[cursor]))
-        cursor = until
-        if until in due:
-            payload = method.fitted(config, x, sums, dt) if held else Payload(0.0, 0.0, 0.0, 0.0, 1.0, Status.TRACKING)
-            yield Estimate(int(stamps[until - 1]), payload.status, None, (), payload)
+    sums = sums_of(config, dt, efforts, angles, begins)
+    for row in due:
+        payload = fitted(config, sums[row], dt) if held[row] else Payload(0.0, 0.0, 0.0, 0.0, 1.0, Status.TRACKING)
+        yield Estimate(int(stamps[row]), payload.status, None, (), payload)
