@@ -172,11 +172,9 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: mem.Fil
     if not damped_step(motion, sensors, m):
         return False
     gained = dot(m.g, m.gradient)
-    # a strongly damped step is short wherever it is taken
-    still |= gained < enough and m.score[mem.LAMBDA] <= first_damping(m)
     # the simplest model is given up by chance, so not before it has converged
     fits &= m.counts[mem.REFITS] > 0 or m.score[mem.EXCESS] < BY_CHANCE
-    m.counts[mem.AGAIN] = 0 if fits or still else 1
+    m.counts[mem.AGAIN] = 0 if fits or still or gained < enough else 1
     m.counts[mem.TRIED] = m.counts[mem.TRIED] + 1 if m.counts[mem.AGAIN] else 0
     if rejected:  # the filter has gone on with noisy efforts
         m.counts[mem.AGAIN] = 0
