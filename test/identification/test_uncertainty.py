@@ -112,7 +112,7 @@ def test_a_model_that_explains_more_than_a_tenth_is_not_poorly_excited(estimator
 def test_intervals_cover_at_40_and_20_db_and_are_as_wide_as_the_bound():
     study = benchmark('identification_coverage')
     for snr_db in (40.0, 20.0):
-        row = study.study(8, snr_db, 0.01)
+        row = study.study(8, snr_db)
         assert min(row['coverage_percent']) >= 60.0, row  # 8 runs: less than 1 in 1000 by chance
         assert np.all(np.abs(row['bias'][:4]) < 1.5 * np.array(row['scatter'][:4])), row
         np.testing.assert_allclose(row['claimed_over_bound'], 1.0, atol=0.02 if snr_db == 40.0 else 0.1)
