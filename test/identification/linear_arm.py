@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import os
 import sys
 from pathlib import Path
@@ -23,15 +23,10 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def benchmark(name: str) -> ModuleType:
     """A benchmark as a module, so that a test can run a short form of it."""
-    if name in sys.modules:
-        return sys.modules[name]
-    spec = importlib.util.spec_from_file_location(name, ROOT / 'benchmarks' / f'{name}.py')
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
+    folder = str(ROOT / 'benchmarks')
+    if folder not in sys.path:
+        sys.path.append(folder)  # benchmarks import each other
+    return importlib.import_module(name)
 
 
 def shared_data(name: str) -> Path:
