@@ -3,7 +3,6 @@
 Every method has one colour and one marker in all figures; links and frequencies differ by the line style.
 """
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -212,10 +211,13 @@ def band(ax: Any, time: Array, runs: Array, label: str, **style: Any) -> None:
 
 
 def quantile(runs: Array, share: float) -> Array:
-    """Quantile over the runs (T, runs) that have a value; nan where none has."""
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore', RuntimeWarning)  # no run has a value yet
-        return np.asarray(np.nanquantile(runs, share, axis=1))
+    """Quantile over the runs that have a value; nan where none has."""
+    found = np.full(runs.shape[0], np.nan)
+    for k, row in enumerate(runs):
+        known = row[np.isfinite(row)]
+        if known.size:
+            found[k] = np.quantile(known, share)
+    return found
 
 
 def _look(method: str) -> dict[str, Any]:
