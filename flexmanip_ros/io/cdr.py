@@ -1,4 +1,4 @@
-"""Decode JointState and Header directly from CDR bytes, and encode JointState.
+"""Decode JointState and Header directly from CDR bytes.
 
 The messages of one publisher share one layout: names and array lengths, and with them every byte offset, stay the
 same. So the messages of a recording are decoded many at a time as rows of one numpy table, after a check that their
