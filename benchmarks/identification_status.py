@@ -55,12 +55,17 @@ LOST: dict[str, Any] = {'5 % lost': 0.05, '1 % lost': 0.01, 'bursts of 100 ms': 
 
 
 class Case(NamedTuple):
-    """A run: what is identified with which settings; the payload where the true frequencies are known."""
+    """A run: what is identified with which settings; the payload where the true frequencies are known.
+
+    whole: the messages before some were lost, with which the predictions are compared; None: none were. What the
+    package puts in the place of a lost message is no measurement.
+    """
 
     name: str
     config: IdentifierParameters
     items: Sequence[JointBlock | CaptureEvent]
     payload: float | None = None
+    whole: Sequence[JointBlock | CaptureEvent] | None = None
 
 
 def cases() -> Iterator[Case]:
@@ -84,8 +89,9 @@ def cases() -> Iterator[Case]:
         yield Case(where, moving, renamed(items), 20.0)
         yield Case(f'{where}, one configuration', still, items, 20.0)
     yield Case('20 kg at 0/45, 40 s', moving, renamed(simulated(40.0, 20.0, (0.0, 45.0))), 20.0)
+    whole = renamed(simulated(7.0, 20.0, (60.0, 45.0)))
     for words, loss in LOST.items():
-        yield Case(words, moving, renamed(simulated(7.0, 20.0, (60.0, 45.0), loss)), 20.0)
+        yield Case(words, moving, renamed(simulated(7.0, 20.0, (60.0, 45.0), loss)), 20.0, whole)
 
 
 def renamed(items: Iterable[JointBlock | JointRecord | CaptureEvent]) -> list[JointBlock | CaptureEvent]:
@@ -137,12 +143,12 @@ def unexplained(model: StateSpace, U: Array, Y: Array, steps: int) -> Array:
 
 
 def readings(case: Case) -> tuple[list[Estimate], Signals]:
-    """Return the readings of a model, and the signals that they are read from."""
+    """Return the readings of a model, and the signals with which they are compared."""
     found, state = [], pipeline.init()
     for item in case.items:
         state, ready = pipeline.step(case.config, state, item)
         found += [estimate for estimate in ready if estimate.model_is_new and estimate.model is not None]
-    return found, sampling.collect(case.config, case.items)
+    return found, sampling.collect(case.config, case.items if case.whole is None else case.whole)
 
 
 def row_of(case: Case) -> dict[str, Any]:

@@ -76,12 +76,12 @@ def test_no_modes_or_angles_give_a_status():
 
 
 def identified(payload: float, seed: int, model: str, **values: object) -> list[Estimate]:
-    """Estimates of a simulated capture at 1.5 s, from one second after it on."""
+    """Estimates of a simulated capture at 1.5 s, from 1.2 s after it on: with 60 kg a rate rings at 50 Hz until then."""
     plant = configure(PlantParameters, {'payload_mass': payload, 'seed': seed, 'model': model})
     capture = CaptureEvent(1_500_000_000, EventKind.CAPTURE)
     run = simulator.simulate(plant, excitation.sequence(ExcitationParameters(), 4000), (capture,))
     settings = configure(IdentifierParameters, {'payload_method': 'frequency', **values})
-    return [one for one in pipeline.run(settings, simulator.records(run, (capture,))) if one.stamp_ns > 2.5e9]
+    return [one for one in pipeline.run(settings, simulator.records(run, (capture,))) if one.stamp_ns > 2.7e9]
 
 
 @pytest.mark.parametrize(('payload', 'seed'), [(5.0, 1), (20.0, 2), (60.0, 1)])
