@@ -73,16 +73,19 @@ $(VENV)/.benchmark: requirements/benchmark.txt $(VENV)/.development
 demo: setup
 	@$(BIN)/demo $(DEMO_ARGS)
 
-# Three parts side by side: nodes, which often wait; programs and tools; and what computes. Nodes go first, as their
-# tests measure time.
+# Four parts side by side: nodes, which often wait; programs and tools; the payload; and what else computes. Nodes go
+# first, as their tests measure time. The other three take about as long as each other, so no core is idle in the end.
 NODES := test/ros
 PROGRAMS := test/cli test/view test/studies test/paper test/packaging
+PAYLOAD := test/payload
 test: setup $(VENV)/.development
 ifeq ($(strip $(PYTEST_ARGS)),)
 	@mkdir -p log; status=0; \
 	ROS_DOMAIN_ID=71 $(BIN)/python -m pytest $(NODES) > log/test_nodes.txt 2>&1 & nodes=$$!; \
 	ROS_DOMAIN_ID=72 nice $(BIN)/python -m pytest $(PROGRAMS) > log/test_programs.txt 2>&1 & programs=$$!; \
-	nice $(BIN)/python -m pytest test $(addprefix --ignore=,$(NODES) $(PROGRAMS)) || status=$$?; \
+	nice $(BIN)/python -m pytest $(PAYLOAD) > log/test_payload.txt 2>&1 & payload=$$!; \
+	nice $(BIN)/python -m pytest test $(addprefix --ignore=,$(NODES) $(PROGRAMS) $(PAYLOAD)) || status=$$?; \
+	wait $$payload || status=$$?; cat log/test_payload.txt; \
 	wait $$programs || status=$$?; cat log/test_programs.txt; \
 	wait $$nodes || status=$$?; cat log/test_nodes.txt; exit $$status
 else
