@@ -169,13 +169,14 @@ def test_bad_input_is_told_in_one_line_with_code_2(
 
 def test_the_report_of_a_looped_recording_shows_the_last_pass_alone(recording: Path, tmp_path: Path) -> None:
     pytest.importorskip('matplotlib')
-    messages = list(bag.read(recording))
+    messages = list(bag.read(recording))[:1000]  # the capture is later: one pass and another are all that counts
     record(tmp_path / 'looped', [*messages, *messages])
     path = tmp_path / 'report.html'
     assert identify_bag.main([str(tmp_path / 'looped'), '--report', str(path)]) == 0
     (inner,) = re.findall(r'<iframe title="[^"]+" srcdoc="([^"]*)"></iframe>', path.read_text(encoding='utf-8'))
     _, frame = shown(html.unescape(inner))
     times = [row[0] for row in frame['payloads']]
+    assert len(times) > 10
     assert times == sorted(set(times))
 
 
