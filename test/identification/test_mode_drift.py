@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from linear_arm import benchmark
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from flexmanip_ros.identification.mode_drift import Drift, drifting, sway, turns
 from flexmanip_ros.identification.prediction_error import Fit, Structure, Theta, descend, moved
@@ -19,10 +18,12 @@ BASIS = np.array([[1.0, 0.3, -0.2, 0.5], [-0.4, 1.2, 0.6, 0.1], [0.2, -0.7, 0.9,
 
 
 def model(frequencies: Array) -> Array:
-    """A (4, 4) of two oscillations [Hz], lightly damped."""
-    angles = 2.0 * np.pi * DT * frequencies
-    blocks = [0.9995 * np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) for a in angles]
-    return np.asarray(BASIS @ block_diag(*blocks) @ np.linalg.inv(BASIS))
+    """A (..., 4, 4) of two oscillations (..., 2) [Hz], lightly damped."""
+    angles, blocks = 2.0 * np.pi * DT * frequencies, np.zeros((*frequencies.shape[:-1], 4, 4))
+    for k in range(2):
+        c, s = np.cos(angles[..., k]), np.sin(angles[..., k])
+        blocks[..., 2 * k:2 * k + 2, 2 * k:2 * k + 2] = 0.9995 * np.stack([c, -s, s, c], -1).reshape(*c.shape, 2, 2)
+    return np.asarray(BASIS @ blocks @ np.linalg.inv(BASIS))
 
 
 def stretch(drift: Array, noise: float, seed: int = 0) -> tuple[Array, Array]:
@@ -31,9 +32,10 @@ def stretch(drift: Array, noise: float, seed: int = 0) -> tuple[Array, Array]:
     B = 0.05 * rng.standard_normal((4, 2))
     U = np.repeat(rng.standard_normal((COUNT // 16, 2)), 16, axis=0)
     Y, x = np.empty((COUNT, 4)), np.zeros(4)
-    for t in range(COUNT):
+    weights = (np.arange(COUNT) - 0.5 * (COUNT - 1)) / COUNT
+    for t, A in enumerate(model(FREQUENCIES + weights[:, None] * drift)):
         Y[t] = x
-        x = model(FREQUENCIES + ((t - 0.5 * (COUNT - 1)) / COUNT) * drift) @ x + B @ U[t]
+        x = A @ x + B @ U[t]
     return U, Y + noise * Y.std() * rng.standard_normal(Y.shape)
 
 
