@@ -132,7 +132,7 @@ def test_what_is_read_while_the_payload_takes_its_rows_changes_no_bit(
 def test_every_fit_after_a_capture_gives_the_same_bits_live_and_replayed() -> None:
     plant = configure(PlantParameters, {'payload_mass': 20.0, 'snr_db': 40.0})
     event = CaptureEvent(600 * MS, EventKind.CAPTURE)
-    made = simulator.simulate(plant, excitation.sequence(ExcitationParameters(), 2600), (event,), 0)
+    made = simulator.simulate(plant, excitation.sequence(ExcitationParameters(), 1800), (event,), 0)
     items = list(simulator.records(made, (event,)))
     for method in ('structured', 'block'):
         config = configure(IdentifierParameters, {'payload_method': method})
