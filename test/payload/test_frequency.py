@@ -76,7 +76,7 @@ def test_no_modes_or_angles_give_a_status():
 
 
 def identified(payload: float, seed: int, model: str, **values: object) -> list[Estimate]:
-    """Estimates of a simulated capture at 1.5 s, from 1.2 s after it on: with 60 kg a rate rings at 50 Hz until then."""
+    """Estimates of a simulated capture at 1.5 s, from 1.2 s after it on: with 60 kg a rate rings until then."""
     plant = configure(PlantParameters, {'payload_mass': payload, 'seed': seed, 'model': model})
     capture = CaptureEvent(1_500_000_000, EventKind.CAPTURE)
     run = simulator.simulate(plant, excitation.sequence(ExcitationParameters(), 4000), (capture,))
