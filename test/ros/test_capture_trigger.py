@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 
@@ -143,6 +145,40 @@ class Auto:
         """Return the first diagnostic entry that has these words."""
         return self.ros.wait(lambda: next((m.status[0] for m in self.heard if words in m.status[0].message), None),
                              what=words)
+
+
+LOADED_BY_THE_WARM_UP = """
+import sys
+from flexmanip_ros.numerics.compiled import Separate
+from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, TriggerParameters
+from flexmanip_ros.payload import capture_detection
+from flexmanip_ros.ros.nodes.capture_trigger import warm_up
+from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
+
+def loaded():
+    values = [value for name, module in list(sys.modules.items()) if name.startswith('flexmanip_ros')
+              for value in vars(module).values()]
+    kernels = [value.kernel if isinstance(value, Separate) else value for value in values]
+    return {(str(kernel.py_func), str(types)) for kernel in kernels if hasattr(kernel, 'py_func')
+            for types in kernel.signatures}
+
+capture = CaptureEvent(1_500_000_000, EventKind.CAPTURE)
+run = simulator.simulate(PlantParameters(), excitation.sequence(ExcitationParameters(), 2000), (capture,))
+config, found = TriggerParameters(mode='auto'), ()
+warm_up(config)
+before, watch = loaded(), capture_detection.watching(config)
+for item in simulator.records(run, (capture,)):
+    if isinstance(item, JointRecord):
+        watch, some = capture_detection.look(watch, item)
+        found += tuple(some)
+assert found and before, (found, before)
+assert loaded() == before, loaded() - before
+"""
+
+
+def test_whatever_finds_a_capture_was_loaded_by_the_warm_up() -> None:
+    subprocess.run([sys.executable, '-c', LOADED_BY_THE_WARM_UP], check=True, timeout=150)
 
 
 def test_mode_auto_counts_what_it_lost_while_it_was_held_up_and_warns(

@@ -24,7 +24,7 @@ from std_msgs.msg import Header
 
 from flexmanip_ros.errors import SignalError
 from flexmanip_ros.parameters import TriggerParameters
-from flexmanip_ros.payload import capture_detection
+from flexmanip_ros.payload import capture_detection, structured
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, to_message
 from flexmanip_ros.ros.diagnostics import RECENT_S, WARN, JointStateFaults, Recent, Report, number
@@ -33,16 +33,19 @@ from flexmanip_ros.samples.signals import joints
 from flexmanip_ros.types import LOOPED_NS, CaptureEvent, EventKind, JointRecord, events_at
 
 NAME = 'capture_trigger'
-WARM_UP_SAMPLES = 1500
-"""Number of made-up samples, enough to call every compiled function of the detector."""
+WARM_UP_SAMPLES = 200
+"""Number of made-up samples: the detector begins, and its fit takes a few steps. No arm swings as they do, so a fit
+that goes on until its horizon closes takes up to 10 s."""
 
 
 def warm_up(config: TriggerParameters) -> None:
-    """Run the detector once on made-up samples, so that nothing is compiled while real ones come."""
+    """Run the detector once on made-up samples, so that nothing is compiled or loaded while real ones come."""
     watch, names = capture_detection.watching(config), joints(config)
     for k in range(WARM_UP_SAMPLES):
         wave = np.array([math.sin(0.05 * k * (i + 1)) for i in range(len(names))]) * 1e-3
         watch, _ = capture_detection.look(watch, JointRecord(k * 1_000_000, names, wave, wave * 0.0, wave * 1e3))
+    if watch.state is not None:  # judges the fit, as the detector does before it begins one again
+        structured.estimate(watch.state.identifier, watch.state.filter)
 
 
 def _began(watch: capture_detection.Watch) -> int | None:
