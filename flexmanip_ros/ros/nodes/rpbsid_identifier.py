@@ -21,6 +21,7 @@ import math
 import sys
 import time
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -87,6 +88,9 @@ WARM_UP_EVENT = 40
 """Number of samples before the event of the warm-up, more than are needed to learn the sample time."""
 WARM_UP_SAMPLES = WARM_UP_EVENT + 3 * batch_fit.BLOCK + 2 * recursive_fit.CHUNK
 """Number of samples of the warm-up: it ends after the fits that follow the event, and one more block."""
+WARM_UP_PAYLOAD = WARM_UP_EVENT + 100
+"""Number of samples of the warm-up with a payload method that takes samples itself: no arm swings as they do, and a fit
+that goes on takes seconds."""
 WARM_UP_STEP_NS = 1_000_000
 
 
@@ -97,21 +101,25 @@ def warm_up(config: IdentifierParameters) -> None:
     """
     import scipy.special  # noqa: F401  the check of the frequencies would load it while messages come
 
+    runs = [(config, WARM_UP_SAMPLES)]
+    if config.payload_method == 'structured':
+        runs = [(config, WARM_UP_PAYLOAD), (replace(config, payload_method='none'), WARM_UP_SAMPLES)]
     try:
-        for _ in pipeline.run(config, _made_up(config)):
-            pass
+        for some, count in runs:
+            for _ in pipeline.run(some, _made_up(config, count)):
+                pass
     except SignalError:  # a configured signal that even these messages, with every field filled, do not carry
         return
 
 
-def _made_up(config: IdentifierParameters) -> Iterator[JointRecord | CaptureEvent]:
+def _made_up(config: IdentifierParameters, count: int) -> Iterator[JointRecord | CaptureEvent]:
     """Yield joints that swing at two frequencies, driven by random torques, and a capture."""
     names = joints(config)
     rng = np.random.default_rng(0)
     step = np.exp(1j * np.array([0.1, 0.2]) - 0.01)
     shape = rng.standard_normal((2, len(names)))
     state = np.zeros(2, dtype=complex)
-    for k in range(WARM_UP_SAMPLES):
+    for k in range(count):
         if k == WARM_UP_EVENT:
             yield CaptureEvent((k - 1) * WARM_UP_STEP_NS, EventKind.CAPTURE)
         effort = rng.standard_normal(len(names))
