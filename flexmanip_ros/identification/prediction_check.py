@@ -32,8 +32,8 @@ STRETCHES = 6
 MOST_ROWS = 4096
 MISSED, MISSED_OF_RATE = 0.5, 0.65
 """Largest share of the power that predictions may miss: of an output, and of a rate beside displacements. Rates contain
-modes above the order. Right models of the default run miss 0.52 of one. With 0.65 predictions of 0.5 % of all readings
-miss half of an output that are TRACKING, without a bound 1 %."""
+modes above the order; right models of the default run miss 0.52 of one. With 0.65, 0.5 % of all readings are TRACKING
+though their predictions miss half of an output; without a bound 1 % are."""
 SILENT = 10.0
 """Power of an output, in units of its white noise, below which the output is silent: it does not count."""
 FOURTH = 0.6744897501960817 * math.sqrt(70.0)
