@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import os
 import warnings
@@ -21,20 +20,6 @@ if TYPE_CHECKING:
     from ros_harness import Ros
 
 _domains = itertools.count(os.getpid())
-
-
-@pytest.fixture(scope='session', autouse=True)
-def warmed_up_once() -> Iterator[None]:
-    """Warm nodes of the same parameters up once: it loads compiled functions, for seconds, and changes nothing else.
-
-    A configuration that cannot work raises each time: only what returns is remembered.
-    """
-    from flexmanip_ros.ros.nodes import capture_trigger, rpbsid_identifier
-
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (capture_trigger, rpbsid_identifier):
-            patch.setattr(module, 'warm_up', functools.cache(module.warm_up))
-        yield
 
 
 @pytest.fixture(autouse=True)
