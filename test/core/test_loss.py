@@ -91,8 +91,8 @@ def tracked(found: Sequence[Estimate]) -> float:
 
 
 @pytest.mark.parametrize(('lost', 'wider'), [
-    (at_random(0.05), 1.5), (in_bursts(30), 1.5), (in_bursts(100), 3.0)],
-    ids=['5 %', '30 ms a second', '100 ms a second'])
+    (at_random(0.01), 1.5), (at_random(0.05), 1.5), (in_bursts(30), 1.5), (in_bursts(100), 3.0)],
+    ids=['1 %', '5 %', '30 ms a second', '100 ms a second'])
 def test_payload_and_modes_are_tracked_with_loss(
         messages: list[JointRecord | CaptureEvent], whole: list[Estimate], lost: np.ndarray, wider: float) -> None:
     every_block_holds_one = length(lost) > 50  # of the model, which is not asked for then

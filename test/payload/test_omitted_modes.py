@@ -77,9 +77,10 @@ def test_they_belong_to_the_measured_angles_unless_a_linear_plant_stays_at_its_w
 
 
 @pytest.mark.parametrize(('own', 'snr_db'), [
-    ({}, 50.0), ({'modes': 4, 'joint_coulomb_friction': (1.0, 0.5)}, 60.0),  # a fifth triples the time of friction
+    ({}, 50.0), ({}, 60.0),
+    ({'modes': 4, 'joint_coulomb_friction': (1.0, 0.5)}, 60.0),  # a fifth sine triples the time of friction
     ({'torque_gain': (1.04, 1.04), 'bend_gain': (0.98, 0.98), 'bend_offset': (5e-4, 5e-4)}, 60.0)],
-    ids=['16 bits', '18 bits, Coulomb friction', '18 bits, gains and offset'])
+    ids=['16 bits', '18 bits', '18 bits, Coulomb friction', '18 bits, gains and offset'])
 def test_precise_encoders_tell_the_payload_better_although_they_show_these_modes(own: dict, snr_db: float) -> None:
     """At 60 dB their noise is 1e-5 rad; the modes that are left out ring by 5e-4 rad after each step of the torques."""
     plant = PlantParameters(arm=replace(ARM, **{'modes': 5, **own}), payload_mass=20.0, snr_db=snr_db)
