@@ -89,8 +89,8 @@ WARM_UP_EVENT = 40
 WARM_UP_SAMPLES = WARM_UP_EVENT + 3 * batch_fit.BLOCK + 2 * recursive_fit.CHUNK
 """Number of samples of the warm-up: it ends after the fits that follow the event, and one more block."""
 WARM_UP_PAYLOAD = WARM_UP_EVENT + 100
-"""Number of samples of the warm-up with a payload method that takes samples itself: no arm swings as they do, and a fit
-that goes on takes seconds."""
+"""Number of samples of the warm-up with a payload method that takes samples itself: its fit has taken steps by then,
+and five estimates were read. No arm swings as these samples do, so a fit that goes on takes seconds."""
 WARM_UP_STEP_NS = 1_000_000
 
 
