@@ -2,15 +2,16 @@
 
 The state is x = [w; w'] with the measured displacements w, so its basis stays the same as the arm turns:
 
-    w'' = -G(c) w - D w' + H(c) tau + s Q(c) [p; p''] + R t,   y = w + E(c) tau + F tau'' + b
+    w'' = -G(c) w - D w' + H(c) tau + s Q(c) [p; p''] + R(c) t,   y = w + E(c) tau + F tau'' + b
 
-c = cos(theta2 - theta1) and s = sin(theta2 - theta1). G, H, E and Q are linear in three functions of c
-(``varying_kernel.basis``). p are the products of two displacements, t those of three: links that swing by an angle in
-proportion to w turn the configuration to and fro, so the mass matrix has terms with s w. Measured displacements stand
-for w in p and t, so the model stays linear in its state. The published model is that of small vibrations, without p and
-t. D has a constant term and one term for the rate of each link. b is a slow offset. E and F stand for the modes above
-those of the model. All signals, p and t too, pass one low-pass filter with a corner above the modes. Each block of
-``BLOCK`` samples updates parameters and state together, as in ``recursive_fit``.
+c = cos(theta2 - theta1) and s = sin(theta2 - theta1). G, H, E, Q and R are linear in three functions of c
+(``varying_kernel.basis``). Links that swing by an angle in proportion to w turn the configuration to and fro, so the
+equations of motion have terms of second and third order: p are the products of two displacements, t those of three, and
+of one displacement and two rates. Measured signals stand for w and w' in them, so the model stays linear in its state.
+The published model is that of small vibrations, without p and t. D has a constant term and one term for the rate of
+each link. b is a slow offset. E and F stand for the modes above those of the model. All signals, p and t too, pass one
+low-pass filter with a corner above the modes. Each block of ``BLOCK`` samples updates parameters and state together, as
+in ``recursive_fit``.
 """
 
 from __future__ import annotations
@@ -26,9 +27,8 @@ import scipy
 from numpy.typing import NDArray
 
 from flexmanip_ros.identification.batch_fit import BLOCK
-from flexmanip_ros.identification.moments import triangle
+from flexmanip_ros.identification.moments import solved, triangle
 from flexmanip_ros.identification.prediction_check import white_noise
-from flexmanip_ros.identification.prediction_error import condition
 from flexmanip_ros.identification.varying_kernel import basis, low_pass, simulate_block
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Rows
@@ -45,12 +45,10 @@ UNEVEN = 1e-4
 """Prior deviation, as a share of the largest entry, of the parts of G that no arm of two links has. With link 2
 pointing the other way, c and the displacements of link 2 change sign. So the entries of G of one link are even
 functions of c, and those that couple the links are odd."""
-SQUARES, CUBES = 2.0, 0.2
+SQUARES, CUBES = 2.0, 0.1
 """Prior deviations of Q for each radian, and of R for each square radian, of the angle through which the links swing.
-Within a radian G changes by about as much as it is large, and a joint swings to and fro within it."""
-MOST_SWING = 0.04
-"""Largest square of the swing's amplitude [rad^2] for which the products of two and three displacements suffice. At
-0.05 (74 mm of bending, default arm) fits that begin there are off by 5 % in frequency, below 0.04 by 0.4 %."""
+Within a radian G changes by about as much as it is large, and a joint swings to and fro within it. The entries of R
+that ten minutes of the default arm show are 0.1 (rms)."""
 DIRECT, DAMPED, TURNING, OFFSET, SHARED = 0.05, 0.05, 2.0, 0.3, 1.0
 """Prior deviations of E and F, of the constant term of D, of its terms with the rates, of b and of zeta. They hold for
 signals of unit power and time in units of 1 / shift."""
@@ -96,8 +94,7 @@ class Varying(NamedTuple):
     angle: relative angle of the links after the last block [rad]; blocks: number taken; strikes: number of bad blocks
     in a row; lost: samples were missing, so filter and state restart; settling: kept samples until the restarted filter
     has settled; turn: angle through which the links swing with displacements of unit power [rad, rms]; power: (h, h)
-    covariance of the scaled displacements, and swing: see ``Block``, averages over the last blocks; center: see
-    ``signals_of``.
+    covariance of the scaled displacements, an average over the last blocks; center: see ``signals_of``.
     """
 
     shift: float
@@ -120,17 +117,15 @@ class Varying(NamedTuple):
     settling: int
     turn: float
     power: Array
-    swing: float
     center: Array
 
 
 class Block(NamedTuple):
     """Filtered and scaled samples of a block, and the configuration in its middle; see ``simulate_block``.
 
-    c: cos(theta2 - theta1) in the middle; by_s: change of c from there to the end; rates: (3,) factors on the terms of
-    D; angle: theta2 - theta1 at the end [rad]; swing: squared amplitude of the angle through which a link swings with
-    the displacements, summed over the links [rad^2]; as for a sinusoid it is twice the mean square; P (N, d): [p; p'';
-    t]; bend (N, d): its changes from row to row; sine: sin(theta2 - theta1) in the middle.
+    c: cos(theta2 - theta1) in the middle; turn: (N,) that cosine minus c; rates: (3,) factors on the terms of D; angle:
+    theta2 - theta1 at the end [rad]; P (N, d): [p; p''; t]; bend (N, d): its changes from row to row; sine:
+    sin(theta2 - theta1) in the middle.
     """
 
     U: Array
@@ -139,13 +134,11 @@ class Block(NamedTuple):
     bend: Array
     V: Array
     Y: Array
-    s: Array
+    turn: Array
     dt: float
     c: float
-    by_s: float
     rates: Array
     angle: float
-    swing: float
     sine: float
 
 
@@ -197,14 +190,19 @@ def triples(h: int) -> int:
     return h * (h + 1) * (h + 2) // 6
 
 
+def third_order(h: int) -> int:
+    """Return the number of terms that R multiplies: products of three displacements, and of one and two rates."""
+    return triples(h) + h * pairs(h)
+
+
 @cache
 def parts(h: int, r: int) -> dict[str, tuple[slice, tuple[int, ...]]]:
     """Return the slice of theta and the shape of each of its parts G, H, E, F, D, b, Q, R and zeta.
 
-    G, H, E, Q have one matrix for each function of c, D has one for each factor of ``Block.rates``.
+    G, H, E, Q, R have one matrix for each function of c, D has one for each factor of ``Block.rates``.
     """
     shapes = {'G': (FUNCTIONS, h, h), 'H': (FUNCTIONS, h, r), 'E': (FUNCTIONS, h, r), 'F': (h, r), 'D': (3, h, h),
-              'b': (h,), 'Q': (FUNCTIONS, h, 2 * pairs(h)), 'R': (h, triples(h)), 'zeta': (1,)}
+              'b': (h,), 'Q': (FUNCTIONS, h, 2 * pairs(h)), 'R': (FUNCTIONS, h, third_order(h)), 'zeta': (1,)}
     found, at = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)
@@ -233,8 +231,8 @@ def prior(G: Array, H: Array, turn: float) -> Array:
         np.abs(G).max() * shares(h).ravel(), np.repeat(share * np.abs(H).max(), h * r),
         np.repeat(DIRECT * np.array([1.0, 0.3, 0.3]), h * r), np.full(h * r, DIRECT),
         np.full(h * h, DAMPED), np.full(2 * h * h, TURNING), np.full(h, OFFSET),
-        np.full(2 * FUNCTIONS * h * pairs(h), SQUARES * turn), np.full(h * triples(h), CUBES * turn ** 2),
-        np.full(1, SHARED)])
+        np.full(2 * FUNCTIONS * h * pairs(h), SQUARES * turn),
+        np.full(FUNCTIONS * h * third_order(h), CUBES * turn ** 2), np.full(1, SHARED)])
 
 
 def walk(theta: Array, h: int, r: int, size: Array, turn: float) -> Array:
@@ -244,9 +242,9 @@ def walk(theta: Array, h: int, r: int, size: Array, turn: float) -> Array:
     return np.concatenate([found, STATE_WALK * size, STATE_WALK * size])
 
 
-def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, sine: float = 0.0
+def local(theta: Array, h: int, r: int, c: float, rates: Array, sine: float = 0.0
           ) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
-    """G, G1, H, H1, D, E, Q of ``simulate_block`` at the configuration c; by_s, rates, sine: see ``Block``."""
+    """G, G1, H, H1, D, E, Q of ``simulate_block`` at the configuration c; rates, sine: see ``Block``."""
     value, by_c, _, _ = basis(c, float(theta[-1]))
 
     def mean(weight: Array, name: str) -> Array:
@@ -254,25 +252,26 @@ def local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, sin
         return np.asarray((weight @ theta[where].reshape(len(weight), -1)).reshape(shape[1:]))
 
     direct = np.hstack([mean(value, 'E'), part(theta, 'F', h, r), part(theta, 'b', h, r)[:, None]])
-    by_products = np.hstack([sine * mean(value, 'Q'), part(theta, 'R', h, r)])
-    return (mean(value, 'G'), mean(by_c * by_s, 'G'), mean(value, 'H'), mean(by_c * by_s, 'H'), mean(rates, 'D'),
+    by_products = np.hstack([sine * mean(value, 'Q'), mean(value, 'R')])
+    return (mean(value, 'G'), mean(by_c, 'G'), mean(value, 'H'), mean(by_c, 'H'), mean(rates, 'D'),
             direct, by_products)
 
 
-def to_local(theta: Array, h: int, r: int, c: float, by_s: float, rates: Array, sine: float = 0.0) -> Array:
+def to_local(theta: Array, h: int, r: int, c: float, rates: Array, sine: float = 0.0) -> Array:
     """(l, k + 2h) derivative of [local parameters; state] with respect to [theta; state]; see ``local``."""
     value, by_c, by_zeta, by_both = basis(c, float(theta[-1]))
     row, column, weight, (first_direct, first_product, end) = _entries(h, r)
     T = np.zeros((end + 2 * h, len(theta) + 2 * h))
-    T[row, column] = np.concatenate([value, by_c * by_s, rates, sine * value, [1.0]])[weight]
-    G, H, E, Q = (part(theta, name, h, r).reshape(FUNCTIONS, -1) for name in 'GHEQ')
+    T[row, column] = np.concatenate([value, by_c, rates, sine * value, [1.0]])[weight]
+    G, H, E, Q, R = (part(theta, name, h, r).reshape(FUNCTIONS, -1) for name in 'GHEQR')
     at = parts(h, r)['zeta'][0].start
     a, b, d = h * h, h * r, 2 * pairs(h)
     direct, products = (T[begin:stop].reshape(h, (stop - begin) // h, -1)
                         for begin, stop in ((first_direct, first_product), (first_product, end)))
-    T[:a, at], T[a:2 * a, at] = by_zeta @ G, by_s * by_both @ G
-    T[2 * a:2 * a + b, at], T[2 * a + b:2 * a + 2 * b, at] = by_zeta @ H, by_s * by_both @ H
-    direct[:, :r, at], products[:, :d, at] = (by_zeta @ E).reshape(h, r), (sine * by_zeta @ Q).reshape(h, d)
+    T[:a, at], T[a:2 * a, at] = by_zeta @ G, by_both @ G
+    T[2 * a:2 * a + b, at], T[2 * a + b:2 * a + 2 * b, at] = by_zeta @ H, by_both @ H
+    direct[:, :r, at] = (by_zeta @ E).reshape(h, r)
+    products[:, :d, at], products[:, d:, at] = (sine * by_zeta @ Q).reshape(h, d), (by_zeta @ R).reshape(h, -1)
     return T
 
 
@@ -286,14 +285,14 @@ def _entries(h: int, r: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDAr
     where = parts(h, r)
     size = where['zeta'][0].stop
     column, one, found = np.arange(size), 4 * FUNCTIONS, []
-    F, b, R = (part(column, name, h, r) for name in 'FbR')
+    F, b = (part(column, name, h, r) for name in 'Fb')
     for i in range(FUNCTIONS):
-        G, H, D, E, Q = (part(column, name, h, r)[i] for name in 'GHDEQ')
+        G, H, D, E, Q, R = (part(column, name, h, r)[i] for name in 'GHDEQR')
         columns = G, G, H, H, D, np.hstack([E, F, b[:, None]]), np.hstack([Q, R])
         weights = i, FUNCTIONS + i, i, FUNCTIONS + i, 2 * FUNCTIONS + i, i, 3 * FUNCTIONS + i
         entries = np.concatenate([block.ravel() for block in columns])
         weight = np.concatenate([np.full(block.size, number) for block, number in zip(columns, weights, strict=True)])
-        weight[np.isin(entries, np.concatenate([F.ravel(), b, R.ravel()]))] = one
+        weight[np.isin(entries, np.concatenate([F.ravel(), b]))], weight[np.isin(entries, R)] = one, i
         found.append((np.arange(len(entries)), entries, weight))
     end, product = len(entries), columns[-1].size
     state = np.arange(2 * h)
@@ -304,11 +303,11 @@ def _entries(h: int, r: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDAr
 
 def _filter(v: Varying) -> tuple[Array, Array, Array]:
     w = 2.0 * np.pi * v.corner
-    A, B, C = np.zeros((5, 5)), np.zeros(4), np.zeros((2, 4))
+    A, B, C = np.zeros((5, 5)), np.zeros(4), np.zeros((3, 4))
     for i, quality in enumerate(QUALITIES):
         A[2 * i, 2 * i + 1], A[2 * i + 1, 2 * i], A[2 * i + 1, 2 * i + 1] = 1.0, -w * w, -w * quality
     A[3, 0], B[1] = w * w, w * w
-    C[0, 2], C[1] = 1.0, A[3, :4]
+    C[0, 2], C[1, 3], C[2] = 1.0, 1.0, A[3, :4]
     A[:4, 4] = B
     step = scipy.linalg.expm(A * v.dt)
     return np.ascontiguousarray(step[:4, :4]), np.ascontiguousarray(step[:4, 4]), C
@@ -336,15 +335,14 @@ def products(Y: Array, count: int) -> Array:
     return np.asarray(np.prod(Y[..., chosen], axis=-1))
 
 
-def passed(v: Varying, signals: Array, anew: bool) -> tuple[Array, Array, Array]:
-    """Filter signals (N, w); return the kept samples, their second derivatives, and the filter's state at the end."""
+def passed(v: Varying, signals: Array, anew: bool) -> tuple[Array, Array]:
+    """Filter signals (N, w); return kept samples with their two derivatives (3, n, w), and the filter's last state."""
     state = np.zeros_like(v.filtered) if anew else v.filtered.copy()
     if anew:
         state[0], state[2] = signals[0], signals[0]  # the steady state for the first sample
-    count = len(signals) // v.every
-    out, second = np.empty((count, signals.shape[1])), np.empty((count, signals.shape[1]))
-    low_pass(signals, *_filter(v), state, v.every, out, second)
-    return out, second, state
+    out = np.empty((3, len(signals) // v.every, signals.shape[1]))
+    low_pass(signals, *_filter(v), state, v.every, out)
+    return out, state
 
 
 def straight(s: Array, Y: Array, angles: Array) -> Array:
@@ -356,31 +354,27 @@ def straight(s: Array, Y: Array, angles: Array) -> Array:
     return np.asarray(found)
 
 
-def block_of(v: Varying, out: Array, second: Array) -> Block:
-    """Scale filtered signals (N, w) and determine the configuration from their angles, see ``straight``."""
-    r, h, n = len(v.scale_u), len(v.scale_y), len(out)
-    U, Y = out[:, :r] * v.scale_u, out[:, r:r + h] * v.scale_y
-    s = np.asarray((np.arange(n) - 0.5 * (n - 1)) / (0.5 * n), dtype=np.float64)
-    lines = straight(s, Y, out[:, r + h:r + h + 2])
-    half, turns = 0.5 * n * v.every * v.dt, Y @ lines[2:]
+def block_of(v: Varying, filtered: Array) -> Block:
+    """Scale filtered signals (3, n, w) and determine the configuration from their angles, see ``straight``."""
+    (out, rate, second), r, h = filtered, len(v.scale_u), len(v.scale_y)
+    n, bends = len(out), slice(r, r + h)
+    U, Y, rates = out[:, :r] * v.scale_u, out[:, bends] * v.scale_y, rate[:, bends] * (v.scale_y / v.shift)
+    s = np.linspace(-1.0, 1.0, n, endpoint=False) + 1.0 / n
+    lines, half = straight(s, Y, out[:, r + h:r + h + 2]), 0.5 * n * v.every * v.dt
     middle, relative, first = float(lines[0, 0]), float(lines[1, 0]) / half, float(lines[1, 1]) / half
-    bent = math.sin(middle) / v.shift
+    c, bent = math.cos(middle), math.sin(middle) / v.shift
     V = np.column_stack([U, second[:, :r] * (v.scale_u / v.shift ** 2), np.ones(n)])
     first_of_three = r + h + 2 + pairs(h)
     two, square = slice(r + h + 2, first_of_three), products(v.scale_y, 2)
+    # The filter delays slow signals alike, so the filtered product of w w' w' is nearly that of the filtered signals.
+    with_rates = (Y[:, :, None] * products(rates, 2)[:, None]).reshape(n, -1)
     P = np.ascontiguousarray(np.hstack([
         out[:, two] * square, second[:, two] * (square / v.shift ** 2),
-        out[:, first_of_three:] * products(v.scale_y, 3)]))
+        out[:, first_of_three:] * products(v.scale_y, 3), with_rates]))
     return Block(
-        np.ascontiguousarray(U), steps(U), P, steps(P), V, np.ascontiguousarray(Y), s, v.every * v.dt * v.shift,
-        math.cos(middle), -math.sin(middle) * relative * half,
-        np.array([1.0, bent * first, bent * (first + relative)]), middle + relative * half,
-        2.0 * swing_power(turns), math.sin(middle))
-
-
-def swing_power(turns: Array) -> float:
-    """Mean square of the angle through which the links swing [rad^2]; turns (N, 2): relative angle, angle of link 1."""
-    return float(np.var(turns[:, 1]) + np.var(turns.sum(axis=1)))
+        np.ascontiguousarray(U), steps(U), P, steps(P), V, np.ascontiguousarray(Y),
+        np.cos(middle + lines[1, 0] * s) - c, v.every * v.dt * v.shift, c,
+        np.array([1.0, bent * first, bent * (first + relative)]), middle + relative * half, math.sin(middle))
 
 
 def steps(U: Array) -> Array:
@@ -391,12 +385,12 @@ def steps(U: Array) -> Array:
 class Run(NamedTuple):
     """Simulation of a block, differentiated by the l local parameters and first states; see ``simulate_block``.
 
-    N: (l, l) information; g: (l,) gradient; moments: (h, h) sum of e e' over the residuals e; X: (2h, l) derivative of
-    the state at the end; end: (2h,) that state.
+    J: (n h, l) derivative of the whitened outputs; e: (n h,) whitened residuals; moments: (h, h) sum of the residuals'
+    outer products; X: (2h, l) derivative of the state at the end; end: (2h,) that state.
     """
 
-    N: Array
-    g: Array
+    J: Array
+    e: Array
     moments: Array
     X: Array
     end: Array
@@ -404,21 +398,23 @@ class Run(NamedTuple):
 
 def _run(v: Varying, block: Block, theta: Array, x: Array, noise: Array) -> Run:
     h, r = len(v.scale_y), len(v.scale_u)
-    size = 3 * h * h + 2 * h * r + h * (2 * r + 1) + h * (2 * pairs(h) + triples(h)) + 2 * h
-    N, g, moments, X = np.zeros((size, size)), np.zeros(size), np.zeros((h, h)), np.zeros((2 * h, size))
+    size = 3 * h * h + 2 * h * r + h * (2 * r + 1) + h * (2 * pairs(h) + third_order(h)) + 2 * h
+    count = block.Y.size
+    J, e, moments, X = np.zeros((count, size)), np.zeros(count), np.zeros((h, h)), np.zeros((2 * h, size))
     X[:, size - 2 * h:] = np.eye(2 * h)
     end = x.copy()
     whiten = np.linalg.inv(np.linalg.cholesky(noise))
-    matrices = local(theta, h, r, block.c, block.by_s, block.rates, block.sine)
-    simulate_block(block.U, block.slope, block.P, block.bend, block.V, block.Y, block.s, block.dt, *matrices, end,
-                   whiten, N, g, moments, X)
-    return Run(N, g, moments, X, end)
+    matrices = local(theta, h, r, block.c, block.rates, block.sine)
+    simulate_block(block.U, block.slope, block.P, block.bend, block.V, block.Y, block.turn, block.dt, *matrices, end,
+                   whiten, J, e, moments, X)
+    return Run(J, e, moments, X, end)
 
 
 def _first_state(v: Varying, block: Block, noise: Array) -> Array:
     """(2h,) first state that fits a block best with the present parameters: a linear least-squares problem."""
     run, n = _run(v, block, v.theta, np.zeros_like(v.x), noise), len(v.x)
-    return np.asarray(np.linalg.solve(run.N[-n:, -n:] + np.eye(n) / UNKNOWN ** 2, run.g[-n:]))
+    J = run.J[:, -n:]
+    return np.asarray(np.linalg.solve(J.T @ J + np.eye(n) / UNKNOWN ** 2, J.T @ run.e))
 
 
 def noise_of(signals: Array, v: Varying) -> Array:
@@ -448,13 +444,12 @@ def updated(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
     theta, runs, after, missed = fit
     block, run, Y = blocks[-1], runs[-1], np.vstack([block.Y for block in blocks])
     moments = np.sum([one.moments for one in runs], axis=0) / len(Y)
-    after[k:] = run.X @ to_local(theta, h, r, block.c, block.by_s, block.rates, block.sine) @ after
+    after[k:] = run.X @ to_local(theta, h, r, block.c, block.rates, block.sine) @ after
     fresh = max(1.0 / (v.blocks + 1.0), 1.0 / NOISE_BLOCKS)
     known = (1.0 - fresh) * v.noise + fresh * moments if v.blocks else moments
     share, chi2, strikes = v.share, v.chi2, 0
     lately = 1.0 / min(v.blocks + 1, SHARE_BLOCKS)
     power = v.power + (np.cov(Y.T, bias=True).reshape(h, h) - v.power) * lately
-    swing = v.swing + (block.swing - v.swing) * lately
     if not v.blocks:
         share, chi2 = np.sqrt(np.diag(moments) / np.var(Y, axis=0)), float(np.mean(np.diag(moments) / np.diag(white)))
     elif not after_gap:  # after a gap the state is unknown, so the block has no prediction
@@ -462,7 +457,7 @@ def updated(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
         strikes = v.strikes + 1 if float(missed.share.max()) > UNPREDICTED else 0
         share, chi2 = share + (missed.share - share) * part_of, chi2 + (missed.chi2 - chi2) * part_of
     return v._replace(theta=theta, x=run.end, root=after if len(blocks) == 1 else triangle(after.T).T, noise=known,
-                      share=share, chi2=chi2, power=power, swing=swing, angle=block.angle, blocks=v.blocks + 1,
+                      share=share, chi2=chi2, power=power, angle=block.angle, blocks=v.blocks + 1,
                       strikes=strikes)
 
 
@@ -489,7 +484,7 @@ def _fitted(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
     best, lowest, z = step, math.inf, step
     for _ in range(MOST_TRIALS * iterations + 1):
         theta, runs = runs_at(z)
-        if not all(np.all(np.isfinite(run.N)) and np.all(np.isfinite(run.end)) for run in runs):
+        if not all(np.all(np.isfinite(run.J)) and np.all(np.isfinite(run.end)) for run in runs):
             return None
         cost = sum(float(np.trace(np.linalg.solve(noise, run.moments))) for run in runs) / wide + float(z @ z)
         if cost > lowest and iterations > 1:
@@ -499,25 +494,38 @@ def _fitted(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
         best, lowest = z, cost
         if i == iterations:
             break
-        information, gradient = np.zeros_like(root), np.zeros_like(z)
+        rows, gradient = [], -z
         for block, run, at in zip(blocks, runs, places, strict=True):
-            along = to_local(theta, h, r, block.c, block.by_s, block.rates, block.sine)
+            along = to_local(theta, h, r, block.c, block.rates, block.sine)
+            J = triangle(run.J)
             if i == 0:
-                missed = _missed(block, run, noise, white, along[:, :k] @ root[:k])
+                missed = _missed(block, run, noise, white, J @ (along[:, :k] @ root[:k]))
             turned = along @ root[at]
-            information += turned.T @ run.N @ turned
-            gradient += turned.T @ run.g
-        after, step = root.copy(), np.empty_like(z)
-        condition(information / wide, after, gradient / wide - z, step)
-        size = float(np.linalg.norm(step))
-        if not np.isfinite(size):
+            rows.append(J @ turned / math.sqrt(wide))
+            gradient = gradient + turned.T @ (run.J.T @ run.e) / wide
+        try:
+            after, step = conditioned(root, np.vstack(rows), gradient)
+        except np.linalg.LinAlgError:  # the information overflows
             return None
+        size = float(np.linalg.norm(step))
         if size < 0.1 and i:
             break
         z, i = z + step, i + 1
     if z is not best:
         theta, runs = runs_at(best)
     return theta, runs, after[places[-1]], missed
+
+
+def conditioned(root: Array, J: Array, gradient: Array) -> tuple[Array, Array]:
+    """Square-root measurement update (Andrews 1968): S with S S' = root (I + J'J)^-1 root', and (I + J'J)^-1 gradient.
+
+    root: (k, k), J: (l, k), of fewer rows than root, gradient: (k,). Raises LinAlgError where I + JJ' is not finite.
+    """
+    one: Array = np.eye(len(J))
+    lower: Array = np.linalg.cholesky(one + J @ J.T)  # type: ignore[assignment]
+    whole = solved(lower.T, solved((lower + one).T, J, trans=1))
+    step = gradient - J.T @ solved(lower.T, solved(lower.T, J @ gradient, trans=1))
+    return root - (root @ J.T) @ whole, step
 
 
 class Missed(NamedTuple):
@@ -533,12 +541,12 @@ class Missed(NamedTuple):
 def _missed(block: Block, run: Run, noise: Array, white: Array, own: Array) -> Missed:
     """Return what the prediction of a block misses.
 
-    own: derivative of the local parameters along the columns of the parameters' covariance root. Errors that these
-    deviations explain are not counted.
+    own: change of the whitened outputs, rotated, along the columns of the parameters' covariance root. Errors that
+    these deviations explain are not counted.
     """
     left = np.diag(run.moments) / len(block.Y)
     power = np.maximum(np.var(block.Y, axis=0), np.diag(noise))
-    explained = 1.0 + float(np.sum((run.N @ own) * own)) / block.Y.size
+    explained = 1.0 + float(np.sum(own ** 2)) / block.Y.size
     return Missed(np.sqrt(left / power) / explained ** 0.25, float(np.mean(left / np.diag(white))) / explained)
 
 
@@ -572,17 +580,18 @@ def measured(v: Varying, signals: Array, missing: NDArray[np.int64]) -> list[tup
 
 def taken(v: Varying, signals: Array) -> Varying | None:
     """Update the fit with samples (N, w) that have no gap between them, once the filter has settled."""
-    out, second, state = passed(v, signals, v.lost)
+    out, state = passed(v, signals, v.lost)
     waiting = settling(v) if v.lost else v.settling
     if v.lost or waiting:
-        v = reopened(v, max(waiting - len(out), 0))._replace(angle=float(out[-1, len(v.scale_u) + len(v.scale_y)]))
-        out, second = out[waiting:], second[waiting:]
+        angle = float(out[0, -1, len(v.scale_u) + len(v.scale_y)])
+        v = reopened(v, max(waiting - out.shape[1], 0))._replace(angle=angle)
+        out = out[:, waiting:]
     v = v._replace(filtered=state)
-    if len(out) < BLOCK // v.every // 4:  # a gap follows, or the filter has just settled
+    if out.shape[1] < BLOCK // v.every // 4:  # a gap follows, or the filter has just settled
         return v
     iterations = ITERATIONS if v.blocks < SHARE_BLOCKS else 1
     white = noise_of(signals, v)
-    return updated(v, [block_of(v, out, second)], v.noise + 0.05 * white, white, iterations)
+    return updated(v, [block_of(v, out)], v.noise + 0.05 * white, white, iterations)
 
 
 def reopened(v: Varying, waiting: int) -> Varying:

@@ -16,11 +16,11 @@ the functions are infinite."""
 
 
 @library
-def low_pass(rows: Array, Ad: Array, Bd: Array, Cd: Array, state: Array, every: int, out: Array, second: Array) -> None:
+def low_pass(rows: Array, Ad: Array, Bd: Array, Cd: Array, state: Array, every: int, out: Array) -> None:
     """Run the columns of rows (N, w) through one filter of state (f, w); keep the last one of each ``every`` rows.
 
-    Ad (f, f), Bd (f,): the filter; Cd (2, f): its output and the second derivative of the output. Fills out and second
-    (N // every, w). All columns pass the same filter, so linear relations between them are preserved.
+    Ad (f, f), Bd (f,): the filter; Cd (d, f): its output and the derivatives of the output. Fills out (d, N // every,
+    w). All columns pass the same filter, so linear relations between them are preserved.
     """
     order, width = state.shape
     after = np.empty(order)
@@ -35,26 +35,25 @@ def low_pass(rows: Array, Ad: Array, Bd: Array, Cd: Array, state: Array, every: 
                 state[i, j] = after[i]
         if (t + 1) % every == 0:
             k = t // every
-            for j in range(width):
-                value, curve = 0.0, 0.0
-                for i in range(order):
-                    value += Cd[0, i] * state[i, j]
-                    curve += Cd[1, i] * state[i, j]
-                out[k, j] = value
-                second[k, j] = curve
+            for d in range(Cd.shape[0]):
+                for j in range(width):
+                    value = 0.0
+                    for i in range(order):
+                        value += Cd[d, i] * state[i, j]
+                    out[d, k, j] = value
 
 
 @library
-def simulate_block(U: Array, slope: Array, P: Array, bend: Array, V: Array, Y: Array, s: Array, dt: float, G: Array,
-                   G1: Array, H: Array, H1: Array, D: Array, E: Array, Q: Array, x: Array, whiten: Array, N: Array,
-                   g: Array, moments: Array, X: Array) -> None:
-    """Simulate w'' = -(G + s G1) w - D w' + (H + s H1) u + Q p, y = w + E v over N steps, with its derivatives.
+def simulate_block(U: Array, slope: Array, P: Array, bend: Array, V: Array, Y: Array, turn: Array, dt: float, G: Array,
+                   G1: Array, H: Array, H1: Array, D: Array, E: Array, Q: Array, x: Array, whiten: Array, J: Array,
+                   residual: Array, moments: Array, X: Array) -> None:
+    """Simulate w'' = -(G + turn G1) w - D w' + (H + turn H1) u + Q p, y = w + E v over N steps, with its derivatives.
 
     U (N, r): u at the begin of each step; slope (N, r): change of u in the step; P, bend (N, d): the same of p; V (N,
-    q): v; Y (N, h): measured y; s (N,): position in the block, -1 to 1; x (2h,): [w; w'], on return at the end. The l
-    local parameters are G, G1, H, H1, D, E, Q row by row, then x at the begin. X (2h, l): derivative of the state by
-    them, [0 I] at the begin. N (l, l) += J' J, g (l,) += J' e with whitened J and e = Y - y; moments (h, h) += e e' of
-    the unwhitened e.
+    q): v; Y (N, h): measured y; turn (N,): change of the configuration, by which G1 and H1 are derivatives; x (2h,):
+    [w; w'], on return at the end. The l local parameters are G, G1, H, H1, D, E, Q row by row, then x at the begin. X
+    (2h, l): derivative of the state by them, [0 I] at the begin. J (N h, l) += the whitened derivative of y, residual
+    (N h,) += the whitened e = Y - y; moments (h, h) += e e' of the unwhitened e.
     """
     h, r = H.shape
     d, q, width = P.shape[1], V.shape[1], X.shape[1]
@@ -63,7 +62,6 @@ def simulate_block(U: Array, slope: Array, P: Array, bend: Array, V: Array, Y: A
     at_d = at_h1 + h * r
     at_e = at_d + h * h
     at_q = at_e + h * q
-    J, residual = np.zeros((U.shape[0] * h, width)), np.zeros(U.shape[0] * h)
     e, t, t_next = np.empty(h), np.empty(2 * h), np.empty(2 * h)
     T, T_next = np.empty((2 * h, width)), np.empty((2 * h, width))
     Gs, Hs = np.empty((h, h)), np.empty((h, r))
@@ -85,9 +83,9 @@ def simulate_block(U: Array, slope: Array, P: Array, bend: Array, V: Array, Y: A
                 moments[o, p] += e[o] * e[p]
         for a in range(h):
             for b in range(h):
-                Gs[a, b] = G[a, b] + s[k] * G1[a, b]
+                Gs[a, b] = G[a, b] + turn[k] * G1[a, b]
             for b in range(r):
-                Hs[a, b] = H[a, b] + s[k] * H1[a, b]
+                Hs[a, b] = H[a, b] + turn[k] * H1[a, b]
         for i in range(2 * h):
             t[i] = x[i]
             for j in range(width):
@@ -113,13 +111,13 @@ def simulate_block(U: Array, slope: Array, P: Array, bend: Array, V: Array, Y: A
                     T_next[h + a, j] = f * total
                 for b in range(h):
                     T_next[h + a, a * h + b] -= f * t[b]
-                    T_next[h + a, at_g1 + a * h + b] -= f * s[k] * t[b]
+                    T_next[h + a, at_g1 + a * h + b] -= f * turn[k] * t[b]
                     T_next[h + a, at_d + a * h + b] -= f * t[h + b]
                 if order <= 2:
                     for b in range(r):
                         v = U[k, b] if order == 1 else slope[k, b]
                         T_next[h + a, at_h + a * r + b] += f * v
-                        T_next[h + a, at_h1 + a * r + b] += f * s[k] * v
+                        T_next[h + a, at_h1 + a * r + b] += f * turn[k] * v
                     for b in range(d):
                         T_next[h + a, at_q + a * d + b] += f * (P[k, b] if order == 1 else bend[k, b])
             for i in range(2 * h):
@@ -128,8 +126,6 @@ def simulate_block(U: Array, slope: Array, P: Array, bend: Array, V: Array, Y: A
                 for j in range(width):
                     X[i, j] += T_next[i, j]
                     T[i, j] = T_next[i, j]
-    N += np.dot(J.T, J)
-    g += np.dot(J.T, residual)
 
 
 def basis(c: float, zeta: float) -> tuple[Array, Array, Array, Array]:

@@ -8,7 +8,6 @@ import numpy as np
 from flexmanip_ros.identification.batch_fit import BLOCK
 from flexmanip_ros.identification.parameter_varying import (
     AT_REST,
-    MOST_SWING,
     Roles,
     Varying,
     local,
@@ -95,7 +94,7 @@ class Configurations(NamedTuple):
 
 def judge(found: Identified, v: Varying) -> Status:
     """Return the status, from the predictions of samples before they were fitted and from the deviations."""
-    if float(v.share.max()) > MISSED or v.swing > MOST_SWING:
+    if float(v.share.max()) > MISSED:
         return Status.INCONSISTENT
     oscillations = modes(found)
     if len(oscillations) < len(v.scale_y):
@@ -130,9 +129,9 @@ def _matrices(read: Configurations, c: float, role: Roles, ratio: float) -> tupl
     v = read.varying
     h, r = len(v.scale_y), len(v.scale_u)
     m, n = len(role.states), 2 * h
-    G, _, H, _, D, E, _ = local(v.theta, h, r, c, 0.0, AT_REST)
+    G, _, H, _, D, E, _ = local(v.theta, h, r, c, AT_REST)
     a, b, q = h * h, h * r, 2 * r + 1
-    L = to_local(v.theta, h, r, c, 0.0, AT_REST)[:, :len(v.theta)] @ (ratio * v.root[:len(v.theta)])
+    L = to_local(v.theta, h, r, c, AT_REST)[:, :len(v.theta)] @ (ratio * v.root[:len(v.theta)])
     of_G, of_D = unmodelled(v, G)
     more = np.zeros((len(L), 2 * h))
     more[:a, :h] = of_G.reshape(h, -1).T
