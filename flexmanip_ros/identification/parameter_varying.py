@@ -123,9 +123,9 @@ class Varying(NamedTuple):
 class Block(NamedTuple):
     """Filtered and scaled samples of a block, and the configuration in its middle; see ``simulate_block``.
 
-    c: cos(theta2 - theta1) in the middle; turn: (N,) that cosine minus c; rates: (3,) factors on the terms of D; angle:
-    theta2 - theta1 at the end [rad]; P (N, d): [p; p''; t]; bend (N, d): its changes from row to row; sine:
-    sin(theta2 - theta1) in the middle.
+    c: cos(theta2 - theta1) in the middle; turn: (N,) that cosine at each row, minus c; rates: (3,) factors on the terms
+    of D; angle: theta2 - theta1 at the end [rad]; P (N, d): [p; p''; t]; bend (N, d): its changes from row to row;
+    sine: sin(theta2 - theta1) in the middle.
     """
 
     U: Array
@@ -191,7 +191,7 @@ def triples(h: int) -> int:
 
 
 def third_order(h: int) -> int:
-    """Return the number of terms that R multiplies: products of three displacements, and of one and two rates."""
+    """Return the number of products of three of h displacements, and of one displacement and two rates."""
     return triples(h) + h * pairs(h)
 
 
