@@ -114,7 +114,7 @@ def kept(state: pipeline.State) -> int:
     refined = state.identifier.estimator.rpbsid.refined
     assert refined is not None
     varying = refined.varying
-    arrays = [] if varying is None else [part for part in varying if isinstance(part, np.ndarray)]
+    arrays = [] if varying is None else [part for part in (*varying, *varying.past) if isinstance(part, np.ndarray)]
     return state.log.end - state.log.start + sum(part.size for part in arrays)
 
 

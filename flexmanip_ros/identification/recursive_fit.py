@@ -42,6 +42,8 @@ SOONEST_S, EACH_S = 0.1, 2e-4
 more."""
 BLOCK_S = 0.06
 """Delay of the result of a block [s]. It is at least CHUNK samples, and below BLOCK samples to keep up with them."""
+REFIT_S = 0.25
+"""Delay of the result of a block with which all blocks are fitted again [s]; that takes up to 0.2 s on a slow core."""
 LATEST = 4096
 """Largest delay in samples that a time [s] may ask for: it bounds the samples that are kept, at any sample rate."""
 PARAMETERS, USUAL = 120, 80
@@ -230,7 +232,9 @@ def ask_block(config: IdentifierParameters, refined: Refined, rows: Rows) -> Ref
     """Request an update by the oldest block that the fit has not used; rows: the latest ones."""
     block = rows.since(refined.seen).between(refined.seen, refined.seen + BLOCK)
     request = FitRequest(config, block, None, None, refined.recursion, varying=refined.varying)
-    later = max(CHUNK, _chunks(refined, int(rows.stamp_ns[-1]), BLOCK_S, BLOCK - CHUNK))
+    again = refined.varying is not None and refined.varying.blocks + 1 in parameter_varying.REFITS
+    duration, most = (REFIT_S, LATEST) if again else (BLOCK_S, BLOCK - CHUNK)
+    later = max(CHUNK, _chunks(refined, int(rows.stamp_ns[-1]), duration, most))
     return refined._replace(request=request, due=refined.end + later)
 
 

@@ -302,7 +302,7 @@ def identified(config: IdentifierParameters, state: RpbsidState, dt: float, rows
         read = Configurations(
             config, refined.varying, dt, model_output.excitation(state.memory[0][:d, :d]), float(state.scalars[POWER]),
             np.zeros(0) if last is None else last.singular_values, float('nan') if last is None else last.condition)
-        return read.with_relative(refined.varying.angle, present=True) if rows is None else read.now(rows)
+        return read.with_relative(refined.varying.angle) if rows is None else read.now(rows)
     if refined is not None and refined.recursion and len(refined.recursion.theta.A) == config.order \
             and FRESH * refined.recursion.weight >= min(state.counts[USED], recursive_fit.MEMORY):
         return model_output.from_fit(

@@ -62,25 +62,23 @@ class Configurations(NamedTuple):
         here = rows.missing == 0
         Y, angles = rows.y[:, list(role.displacements)] - v.center, relative_angle(self.config, rows.angles)
         if np.count_nonzero(here) < count // 2:  # too few measured rows
-            found = self.with_relative(v.angle, present=True)
+            found = self.with_relative(v.angle)
             if len(rows) == len(latest) or found.status is not Status.TRACKING:
                 return found
             return found._replace(status=Status.WARMING_UP, reason='the angle between the links since the last gap is '
                                                                    'not known yet')
         s = np.linspace(-1.0, 0.0, len(rows))
-        return self.with_relative(float(straight(s[here], Y[here] * v.scale_y, angles[here, None])[0, 0]), present=True)
+        return self.with_relative(float(straight(s[here], Y[here] * v.scale_y, angles[here, None])[0, 0]))
 
-    def with_relative(self, angle: float, *, present: bool = False) -> Identified:
+    def with_relative(self, angle: float) -> Identified:
         """Return the model where link 2 makes this angle with link 1 [rad].
 
-        present: the arm is at this angle, so the errors of its predictions give the uncertainty of the frequencies. At
-        other angles the deviations of the parameters are multiplied by the Birge ratio of the predictions (root of chi
-        square over degrees of freedom).
+        The deviations of the parameters are multiplied by the Birge ratio of the predictions (root of chi square over
+        degrees of freedom).
         """
         role = shown(self.config)
         assert role is not None
-        ratio = 1.0 if present else math.sqrt(max(self.varying.chi2, 1.0))
-        model, along = _matrices(self, math.cos(angle), role, ratio)
+        model, along = _matrices(self, math.cos(angle), role, math.sqrt(max(self.varying.chi2, 1.0)))
         v = self.varying
         rest = np.zeros(model.order)  # the state at rest: C = [I 0]
         rest[list(role.displacements)] = v.center + part(v.theta, 'b', len(v.scale_y), len(v.scale_u)) / v.scale_y
@@ -108,9 +106,9 @@ def unmodelled(v: Varying, G: Array) -> tuple[Array, Array]:
     """Return deviations of G and D (h, h, h), one for each mode, that explain what predictions over a block miss.
 
     A relative frequency error e of a mode w gives the phase error w t e after a time t; over a block of duration T its
-    root mean square is w T e / sqrt(3), as a share of the mode's own amplitude. Half of the missed power counts as
-    phase error, half as amplitude error, and either may come from any one mode. So a mode that has a hundredth of the
-    power is ten times as uncertain as one that has all of it.
+    root mean square is w T e / sqrt(3), as a share of the mode's own amplitude. Of the missed power the share 1 - 1 /
+    chi2 is not that of white noise. Half of it counts as phase error, half as amplitude error, and either may come from
+    any one mode. So a mode that has a hundredth of the power is ten times as uncertain as one that has all of it.
     """
     values, V = np.linalg.eig(G)
     if np.iscomplexobj(values) or not np.all(values > 0.0) or np.linalg.cond(V) > MOST_SKEW:
@@ -119,7 +117,8 @@ def unmodelled(v: Varying, G: Array) -> tuple[Array, Array]:
     size = np.einsum('kp,pq,kq->k', U, v.power, U)
     share = np.minimum(np.mean(V ** 2 * size / np.diag(v.power)[:, None], axis=0), 1.0)
     w = np.sqrt(values)
-    error = np.sqrt(1.5 * np.mean(v.share ** 2) / np.maximum(share, 1e-12)) / (w * v.shift * BLOCK * v.dt)
+    missed = np.mean(v.share ** 2) * (1.0 - 1.0 / max(v.chi2, 1.0))
+    error = np.sqrt(1.5 * missed / np.maximum(share, 1e-12)) / (w * v.shift * BLOCK * v.dt)
     shapes = np.einsum('ok,kp->kop', V, U)
     return 2.0 * (error * values)[:, None, None] * shapes, 2.0 * (error * w)[:, None, None] * shapes
 

@@ -58,8 +58,8 @@ LATE = 16.0
 ZETA = 0.8
 """First value of zeta: k = 0.69."""
 MOST_SWING = 0.04
-"""Largest square of the swing's amplitude [rad^2] at which a fit may begin. In the 12 s after a
-begin the first frequency of the default arm is 1.4 % off (median) above 0.03, 0.4 to 0.9 % from 0.003 to 0.03."""
+"""Largest square of the swing's amplitude [rad^2] at which a fit may begin. In the 12 s after a begin f1 of the default
+arm is 0.3 to 0.6 % off (median) up to 0.03, and no band misses by a factor of three; above 0.05 12 % do."""
 SAME = 0.3
 """Factor on the prior deviations around the model before an event: the arm is the same, its object another."""
 
@@ -125,7 +125,7 @@ def start(config: IdentifierParameters, rows: Rows, old: Recursion | None, befor
         root[:len(theta), :len(theta)] *= known
     return _fit_stretch(config, begun._replace(
         dt=dt, theta=theta, root=root, scale_u=unit[:r], scale_y=unit[r:], turn=turn,
-        center=np.mean(Y, axis=0)), rows, role)
+        center=np.mean(Y, axis=0), prior=np.stack([theta, np.diag(root)[:len(theta)]]), past=()), rows, role)
 
 
 def _turn(config: IdentifierParameters, rows: Rows, Y: Array) -> float:
@@ -168,7 +168,8 @@ def _from_recursion(old: Recursion, role: Roles, r: int, dt: float, c: float) ->
         shift=shift, scale_u=scale[:r].copy(), scale_y=scale[r:][list(role.displacements)].copy(), theta=theta,
         x=np.zeros(2 * h), root=root, noise=np.zeros((h, h)), share=np.zeros(h), chi2=1.0, corner=corner,
         every=every, filtered=np.zeros((4, width(h, r))), dt=dt, angle=0.0, blocks=0, strikes=0, lost=False,
-        settling=0, turn=0.0, power=np.zeros((h, h)), center=np.zeros(h))
+        settling=0, turn=0.0, power=np.zeros((h, h)), center=np.zeros(h), white=np.zeros((h, h)),
+        prior=np.stack([theta, np.diag(root)[:len(theta)]]), past=())
 
 
 def _fit_stretch(config: IdentifierParameters, v: Varying, rows: Rows, role: Roles) -> Varying | None:
@@ -216,4 +217,6 @@ def _fit_at_once(v: Varying, signals: Array, missing: NDArray[np.int64]) -> Vary
     _, last, out, state = stretches[-1]
     if out.shape[1] < quiet + FEWEST:  # the filter has not settled since the last gap
         v = reopened(v, max(quiet - out.shape[1], 0))
+    settled = (out[:, quiet:] for _, _, out, _ in stretches)
+    v = v._replace(white=least, past=tuple(out for out in settled if out.shape[1] >= FEWEST))
     return v._replace(filtered=state) if last == len(signals) else lost(v)

@@ -180,7 +180,7 @@ def _of_every_configuration(config: IdentifierParameters, signals: Signals, a: i
     for first in range(0, b - a - BLOCK + 1, BLOCK):
         angle = float(np.nanmean(relative[first:first + BLOCK]))
         course.append((float(signals.time[a + first + BLOCK // 2]), modes(found.with_relative(angle))))
-    status = found.with_relative(found.varying.angle, present=True).status
+    status = found.with_relative(found.varying.angle).status
     return Smoothed(float(signals.time[a]), float(signals.time[b - 1]), b - a, 'every configuration', status,
                     course[-1][1], tuple(course))
 

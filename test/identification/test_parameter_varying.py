@@ -110,6 +110,15 @@ def test_readings_of_a_moving_arm_are_right_and_their_bands_hold(run: Run) -> No
     assert np.mean(errors < 1.96 * deviations) > 0.8
 
 
+def test_fitting_all_blocks_again_removes_the_error_of_the_first_linearizations(run: Run) -> None:
+    last = parameter_varying.REFITS[-1] * parameter_varying.BLOCK / 1000.0
+    late = [one for one in run.estimates if one.stamp_ns >= (CAPTURE_S + last + 1.0) * 1e9 and len(one.modes) == 2]
+    errors = np.array([np.abs([mode.frequency_hz for mode in one.modes] / truth(run, one) - 1.0) for one in late])
+    assert len(late) > 10
+    assert np.median(errors) < 0.001
+    assert errors.max() < 0.003
+
+
 def test_no_wrong_mode_is_published_as_tracking_after_a_capture(run: Run) -> None:
     after = [one for one in run.estimates if CAPTURE_S * 1e9 <= one.stamp_ns < SETTLED_S * 1e9
              and one.model_status is Status.TRACKING]
@@ -304,6 +313,7 @@ def test_the_memory_is_constant(run: Run) -> None:
     assert refined is not None
     assert refined.varying is not None
     assert sum(part.size for part in refined.varying if isinstance(part, np.ndarray)) < 40_000
+    assert not refined.varying.past
     assert run.state.log.end - run.state.log.start < 4096
 
 
