@@ -156,17 +156,21 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: mem.Fil
         for c in range(i + 1):
             m.normal[i, c] = m.N[i, c]
     # by the trajectory: a linearized filter explains residuals of one that is far from the minimum
-    fits = m.score[mem.COST] < FITS * (nx + m.noise.shape[0] * m.counts[mem.MEASURED])
+    ratio = m.score[mem.COST] / (nx + m.noise.shape[0] * m.counts[mem.MEASURED])
+    fits = ratio < FITS
     enough = CONVERGED * m.counts[mem.ITERATED]
     # two steps may undo each other for ever where the valley bends
-    still = (m.counts[mem.BEFORE] == m.counts[mem.ITERATED] and m.score[mem.LAMBDA] <= first_damping(m)
-             and m.score[mem.COST_BEFORE] - m.score[mem.COST] < enough)
+    still = m.counts[mem.BEFORE] == m.counts[mem.ITERATED] and m.score[mem.COST_BEFORE] - m.score[mem.COST] < enough
+    free = m.score[mem.LAMBDA] <= first_damping(m)  # a strongly damped step gains little wherever it is taken
     m.counts[mem.BEFORE] = m.counts[mem.ITERATED]
     m.score[mem.COST_BEFORE] = m.score[mem.COST]
     rejected = are_efforts_noisy(m)
     if not rejected:
         judge_residuals(m)
     m.score[mem.LAMBDA] = m.score[mem.LAMBDA] / FADING if m.score[mem.LAMBDA] > FADED * first_damping(m) else 0.0
+    if m.counts[mem.HELD] == 1 and not fits:
+        # with s times the noise, which explains the residuals, the cost's second derivative is that of s I + N
+        m.score[mem.LAMBDA] = max(m.score[mem.LAMBDA], ratio - 1.0)
     m.counts[mem.REJECTED] = 0
     m.counts[mem.ITERATING] = 0
     if not damped_step(motion, sensors, m):
@@ -174,7 +178,9 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: mem.Fil
     gained = dot(m.g, m.gradient)
     # the simplest model is given up by chance, so not before it has converged
     fits &= m.counts[mem.REFITS] > 0 or m.score[mem.EXCESS] < BY_CHANCE
-    m.counts[mem.AGAIN] = 0 if fits or still or gained < enough else 1
+    m.counts[mem.AGAIN] = 0 if fits or (free and (still or gained < enough)) else 1
+    if fits and m.counts[mem.HELD] == 1:  # the next iteration reads more: its cost is another
+        m.score[mem.LAMBDA] = 0.0
     m.counts[mem.TRIED] = m.counts[mem.TRIED] + 1 if m.counts[mem.AGAIN] else 0
     if rejected:  # the filter has gone on with noisy efforts
         m.counts[mem.AGAIN] = 0

@@ -115,8 +115,8 @@ def test_fitting_all_blocks_again_removes_the_error_of_the_first_linearizations(
     late = [one for one in run.estimates if one.stamp_ns >= (CAPTURE_S + last + 1.0) * 1e9 and len(one.modes) == 2]
     errors = np.array([np.abs([mode.frequency_hz for mode in one.modes] / truth(run, one) - 1.0) for one in late])
     assert len(late) > 10
-    assert np.median(errors) < 0.001
-    assert errors.max() < 0.003
+    assert np.all(np.median(errors, axis=0) < 0.0008)  # f1 without: 0.0013
+    assert errors.max() < 0.0015
 
 
 def test_no_wrong_mode_is_published_as_tracking_after_a_capture(run: Run) -> None:
