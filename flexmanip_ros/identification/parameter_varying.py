@@ -49,7 +49,7 @@ SQUARES, CUBES = 2.0, 1.0
 """Prior deviations of Q for each radian, and of R for each square radian, of the angle through which the links swing.
 Within a radian G changes by about as much as it is large, and a joint swings to and fro within it. With R of 0.1, which
 ten minutes of the default arm show, a fit that begins on an arm that swings is too sure: R and G cannot be told apart
-in its first seconds, and 27 to 40 % of its bands of f1 missed by a factor of three (with 1: none)."""
+in its first seconds, and 13 to 32 % of its bands of f1 missed by a factor of three (with 1: none)."""
 DIRECT, DAMPED, TURNING, OFFSET, SHARED = 0.05, 0.05, 2.0, 0.3, 1.0
 """Prior deviations of E and F, of the constant term of D, of its terms with the rates, of b and of zeta. They hold for
 signals of unit power and time in units of 1 / shift."""

@@ -59,7 +59,7 @@ ZETA = 0.8
 """First value of zeta: k = 0.69."""
 MOST_SWING = 0.04
 """Largest square of the swing's amplitude [rad^2] at which a fit may begin. In the 12 s after a begin f1 of the default
-arm is 0.3 to 0.6 % off (median) up to 0.03, and no band misses by a factor of three; above 0.05 12 % do."""
+arm is 0.3 to 0.6 % off (median) up to 0.03, and no band misses by a factor of three; above 0.05 10 % do."""
 SAME = 0.3
 """Factor on the prior deviations around the model before an event: the arm is the same, its object another."""
 
