@@ -75,7 +75,8 @@ far. A later block gets one iteration: more improved nothing in three minutes of
 REFITS = (8, 16, 32)
 """Numbers of blocks at which all blocks since the begin are fitted again, linearized at the present parameters. A block
 is linearized where the parameters are when it comes; those of the first seconds are far off, and that error would
-remain. Without it f1 of the default arm is 0.2 % off (rms, eight noises) from 10 to 34 s, with it 0.02 %."""
+remain. Without it f1 of the default arm is 0.15 to 0.21 % off (rms, four noises) from 15 to 26 s, with it 0.03 to 0.05
+%."""
 AT_REST = np.array([1.0, 0.0, 0.0])
 """Factors on the three terms of D when the links stand still."""
 QUALITIES = (1.0 / 0.5411961, 1.0 / 1.3065630)
@@ -446,7 +447,7 @@ def updated(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
     mean: (k,) prior mean of the parameters, by default those of v; noise: (h, h) covariance that weighs the residuals;
     white: (h, h) that of the sensors.
 
-    The first block starts from the state of v. Each further block follows a gap and has an unknown first state.
+    The first block starts from the state of v. The first state of each further block is unknown, as after a gap.
     """
     h, r, k = len(v.scale_y), len(v.scale_u), len(v.theta)
     root = v.root

@@ -169,7 +169,7 @@ def _from_recursion(old: Recursion, role: Roles, r: int, dt: float, c: float) ->
         x=np.zeros(2 * h), root=root, noise=np.zeros((h, h)), share=np.zeros(h), chi2=1.0, corner=corner,
         every=every, filtered=np.zeros((4, width(h, r))), dt=dt, angle=0.0, blocks=0, strikes=0, lost=False,
         settling=0, turn=0.0, power=np.zeros((h, h)), center=np.zeros(h), white=np.zeros((h, h)),
-        prior=np.stack([theta, np.diag(root)[:len(theta)]]), past=())
+        prior=np.zeros((2, len(theta))), past=())
 
 
 def _fit_stretch(config: IdentifierParameters, v: Varying, rows: Rows, role: Roles) -> Varying | None:
