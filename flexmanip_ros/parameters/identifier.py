@@ -48,8 +48,8 @@ class PayloadParameters:
         LEARNABLE, "method structured: what the empty arm teaches, beside the motion; [''] for nothing")
     use_joint_rates: bool = parameter(
         True, 'method structured: Coulomb friction follows the measured rates of the joints where messages carry them; '
-        'false, or at samples of 1.5 ms and less where their noise is above 1.4 mrad/s: those of the model (false is '
-        'for rates that are late or smoothed by more than a sample)')
+        'false, or at samples of 1.5 ms and less where their noise is above 1.4 mrad/s or above the vibration of modes '
+        'that the model omits: those of the model (false is for rates that are late or smoothed by more than a sample)')
     memory_time: float = parameter(
         20.0, 'time over which the structured filter forgets old samples', unit='s', low=0.1, high=1e6)
 

@@ -109,6 +109,8 @@ class FilterState(NamedTuple):
     in the filter, and in the linearized one."""
     effort_noise: Array
     """(L,) variance of the white part of each reported effort [N^2 m^2]."""
+    rate_noise: Array
+    """(L,) variance of the white noise of each measured joint rate, over ``STICTION_RATE``^2; infinity: never used."""
     ringing: Array
     """(3, 3, L) vibration that the changes of each torque excite in omitted modes, a phasor of two parts [N m], and its
     last effort [N m]: in the filter, at the last event, and in the iteration; see ``note_change``."""
@@ -126,7 +128,7 @@ def memory(nx: int, m: int, links: int) -> FilterState:
         moved=np.zeros((nx, 2)), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
         normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, 2 * nx + 1)),
         N=np.zeros((nx, nx)), g=np.zeros(nx), batch=np.zeros(nx), B=np.zeros((nx, nx)),
-        torque_noise=np.zeros((2, links)), effort_noise=np.zeros(links),
+        torque_noise=np.zeros((2, links)), effort_noise=np.zeros(links), rate_noise=np.zeros(links),
         ringing=np.zeros((3, 3, links)), innovation=np.zeros((m, 2)), power=np.ones(m))
 
 

@@ -59,6 +59,8 @@ class MeasurementModel(NamedTuple):
     """(m,) which state is its delay; -1: none."""
     omitted: Array
     """(m, L) variance that the omitted modes add at a step of 1 N m of each torque, in units of the sensor."""
+    waves: Array
+    """(L, L) the same of the rate of each joint, over ``STICTION_RATE``^2."""
     turn: Array
     """(2,) real and imaginary part of exp((i w - 1 / 2 T) h): the phasor of these modes from one sample to the next."""
     reach: int

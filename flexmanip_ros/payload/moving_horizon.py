@@ -103,6 +103,21 @@ WAVES = 2.0
 
 
 @inner
+def choose_rates(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, ringing: Array) -> None:
+    """Take, of each joint, the measured rate or the model's for the Coulomb friction: the one with the smaller error.
+
+    The measured rate has its white noise; the model's lacks the vibration of the omitted modes (3, L), ``note_change``.
+    A noisy rate is a torque that never acted. Where little else moves the arm, a fit finds an object too heavy to be
+    moved by it, or too light (errors in variables).
+    """
+    for i in range(motion.calm.size):
+        variance: float = 0.0
+        for j in range(ringing.shape[1]):
+            variance += sensors.waves[i, j] * (ringing[0, j] * ringing[0, j] + ringing[1, j] * ringing[1, j])
+        motion.calm[i] = variance < m.rate_noise[i]
+
+
+@inner
 def gather_torque_noise(motion: ProcessModel, m: mem.FilterState, variance: Array, noisy: bool) -> None:
     """Add to variance (L,) that of each torque over a sample [N^2 m^2]; ``predict`` was just called.
 
@@ -132,10 +147,11 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: mem.Filte
     columns = 2 * used + 1 if linearized else used
     first, f = 1 + 3 * motion.effort.size, sensors.wide[:columns]
     rows = table[k + 1 - sensors.reach:k + 1]
+    note_change(sensors, m.ringing[2], sample[1:1 + motion.effort.size])
+    choose_rates(motion, sensors, m, m.ringing[2])
     steps = predict(motion, m.xr, m.Sr, columns, rows, sensors.period, sample[0])
     if steps == 0:
         return 0
-    note_change(sensors, m.ringing[2], sample[1:1 + motion.effort.size])
     measured = sample[first] == sample[first]
     if measured:
         m.counts[mem.MEASURED] += 1
@@ -468,10 +484,11 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, ta
     """
     duration, y = table[k, 0], table[k, 1 + 3 * motion.effort.size:]
     rows = table[k + 1 - sensors.reach:k + 1]
+    note_change(sensors, m.ringing[0], table[k, 1:1 + motion.effort.size])
+    choose_rates(motion, sensors, m, m.ringing[0])
     if not predict(motion, m.x, m.S, m.counts[mem.USED], rows, sensors.period, duration):
         return False
     came = y[0] == y[0]
-    note_change(sensors, m.ringing[0], table[k, 1:1 + motion.effort.size])
     if came:
         measure(sensors, m, y, motion.k[0], motion.opened)
         if not abs(m.x[2 * sensors.H.shape[1]]) < 1e9:

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
@@ -60,8 +59,6 @@ class StructuredState(NamedTuple):
     """(P, L) effort held since then, and those of the samples before, newest last [N m]."""
     rates: Array = np.empty(0)
     """(L,) measured rates of the joints in that sample [rad/s]; NaN: unknown."""
-    unused: NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
-    """(L,) joints whose measured rates are too noisy to tell the Coulomb friction."""
     missing: int = 0
     """How many rows in a row were missing up to now."""
     peak: Array = np.empty(0)
@@ -361,10 +358,11 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     time_ns, efforts = int(rows.time_ns[0]), latest(seen, rows.u[:1], state.efforts)
     m.ringing[:, 2] = efforts[-1]
     rates = np.full(efforts.shape[1], np.nan)
-    unused = structured_model.too_noisy(rows.rates, dt) if rows.rates.shape[1] else np.zeros(rates.size, dtype=np.bool_)
+    if rows.rates.shape[1]:
+        m.rate_noise[:] = structured_model.rate_noise(rows.rates, dt)
     state = state._replace(
         model=model, memory=m, sensors=seen, begin=None, early=(), cursor=rows.first, last_ns=int(rows.stamp_ns[0]),
-        time_ns=time_ns, efforts=efforts, rates=rates, unused=unused)
+        time_ns=time_ns, efforts=efforts, rates=rates)
     state = state._replace(horizon=state.here)
     for row, item in events:
         state = event(config, _part(config, state, rows, row), item)
@@ -528,7 +526,6 @@ def input_table(state: StructuredState, rows: Rows) -> tuple[Array, int]:
     table[:, 0] *= 1e-9
     begins, ends = table[:, 1 + links:1 + 2 * links], table[:, 1 + 2 * links:first]
     ends[:] = reach.rates if reach.rates.shape[1] else np.nan
-    ends[:, state.unused] = np.nan
     table[:, first:] = y
     table[reach.missing > 0, 1 + 2 * links:] = np.nan
     begins[0], begins[1:] = rates, ends[:-1]

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from flexmanip_ros.arm.capture import tip_jacobian
 from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, assemble
@@ -245,7 +244,8 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         least_rotor=-0.25 * _inertias_at_joints(nominal, M), substeps=STEP_ANGLE / fastest_mode(config.arm),
         payload=np.zeros(4), effort=np.zeros(links), gain=np.ones(links), late=np.zeros((links, 2)),
         slope=np.zeros((links, 2)), driven=np.zeros(links), coulomb=nominal.coulomb.copy(),
-        share=np.full(links, np.nan), rate=np.full(links, np.nan), opened=np.array([size, *range(size)]),
+        share=np.full(links, np.nan), rate=np.full(links, np.nan),
+        calm=np.zeros(links, dtype=np.bool_), opened=np.array([size, *range(size)]),
         bounds=allocate_bounds(size, nx), p=np.zeros(size), a=np.zeros(n), k=np.zeros((20, n)), dq=np.zeros((n, n)),
         dqd=np.zeros((n, n)), dp=np.zeros((n, 4)), G=np.zeros((n, 2 * size)), F=np.zeros((n, 2 * n)),
         X=np.zeros((2 * n, 2 * n)), Y=np.zeros((n, n)), scratch=spread_scratch(n, size, 2 * nx + 1))
@@ -277,8 +277,9 @@ def sensors(config: IdentifierParameters, model: Model, dt: float, angles: Array
     nx = model.payload + model.motion.kind.size
     block = max(2, round(0.1 / (model.slowest * dt)))
     return MeasurementModel(H=H, period=dt, rate=rate, gain=gain, offset=offset, delay=delay,
-                            omitted=omitted, turn=np.array([turn.real, turn.imag]),
-                            reach=torque_reach(model, dt), block=block, kicks_every=max(1, block // 4),
+                            omitted=omitted, waves=beyond.variance[1, :links] / STICTION_RATE ** 2,
+                            turn=np.array([turn.real, turn.imag]), reach=torque_reach(model, dt), block=block,
+                            kicks_every=max(1, block // 4),
                             noise_every=max(1, round(0.01 * config.payload.memory_time / dt)),
                             diffusion=diffusion(config, model), noise=np.zeros((nx, nx)), kicks=np.zeros((nx, links)),
                             f=np.zeros(nx), wide=np.zeros(2 * nx + 1), L=np.zeros((nx, nx)), W=np.zeros((nx, 2 * nx)),
@@ -414,21 +415,22 @@ def _inertias_at_joints(arm: Manipulator, M: Array) -> Array:
     return np.array([1.0 / float(row @ np.linalg.solve(M, row)) for row in arm.joint])
 
 
-def too_noisy(rates: Array, dt: float) -> NDArray[np.bool_]:
-    """Return of which joints (L,) the measured rates (N, L) tell less of the Coulomb friction than those of the model.
+def rate_noise(rates: Array, dt: float) -> Array:
+    """Return the variance w (L,) of the white noise of the measured rates (N, L) over ``STICTION_RATE``^2.
 
-    dt: sample time [s]; beyond ``LONGEST_PERIOD`` the noise is not known, and the rates are used.
-    Where the measured rate is v and its noise has the variance w, the true share tanh(rate / s) of the friction has the
-    mean tanh(v / r) nearly, r^2 = s^2 + pi w / 2 (MacKay 1992). So its variance at v = 0 is 1 - s / r. To that the
-    waves in the rate add ``MEASURED_SHARE``^2; with the model's rates they are ``MODELLED_SHARE``^2.
+    dt: sample time [s]; beyond ``LONGEST_PERIOD`` the noise is not known, and 0 is returned. Infinity: the rates tell
+    less of the Coulomb friction than those of the model at any time. Where the measured rate is v, the true share
+    tanh(rate / s) of the friction has the mean tanh(v / r) nearly, r^2 = s^2 (1 + pi w / 2) (MacKay 1992). So its
+    variance at v = 0 is 1 - s / r. To that the waves in the rate add ``MEASURED_SHARE``^2; with the model's rates they
+    are ``MODELLED_SHARE``^2.
     """
-    noisy = np.zeros(rates.shape[1], dtype=np.bool_)
-    for joint in range(noisy.size if dt <= LONGEST_PERIOD else 0):
+    w = np.zeros(rates.shape[1])
+    for joint in range(w.size if dt <= LONGEST_PERIOD else 0):
         known = rates[~np.isnan(rates[:, joint]), joint:joint + 1]  # a message may have the rate of one joint alone
         if len(known) >= FEWEST:
-            by_noise = 1.0 - 1.0 / np.sqrt(1.0 + np.pi / 2.0 * white_noise(known)[0] / STICTION_RATE ** 2)
-            noisy[joint] = by_noise + MEASURED_SHARE ** 2 > MODELLED_SHARE ** 2
-    return noisy
+            w[joint] = white_noise(known)[0] / STICTION_RATE ** 2
+    by_noise = 1.0 - 1.0 / np.sqrt(1.0 + np.pi / 2.0 * w)
+    return np.where(by_noise + MEASURED_SHARE ** 2 > MODELLED_SHARE ** 2, np.inf, w)
 
 
 def noise(model: Model, Y: Array) -> Array:

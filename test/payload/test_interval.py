@@ -16,7 +16,7 @@ from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, Identi
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.interval import SHARE_ERROR, by_rotors, friction_error, judge
 from flexmanip_ros.payload.process_model import Kind
-from flexmanip_ros.payload.structured_model import ROTOR_ERROR, build, sensors, too_noisy
+from flexmanip_ros.payload.structured_model import ROTOR_ERROR, build, rate_noise, sensors
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, Status
 
@@ -114,17 +114,17 @@ def test_rates_tell_the_friction_unless_their_noise_hides_where_it_reverses(
         seed: int, quiet: float, loud: float) -> None:
     moving = np.sin(0.01 * np.arange(60))[:, None]  # 10 rad/s^2 at 1 kHz
     rates = moving + np.random.default_rng(seed).standard_normal((60, 2)) * [quiet, loud]
-    assert too_noisy(rates, 1e-3).tolist() == [False, True]
-    assert not too_noisy(rates, 2e-3).any()  # vibrations would be taken for noise
+    assert np.isinf(rate_noise(rates, 1e-3)).tolist() == [False, True]
+    assert not rate_noise(rates, 2e-3).any()  # vibrations would be taken for noise
     rates[1:] = np.nan
-    assert not too_noisy(rates, 1e-3).any()  # one sample tells no noise
+    assert not rate_noise(rates, 1e-3).any()  # one sample tells no noise
 
 
 @pytest.mark.parametrize(('joint', 'noisy'), [(0, [True, False]), (1, [False, True])])
 def test_rates_of_one_joint_alone_are_looked_at_too(joint: int, noisy: list[bool]) -> None:
     rates = np.full((24, 2), np.nan)
     rates[:, joint] = np.random.default_rng(0).normal(0.0, 0.01, 24)
-    assert too_noisy(rates, 1e-3).tolist() == noisy
+    assert np.isinf(rate_noise(rates, 1e-3)).tolist() == noisy
 
 
 def test_noise_hides_the_share_of_friction_as_reckoned() -> None:
