@@ -107,8 +107,8 @@ def choose_rates(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterS
     """Take, of each joint, the measured rate or the model's for the Coulomb friction: the one with the smaller error.
 
     The measured rate has its white noise; the model's lacks the vibration of the omitted modes (3, L), ``note_change``.
-    A noisy rate is a torque that never acted. Where little else moves the arm, a fit finds an object too heavy to be
-    moved by it, or too light (errors in variables).
+    A noisy rate is a torque that never acted. Where little else moves the arm, it biases the mass that a fit
+    finds (errors in variables): 10 kg were found for 16 kg.
     """
     for i in range(motion.calm.size):
         variance: float = 0.0
