@@ -152,11 +152,14 @@ def note_change(sensors: MeasurementModel, ringing: Array, efforts: Array) -> No
 
 
 @inner
-def omitted_variance(sensors: MeasurementModel, i: int, ringing: Array) -> float:
-    """Return the variance of sensor i that comes from modes that the shape functions leave out (``omitted_modes``)."""
+def omitted_variance(of_step: Array, i: int, ringing: Array) -> float:
+    """Return the variance of signal i that comes from modes that the shape functions leave out (``omitted_modes``).
+
+    of_step: (m, L) that of each signal after a step of 1 N m of each torque; ringing: (3, L), see ``note_change``.
+    """
     variance: float = 0.0
     for j in range(ringing.shape[1]):
-        variance += sensors.omitted[i, j] * (ringing[0, j] * ringing[0, j] + ringing[1, j] * ringing[1, j])
+        variance += of_step[i, j] * (ringing[0, j] * ringing[0, j] + ringing[1, j] * ringing[1, j])
     return variance
 
 
@@ -170,7 +173,7 @@ def measure(sensors: MeasurementModel, m: mem.FilterState, y: Array, qdd: Array,
     n = sensors.H.shape[1]
     payload = 2 * n
     for i in range(y.size):
-        r = m.noise[i, mem.EFFECTIVE] + omitted_variance(sensors, i, m.ringing[0])
+        r = m.noise[i, mem.EFFECTIVE] + omitted_variance(sensors.omitted, i, m.ringing[0])
         e = y[i] - observe(sensors, i, n, x, S, f, qdd)
         spread = dot(f, f)
         variance = spread + r

@@ -110,11 +110,8 @@ def choose_rates(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterS
     A noisy rate is a torque that never acted. Where little else moves the arm, it biases the mass that a fit
     finds (errors in variables): 10 kg were found for 16 kg.
     """
-    for i in range(motion.calm.size):
-        variance: float = 0.0
-        for j in range(ringing.shape[1]):
-            variance += sensors.waves[i, j] * (ringing[0, j] * ringing[0, j] + ringing[1, j] * ringing[1, j])
-        motion.calm[i] = variance < m.rate_noise[i]
+    for i in range(motion.modelled.size):
+        motion.modelled[i] = omitted_variance(sensors.waves, i, ringing) < m.rate_noise[i]
 
 
 @inner
@@ -157,7 +154,7 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: mem.Filte
         m.counts[mem.MEASURED] += 1
     for i in range(m.noise.shape[0] if measured else 0):
         own = m.noise[i, mem.EFFECTIVE]
-        r = own + omitted_variance(sensors, i, m.ringing[2])
+        r = own + omitted_variance(sensors.omitted, i, m.ringing[2])
         e = sample[first + i] - observe(sensors, i, n, m.xr, m.Sr, f, motion.k[0])
         weight = 1.0 / r
         m.score[mem.COST] += e * e * weight

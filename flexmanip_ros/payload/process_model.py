@@ -146,9 +146,9 @@ class ProcessModel(NamedTuple):
     """(L,) part of it that acts over the present sample, -1 to 1, by the measured rate of the joint; NaN: that of the
     model is used."""
     rate: Array
-    """(L,) measured mean rate of each joint over that sample [rad/s]; NaN: it was not measured."""
-    calm: NDArray[np.bool_]
-    """(L,) whether the model's rate of the joint is nearer to the true one than the measured rate."""
+    """(L,) measured mean rate of each joint over that sample [rad/s]; NaN: it was not measured or is not used."""
+    modelled: NDArray[np.bool_]
+    """(L,) whether Coulomb friction follows the model's rate of the joint even where a rate was measured."""
     opened: NDArray[np.int64]
     """(1 + np,) number of the entries of p that are uncertain, then their indices."""
     bounds: Bounds
@@ -243,7 +243,7 @@ def set_torques(motion: ProcessModel, rows: Array, period: float) -> None:
         slope[0] *= motion.gain[i]
         slope[1] *= motion.gain[i]
         share, motion.rate[i] = np.nan, np.nan
-        if rows.shape[1] > 1 + links and not motion.calm[i]:
+        if rows.shape[1] > 1 + links and not motion.modelled[i]:
             begin, end = rows[newest, 1 + links + i], rows[newest, 1 + 2 * links + i]
             share = mean_share(begin / STICTION_RATE, end / STICTION_RATE)
             motion.rate[i] = 0.5 * (begin + end)

@@ -245,7 +245,7 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         payload=np.zeros(4), effort=np.zeros(links), gain=np.ones(links), late=np.zeros((links, 2)),
         slope=np.zeros((links, 2)), driven=np.zeros(links), coulomb=nominal.coulomb.copy(),
         share=np.full(links, np.nan), rate=np.full(links, np.nan),
-        calm=np.zeros(links, dtype=np.bool_), opened=np.array([size, *range(size)]),
+        modelled=np.zeros(links, dtype=np.bool_), opened=np.array([size, *range(size)]),
         bounds=allocate_bounds(size, nx), p=np.zeros(size), a=np.zeros(n), k=np.zeros((20, n)), dq=np.zeros((n, n)),
         dqd=np.zeros((n, n)), dp=np.zeros((n, 4)), G=np.zeros((n, 2 * size)), F=np.zeros((n, 2 * n)),
         X=np.zeros((2 * n, 2 * n)), Y=np.zeros((n, n)), scratch=spread_scratch(n, size, 2 * nx + 1))

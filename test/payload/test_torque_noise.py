@@ -138,7 +138,7 @@ def test_friction_follows_measured_rates_where_a_step_of_the_torque_adds_more_to
         m.ringing[0, :2] = 0.0
         m.ringing[0, 0] = step
         choose_rates(motion, sensors, m, m.ringing[0])
-        assert motion.calm.tolist() == [not measured, True]
+        assert motion.modelled.tolist() == [not measured, True]
 
 
 @pytest.mark.parametrize(('failed', 'deviations'), [(1, 0.0), (2, 1.0), (3, 1.0)])
