@@ -1,5 +1,6 @@
 """Mass matrix and momentum of the arm, and its linear vibration model at a working point (paper eqs. 12-23)."""
 
+import copy
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -150,7 +151,9 @@ def omitted_modes(arm: ArmParameters, theta: Array) -> OmittedModes:
     if arm.shape_functions != 'component_modes':
         return OmittedModes(np.zeros((2, 2 * L, L)), 1.0, 0.0)
     dt = 1.0 / (INSTANTS * min(pinned_frequencies(arm)))
-    square = (step_response(replace(arm, modes=arm.modes + MORE_SINES), theta, dt) - step_response(arm, theta, dt)) ** 2
+    finer = copy.copy(arm)
+    object.__setattr__(finer, 'modes', arm.modes + MORE_SINES)  # also beyond the largest number that may be given
+    square = (step_response(finer, theta, dt) - step_response(arm, theta, dt)) ** 2
     energy, instants = square.sum(axis=0) * dt, dt * np.arange(1, INSTANTS + 1)
     by_output = energy.sum(axis=2)
     duration = float(np.mean(dt * (instants @ square[:, 0].sum(axis=2)) / by_output[0]))

@@ -64,6 +64,13 @@ def test_a_link_alone_and_a_floating_base_have_theirs_too() -> None:
     np.testing.assert_allclose(heavy.variance, pinned.variance, rtol=1e-3)
 
 
+def test_the_largest_number_of_sines_that_may_be_given_leaves_modes_out_too() -> None:
+    """They are computed with more sines than may be given: more than 8 sines ended with modes out of range."""
+    many = omitted_modes(replace(ARM, modes=12), np.array(ANGLES))
+    assert np.all(many.variance > 0.0)
+    assert np.all(many.variance[0] < omitted_modes(ARM, np.array(ANGLES)).variance[0])
+
+
 def test_they_belong_to_the_measured_angles_unless_a_linear_plant_stays_at_its_working_point() -> None:
     there, elsewhere, found = np.array([1.0, -0.3]), (0.0, 1.5), {}
     for name, payload in (('nowhere', {}), ('moving', {'working_point': elsewhere}),
