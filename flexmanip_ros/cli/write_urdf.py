@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from flexmanip_ros.types import Array
 
 PROG = 'write_urdf'
+MOST_SEGMENTS = 10_000
+"""Largest number of segments of a link; the file has 0.7 kB each, and a viewer draws every one."""
 EXAMPLES = """examples:
   write_urdf --params config/arms/reference.yaml --output arm.urdf
   write_urdf --set 'arm.link_length=[1.0, 0.8]' --segments 20 > arm.urdf
@@ -35,7 +37,8 @@ def _parser() -> console.Parser:
     made = console.parser(
         PROG, 'Write the arm as URDF. Its links are chains of segments that bend with the joint states.', EXAMPLES)
     console.add_parameters(made, 'plant_simulator or rpbsid_identifier')
-    made.add_argument('--segments', metavar='N', type=int, default=12, help='segments of each link; default: 12')
+    made.add_argument('--segments', metavar='N', type=lambda text: console.whole(text, MOST_SEGMENTS), default=12,
+                      help='segments of each link; default: 12')
     made.add_argument('--output', metavar='FILE', help='file to write; default: standard output')
     return made
 

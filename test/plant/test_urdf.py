@@ -87,6 +87,13 @@ def test_one_segment_cannot_bend() -> None:
         urdf(ARM, segments=1)
 
 
+def test_more_segments_than_any_viewer_draws_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    """A hundred million of them would fill the memory before anything is written."""
+    with pytest.raises(SystemExit, match='2'):
+        write_urdf.main(['--segments', '100000000'])
+    assert "'100000000' is not a whole number from 0 to 10000" in capsys.readouterr().err
+
+
 def test_the_program_writes_what_the_library_makes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
