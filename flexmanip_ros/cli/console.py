@@ -233,7 +233,7 @@ def start(parser: Callable[[], Parser], body: Callable[[argparse.Namespace], int
 def run(prog: str, body: Callable[[], int]) -> int:
     """Run a program; return its exit status.
 
-    That is 2 after an error of the package or of the file system, 130 when interrupted, 1 for a defect.
+    That is 2 after an error of the package, of the file system or without memory, 130 when interrupted, 1 for a defect.
     """
     open_streams()
     try:  # around all of it, as a signal may come while a context manager ends
@@ -258,6 +258,8 @@ def run(prog: str, body: Callable[[], int]) -> int:
             place = '' if error.filename is None else f"'{error.filename}': "
             words = f'{place}{error.strerror or error}; check names, permissions and space on the disk'
             return print_error(prog, words)
+        if isinstance(error, MemoryError):
+            return print_error(prog, f'the memory does not suffice: {error}; ask for fewer samples, or a lower rate')
         return print_error(prog, f'a defect of this program: {type(error).__name__}: {error}; '
                            f'please report it with the recording ({TRACEBACK}=1 shows where)', DEFECT)
 

@@ -13,6 +13,7 @@ import time
 import warnings
 from typing import Any
 
+import numpy as np
 import pytest
 
 from flexmanip_ros.cli import console
@@ -110,3 +111,11 @@ def test_an_error_of_the_file_system_is_one_line_and_exit_2(capsys: pytest.Captu
     assert err.count('\n') == 1
     assert f"'{'x' * 300}': File name too long" in err
     assert 'defect' not in err
+
+
+def test_work_that_the_memory_does_not_suffice_for_is_no_defect(capsys: pytest.CaptureFixture[str]) -> None:
+    """A simulation of 10^6 s at 100 kHz is one line too, and names the size; the samples here have a million TB."""
+    assert console.run('program', lambda: np.empty((1 << 57, 1)).size) == console.BAD_INPUT
+    err = capsys.readouterr().err
+    assert err.count('\n') == 1
+    assert 'program: the memory does not suffice: Unable to allocate 1.00 EiB' in err
