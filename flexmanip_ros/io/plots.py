@@ -338,10 +338,8 @@ def configurations_figure(found: Sweep) -> Figure:
     inside = (found.seen[0] <= found.relative) & (found.relative <= found.seen[1])
     limit(ax, found.frequency[inside] if inside.any() else found.frequency, found.frequency[np.isfinite(
         found.frequency)].tolist())
-    ax.set_xlim(0.0, 180.0)
-    ax.set_xticks(range(0, 181, 30))
-    ax.set_xlabel('angle between the links, to either side [degrees]')
-    ax.set_ylabel('frequency\n[Hz]')
+    ax.set(xlim=(0.0, 180.0), xticks=range(0, 181, 30), xlabel='angle between the links, to either side [degrees]',
+           ylabel='frequency\n[Hz]')
     legend(ax)
     return drawn
 
@@ -378,8 +376,7 @@ def validation_figure(scores: Scores, outputs: Sequence[str], *, has_arm: bool) 
             ax.plot(rows[:, 0], rows[:, 1], color=colour, linewidth=width, linestyle=line, label=label)
         spread = scale * scores.measured[:, k]
         room = 0.3 * (float(spread.max() - spread.min()) or 1.0)
-        ax.set_ylim(float(spread.min()) - room, float(spread.max()) + room)
-        ax.set_ylabel(f'{joint}\n{field}\n[{unit}]')
+        ax.set(ylim=(float(spread.min()) - room, float(spread.max()) + room), ylabel=f'{joint}\n{field}\n[{unit}]')
         ax.set_title(f'VAF {scores.simulation[k]:.2f} % simulated, {scores.prediction[k]:.2f} % predicted',
                      loc='left', fontsize=9)
         if k == 0:

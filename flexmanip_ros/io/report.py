@@ -265,9 +265,7 @@ def errors(rows: Sequence[Row]) -> Figure | None:
     spread = float(np.percentile(np.abs(relative[0]), 95))
     # the errors stay visible where the intervals are much wider
     room = 1.5 * (spread + min(float(np.median(relative[2] - relative[1])), 3.0 * spread))
-    axes[0].set_ylim(-room or -1.0, room or 1.0)
-    axes[0].set_xlabel('true payload [kg]')
-    axes[0].set_ylabel('error [%]')
+    axes[0].set(ylim=(-room or -1.0, room or 1.0), xlabel='true payload [kg]', ylabel='error [%]')
     plots.legend(axes[0])
     return drawn
 

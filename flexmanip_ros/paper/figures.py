@@ -33,6 +33,7 @@ SHARE = 0.95
 """Share of the runs that a band contains."""
 TRUE = {'color': plots.TRUTH_COLOUR, 'linestyle': (0, (4, 3)), 'linewidth': 1.1}
 CAPTURE = ((experiments.CAPTURE_TIME, EventKind.CAPTURE),)
+SINCE_CAPTURE = (experiments.CAPTURE_TIME - 0.1, experiments.WINDOW[1])
 CLOSE = ('restart', 'known M_b', 'structured')
 """Methods whose own 95 % interval is drawn."""
 LEAST_SHARE = 1e-5
@@ -135,11 +136,8 @@ def arms(cases: Sequence[experiments.Case], arm: ArmParameters) -> Figure:
         ax.plot(x, y, color='#444444', linewidth=3.0, solid_capstyle='round')
         for k, (marker, label) in enumerate((('s', 'joint 1'), ('o', 'joint 2'), ('*', 'payload'))):
             ax.plot(x[k], y[k], marker, markersize=10, color=screen.COLOURS[k], label=label)
-        ax.set_xlim(-0.1 * reach, reach)
-        ax.set_ylim(-0.55 * reach, 0.55 * reach)
-        ax.set_aspect('equal')
+        ax.set(xlim=(-0.1 * reach, reach), ylim=(-0.55 * reach, 0.55 * reach), aspect='equal', xlabel='X [m]')
         ax.set_title(f'{case.angles_deg[0]:g}/{case.angles_deg[1]:g} deg', loc='left', fontsize=10)
-        ax.set_xlabel('X [m]')
     columns[0].set_ylabel('Y [m]')
     plots.legend(columns[-1])
     return drawn
@@ -161,10 +159,9 @@ def test_response(true: Response, found: Mapping[str, Response]) -> Figure:
                 top.plot(true.time, estimate, **style)
                 below.semilogy(true.time[1:], np.abs(estimate - exact[:, k])[1:], **style)
         room = 1.2 * float(np.abs(exact).max())
-        top.set_ylim(-room, room)  # the range of the true response, so that a wrong model does not hide it
-        below.set_ylim(1e-6 * room, 10.0 * room)
-        top.set_ylabel(f'{name}\n[{unit}]')
-        below.set_ylabel(f'error of\n{name} [{unit}]')
+        # the range of the true response, so that a wrong model does not hide it
+        top.set(ylim=(-room, room), ylabel=f'{name}\n[{unit}]')
+        below.set(ylim=(1e-6 * room, 10.0 * room), ylabel=f'error of\n{name} [{unit}]')
         plots.legend(top)
     axes[-1].set_xlabel('time since the start of the test [s]')
     return drawn
@@ -187,18 +184,15 @@ def frequency_tracks(tracks: Tracks, before: Sequence[float], after: Sequence[fl
                                        (experiments.CAPTURE_TIME, experiments.WINDOW[1], after)):
                 ax.plot([begin, end], [values[k]] * 2, **TRUE, label='true' if k == 0 and begin == 0.0 else None)
         low, high = min(*before, *after), max(*before, *after)
-        ax.set_ylim(low - 0.7 * (high - low), high + 0.7 * (high - low))
-        ax.set_ylabel(f'frequency [Hz],\n{method}')
+        ax.set(ylim=(low - 0.7 * (high - low), high + 0.7 * (high - low)), ylabel=f'frequency [Hz],\n{method}')
         plots.legend(ax)
     for limit, words in ((5.0, 'the paper accepts 5 %'), (0.5, 'our target 0.5 %')):
         axes[2].axhline(limit, color='#555555', linewidth=1.0, linestyle=':')
         axes[2].annotate(words, (0.995, limit), xycoords=('axes fraction', 'data'), xytext=(0, 2), ha='right',
                          textcoords='offset points', fontsize=8, color='#555555',
                          bbox={'facecolor': 'white', 'edgecolor': 'none', 'alpha': 0.8, 'pad': 0.5})
-    axes[2].set_ylim(1e-4, 50.0)
-    axes[2].set_ylabel('median error\n[%]')
+    axes[2].set(xlim=(0.0, experiments.WINDOW[1]), ylim=(1e-4, 50.0), ylabel='median error\n[%]')
     plots.legend(axes[2])
-    axes[2].set_xlim(0.0, experiments.WINDOW[1])
     plots.events(axes, CAPTURE)
     return drawn
 
@@ -239,9 +233,7 @@ def payload_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Track
             if runs:
                 band(ax, runs[0].time, _masses(runs), method, **_look(method))
         ax.axhline(case.payload, **TRUE, label='true')
-        ax.set_xlim(*experiments.WINDOW)
-        ax.set_ylim(-0.05 * case.payload, 2.0 * case.payload)
-        ax.set_ylabel('payload\n[kg]')
+        ax.set(xlim=experiments.WINDOW, ylim=(-0.05 * case.payload, 2.0 * case.payload), ylabel='payload\n[kg]')
         ax.set_title(f'{case.title}, captured at {experiments.CAPTURE_TIME:g} s', loc='left', fontsize=10)
         plots.legend(ax)
     return drawn
@@ -263,9 +255,7 @@ def interval_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Trac
                 widest = max(widest, float(np.median(known)) if known.size else 0.0)
         ax.axhline(case.payload, **TRUE, label='true')
         room = min(1.8 * widest, case.payload) or case.payload
-        ax.set_xlim(experiments.CAPTURE_TIME - 0.1, experiments.WINDOW[1])
-        ax.set_ylim(case.payload - room, case.payload + room)
-        ax.set_ylabel('payload, close up\n[kg]')
+        ax.set(xlim=SINCE_CAPTURE, ylim=(case.payload - room, case.payload + room), ylabel='payload, close up\n[kg]')
         ax.set_title(case.title, loc='right', fontsize=10)  # the event's name is at the left
         plots.legend(ax)
         for track in tracks[case.name].get('structured', ())[:1]:  # its band may be thinner than the line
@@ -289,10 +279,8 @@ def error_tracks(cases: Sequence[experiments.Case], tracks: Mapping[str, Tracks]
             error = np.maximum(np.abs(_masses(runs) - case.payload), LEAST_SHARE * case.payload)[since]
             if np.isfinite(error).any():
                 band(ax, runs[0].time[since], error, method, **_look(method))
-        ax.set_yscale('log')
-        ax.set_xlim(experiments.CAPTURE_TIME - 0.1, experiments.WINDOW[1])
-        ax.set_ylim(LEAST_SHARE * case.payload, 100.0 * case.payload)
-        ax.set_ylabel('absolute error\n[kg]')
+        ax.set(yscale='log', xlim=SINCE_CAPTURE, ylim=(LEAST_SHARE * case.payload, 100.0 * case.payload),
+               ylabel='absolute error\n[kg]')
         ax.set_title(case.title, loc='right', fontsize=10)  # the event's name is at the left
         plots.legend(ax)
     plots.events(axes, CAPTURE)
@@ -314,11 +302,9 @@ def error_points(cases: Sequence[experiments.Case], errors: Mapping[tuple[str, s
             ax.plot(values.mean(), place, marker, markersize=8, color=colour)
             ax.annotate(f'{plain(values.mean())} %', (values.mean(), place), xytext=(0, 6),
                         textcoords='offset points', ha='center', fontsize=8)
-        ax.set_xscale('log')
-        ax.set_xlim(1e-3, 1e5)
-        ax.set_ylim(len(names) - 0.4, -0.8)
+        ax.set(xscale='log', xlim=(1e-3, 1e5), ylim=(len(names) - 0.4, -0.8),
+               xlabel='mean relative error,\n4 to 6 s [%]')
         ax.set_yticks(range(len(names)), names if ax is columns[0] else [''] * len(names))
-        ax.set_xlabel('mean relative error,\n4 to 6 s [%]')
         ax.set_title(case.title.replace(', ', ',\n'), loc='left', fontsize=10)
     return drawn
 
