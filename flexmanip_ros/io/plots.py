@@ -22,15 +22,7 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.whole_recording import Scores, Smoothed, Sweep
 from flexmanip_ros.types import QUANTILE, Array, CaptureEvent, Estimate, EventKind, Status
-from flexmanip_ros.view.screen import (
-    COLOURS,
-    EVENT_COLOUR,
-    KNOWN_BAND,
-    MODES_APART,
-    PAYLOAD_COLOUR,
-    STATUS_LOOKS,
-    thinned,
-)
+from flexmanip_ros.view import screen
 
 LINES: tuple[Any, ...] = ('-', (0, (4, 1.2)), (0, (1.2, 1)), (0, (6, 1.2, 1.2, 1.2)))
 """Line styles, so that signals in one plot differ by more than their colour."""
@@ -66,9 +58,9 @@ def figure(heights: Sequence[float], *, columns: int = 1, share_time: bool = Tru
 
 def lines(ax: Any, time: Array, columns: Array, labels: Sequence[str], title: str, unit: str) -> None:
     """Draw signals (N, k) over time."""
-    rows = thinned(np.column_stack([time, columns]), POINTS)
+    rows = screen.thinned(np.column_stack([time, columns]), POINTS)
     for k, label in enumerate(labels):
-        ax.plot(rows[:, 0], rows[:, 1 + k], color=COLOURS[k % len(COLOURS)],
+        ax.plot(rows[:, 0], rows[:, 1 + k], color=screen.COLOURS[k % len(screen.COLOURS)],
                 linestyle=LINES[k % len(LINES)], linewidth=1.1, label=label)
     ax.set_ylabel(f'{title}\n[{unit}]')
     legend(ax)
@@ -84,10 +76,10 @@ def events(axes: Iterable[Any], found: Sequence[Event]) -> None:
     """Mark captures and releases in every plot, named in the first; those outside of its times are not named."""
     for index, ax in enumerate(axes):
         for time, kind in found:
-            ax.axvline(time, color=EVENT_COLOUR, linestyle='--', linewidth=1.2)
+            ax.axvline(time, color=screen.EVENT_COLOUR, linestyle='--', linewidth=1.2)
             if index == 0:
                 ax.annotate(f'{kind.value} {time:.2f} s', (time, 1.0), xycoords=('data', 'axes fraction'),
-                            xytext=(3, 3), textcoords='offset points', color=EVENT_COLOUR, fontsize=9,
+                            xytext=(3, 3), textcoords='offset points', color=screen.EVENT_COLOUR, fontsize=9,
                             annotation_clip=True)
 
 
@@ -120,7 +112,7 @@ def frequencies(ax: Any, estimates: Sequence[Estimate], start_ns: int, truth: Se
 
 def _band(ax: Any, x: Array, frequency: Array, std: Array, k: int) -> None:
     """Draw the frequency of mode k over x with its 95 % band."""
-    colour, spread = COLOURS[k % len(COLOURS)], QUANTILE * std
+    colour, spread = screen.COLOURS[k % len(screen.COLOURS)], QUANTILE * std
     ax.fill_between(x, frequency - spread, frequency + spread, color=colour, alpha=0.2, linewidth=0)
     ax.plot(x, frequency, color=colour, linestyle=LINES[k % len(LINES)], linewidth=1.4,
             label=f'mode {k + 1}, 95 % band')
@@ -134,13 +126,13 @@ def _lowest(values: Array, stds: Array, trusted: NDArray[np.bool_]) -> Array:
     """
     settled, spread = values[values.shape[0] // 2:], stds[values.shape[0] // 2:]
     low = settled[np.isfinite(settled)]
-    known = settled[QUANTILE * spread <= KNOWN_BAND * settled]  # a drift of the sensors gives a mode near 0 Hz
+    known = settled[QUANTILE * spread <= screen.KNOWN_BAND * settled]  # a drift of the sensors gives a mode near 0 Hz
     if known.size:
         low = known
     if low.size == 0:
         return values
     lowest = np.where(trusted, values[:, 0], np.percentile(low, 5))
-    return np.where(values <= MODES_APART * lowest[:, None], values, np.nan)
+    return np.where(values <= screen.MODES_APART * lowest[:, None], values, np.nan)
 
 
 def _note_beyond(ax: Any, last: Array) -> None:
@@ -160,9 +152,9 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
     """
     found = _with_payload(estimates, start_ns)
     time, table = found['time_s'], np.column_stack([found[f'payload_{name}_kg'] for name in ('mass', 'lower', 'upper')])
-    ax.fill_between(time, table[:, 1], table[:, 2], color=PAYLOAD_COLOUR, alpha=0.25, linewidth=0,
+    ax.fill_between(time, table[:, 1], table[:, 2], color=screen.PAYLOAD_COLOUR, alpha=0.25, linewidth=0,
                     label='95 % interval')
-    ax.plot(time, table[:, 0], color=PAYLOAD_COLOUR, linewidth=1.5, label='estimate')
+    ax.plot(time, table[:, 0], color=screen.PAYLOAD_COLOUR, linewidth=1.5, label='estimate')
     for index, (begin, end, mass) in enumerate(truth):
         ax.plot([begin, end], [mass, mass], color=TRUTH_COLOUR, linestyle=(0, (4, 3)), linewidth=1.2,
                 label='true' if index == 0 else None)
@@ -173,7 +165,7 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
         digits = min(max(1 - math.floor(math.log10(width)), 0), 6)  # two significant digits of the interval's width
         words = f'{last[0]:.{digits}f} kg, 95 %: {last[1]:.{digits}f} to {last[2]:.{digits}f} kg'
         ax.annotate(words, (1.0, 0.03), ha='right', va='bottom', xycoords='axes fraction',
-                    color=PAYLOAD_COLOUR, fontsize=10, fontweight='bold')
+                    color=screen.PAYLOAD_COLOUR, fontsize=10, fontweight='bold')
     ax.set_ylabel('payload, close up\n[kg]' if zoom else 'payload\n[kg]')
     legend(ax)
 
@@ -214,7 +206,7 @@ def statuses(ax: Any, estimates: Sequence[Estimate], start_ns: int) -> None:
 
 
 def _status_look(status: Status) -> dict[str, Any]:
-    colour, hatch = STATUS_LOOKS[status]
+    colour, hatch = screen.STATUS_LOOKS[status]
     return {'facecolor': colour, 'hatch': hatch, 'edgecolor': '#FFFFFF', 'linewidth': 0}
 
 
@@ -351,7 +343,7 @@ def payload_figure(made: Run) -> Figure:
     payload(axes[1], made.estimates, made.start_ns, _stretches(made)[1], zoom=True)
     found = _with_payload(made.estimates, made.start_ns)
     values = found['consistency']
-    axes[2].plot(found['time_s'], values, color=COLOURS[0], linewidth=1.2)
+    axes[2].plot(found['time_s'], values, color=screen.COLOURS[0], linewidth=1.2)
     axes[2].axhline(1.0, color='#555555', linewidth=1.0, linestyle=':')
     finite = values[np.isfinite(values)]
     if finite.size:
@@ -370,9 +362,9 @@ def validation_figure(scores: Scores, outputs: Sequence[str], *, has_arm: bool) 
         _, unit, scale = _quantity(joint, field, has_arm)
         for values, label, colour, width, line in (
                 (scores.measured, 'measured', '#9A9A9A', 2.6, LINES[0]),
-                (scores.simulated, 'simulated', COLOURS[1], 1.1, LINES[0]),
-                (scores.predicted, 'one step ahead', COLOURS[0], 0.9, LINES[1])):
-            rows = thinned(np.column_stack([scores.time, scale * values[:, k]]), POINTS)
+                (scores.simulated, 'simulated', screen.COLOURS[1], 1.1, LINES[0]),
+                (scores.predicted, 'one step ahead', screen.COLOURS[0], 0.9, LINES[1])):
+            rows = screen.thinned(np.column_stack([scores.time, scale * values[:, k]]), POINTS)
             ax.plot(rows[:, 0], rows[:, 1], color=colour, linewidth=width, linestyle=line, label=label)
         spread = scale * scores.measured[:, k]
         room = 0.3 * (float(spread.max() - spread.min()) or 1.0)

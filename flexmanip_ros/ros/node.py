@@ -38,18 +38,8 @@ from flexmanip_ros.event_replay import MOST_EVENTS
 from flexmanip_ros.io import cdr
 from flexmanip_ros.messages import Diagnostics
 from flexmanip_ros.parameters.document import help_text
-from flexmanip_ros.ros import qos, rclpy_workarounds
+from flexmanip_ros.ros import diagnostics, qos, rclpy_workarounds
 from flexmanip_ros.ros.conversions import to_message
-from flexmanip_ros.ros.diagnostics import (
-    CLOCK,
-    ERROR,
-    WARN,
-    JointStateFaults,
-    LossCounter,
-    Meter,
-    Report,
-    shortened,
-)
 from flexmanip_ros.ros.parameters import NodeParameters, arm_line
 from flexmanip_ros.samples.signals import Rejection
 
@@ -100,7 +90,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         """
         super().__init__(name, parameter_overrides=overrides, **options)
         self.active = False
-        self.meter = Meter()
+        self.meter = diagnostics.Meter()
         self.events: dict[str, int] = {}
         """Counts of QoS events, by topic and kind: missed deadlines, incompatible publishers, ..."""
         self._entities_made = False
@@ -156,7 +146,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
     def configuration_changed(self, config: Config, names: Collection[str]) -> None:
         """Apply parameters of these names that were set while the node runs, to whatever values."""
 
-    def report(self, report: Report) -> None:
+    def report(self, report: diagnostics.Report) -> None:
         """Fill the node's diagnostic entry; never called before ``make_entities``."""
 
     # Lifecycle transitions.
@@ -217,7 +207,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
             return self.create_publisher(kind, topic, profile, qos_overriding_options=qos.overridable())
 
     def subscription(self, kind: type[Any], topic: str, callback: Callable[[Any], None], profile: QoSProfile, *,
-                     raw: bool = False, losses: LossCounter | None = None) -> Subscription:
+                     raw: bool = False, losses: diagnostics.LossCounter | None = None) -> Subscription:
         """Create a subscription whose quality of service the user may override; its QoS events are counted.
 
         losses: counts the messages that do not arrive.
@@ -237,7 +227,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
                 kind, topic, callback if losses is None else rclpy_workarounds.with_info(counted), profile, raw=raw,
                 event_callbacks=watch, qos_overriding_options=qos.overridable())
 
-    def each_joint_state(self, take: Callable[[bytes], None], losses: LossCounter | None = None) -> None:
+    def each_joint_state(self, take: Callable[[bytes], None], losses: diagnostics.LossCounter | None = None) -> None:
         """Subscribe to the joint states, serialized; ``take`` gets each while the node is active, and is timed."""
         def timed(raw: bytes) -> None:
             if self.active:
@@ -261,7 +251,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         for topic in ('capture_event', 'capture_detected'):
             self.subscription(Header, topic, partial(heard, topic), qos.latched_input())
 
-    def waiting_joint_states(self, losses: LossCounter) -> rclpy_workarounds.Batches:
+    def waiting_joint_states(self, losses: diagnostics.LossCounter) -> rclpy_workarounds.Batches:
         """Subscribe to the joint states, which wait, serialized, until they are taken."""
         made = rclpy_workarounds.Batches(self, self.subscription(
             JointState, 'joint_states', lambda raw: None, qos.sensor_input(), raw=True, losses=losses), losses.note)
@@ -316,16 +306,16 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
             return
         self._logged_at[reason] = now
         if is_error:
-            self.get_logger().error(shortened(words))
+            self.get_logger().error(diagnostics.shortened(words))
         else:  # rclpy raises where one line of code logs with two severities
-            self.get_logger().warning(shortened(words))
+            self.get_logger().warning(diagnostics.shortened(words))
 
     def log_dropped(self, why: Rejection | None) -> None:
         """Log why a joint state was dropped, where there is a reason."""
         if why is not None:
             self.log_throttled(why.reason, f'message dropped: {why.problem}; {why.remedy}')
 
-    def report_faults(self, report: Report, faults: JointStateFaults) -> None:
+    def report_faults(self, report: diagnostics.Report, faults: diagnostics.JointStateFaults) -> None:
         """Report the faults of the joint states; log why none can be used, and once what the likely cause is."""
         self.log_dropped(faults.report(report))
         before, self._cause = self._cause, faults.likely_cause()
@@ -335,7 +325,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
     def diagnose(self) -> None:
         """Publish the node's diagnostic entry; log when the messages that it needs stop or come."""
         now = time.monotonic()
-        report = Report(silence_s=None if self._heard_at is None else now - self._heard_at)
+        report = diagnostics.Report(silence_s=None if self._heard_at is None else now - self._heard_at)
         if self._entities_made:
             report.values.update(self.meter.window())
             self.report(report)
@@ -343,10 +333,11 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         for name, count in self.events.items():
             report.values[name] = count
             if count:
-                report.worse(WARN if name.endswith('deadline_missed') else ERROR, f'{name}: {count}')
+                level = diagnostics.WARN if name.endswith('deadline_missed') else diagnostics.ERROR
+                report.worse(level, f'{name}: {count}')
         own = self.get_name(), self.get_namespace()
         if self.get_node_names_and_namespaces().count(own) > 1:
-            report.worse(ERROR, 'another node has the same name; stop one, or rename it with __node')
+            report.worse(diagnostics.ERROR, 'another node has the same name; stop one, or rename it with __node')
         if not self.active:
             report.words.insert(0, 'not active')
         else:
@@ -355,7 +346,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
         entry = report.entry(self.get_fully_qualified_name(), self.get_namespace())
         self._diagnostics.publish(to_message(Diagnostics(self.get_clock().now().nanoseconds, (entry,))))
 
-    def _log_silence(self, report: Report) -> None:
+    def _log_silence(self, report: diagnostics.Report) -> None:
         """Log when the messages that the node needs cease or come."""
         before, self._waits_for = self._waits_for, report.waits_for
         if report.waits_for == before:
@@ -365,8 +356,8 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
             self.get_logger().warning(report.silence(topic))
         elif report.waits_for:
             self.get_logger().info(report.silence(topic, none='waiting for'))
-        elif before == CLOCK:
-            self.get_logger().info(f'{CLOCK} is there')
+        elif before == diagnostics.CLOCK:
+            self.get_logger().info(f'{diagnostics.CLOCK} is there')
         else:
             self.get_logger().info(f'messages arrive: {report.values["rate_hz"]:.0f} a second')
 

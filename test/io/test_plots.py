@@ -11,6 +11,7 @@ from flexmanip_ros.io import plots
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.types import Estimate, JointRecord, Mode, Payload, Status
+from flexmanip_ros.view import screen
 
 BEFORE, AFTER = (5.76, 6.89), (5.63, 6.55)
 
@@ -70,7 +71,7 @@ def test_an_interval_keeps_the_digits_that_tell_its_ends_apart(lower, upper, wor
 
 
 def test_every_status_has_a_colour_and_a_pattern_of_its_own():
-    looks = [plots.STATUS_LOOKS[status] for status in Status]
+    looks = [screen.STATUS_LOOKS[status] for status in Status]
     assert len({hatch for _, hatch in looks}) == len(looks)
 
 

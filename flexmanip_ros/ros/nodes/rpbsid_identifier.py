@@ -41,19 +41,9 @@ from flexmanip_ros.identification import batch_fit, recursive_fit
 from flexmanip_ros.io.checkpoint import CheckpointWriter, too_old
 from flexmanip_ros.numerics.background import Deferred
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.ros import qos
+from flexmanip_ros.ros import diagnostics, qos
 from flexmanip_ros.ros.arm_markers import ArmMarkers
 from flexmanip_ros.ros.conversions import JointStateReader, capture_event, to_message
-from flexmanip_ros.ros.diagnostics import (
-    ERROR,
-    UNANNOUNCED,
-    JointStateFaults,
-    Report,
-    number,
-    report_estimate,
-    shortened,
-    status_line,
-)
 from flexmanip_ros.ros.node import FlexmanipNode, run
 from flexmanip_ros.samples.signals import joints
 from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, JointRecord, Status
@@ -147,7 +137,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self.rejected = self.published = 0
         self.problem = ''
         """Why the latest message was rejected."""
-        self.faults = JointStateFaults(joints(self.config), self.resolve_topic_name('joint_states'))
+        self.faults = diagnostics.JointStateFaults(joints(self.config), self.resolve_topic_name('joint_states'))
         self.losses = self.faults.losses
         self._reader = JointStateReader()
         self._background = Deferred()
@@ -366,7 +356,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
 
     def _reject(self, reason: str, words: str, count: int = 1) -> None:
         self.rejected += count
-        self.problem = shortened(words)
+        self.problem = diagnostics.shortened(words)
         self.log_throttled(reason, words)
 
     def _on_reset(self) -> tuple[bool, str]:
@@ -376,7 +366,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         self.get_logger().info(f'reset: {words}')
         return True, words
 
-    def report(self, report: Report) -> None:
+    def report(self, report: diagnostics.Report) -> None:
         """Report the rate, losses, drops by reason, and the quality of the latest estimate."""
         values, counters = report.values, self.state.counters
         self.report_faults(report, self.faults)
@@ -392,15 +382,15 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             report.silent('joint_states')
         report.busy(FASTER)
         if self.rejected:
-            report.worse(ERROR, f'{number(self.rejected, "message")} rejected: {self.problem}')
-        report_estimate(report, self.estimate, self.config.order)
+            report.worse(diagnostics.ERROR, f'{diagnostics.number(self.rejected, "message")} rejected: {self.problem}')
+        diagnostics.report_estimate(report, self.estimate, self.config.order)
         if self.active and self.estimate is not None:
             self._log_estimate(self.estimate)
 
-    def _report_checkpoint(self, report: Report, problem: str) -> None:
+    def _report_checkpoint(self, report: diagnostics.Report, problem: str) -> None:
         """Report why the last state could not be saved, and log it once."""
         if problem:
-            report.worse(ERROR, problem)
+            report.worse(diagnostics.ERROR, problem)
             if self._logged.get('checkpoint') != problem:
                 self.get_logger().error(problem)
         self._logged['checkpoint'] = problem
@@ -410,7 +400,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         log = self.get_logger()
         if self._logged.get('status') is not estimate.status:
             self._logged['status'] = estimate.status
-            log.info(status_line(self.config, estimate.status, estimate.status_reason))
+            log.info(diagnostics.status_line(self.config, estimate.status, estimate.status_reason))
         payload, since_ns = estimate.payload, self.state.stamp_of(EventKind.CAPTURE)
         if payload is None:
             return
@@ -422,7 +412,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         known = payload.status in (Status.WARMING_UP, Status.UNOBSERVABLE) or math.isfinite(payload.upper)
         if not known and since_ns is None and 'unannounced' not in self._logged:
             self._logged['unannounced'] = True
-            log.warning(UNANNOUNCED)
+            log.warning(diagnostics.UNANNOUNCED)
 
 
 main = partial(run, RpbsidIdentifier, NAME, __doc__, IdentifierParameters)
