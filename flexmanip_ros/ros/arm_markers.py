@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import Point
@@ -18,18 +17,10 @@ POINTS = 13
 """Number of points of the line strip that draws one link."""
 
 
-class Drawing(NamedTuple):
-    """The shape of the L links in the base frame, whose origin is joint 1."""
+def draw(arm: ArmParameters, angles: Array, bends: Array, points: int = POINTS) -> tuple[Array, float]:
+    """Return the links (L, N, 2) [m], in points from root to tip, and the direction of the last tip's tangent [rad].
 
-    links: Array
-    """(L, N, 2) points of each link from root to tip [m]."""
-    tip_angle: float
-    """Direction of the tangent at the tip of the last link [rad], the x axis of the payload frame."""
-
-
-def draw(arm: ArmParameters, angles: Array, bends: Array, points: int = POINTS) -> Drawing:
-    """Return the arm at joint angles (L,) [rad] and deflections of the bend sensors (L,) [m].
-
+    The origin is joint 1. angles: of the joints (L,) [rad]; bends: deflections of the bend sensors (L,) [m].
     The deflection from the chord is the first shape function, w(x) = b sin(pi x / L) / sin(pi s), with b the reading of
     the sensor at s L. An encoder reads the slope of a link's root: link 1 from the base, link 2 from the tip of link 1.
     """
@@ -46,7 +37,7 @@ def draw(arm: ArmParameters, angles: Array, bends: Array, points: int = POINTS) 
         links[k, :, 0] = root[0] + c * L * x - s * w
         links[k, :, 1] = root[1] + s * L * x + c * w
         root, tip = links[k, -1], chord - slope
-    return Drawing(links, tip)
+    return links, tip
 
 
 LINK_COLOURS = (0.0, 0.45, 0.70), (0.84, 0.37, 0.0)
@@ -83,12 +74,12 @@ class ArmMarkers:
         bends = np.array([record.position[found[name]] if name in found else 0.0 for name in self._bends])
         if not (np.isfinite(angles).all() and np.isfinite(bends).all()):
             return None
-        drawing = draw(self._config.arm, angles, bends)
-        width, tips = self._width, drawing.links[:, -1].tolist()
+        shapes, tip_angle = draw(self._config.arm, angles, bends)
+        width, tips = self._width, shapes[:, -1].tolist()
         links = [_marker('link', k, Marker.LINE_STRIP, (width, 0.0, 0.0), LINK_COLOURS[k], points=line)
-                 for k, line in enumerate(drawing.links.tolist())]
+                 for k, line in enumerate(shapes.tolist())]
         ends = _marker('joint', 0, Marker.SPHERE_LIST, (2.0 * width,) * 3, JOINT, points=[[0.0, 0.0], *tips])
-        held = self._held(payload, tips[-1], drawing.tip_angle)
+        held = self._held(payload, tips[-1], tip_angle)
         made = MarkerArray(markers=[*links, ends, *held])
         for marker in made.markers:
             marker.header.stamp = time_message(record.stamp_ns)

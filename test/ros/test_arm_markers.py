@@ -35,19 +35,19 @@ def by_name(drawn: MarkerArray | None) -> dict[str, Any]:
 
 
 def test_a_straight_arm_is_two_straight_lines_from_joint_to_joint() -> None:
-    drawn = draw(ARM, np.array([np.pi / 2, -np.pi / 2]), np.zeros(2))
-    np.testing.assert_allclose(drawn.links[0, [0, -1]], [[0.0, 0.0], [0.0, 3.0]], atol=1e-12)
-    np.testing.assert_allclose(drawn.links[1, [0, -1]], [[0.0, 3.0], [2.0, 3.0]], atol=1e-12)
-    assert drawn.tip_angle == pytest.approx(0.0)
+    links, tip_angle = draw(ARM, np.array([np.pi / 2, -np.pi / 2]), np.zeros(2))
+    np.testing.assert_allclose(links[0, [0, -1]], [[0.0, 0.0], [0.0, 3.0]], atol=1e-12)
+    np.testing.assert_allclose(links[1, [0, -1]], [[0.0, 3.0], [2.0, 3.0]], atol=1e-12)
+    assert tip_angle == pytest.approx(0.0)
 
 
 @pytest.mark.parametrize('convention', ['encoder', 'chord'])
 def test_the_deflection_of_the_sensor_point_from_the_chord_is_the_bend(convention: str) -> None:
     arm = replace(ARM, angle_convention=convention)
     bends = np.array([0.02, -0.03])
-    drawn = draw(arm, np.array([0.7, 0.4]), bends, points=11)  # 0.5 and 0.4 of a link are points
+    links, _ = draw(arm, np.array([0.7, 0.4]), bends, points=11)  # 0.5 and 0.4 of a link are points
     for link, index in ((0, 5), (1, 4)):
-        root, tip, there = drawn.links[link, 0], drawn.links[link, -1], drawn.links[link, index]
+        root, tip, there = links[link, 0], links[link, -1], links[link, index]
         along = (tip - root) / np.linalg.norm(tip - root)
         assert np.linalg.norm(tip - root) == pytest.approx(arm.link_length[link])
         assert along[0] * (there - root)[1] - along[1] * (there - root)[0] == pytest.approx(bends[link])
@@ -55,30 +55,30 @@ def test_the_deflection_of_the_sensor_point_from_the_chord_is_the_bend(conventio
 
 def test_an_encoder_reads_the_slope_of_the_root_from_the_tip_before_it() -> None:
     angles = np.array([0.3, 0.5])
-    drawn = draw(ARM, angles, np.array([0.02, 0.01]), points=2001)
-    first, last = (np.diff(line, axis=1) for line in (drawn.links[:, :2], drawn.links[:, -2:]))
+    links, tip_angle = draw(ARM, angles, np.array([0.02, 0.01]), points=2001)
+    first, last = (np.diff(line, axis=1) for line in (links[:, :2], links[:, -2:]))
     slopes, tips = (np.arctan2(part[:, 0, 1], part[:, 0, 0]) for part in (first, last))
     assert slopes[0] == pytest.approx(angles[0], abs=1e-4)
     assert slopes[1] - tips[0] == pytest.approx(angles[1], abs=1e-4)
-    assert drawn.tip_angle == pytest.approx(tips[1], abs=1e-4)
+    assert tip_angle == pytest.approx(tips[1], abs=1e-4)
 
 
 def test_chord_angles_are_absolute() -> None:
     arm = replace(ARM, angle_convention='chord')
-    drawn = draw(arm, np.array([0.3, 0.5]), np.array([0.02, 0.01]))
-    chords = drawn.links[:, -1] - drawn.links[:, 0]
+    links, _ = draw(arm, np.array([0.3, 0.5]), np.array([0.02, 0.01]))
+    chords = links[:, -1] - links[:, 0]
     np.testing.assert_allclose(np.arctan2(chords[:, 1], chords[:, 0]), [0.3, 0.5])
 
 
 def test_the_links_are_drawn_from_the_signals_by_name_and_the_object_at_its_centre_of_mass() -> None:
     config = IdentifierParameters(base_frame='world')
     found = by_name(ArmMarkers(config).message(RECORD, HELD))
-    drawn = draw(config.arm, np.array([0.3, 0.5]), np.array([0.02, 0.01]))
+    links, tip_angle = draw(config.arm, np.array([0.3, 0.5]), np.array([0.02, 0.01]))
     for link in range(2):
         points = np.array([(point.x, point.y) for point in found[f'link{link}'].points])
-        np.testing.assert_array_equal(points, drawn.links[link])
+        np.testing.assert_array_equal(points, links[link])
     ball = found['object0']
-    tip, angle = drawn.links[1, -1], drawn.tip_angle
+    tip, angle = links[1, -1], tip_angle
     assert (ball.pose.position.x, ball.pose.position.y) == pytest.approx(
         (tip[0] + 0.1 * math.cos(angle), tip[1] + 0.1 * math.sin(angle)))
     assert 1000.0 * math.pi / 6.0 * ball.scale.x ** 3 == pytest.approx(20.0)  # as heavy as water
