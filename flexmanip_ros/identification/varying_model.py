@@ -5,17 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flexmanip_ros.identification import parameter_varying as lpv
 from flexmanip_ros.identification.batch_fit import BLOCK
-from flexmanip_ros.identification.parameter_varying import (
-    AT_REST,
-    Roles,
-    Varying,
-    local,
-    part,
-    shown,
-    straight,
-    to_local,
-)
 from flexmanip_ros.identification.prediction_check import MOST_SKEW, VAGUE
 from flexmanip_ros.identification.uncertainty import Identified, Tangent, modes
 from flexmanip_ros.parameters import IdentifierParameters
@@ -39,7 +30,7 @@ class Configurations(NamedTuple):
     """A model of every configuration; ``at`` returns the model at one of them."""
 
     config: IdentifierParameters
-    varying: Varying
+    varying: lpv.Varying
     dt: float
     excitation: float
     innovation_power: float
@@ -52,7 +43,7 @@ class Configurations(NamedTuple):
 
     def now(self, rows: Rows) -> Identified:
         """Return the model at the configuration at the end of the latest rows, see ``straight``."""
-        v, role = self.varying, shown(self.config)
+        v, role = self.varying, lpv.shown(self.config)
         assert role is not None
         count = math.ceil(PERIODS * 2.0 * math.pi / (v.shift * self.dt))
         latest = rows.between(max(rows.first, rows.until - count), rows.until)
@@ -68,7 +59,7 @@ class Configurations(NamedTuple):
             return found._replace(status=Status.WARMING_UP, reason='the angle between the links since the last gap is '
                                                                    'not known yet')
         s = np.linspace(-1.0, 0.0, len(rows))
-        return self.with_relative(float(straight(s[here], Y[here] * v.scale_y, angles[here, None])[0, 0]))
+        return self.with_relative(float(lpv.straight(s[here], Y[here] * v.scale_y, angles[here, None])[0, 0]))
 
     def with_relative(self, angle: float) -> Identified:
         """Return the model where link 2 makes this angle with link 1 [rad].
@@ -76,12 +67,12 @@ class Configurations(NamedTuple):
         The deviations of the parameters are multiplied by the Birge ratio of the predictions (root of chi square over
         degrees of freedom).
         """
-        role = shown(self.config)
+        role = lpv.shown(self.config)
         assert role is not None
         model, along = _matrices(self, math.cos(angle), role, math.sqrt(max(self.varying.chi2, 1.0)))
         v = self.varying
         rest = np.zeros(model.order)  # the state at rest: C = [I 0]
-        rest[list(role.displacements)] = v.center + part(v.theta, 'b', len(v.scale_y), len(v.scale_u)) / v.scale_y
+        rest[list(role.displacements)] = v.center + lpv.part(v.theta, 'b', len(v.scale_y), len(v.scale_u)) / v.scale_y
         found = Identified(
             model=model, constant=rest - model.A @ rest, spread=along.flat(),
             singular_values=self.singular_values, excitation=self.excitation,
@@ -90,7 +81,7 @@ class Configurations(NamedTuple):
         return found._replace(status=judge(found, v))
 
 
-def judge(found: Identified, v: Varying) -> Status:
+def judge(found: Identified, v: lpv.Varying) -> Status:
     """Return the status, from the predictions of samples before they were fitted and from the deviations."""
     if float(v.share.max()) > MISSED:
         return Status.INCONSISTENT
@@ -102,7 +93,7 @@ def judge(found: Identified, v: Varying) -> Status:
     return Status.TRACKING
 
 
-def unmodelled(v: Varying, G: Array) -> tuple[Array, Array]:
+def unmodelled(v: lpv.Varying, G: Array) -> tuple[Array, Array]:
     """Return deviations of G and D (h, h, h), one for each mode, that explain what predictions over a block miss.
 
     A relative frequency error e of a mode w gives the phase error w t e after a time t; over a block of duration T its
@@ -123,14 +114,14 @@ def unmodelled(v: Varying, G: Array) -> tuple[Array, Array]:
     return 2.0 * (error * values)[:, None, None] * shapes, 2.0 * (error * w)[:, None, None] * shapes
 
 
-def _matrices(read: Configurations, c: float, role: Roles, ratio: float) -> tuple[StateSpace, Tangent]:
+def _matrices(read: Configurations, c: float, role: lpv.Roles, ratio: float) -> tuple[StateSpace, Tangent]:
     """Model at c in JointState units, and its tangent; ratio: factor on the parameters' deviations."""
     v = read.varying
     h, r = len(v.scale_y), len(v.scale_u)
     m, n = len(role.states), 2 * h
-    G, _, H, _, D, E, _ = local(v.theta, h, r, c, AT_REST)
+    G, _, H, _, D, E, _ = lpv.local(v.theta, h, r, c, lpv.AT_REST)
     a, b, q = h * h, h * r, 2 * r + 1
-    L = to_local(v.theta, h, r, c, AT_REST)[:, :len(v.theta)] @ (ratio * v.root[:len(v.theta)])
+    L = lpv.to_local(v.theta, h, r, c, lpv.AT_REST)[:, :len(v.theta)] @ (ratio * v.root[:len(v.theta)])
     of_G, of_D = unmodelled(v, G)
     more = np.zeros((len(L), 2 * h))
     more[:a, :h] = of_G.reshape(h, -1).T

@@ -7,31 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexmanip_ros.errors import ModelError
+from flexmanip_ros.identification import parameter_varying as lpv
 from flexmanip_ros.identification.batch_fit import BLOCK, Recursion
-from flexmanip_ros.identification.parameter_varying import (
-    AT_REST,
-    UNKNOWN,
-    Roles,
-    Varying,
-    advance,
-    block_of,
-    local,
-    lost,
-    measured,
-    noise_of,
-    part,
-    parts,
-    passed,
-    prior,
-    reopened,
-    roles,
-    settling,
-    shares,
-    signals_of,
-    straight,
-    updated,
-    width,
-)
 from flexmanip_ros.identification.prediction_check import DAMPED
 from flexmanip_ros.identification.realization import known_output_basis, slowest, to_continuous, transform
 from flexmanip_ros.identification.varying_kernel import basis
@@ -64,7 +41,7 @@ SAME = 0.3
 """Factor on the prior deviations around the model before an event: the arm is the same, its object another."""
 
 
-def from_model(model: StateSpace, role: Roles) -> tuple[Array, Array, Array] | None:
+def from_model(model: StateSpace, role: lpv.Roles) -> tuple[Array, Array, Array] | None:
     """G, D, H of a model of one configuration, in its own units; None without h lightly damped oscillations.
 
     From a model with more modes than the h displacements the slowest modes are taken.
@@ -92,16 +69,17 @@ def from_model(model: StateSpace, role: Roles) -> tuple[Array, Array, Array] | N
     return G, D, H
 
 
-def start(config: IdentifierParameters, rows: Rows, old: Recursion | None, before: Varying | None) -> Varying | None:
+def start(config: IdentifierParameters, rows: Rows, old: Recursion | None, before: lpv.Varying | None
+          ) -> lpv.Varying | None:
     """Start with a stretch of samples, from the fit of one configuration or from the model before an event."""
-    role = roles(config)
+    role = lpv.roles(config)
     if role is None or len(rows) < GROWTH[0] or rows.angles.shape[1] != 2 or (old is None and before is None):
         return None
     stamps = rows.stamp_ns
     dt = float(stamps[-1] - stamps[0]) * 1e-9 / (len(rows) - 1)
     h, r, c = len(role.displacements), len(config.inputs), math.cos(float(np.mean(relative_angle(config, rows.angles))))
     if before is not None:
-        begun: Varying | None = before._replace(x=np.zeros(2 * h), blocks=0, strikes=0, lost=False, settling=0)
+        begun: lpv.Varying | None = before._replace(x=np.zeros(2 * h), blocks=0, strikes=0, lost=False, settling=0)
     else:
         assert old is not None
         begun = _from_recursion(old, role, r, dt, c)
@@ -111,7 +89,7 @@ def start(config: IdentifierParameters, rows: Rows, old: Recursion | None, befor
     power = np.concatenate([np.mean(rows.u ** 2, axis=0), np.var(Y, axis=0)])
     if not np.all(power > 0.0) or not np.all(np.isfinite(power)):
         return None
-    G, _, H, _, D, _, _ = local(begun.theta, h, r, c, AT_REST)
+    G, _, H, _, D, _, _ = lpv.local(begun.theta, h, r, c, lpv.AT_REST)
     unit = 1.0 / np.sqrt(power)
     more_u, more_y = unit[:r] / begun.scale_u, unit[r:] / begun.scale_y
     ratio = more_y[:, None] / more_y
@@ -121,7 +99,7 @@ def start(config: IdentifierParameters, rows: Rows, old: Recursion | None, befor
     theta, root = _around(G * ratio, H * more_y[:, None] / more_u, D * ratio, c, turn)
     if before is not None:  # the arm is the same, its object another; the products start anew
         known = np.ones(len(theta))
-        known[:parts(h, r)['Q'][0].start], known[-1] = SAME, SAME
+        known[:lpv.parts(h, r)['Q'][0].start], known[-1] = SAME, SAME
         root[:len(theta), :len(theta)] *= known
     return _fit_stretch(config, begun._replace(
         dt=dt, theta=theta, root=root, scale_u=unit[:r], scale_y=unit[r:], turn=turn,
@@ -131,7 +109,7 @@ def start(config: IdentifierParameters, rows: Rows, old: Recursion | None, befor
 def _turn(config: IdentifierParameters, rows: Rows, Y: Array) -> float:
     """Return the angle through which the links swing with displacements Y (N, h) [rad, rms]."""
     angles = np.column_stack([relative_angle(config, rows.angles), rows.angles[:, 0]])
-    turns = Y @ straight(np.linspace(-1.0, 1.0, len(Y)), Y, angles)[2:]
+    turns = Y @ lpv.straight(np.linspace(-1.0, 1.0, len(Y)), Y, angles)[2:]
     return math.sqrt(float(np.var(turns[:, 1]) + np.var(turns.sum(axis=1))))  # relative angle, and that of link 1
 
 
@@ -141,15 +119,15 @@ def _around(G: Array, H: Array, D: Array, c: float, turn: float) -> tuple[Array,
     The root is that of the covariance of [theta; state].
     """
     h, r = H.shape
-    value, variance = basis(c, ZETA)[0][:, None, None], shares(h) ** 2
+    value, variance = basis(c, ZETA)[0][:, None, None], lpv.shares(h) ** 2
     g = variance * value / np.sum(variance * value ** 2, axis=0) * G
     b, d = (np.concatenate([X.ravel(), np.zeros(2 * X.size)]) for X in (H, D))
-    rest = sum(parts(h, r)[name][0].stop - parts(h, r)[name][0].start for name in 'bQR')
+    rest = sum(lpv.parts(h, r)[name][0].stop - lpv.parts(h, r)[name][0].start for name in 'bQR')
     theta = np.concatenate([g.ravel(), b, np.zeros(4 * h * r), d, np.zeros(rest), np.full(1, ZETA)])
-    return theta, np.diag(np.concatenate([prior(G, H, turn), np.full(2 * h, UNKNOWN)]))
+    return theta, np.diag(np.concatenate([lpv.prior(G, H, turn), np.full(2 * h, lpv.UNKNOWN)]))
 
 
-def _from_recursion(old: Recursion, role: Roles, r: int, dt: float, c: float) -> Varying | None:
+def _from_recursion(old: Recursion, role: lpv.Roles, r: int, dt: float, c: float) -> lpv.Varying | None:
     fit, scale = old.theta, old.scale
     found = from_model(StateSpace(fit.A, fit.B[:, :r], fit.C, fit.D, fit.K, dt), role)
     if found is None:
@@ -164,36 +142,37 @@ def _from_recursion(old: Recursion, role: Roles, r: int, dt: float, c: float) ->
     if every < 1:
         return None
     theta, root = _around(G / shift ** 2, H / shift ** 2, D / shift, c, 0.0)
-    return Varying(
+    return lpv.Varying(
         shift=shift, scale_u=scale[:r].copy(), scale_y=scale[r:][list(role.displacements)].copy(), theta=theta,
         x=np.zeros(2 * h), root=root, noise=np.zeros((h, h)), share=np.zeros(h), chi2=1.0, corner=corner,
-        every=every, filtered=np.zeros((4, width(h, r))), dt=dt, angle=0.0, blocks=0, strikes=0, lost=False,
+        every=every, filtered=np.zeros((4, lpv.width(h, r))), dt=dt, angle=0.0, blocks=0, strikes=0, lost=False,
         settling=0, turn=0.0, power=np.zeros((h, h)), center=np.zeros(h), white=np.zeros((h, h)),
         prior=np.zeros((2, len(theta))), past=())
 
 
-def _fit_stretch(config: IdentifierParameters, v: Varying, rows: Rows, role: Roles) -> Varying | None:
+def _fit_stretch(config: IdentifierParameters, v: lpv.Varying, rows: Rows, role: lpv.Roles) -> lpv.Varying | None:
     """Fit a whole stretch: its first ``WINDOW`` samples at once, the rest block by block."""
     begun = None
     for _ in range(CENTERED):
-        signals = signals_of(config, rows, role, v.center)
+        signals = lpv.signals_of(config, rows, role, v.center)
         if not np.all(np.isfinite(signals)):
             return None
         begun = _fit_at_once(v, signals[:WINDOW], rows.missing[:WINDOW])
         if begun is None:
             return None
-        offset = part(begun.theta, 'b', len(v.scale_y), len(v.scale_u)) / v.scale_y
+        offset = lpv.part(begun.theta, 'b', len(v.scale_y), len(v.scale_u)) / v.scale_y
         v = v._replace(center=v.center + offset)
     for row in range(rows.first + WINDOW, rows.until, BLOCK):
-        begun = None if begun is None else advance(config, begun, rows.between(row, min(row + BLOCK, rows.until)))
+        begun = None if begun is None else lpv.advance(config, begun, rows.between(row, min(row + BLOCK, rows.until)))
     return begun
 
 
-def _fit_at_once(v: Varying, signals: Array, missing: NDArray[np.int64]) -> Varying | None:
+def _fit_at_once(v: lpv.Varying, signals: Array, missing: NDArray[np.int64]) -> lpv.Varying | None:
     """Fit growing stretches of signals (N, w), leaving out gaps and, after each, the settling time of the filter."""
-    quiet, begin = settling(v), v
-    stretches = [(first, last, *passed(v, signals[first:last], True)) for first, last in measured(v, signals, missing)]
-    least = noise_of(signals, v)
+    quiet, begin = lpv.settling(v), v
+    stretches = [(first, last, *lpv.passed(v, signals[first:last], True))
+                 for first, last in lpv.measured(v, signals, missing)]
+    least = lpv.noise_of(signals, v)
     inside = slice(len(v.scale_u), len(v.scale_u) + len(v.scale_y))
     if not any(out.shape[1] >= quiet + FEWEST for _, _, out, _ in stretches):
         return None
@@ -203,20 +182,20 @@ def _fit_at_once(v: Varying, signals: Array, missing: NDArray[np.int64]) -> Vary
         for first, last, out, _ in stretches:
             end = (min(count, last) - first) // v.every
             if end >= quiet + FEWEST:
-                blocks.append(block_of(v, out[:, quiet:end]))
+                blocks.append(lpv.block_of(v, out[:, quiet:end]))
         if not blocks:
             continue
         noise = (LATE if count < WINDOW else 4.0) * least + 1e-4 * power
-        found = updated(begin, blocks, noise, least, ITERATIONS)
+        found = lpv.updated(begin, blocks, noise, least, ITERATIONS)
         if found is not None:  # once more, weighted with the residuals' covariance
             begin = begin._replace(theta=found.theta)
-            found = updated(begin, blocks, 1.5 * found.noise + least, least, ITERATIONS)
+            found = lpv.updated(begin, blocks, 1.5 * found.noise + least, least, ITERATIONS)
         if found is None:
             return None
         begin, v = begin._replace(theta=found.theta), found
     _, last, out, state = stretches[-1]
     if out.shape[1] < quiet + FEWEST:  # the filter has not settled since the last gap
-        v = reopened(v, max(quiet - out.shape[1], 0))
+        v = lpv.reopened(v, max(quiet - out.shape[1], 0))
     settled = (out[:, quiet:] for _, _, out, _ in stretches)
     v = v._replace(white=least, past=tuple(out for out in settled if out.shape[1] >= FEWEST))
-    return v._replace(filtered=state) if last == len(signals) else lost(v)
+    return v._replace(filtered=state) if last == len(signals) else lpv.lost(v)
