@@ -153,7 +153,8 @@ class Manipulator(NamedTuple):
     unit_stiffness: Array
     """(n,) derivative of ``stiffness`` with respect to the EI of its link."""
     torque: Array
-    """(n, L) torque matrix B of straight links."""
+    """(n, L) torque matrix B of straight links. Convention ``paper``: each torque acts on its link's chord alone;
+    ``joint``: it also reacts on the end of the link before (or on the base), and does work through the slopes."""
     joint: Array
     """(L, n) joint angles from q, between the slopes of adjacent links (or the base); rotors turn with them."""
     output: Array
@@ -272,7 +273,8 @@ def manipulator(arm: ArmParameters, kappa: int | None = None, points: int | None
         curvature=curvature / scale ** 2, along=weight * length[:, None] * arm.shortening,
         tip_shortening=G[-1] / scale, root_slope=root, tip_slope=tip,
         rotary=_rotary(arm, shapes, root, tip, joint), stiffness=stiffness, damping=_damping(arm, shapes, stiffness),
-        unit_stiffness=unit, torque=_torque_matrix(arm, joint), joint=joint,
+        unit_stiffness=unit, joint=joint,
+        torque=joint.T.copy() if arm.torque_convention == 'joint' else np.eye(n, links),
         output=_output_matrix(arm, shapes, joint),
         viscous=np.array(arm.joint_viscous_friction), coulomb=np.array(arm.joint_coulomb_friction),
         base=np.array([arm.base_mass, *arm.base_joint_offset]), gravity=np.array(arm.gravity))
@@ -343,17 +345,6 @@ def _damping(arm: ArmParameters, shapes: ShapeFunctions, stiffness: Array) -> Ar
         omega = np.sqrt(K / M)
         D[at] = 2 * arm.damping_ratio * (K / omega[0] if arm.damping_model == 'stiffness' else M * omega)
     return D
-
-
-def _torque_matrix(arm: ArmParameters, joint: Array) -> Array:
-    """Matrix (n, L) from joint torques to generalized forces.
-
-    ``paper``: each torque acts on its link's chord alone. ``joint``: it also reacts on the end of the link before
-    (or on the base), and it does work through the slopes of the shapes.
-    """
-    if arm.torque_convention == 'joint':
-        return joint.T.copy()
-    return np.eye(joint.shape[1], len(joint))
 
 
 def _output_matrix(arm: ArmParameters, shapes: ShapeFunctions, joint: Array) -> Array:
