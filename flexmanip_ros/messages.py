@@ -36,18 +36,10 @@ LATCHED = frozenset({MODEL, PAYLOAD_ESTIMATE, PAYLOAD, PAYLOAD_BODY, ARM_PARAMET
 """The topics whose last message a late subscription still gets (transient local, depth 1)."""
 
 
-class Dimension(NamedTuple):
-    """One dimension of a Float64MultiArray."""
-
-    label: str
-    size: int
-    stride: int
-
-
 class LabelledArray(NamedTuple):
-    """A Float64MultiArray: ``data`` flat and row-major, ``dimensions`` outermost first, data_offset 0."""
+    """A Float64MultiArray, row-major, data_offset 0; labels: one for each dimension of ``data``, outermost first."""
 
-    dimensions: tuple[Dimension, ...]
+    labels: tuple[str, ...]
     data: Array
 
 
@@ -81,18 +73,12 @@ class Diagnostics(NamedTuple):
     statuses: tuple[DiagnosticStatus, ...]
 
 
-def _matrix(rows: str, columns: str, values: Array) -> LabelledArray:
-    height, width = values.shape
-    dimensions = (Dimension(rows, height, height * width), Dimension(columns, width, width))
-    return LabelledArray(dimensions, np.ascontiguousarray(values, dtype=np.float64).ravel())
-
-
 def model_matrix(model: StateSpace) -> LabelledArray:
     """Return [[A, B, K], [C, D, I]] (n + m, n + r + m) with its sizes and sample time in the labels."""
     n, r, m = model.order, model.B.shape[1], model.C.shape[0]
     values = np.block([[model.A, model.B, model.K], [model.C, model.D, np.eye(m)]])
-    return _matrix(f'rows: state={n} output={m} dt={model.dt!r}',
-                   f'columns: state={n} input={r} innovation={m}', values)
+    return LabelledArray((f'rows: state={n} output={m} dt={model.dt!r}',
+                          f'columns: state={n} input={r} innovation={m}'), values)
 
 
 def modes_matrix(modes: tuple[Mode, ...], order: int) -> LabelledArray:
@@ -102,7 +88,7 @@ def modes_matrix(modes: tuple[Mode, ...], order: int) -> LabelledArray:
     draws one curve for each entry of the first message shows all modes.
     """
     rows = [(mode.frequency_hz, mode.damping_ratio) for mode in _known(modes)]
-    return _matrix('modes', 'frequency_hz damping_ratio', _filled(rows, order // 2, 2))
+    return LabelledArray(('modes', 'frequency_hz damping_ratio'), _filled(rows, order // 2, 2))
 
 
 def modes_interval(modes: tuple[Mode, ...], order: int) -> LabelledArray:
@@ -119,8 +105,8 @@ def modes_interval(modes: tuple[Mode, ...], order: int) -> LabelledArray:
         damping = damping if damping <= 1.0 else math.nan
         rows.append((mode.frequency_hz - frequency, mode.frequency_hz + frequency,
                      mode.damping_ratio - damping, mode.damping_ratio + damping))
-    return _matrix('modes', 'frequency_lower95_hz frequency_upper95_hz damping_lower95 damping_upper95',
-                   _filled(rows, order // 2, 4))
+    return LabelledArray(('modes', 'frequency_lower95_hz frequency_upper95_hz damping_lower95 damping_upper95'),
+                         _filled(rows, order // 2, 4))
 
 
 def _known(modes: tuple[Mode, ...]) -> list[Mode]:
@@ -141,20 +127,21 @@ def _filled(rows: Sequence[tuple[float, ...]], height: int, width: int) -> Array
 def payload_row(payload: Payload) -> LabelledArray:
     """Return mass, standard deviation, lower 95 %, upper 95 % [kg], consistency."""
     values = np.array([payload.mass, payload.std, payload.lower, payload.upper, payload.consistency])
-    return LabelledArray((Dimension('mass std lower95 upper95 consistency', 5, 5),), values)
+    return LabelledArray(('mass std lower95 upper95 consistency',), values)
 
 
 def payload_body(payload: Payload) -> LabelledArray:
     """Return (5, 4): row 1 mass [kg], centre of mass x, y [m], inertia about it [kg m^2]; rows 2 to 5 covariance."""
     first = np.array([payload.mass, payload.com[0], payload.com[1], payload.inertia[5]])
-    return _matrix('value covariance_mass covariance_com_x covariance_com_y covariance_izz', 'mass com_x com_y izz',
-                   np.vstack([first, np.array(payload.covariance).reshape(4, 4)]))
+    return LabelledArray(
+        ('value covariance_mass covariance_com_x covariance_com_y covariance_izz', 'mass com_x com_y izz'),
+        np.vstack([first, np.array(payload.covariance).reshape(4, 4)]))
 
 
 def arm_parameters(found: Sequence[ArmParameter]) -> LabelledArray:
     """Return value and standard deviation, one parameter a row; the label of the rows lists the names in order."""
-    return _matrix(','.join(one.name for one in found), 'value std',
-                   np.array([(one.value, one.std) for one in found]).reshape(len(found), 2))
+    return LabelledArray((','.join(one.name for one in found), 'value std'),
+                         np.array([(one.value, one.std) for one in found]).reshape(len(found), 2))
 
 
 def payload_status(payload: Payload, stamp_ns: int, frame_id: str) -> Diagnostics:
@@ -214,9 +201,11 @@ def message(value: AnyValue, new: Callable[..., Any]) -> Any:
     if isinstance(value, CaptureEvent):
         return header(value.stamp_ns, value.kind.value)
     if isinstance(value, LabelledArray):
-        dimensions = [new('std_msgs/msg/MultiArrayDimension', **item._asdict()) for item in value.dimensions]
+        shape, data = value.data.shape, np.ascontiguousarray(value.data, dtype=np.float64).ravel()
+        dimensions = [new('std_msgs/msg/MultiArrayDimension', label=label, size=size, stride=math.prod(shape[k:]))
+                      for k, (label, size) in enumerate(zip(value.labels, shape, strict=True))]
         layout = new('std_msgs/msg/MultiArrayLayout', dim=dimensions, data_offset=0)
-        return new('std_msgs/msg/Float64MultiArray', layout=layout, data=np.asarray(value.data, dtype=np.float64))
+        return new('std_msgs/msg/Float64MultiArray', layout=layout, data=data)
     if isinstance(value, Inertia):
         com = new('geometry_msgs/msg/Vector3', **dict(zip('xyz', map(float, value.com), strict=True)))
         moments = dict(zip(('ixx', 'ixy', 'ixz', 'iyy', 'iyz', 'izz'), map(float, value.inertia), strict=True))
