@@ -124,12 +124,6 @@ def _filled(rows: Sequence[tuple[float, ...]], height: int, width: int) -> Array
     return values
 
 
-def payload_row(payload: Payload) -> LabelledArray:
-    """Return mass, standard deviation, lower 95 %, upper 95 % [kg], consistency."""
-    values = np.array([payload.mass, payload.std, payload.lower, payload.upper, payload.consistency])
-    return LabelledArray(('mass std lower95 upper95 consistency',), values)
-
-
 def payload_body(payload: Payload) -> LabelledArray:
     """Return (5, 4): row 1 mass [kg], centre of mass x, y [m], inertia about it [kg m^2]; rows 2 to 5 covariance."""
     first = np.array([payload.mass, payload.com[0], payload.com[1], payload.inertia[5]])
@@ -224,7 +218,9 @@ def message(value: AnyValue, new: Callable[..., Any]) -> Any:
 def outgoing(estimate: Estimate, frame_id: str) -> Iterator[tuple[str, Value]]:
     """Yield (topic below the node's name, value) of everything an estimate publishes."""
     yield from outgoing_payload(estimate.payload, estimate.stamp_ns, frame_id)
-    yield from outgoing_arm(estimate)
+    found = estimate.arm_parameters
+    if found and all(math.isfinite(one.value) and math.isfinite(one.std) for one in found):
+        yield ARM_PARAMETERS, arm_parameters(found)
     yield from outgoing_model(estimate)
 
 
@@ -241,19 +237,12 @@ def outgoing_payload(payload: Payload | None, stamp_ns: int, frame_id: str) -> I
         return
     if all(map(math.isfinite, (payload.std, *payload.com, *payload.inertia))):
         yield PAYLOAD, Inertia(stamp_ns, frame_id, payload.mass, payload.com, payload.inertia)
-    yield PAYLOAD_ESTIMATE, payload_row(payload)
+    yield PAYLOAD_ESTIMATE, LabelledArray(('mass std lower95 upper95 consistency',), np.array([payload.mass, *numbers]))
     if payload.covariance and all(map(math.isfinite, (*payload.covariance, *payload.com, *payload.inertia))):
         yield PAYLOAD_BODY, payload_body(payload)
     if math.isfinite(payload.std):
         yield PAYLOAD_MASS, payload.mass
     yield STATUS, payload_status(payload, stamp_ns, frame_id)
-
-
-def outgoing_arm(estimate: Estimate) -> Iterator[tuple[str, Value]]:
-    """Yield the learned arm parameters, if this estimate carries them."""
-    found = estimate.arm_parameters
-    if found and all(math.isfinite(one.value) and math.isfinite(one.std) for one in found):
-        yield ARM_PARAMETERS, arm_parameters(found)
 
 
 def outgoing_model(estimate: Estimate) -> Iterator[tuple[str, Value]]:
