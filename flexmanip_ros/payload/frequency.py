@@ -14,6 +14,7 @@ from flexmanip_ros.arm.linearization import mass_matrix, momentum
 from flexmanip_ros.arm.manipulator import manipulator, payload_array
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload.block_extraction import unknown
+from flexmanip_ros.payload.interval import POWER_LIMIT
 from flexmanip_ros.payload.structured_model import working_point
 from flexmanip_ros.types import Array, Mode, Payload, Status
 
@@ -97,7 +98,8 @@ def _at(arm: ArmParameters, theta: Array, usable: Sequence[Mode]) -> Payload:
         status = Status.INCONSISTENT
     elif deviation > max(mass, lightest):
         status = Status.POORLY_EXCITED
-    return Payload(mass, deviation, lower, upper, max(least, 1.0), status)
+    # as with the other methods, what is above ``POWER_LIMIT`` is INCONSISTENT
+    return Payload(mass, deviation, lower, upper, max(POWER_LIMIT * least / MISFIT, 1.0), status)
 
 
 def _misfit(model: Array, natural: Array, std: Array) -> Array:

@@ -69,6 +69,14 @@ def test_frequencies_of_another_arm_are_found_out():
     assert found.status is Status.INCONSISTENT
 
 
+def test_an_estimate_is_tracking_up_to_the_consistency_that_its_consumers_trust() -> None:
+    """Adapter and controller trust a consistency up to 2."""
+    found = [frequency.estimate(config(ARM), modes(20.0, 1e-3, (0.0, error)), ANGLES, NOWHERE)
+             for error in np.linspace(0.0, 0.01, 41)]
+    assert {one.status for one in found} == {Status.TRACKING, Status.INCONSISTENT}
+    assert all((one.status is Status.TRACKING) == (one.consistency <= 2.0) for one in found)
+
+
 def test_no_modes_or_angles_give_a_status():
     assert frequency.estimate(config(ARM), (), ANGLES, NOWHERE).status is Status.WARMING_UP
     assert frequency.estimate(config(ARM), modes(20.0), np.empty(0), NOWHERE).status is Status.UNOBSERVABLE
