@@ -97,6 +97,20 @@ def test_a_requested_capture_is_stamped_after_the_latest_sample_and_latched(ros:
     assert late[1].frame_id == 'release'
 
 
+def test_a_release_requested_before_the_next_joint_state_comes_after_the_capture(ros: Ros) -> None:
+    """Of events with one stamp the identifier takes the release first, and the arm would hold an object."""
+    node = ros.managed(CaptureTrigger(context=ros.context))
+    ros.publisher(JointState, 'joint_states', qos.sensor_output()).publish(joint_state(5))
+    ros.wait(lambda: node._last_ns is not None)
+    heard = ros.listen(Header, 'capture_event', qos.latched())
+    for request in ('capture', 'release', 'capture'):
+        assert ros.call(Trigger, f'capture_trigger/{request}').success
+    ros.wait(lambda: len(heard) == 3)
+    assert [event.frame_id for event in sorted(heard, key=lambda event: stamp_ns(event.stamp))] == [
+        'capture', 'release', 'capture']
+    assert len({stamp_ns(event.stamp) for event in heard}) == 3
+
+
 def test_a_request_without_joint_states_is_refused_with_the_reason(ros: Ros) -> None:
     node = ros.managed(CaptureTrigger(context=ros.context))
     answer = ros.call(Trigger, 'capture_trigger/capture')

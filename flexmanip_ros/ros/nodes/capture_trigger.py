@@ -33,6 +33,9 @@ from flexmanip_ros.samples.signals import joints
 from flexmanip_ros.types import LOOPED_NS, CaptureEvent, EventKind, JointRecord, events_at
 
 NAME = 'capture_trigger'
+MOST_REQUESTS = 1000
+"""Number of requests since a joint state that have stamps of their own, 1 ns apart: at one stamp the identifier takes a
+release before a capture."""
 WARM_UP_SAMPLES = 200
 """Number of made-up samples: the detector begins, and its fit takes a few steps. No arm swings as they do, so a fit
 that goes on until its horizon closes takes up to 10 s."""
@@ -184,7 +187,10 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
             return False, 'no joint_states with a stamp came yet, so the instant has no stamp; start the arm first'
         if silent > self.config.stale_after:
             return False, f'no joint_states for {silent:.1f} s; is the driver alive?'
-        event = CaptureEvent(self._last_ns + round(self.config.service_delay * 1e9), kind)
+        stamp = self._last_ns + round(self.config.service_delay * 1e9)
+        if self.latest is not None and 0 <= self.latest.stamp_ns - stamp < MOST_REQUESTS:  # since the same joint state
+            stamp = self.latest.stamp_ns + 1
+        event = CaptureEvent(stamp, kind)
         words = f'{kind.value} at {event.stamp_ns * 1e-9:.6f}{self._adds_an_object(event)}'
         self._announce(event)
         return True, words
