@@ -68,7 +68,8 @@ class ModelEstimator(NamedTuple):
     since_ns: int = 0
     """Stamp of the last event; 0 before the first."""
     turned: Array = NO_ANGLES
-    """Smallest and largest angle between the links since the last event [rad]; (0,) where the model has no angles."""
+    """Smallest and largest angle between the links since the last event, their sum [rad], and number; (0,) where the
+    model has no angles."""
 
     def first_needed(self, cursor: int) -> int:
         """Return the first row of the sample log that will be read again."""
@@ -97,12 +98,29 @@ class ModelEstimator(NamedTuple):
 
 
 def extended(config: IdentifierParameters, turned: Array, rows: Rows) -> Array:
-    """Return the smallest and largest angle between the links (2,) [rad] after more rows; see ``turned``."""
+    """Return smallest, largest, sum and number of angles between the links (4,) after more rows; see ``turned``."""
     if parameter_varying.roles(config) is None or rows.angles.shape[1] != 2:
         return turned
-    angles = np.concatenate([turned, relative_angle(config, rows.angles)])
+    angles = relative_angle(config, rows.angles)
     known = angles[np.isfinite(angles)]
-    return np.array([known.min(), known.max()]) if known.size else turned
+    if not known.size:
+        return turned
+    low, high, total, count = turned if turned.size else (np.inf, -np.inf, 0.0, 0.0)
+    # added one by one, so that the sum does not depend on how many rows come at once
+    return np.array([min(low, known.min()), max(high, known.max()), np.cumsum([total, *known])[-1], count + known.size])
+
+
+def turning(config: IdentifierParameters, turned: Array, lately: Rows) -> tuple[float, float]:
+    """Return the range of the angle between the links since the last event, and how far its mean drifted [rad].
+
+    The drift is the mean of the latest rows less that of all rows since the event, see ``turned``.
+    """
+    if not turned.size:
+        return 0.0, 0.0
+    low, high, total, count = turned.tolist()
+    angles = relative_angle(config, lately.angles)
+    known = angles[np.isfinite(angles)]
+    return high - low, float(np.mean(known)) - total / count if known.size else 0.0
 
 
 def init(config: IdentifierParameters) -> tuple[PayloadEstimator, ModelEstimator]:
@@ -170,13 +188,13 @@ class ModelRequest:
         found, without = _identified(config, identifier.rpbsid, self.dt, self.rows)
         if found is not None:
             role = parameter_varying.roles(config)
+            turned, drift = turning(config, identifier.turned, self.rows)
             filtered = rpbsid.latest(config, identifier.rpbsid, identifier.since_ns, self.dt)
             since = float(identifier.rpbsid.counts[USED])
             found = prediction_check.judged(
                 found, self.rows if filtered is None else filtered, config.outputs,
-                0 if role is None else len(role.displacements),
-                float(np.ptp(identifier.turned)) if identifier.turned.size else 0.0,
-                since, filtered=filtered is not None)
+                0 if role is None else len(role.displacements), turned, since,
+                drift=drift, filtered=filtered is not None)
             found = held_back.judged(
                 found, identifier.rpbsid.held, config.outputs, prediction_check.is_early(found, since))
         if config.payload_method == 'block' and found is not None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from flexmanip_ros import estimator
 from flexmanip_ros.identification import prediction_check, validation
 from flexmanip_ros.identification.realization import to_discrete
 from flexmanip_ros.identification.uncertainty import Identified, modes
+from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.types import Array, StateSpace, Status
 
@@ -129,6 +132,32 @@ def test_a_model_of_one_configuration_shows_each_bend_s_mode_and_holds_until_the
         damping: float, bends: int, turned: float, said: Status) -> None:
     u, model = torques(), two_modes(5.6, 6.1, damping)
     assert judged(tracking(model, 1e4), u, measured(model, u), bends, turned).status is said
+
+
+def test_the_bands_of_an_arm_that_turns_hold_what_the_frequencies_change_from_its_mean_configuration_on() -> None:
+    """A drift of 0.05 rad changes a frequency by 0.5 % (rms); the last samples do not show so little."""
+    u, model = torques(), two_modes(5.6, 6.1)
+    rows = log_of(u, measured(model, u)).rows(0, len(u))
+    rests, drifts = (modes(prediction_check.judged(
+        tracking(model, 1e4), rows, ('a/position', 'b/position'), 2, 0.1, drift=drift)) for drift in (0.0, -0.05))
+    for mode, before in zip(drifts, rests, strict=True):
+        more = math.sqrt(mode.frequency_std_hz ** 2 - before.frequency_std_hz ** 2)
+        assert more == pytest.approx(0.005 * mode.frequency_hz, rel=0.01)
+
+
+def test_the_drift_is_the_mean_of_the_latest_angles_less_that_of_all() -> None:
+    """However many rows come at once; angles that were not measured do not count."""
+    config, steps = IdentifierParameters(), 1000
+    angles = np.column_stack([np.ones(steps), np.random.default_rng(3).normal(0.3, 0.1, steps)])
+    angles[::7] = np.nan
+    rows = log_of(np.zeros((steps, 2)), np.zeros((steps, 4)), angles).rows(0, steps)
+    whole = estimator.extended(config, np.empty(0), rows)
+    part = estimator.extended(config, np.empty(0), rows.between(0, 123))
+    np.testing.assert_array_equal(estimator.extended(config, part, rows.since(123)), whole)
+    turned, drift = estimator.turning(config, whole, rows.since(900))
+    assert turned == np.nanmax(angles[:, 1]) - np.nanmin(angles[:, 1])
+    assert drift == pytest.approx(np.nanmean(angles[900:, 1]) - np.nanmean(angles[:, 1]), rel=1e-9)
+    assert estimator.turning(config, np.empty(0), rows) == (0.0, 0.0)
 
 
 def test_samples_that_show_no_frequency_leave_the_band_of_a_model_as_it_is() -> None:
