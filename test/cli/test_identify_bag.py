@@ -166,7 +166,7 @@ def test_a_recording_of_the_estimates_holds_what_the_node_would_publish(recordin
         if isinstance(value, messages.Diagnostics):
             assert [item.message for item in message.status] == [item.message for item in value.statuses]
         else:
-            np.testing.assert_array_equal(message.data, value.data)
+            np.testing.assert_array_equal(message.data, value.data.ravel())
 
 
 def test_an_existing_recording_is_kept_and_said_before_the_work(recording, capsys, tmp_path):
