@@ -97,17 +97,23 @@ class ModelEstimator(NamedTuple):
         return int(self.rpbsid.counts[REJECTED])
 
 
+def measured_angles(config: IdentifierParameters, rows: Rows) -> Array:
+    """Return the angle between the links [rad] in the rows in which it was measured."""
+    angles = relative_angle(config, rows.angles)
+    return angles[np.isfinite(angles)]
+
+
 def extended(config: IdentifierParameters, turned: Array, rows: Rows) -> Array:
     """Return smallest, largest, sum and number of angles between the links (4,) after more rows; see ``turned``."""
     if parameter_varying.roles(config) is None or rows.angles.shape[1] != 2:
         return turned
-    angles = relative_angle(config, rows.angles)
-    known = angles[np.isfinite(angles)]
+    known = measured_angles(config, rows)
     if not known.size:
         return turned
     low, high, total, count = turned if turned.size else (np.inf, -np.inf, 0.0, 0.0)
     # added one by one, so that the sum does not depend on how many rows come at once
-    return np.array([min(low, known.min()), max(high, known.max()), np.cumsum([total, *known])[-1], count + known.size])
+    total = np.cumsum(np.append(total, known))[-1]
+    return np.array([min(low, known.min()), max(high, known.max()), total, count + known.size])
 
 
 def turning(config: IdentifierParameters, turned: Array, lately: Rows) -> tuple[float, float]:
@@ -118,8 +124,7 @@ def turning(config: IdentifierParameters, turned: Array, lately: Rows) -> tuple[
     if not turned.size:
         return 0.0, 0.0
     low, high, total, count = turned.tolist()
-    angles = relative_angle(config, lately.angles)
-    known = angles[np.isfinite(angles)]
+    known = measured_angles(config, lately)
     return high - low, float(np.mean(known)) - total / count if known.size else 0.0
 
 
