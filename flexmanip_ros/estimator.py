@@ -18,7 +18,7 @@ from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, frequency, structured
 from flexmanip_ros.payload.arm_parameters import taught
 from flexmanip_ros.samples.sample_log import Rows, SampleLog
-from flexmanip_ros.samples.signals import relative_angle
+from flexmanip_ros.samples.signals import relative_angle, without_friction
 from flexmanip_ros.types import ArmParameter, Array, CaptureEvent, Estimate, Payload, Status
 
 NO_ANGLES: Array = np.empty(0)
@@ -78,7 +78,7 @@ class ModelEstimator(NamedTuple):
     def advance(self, config: IdentifierParameters, rows: Rows, background: Background) -> ModelEstimator:
         """Take the next rows of the log. One call with N rows gives the bits of N calls with one."""
         return ModelEstimator(
-            rpbsid.advance(config, self.rpbsid, rows, background), rows.angles[-1].copy(),
+            rpbsid.advance(config, self.rpbsid, without_friction(config, rows), background), rows.angles[-1].copy(),
             block_extraction.extend_range(config, self.configuration_range, rows), self.since_ns,
             extended(config, self.turned, rows))
 
@@ -188,16 +188,16 @@ class ModelRequest:
 
     def solve(self) -> Estimate:
         """Return the estimate with model and modes, and with the payload where it is read from them."""
-        config, identifier = self.config, self.identifier
+        config, identifier, rows = self.config, self.identifier, without_friction(self.config, self.rows)
         payload: Payload | None = None
-        found, without = _identified(config, identifier.rpbsid, self.dt, self.rows)
+        found, without = _identified(config, identifier.rpbsid, self.dt, rows)
         if found is not None:
             role = parameter_varying.roles(config)
-            turned, drift = turning(config, identifier.turned, self.rows)
+            turned, drift = turning(config, identifier.turned, rows)
             filtered = rpbsid.latest(config, identifier.rpbsid, identifier.since_ns, self.dt)
             since = float(identifier.rpbsid.counts[USED])
             found = prediction_check.judged(
-                found, self.rows if filtered is None else filtered, config.outputs,
+                found, rows if filtered is None else filtered, config.outputs,
                 0 if role is None else len(role.displacements), turned, since,
                 drift=drift, filtered=filtered is not None)
             found = held_back.judged(

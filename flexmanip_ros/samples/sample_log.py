@@ -30,6 +30,19 @@ class Width(NamedTuple):
     rates: int = 0
 
 
+class Friction(NamedTuple):
+    """Coulomb friction F tanh(w / rate) of a joint with the measured rate w, which opposes an input."""
+
+    input: int
+    """Column of u."""
+    joint: int
+    """Column of the joints' rates."""
+    torque: float
+    """F [N m]."""
+    rate: float
+    """Rate [rad/s] at which 76 % of F act."""
+
+
 @dataclass(eq=False, slots=True)
 class _Buffer:
     """Memory shared by logs. Rows below ``filled`` belong to some log and are never written again.
@@ -152,6 +165,8 @@ class Rows:
     until: int
     chosen: tuple[int, ...] | None = None
     """Which outputs ``y`` shows; None: all."""
+    friction: tuple[Friction, ...] = ()
+    """Coulomb friction that ``u`` is without."""
 
     def __len__(self) -> int:
         """Return N."""
@@ -161,11 +176,11 @@ class Rows:
         """Return the rows from another first row on. Raises IndexError where that is not kept any more."""
         if not self.log.start <= first <= self.until:
             raise IndexError(f'row {first} of a log that holds {self.log.start} to {self.log.end}')
-        return Rows(self.log, first, self.until, self.chosen)
+        return Rows(self.log, first, self.until, self.chosen, self.friction)
 
     def between(self, first: int, until: int) -> Rows:
         """Return the rows ``first <= row < until`` of the same log."""
-        return Rows(self.log, first, until, self.chosen)
+        return Rows(self.log, first, until, self.chosen, self.friction)
 
     def _column(self, name: str, kind: type[Kind]) -> NDArray[Kind]:
         buffer = self.log._buffer
@@ -191,8 +206,14 @@ class Rows:
 
     @property
     def u(self) -> Array:
-        """(N, r) inputs, each held from its stamp on [N m]."""
-        return self._values(0, self.log.width.inputs)
+        """(N, r) inputs, each held from its stamp on [N m], less the ``friction``, zero where no rate is known."""
+        u = self._values(0, self.log.width.inputs)
+        if not self.friction:
+            return u
+        net = u.copy()
+        for column, joint, torque, rate in self.friction:
+            net[:, column] -= torque * np.nan_to_num(np.tanh(self.rates[:, joint] / rate))
+        return net
 
     @property
     def y(self) -> Array:
@@ -203,7 +224,9 @@ class Rows:
     @property
     def u_y(self) -> Array:
         """(N, r + m) inputs and outputs."""
-        return self._values(0, self.log.width.inputs + self.log.width.outputs)
+        inputs = self.log.width.inputs
+        both = self._values(0, inputs + self.log.width.outputs)
+        return np.hstack([self.u, both[:, inputs:]]) if self.friction else both
 
     @property
     def angles(self) -> Array:

@@ -24,6 +24,7 @@ from flexmanip_ros.samples.signals import (
     joint_rates,
     not_finite,
     resolve,
+    without_friction,
     wrong_size,
 )
 from flexmanip_ros.samples.stamp_jitter import Jitter
@@ -257,8 +258,8 @@ def flush(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Sampled
 
 
 def signals(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Signals:
-    """Return every row that the log holds, with the names of its columns."""
-    rows = log.rows(log.start, log.end)
+    """Return every row that the log holds, with the names of its columns. The inputs are ``without_friction``."""
+    rows = without_friction(config, log.rows(log.start, log.end))
     return Signals(rows.stamp_ns, rows.u, rows.y, rows.angles, rows.gap, rows.missing, config.inputs,
                    clock.outputs or config.outputs)
 

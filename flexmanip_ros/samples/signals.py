@@ -1,12 +1,14 @@
 """Position of the configured signals in a message: matched by name, in any order, extra joints ignored."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flexmanip_ros.arm.equations_of_motion import STICTION_RATE
 from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
 from flexmanip_ros.parameters.field import of_links
+from flexmanip_ros.samples.sample_log import Friction, Rows
 from flexmanip_ros.types import Array, JointBlock, JointRecord, Sample
 
 
@@ -77,10 +79,29 @@ def reads_angles(config: IdentifierParameters) -> bool:
 
 
 def reads_rates(config: IdentifierParameters) -> bool:
-    """Whether the joints' rates are read: where the friction of a joint does work on the angle that is measured."""
+    """Whether the joints' rates are read: where the friction of a joint does work on the angle that is measured.
+
+    Friction is learned with the payload (``structured``), or given.
+    """
     arm = config.arm
-    return (config.payload.use_joint_rates and reads_angles(config) and config.payload_method == 'structured'
+    return (config.payload.use_joint_rates and reads_angles(config)
+            and (config.payload_method == 'structured' or any(arm.joint_coulomb_friction))
             and arm.angle_convention == 'encoder' and arm.torque_convention == 'joint')
+
+
+def without_friction(config: IdentifierParameters, rows: Rows) -> Rows:
+    """Return the rows with the inputs less the given Coulomb friction of their joints, where the rates are measured.
+
+    A linear model has no such friction. With the whole torques as inputs its frequencies are off by percents. An input
+    and an angle belong to the same joint where they have its name. The friction is in units of the input.
+    """
+    arm = config.arm
+    if not rows.log.width.rates or not any(arm.joint_coulomb_friction):
+        return rows
+    inputs, angles = ([name.rpartition('/')[0] for name in names] for names in (config.inputs, config.angles))
+    return replace(rows, friction=tuple(
+        Friction(inputs.index(name), joint, arm.joint_coulomb_friction[joint] / arm.torque_gain[joint], STICTION_RATE)
+        for joint, name in enumerate(angles) if name in inputs))
 
 
 def _is_default(group: str, config: IdentifierParameters) -> bool:

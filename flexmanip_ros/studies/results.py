@@ -292,7 +292,8 @@ def payload_bound(config: IdentifierParameters, signals: Signals, capture_time: 
     count = min(signals.stamp_ns.size - first, LONGEST)
     if count < RATE_WINDOW:
         return None
-    config = replace(config, outputs=signals.outputs)
+    frictionless = (0.0,) * len(config.arm.link_length)  # the signals have inputs without it
+    config = replace(config, outputs=signals.outputs, arm=replace(config.arm, joint_coulomb_friction=frictionless))
     extra = [k for k, name in enumerate(config.angles) if name not in signals.outputs]
     noise = np.sqrt(white_noise(np.hstack([signals.y[first:], signals.angles[first:][:, extra]])))
     if not (noise > 0.0).all():
