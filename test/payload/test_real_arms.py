@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recording import event, record, run
+from recording import event, payload_at_end, record, run
 
-from flexmanip_ros import pipeline
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.parameter_file import read
 from flexmanip_ros.parameters import (
@@ -44,12 +43,7 @@ def last_payload(name: str) -> tuple[Payload, dict[str, Any]]:
     arm = ArmParameters(damping_ratio=0.003)
     if 'base' in truth:
         arm = replace(arm, base_mass=truth['base']['mass'], base_inertia=truth['base']['inertia'])
-    config = IdentifierParameters(arm=arm, model_rate=0.1)
-    payload = None
-    for estimate in pipeline.run(config, bag.read(folder / name)):
-        payload = estimate.payload
-    assert payload is not None
-    return payload, truth
+    return payload_at_end(IdentifierParameters(arm=arm), bag.read(folder / name)), truth
 
 
 @pytest.mark.parametrize('name', ['arm_friction_rotor', 'arm_gains', 'arm_body', 'arm_orbit'])
@@ -67,10 +61,7 @@ def test_rotors_that_nobody_told_of_are_learned_from_a_hundred_samples_a_second_
                             seed=3)
     capture = CaptureEvent(3_000_000_000, EventKind.CAPTURE)
     trajectory = simulator.simulate(plant, excitation.sequence(ExcitationParameters(rate=100.0), 600), (capture,))
-    config, found = IdentifierParameters(arm=arm, model_rate=0.1), None
-    for estimate in pipeline.run(config, simulator.records(trajectory, (capture,))):
-        found = estimate.payload
-    assert found is not None
+    found = payload_at_end(IdentifierParameters(arm=arm), simulator.records(trajectory, (capture,)))
     assert found.status is Status.TRACKING
     assert found.mass == pytest.approx(20.0, rel=0.007)
     assert found.lower < 20.0 < found.upper
