@@ -106,7 +106,7 @@ def test_a_floating_arm_with_every_fault_learns_frictions_that_can_be_and_knows_
         told, modes=5, joint_viscous_friction=(0.8, 0.8), joint_coulomb_friction=(0.15, 0.15),
         rotor_inertia=(0.2, 0.2), torque_gain=(1.04, 1.04), bend_gain=(0.98, 0.98), bend_offset=(5e-4, 5e-4))
     config, caught, mass = IdentifierParameters(arm=told), event(3.0), rng.uniform(10.0, 40.0)
-    samples = record(6.0, (caught,), degrees=(rng.uniform(0.0, 90.0), rng.uniform(20.0, 100.0)), payload=mass, arm=arm,
+    samples = record(4.6, (caught,), degrees=(rng.uniform(0.0, 90.0), rng.uniform(20.0, 100.0)), payload=mass, arm=arm,
                      seed=seed, payload_com=tuple(rng.uniform(-0.1, 0.1, 2).tolist()), payload_inertia=1.0,
                      object_spin=0.1)
     state = run(config, samples, (caught,))
