@@ -43,7 +43,7 @@ CONFIG = ControllerParameters(arm=ArmParameters(modes=2))
 
 
 def test_the_arm_goes_where_it_should_and_rests_with_modes_not_modelled_too() -> None:
-    positions, torques, _ = run(CONFIG, 7.0, plant_modes=5)
+    positions, torques, _ = run(CONFIG, 5.5, plant_modes=5)
     end = positions[-300:]
     assert np.abs(end[:, :2].mean(axis=0) - positions[0, :2] - [0.1, -0.1]).max() < 5e-3
     assert np.abs(end[:, 2:]).max() < 3e-4
@@ -52,7 +52,7 @@ def test_the_arm_goes_where_it_should_and_rests_with_modes_not_modelled_too() ->
 
 def test_knowing_the_payload_brings_the_arm_there_sooner() -> None:
     def error(told: bool) -> float:
-        positions, _, _ = run(CONFIG, 5.0, payload=60.0, told=told)
+        positions, _, _ = run(CONFIG, 4.0, payload=60.0, told=told)
         return float(np.abs(positions[-500:, :2] - positions[0, :2] - [0.1, -0.1]).mean())
 
     assert error(told=True) < 0.5 * error(told=False)
@@ -89,7 +89,7 @@ def test_a_raised_limit_moves_the_torque_without_a_step_and_a_lowered_one_holds_
     assert torques[210:] == pytest.approx([min(20.0 + 1.5 * (k + 1), 150.0) for k in range(100)])
 
 
-@pytest.mark.parametrize('limits', [(300.0, 0.0), (0.0, 150.0), (0.0, 0.0), (1e-300, 5e-324)])
+@pytest.mark.parametrize('limits', [(300.0, 0.0), (0.0, 150.0), (1e-300, 5e-324)])
 def test_an_arm_with_passive_joints_moves_with_finite_torques_and_none_there(limits: tuple[float, float]) -> None:
     config = replace(CONFIG, effort_limit=limits)
     positions, torques, state = run(config, 4.0)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexmanip_ros.control import controller
@@ -17,6 +17,7 @@ def along(way: controller.Path, count: int = 400) -> np.ndarray:
     return np.array([way.after(way.duration * k / count).now() for k in range(count + 1)])
 
 
+@settings(max_examples=40)
 @given(distances, st.floats(0.1, 2.0))
 def test_a_move_from_rest_keeps_to_its_limits_and_touches_one(distance: np.ndarray, fastest: float) -> None:
     begin = np.array([0.3, -0.2])

@@ -20,7 +20,6 @@ from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointRecord, 
 
 COUNT, CAPTURE, BEGIN = 6000, 2000, 2900
 PLANT = PlantParameters()
-RATE = IdentifierParameters().model_rate
 
 
 @pytest.fixture(scope='module')
@@ -48,9 +47,9 @@ def in_bursts(length: int) -> np.ndarray:
     return lost
 
 
-def later(items: Sequence[JointRecord | CaptureEvent], model_rate: float = RATE) -> list[Estimate]:
+def later(items: Sequence[JointRecord | CaptureEvent], method: str = 'structured') -> list[Estimate]:
     """Estimates from 1 s after the capture on."""
-    return [one for one in pipeline.run(configure(IdentifierParameters, {'model_rate': model_rate}), items)
+    return [one for one in pipeline.run(configure(IdentifierParameters, {'payload_method': method}), items)
             if one.stamp_ns >= (CAPTURE + 1000) * 1_000_000]
 
 
@@ -75,9 +74,19 @@ def before(messages: list[JointRecord | CaptureEvent]) -> structured.StructuredS
     return begun(messages)
 
 
+def payloads_of(items: Sequence[JointRecord | CaptureEvent]) -> list[Payload]:
+    """What is known of the payload from 1 s after the capture on, at the publishing rate, and no model."""
+    config, rows, found = IdentifierParameters(), rows_of(items), []
+    state = begun(items, CAPTURE + 1000)
+    for first in range(CAPTURE + 1000, COUNT, 20):
+        found.append(structured.estimate(config, state))
+        state = structured.advance(config, state, rows.between(first, first + 20))
+    return [*found, structured.estimate(config, state)]
+
+
 @pytest.fixture(scope='module')
-def whole(messages: list[JointRecord | CaptureEvent]) -> list[Estimate]:
-    return later(messages)
+def whole(messages: list[JointRecord | CaptureEvent]) -> list[Payload]:
+    return payloads_of(messages)
 
 
 def length(lost: np.ndarray) -> int:
@@ -91,16 +100,17 @@ def tracked(found: Sequence[Estimate]) -> float:
 
 
 @pytest.mark.parametrize(('lost', 'wider'), [
-    (at_random(0.01), 1.5), (at_random(0.05), 1.5), (in_bursts(30), 1.5), (in_bursts(100), 3.0)],
-    ids=['1 %', '5 %', '30 ms a second', '100 ms a second'])
+    (at_random(0.05), 1.5), (in_bursts(30), 1.5), (in_bursts(100), 3.0)],
+    ids=['5 %', '30 ms a second', '100 ms a second'])
 def test_payload_and_modes_are_tracked_with_loss(
-        messages: list[JointRecord | CaptureEvent], whole: list[Estimate], lost: np.ndarray, wider: float) -> None:
+        messages: list[JointRecord | CaptureEvent], whole: list[Payload], lost: np.ndarray, wider: float) -> None:
     every_block_holds_one = length(lost) > 50  # of the model, which is not asked for then
-    found = later(surviving(messages, lost), 0.1 if every_block_holds_one else RATE)
-    payloads = [one.payload for one in found if one.payload is not None]
+    found = [] if every_block_holds_one else later(surviving(messages, lost))
+    payloads = (payloads_of(surviving(messages, lost)) if every_block_holds_one else
+                [one.payload for one in found if one.payload is not None])
     assert np.mean([one.status is Status.TRACKING for one in payloads]) >= 0.95
     assert max(abs(one.mass - 20.0) / one.std for one in payloads) < 4.0
-    known = np.median([one.payload.std for one in whole if one.payload is not None])
+    known = np.median([one.std for one in whole])
     assert np.median([one.std for one in payloads]) < wider * known  # a torque that changed in a burst is unknown
     if every_block_holds_one:
         return
@@ -135,13 +145,12 @@ def test_messages_lost_at_a_step_of_the_torque_do_not_bias_the_payload(
 
 @pytest.mark.parametrize('first', [4455, 4480])
 def test_a_burst_in_which_both_torques_change_does_not_widen_the_interval_for_good(
-        messages: list[JointRecord | CaptureEvent], whole: list[Estimate], before: structured.StructuredState,
+        messages: list[JointRecord | CaptureEvent], whole: list[Payload], before: structured.StructuredState,
         first: int) -> None:
     """45 ms, with both steps at 4.5 s, hide the motion: then it is learned again, with the payload as it was known."""
     lost = np.zeros(COUNT, dtype=bool)
     lost[first:first + 46] = True
-    found, known = held(before, surviving(messages, lost)), whole[-1].payload
-    assert known is not None
+    found, known = held(before, surviving(messages, lost)), whole[-1]
     assert found.status is Status.TRACKING
     assert abs(found.mass - 20.0) < 3.0 * found.std
     assert found.std < 2.0 * known.std
@@ -152,7 +161,7 @@ def test_a_gap_soon_after_a_capture_does_not_leave_a_poor_model_for_good(
     """Bursts hide steps of the torque 0.25 s after the start and 0.5 s after the capture, when fits are young."""
     lost = np.zeros(COUNT, dtype=bool)
     lost[237:291] = lost[2455:2540] = True
-    found = later(surviving(messages, lost))
+    found = later(surviving(messages, lost), 'none')
     assert tracked([one for one in found if one.stamp_ns >= (CAPTURE + 1600) * 1_000_000]) >= 0.95
     true = frequencies(vibration_model(PLANT.arm, np.array(PLANT.initial_angles), 20.0)[0])
     assert [mode.frequency_hz for mode in found[-1].modes] == pytest.approx(true[:2].tolist(), rel=0.03)  # it turns

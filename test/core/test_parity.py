@@ -55,7 +55,7 @@ def _arrivals(bad: list[tuple[int, str]], events: list[tuple[int, int, EventKind
     return [item for group in items for item in group]
 
 
-@settings(max_examples=8, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=6, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(faults, announced)
 def test_message_by_message_is_the_replay_bit_for_bit(bad: list[tuple[int, str]],
                                                       events: list[tuple[int, int, EventKind]]) -> None:

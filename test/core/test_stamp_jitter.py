@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexmanip_ros import pipeline
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, IdentifierParameters, PlantParameters
+from flexmanip_ros.payload import structured
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.samples.stamp_jitter import LEAST_GAIN, LOSS, Jitter
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, JointRecord, Status
+from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, Status
 
 CONFIG = IdentifierParameters(payload_method='none')
 NAMES = ('joint1', 'joint2', 'link1_bend', 'link2_bend')
@@ -142,11 +142,17 @@ def test_a_payload_is_tracked_at_stamps_that_jitter_by_a_tenth_of_the_sample_tim
     plant = PlantParameters(payload_mass=20.0, seed=3)
     event = CaptureEvent(2_000_000_000, EventKind.CAPTURE)
     run = simulator.simulate(plant, excitation.sequence(ExcitationParameters(), 5000), (event,))
-    rng = np.random.default_rng(4)
-    items = [item._replace(stamp_ns=item.stamp_ns + round(rng.normal(0.0, 1e5))) if isinstance(item, JointRecord) else
-             item for item in simulator.records(run, (event,))]
-    late = [found.payload for found in pipeline.run(IdentifierParameters(), items)
-            if found.payload is not None and found.stamp_ns > 3_000_000_000]
+    stamps = run.stamp_ns + np.round(np.random.default_rng(4).normal(0.0, 1e5, 5000)).astype(np.int64)
+    effort = np.hstack([run.effort, np.zeros_like(run.effort)])
+    config = IdentifierParameters()
+    _, rows = _rows(JointBlock(run.names, stamps, run.position, run.velocity, effort), config)
+    caught = rows.log.row_at(event.stamp_ns, 0)
+    state = structured.advance(config, structured.init(config), rows.between(0, caught))
+    state, late = structured.event(config, state, event), []
+    state = structured.advance(config, state, rows.between(caught, 3000))
+    for row in range(3000, 5000, 20):
+        state = structured.advance(config, state, rows.between(row, row + 20))
+        late.append(structured.estimate(config, state))
     assert np.mean([payload.status is Status.TRACKING for payload in late]) > 0.95
     assert max(abs(payload.mass - 20.0) / payload.std for payload in late) < 3.5
     assert late[-1].mass == pytest.approx(20.0, rel=0.001)

@@ -180,7 +180,8 @@ def test_offsets_of_the_bend_sensors_are_no_error_of_the_model(run: Run, size: f
     """size: the offsets, in units of the rms bends. Above 2 no model began; products with them would be terms of G."""
     trajectory, event, _ = record()
     position = trajectory.position + np.array([0.0, 0.0, size, -size]) * trajectory.position.std(axis=0)
-    estimates, _ = identify(trajectory._replace(position=position), event, 1000)
+    moved = some_of(trajectory._replace(position=position), slice(11_000))
+    estimates, _ = identify(moved, event, 1000)
     last = [one for one in estimates if one.stamp_ns > (CAPTURE_S + 4.0) * 1e9]
     tracking = [one for one in last if one.model_status is Status.TRACKING]
     assert len(tracking) > 0.8 * len(last) > 8
@@ -256,14 +257,14 @@ def test_a_simulated_block_is_the_solution_of_the_differential_equation_with_pro
 
 
 def test_after_a_gap_the_model_is_that_of_the_configuration_after_it() -> None:
-    """In the gap the angle between the links changes by 1.3 degrees, which is 0.5 % of the second frequency."""
+    """In the gap the angle between the links changes by 1.4 degrees, which is 0.5 % of the second frequency."""
     trajectory, event, chords = record()
-    kept = np.r_[:9000, 10500:11000]
+    kept = np.r_[:6250, 7750:8250]
     parts = some_of(trajectory, kept)
     config = replace(CONFIG, model_rate=50.0)
     after = [one for one in pipeline.run(config, [event, *blocks(parts, 500)])
-             if one.model_is_new and one.stamp_ns >= 10_500_000_000]
-    early = [one for one in after if one.stamp_ns < 10_600_000_000]
+             if one.model_is_new and one.stamp_ns >= 7_750_000_000]
+    early = [one for one in after if one.stamp_ns < 7_850_000_000]
     assert {one.model_status for one in early} == {Status.WARMING_UP}
     assert 'gap' in early[0].reason
     tracking = [one for one in after if one.model_status is Status.TRACKING]
@@ -293,7 +294,7 @@ def test_no_fit_begins_while_the_links_swing_by_more_than_a_fifth_of_a_radian(ru
 
 def test_a_replay_in_blocks_gives_the_bits_of_another_one() -> None:
     trajectory, event, _ = record()
-    short = some_of(trajectory, slice(5200))
+    short = some_of(trajectory, slice(1500, 5200))
     (one, _), (other, _) = identify(short, event, 5200), identify(short, event, 7)
     assert len(one) == len(other) > 10
     for a, b in zip(one, other, strict=True):
@@ -378,11 +379,12 @@ def test_a_burst_of_lost_samples_each_second_leaves_both_frequencies_known(seed:
 def test_missing_samples_cost_no_more_than_the_blocks_they_are_in() -> None:
     trajectory, event, chords = record()
     kept = np.ones(len(trajectory.stamp_ns), dtype=np.bool_)
-    kept[8000:8003] = kept[9500] = kept[11000:11200] = False
+    kept[6000:6003] = kept[7500] = kept[9000:9200] = kept[11500:] = False
     thin = some_of(trajectory, kept)
     estimates, state = identify(thin, event, 1000)
     run = Run(estimates, state, chords)
-    late = [one for one in estimates if one.stamp_ns > 12e9]
+    late = [one for one in estimates if one.stamp_ns > 10e9]
+    assert len(late) >= 5
     assert all(len(one.modes) == 2 for one in late)
     for one in late:
         assert np.all(np.abs([mode.frequency_hz for mode in one.modes] / truth(run, one) - 1.0) < 0.015)

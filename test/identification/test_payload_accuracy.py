@@ -9,13 +9,13 @@ LONG = {'forgetting_factor': [0.9995] * 3, 'regularization': [1e-6] * 3}
 
 @pytest.mark.parametrize('convention', ['paper', 'joint'])
 @pytest.mark.parametrize('degrees', [(60.0, 45.0), (0.0, 0.0), (45.0, 0.0), (-45.0, 45.0)])
-@pytest.mark.parametrize('mass', [20.0, 50.0, 100.0])
+@pytest.mark.parametrize('mass', [20.0, 100.0])
 def test_noise_free_record_gives_the_payload(convention, degrees, mass):
     study = benchmark('identification_paper_settings')
     u, y = study.response(mass, degrees, convention, 400.0, 0, capture=1000, samples=3000)
     window = {'capture': 1000, 'begin': 2500, 'every': 250}
     ways = [({}, y)]
-    if mass == 50.0:
+    if mass == 20.0:
         ways += [(LONG | {'refinement': 'none'}, y), (LONG, y[:, :2]), (LONG | {'estimator': 'paper'}, y)]
     for settings, signals in ways:
         errors = study.payload_errors(settings, u, signals, mass, degrees, convention, **window)

@@ -10,7 +10,7 @@ from flexmanip_ros.identification.moments import riccati_gain
 
 
 @given(st.integers(1, 8), st.integers(1, 6), st.floats(0.5, 1.05), st.integers(0, 10_000))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_the_gain_is_where_the_kalman_filter_comes_to_rest(n: int, m: int, radius: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     A = rng.standard_normal((n, n))

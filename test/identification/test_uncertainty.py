@@ -82,7 +82,7 @@ def test_deviations_of_A_and_B_are_the_scatter_of_many_runs(estimator, feedthrou
     np.testing.assert_allclose(claimed / scatter, 1.0, atol=0.5)
 
 
-@pytest.mark.parametrize('factor', [1, 2, 5])
+@pytest.mark.parametrize('factor', [1, 5])
 def test_deviations_of_a_decimated_model_are_the_scatter_of_many_runs(factor):
     study = benchmark('identification_coverage')
     arm = ArmParameters(torque_convention='paper', damping_ratio=0.01, modes=1)

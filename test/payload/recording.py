@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import scipy.signal
 
@@ -13,9 +15,10 @@ from flexmanip_ros.parameters import (
 )
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured
+from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Rows, log_of
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import CaptureEvent, EventKind
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, Payload
 
 BENDS = ('link1_bend/position', 'link2_bend/position')
 RATES = ('link1_bend/velocity', 'link2_bend/velocity')
@@ -93,3 +96,26 @@ def noise_of_rows(state: structured.StructuredState, efforts: np.ndarray) -> np.
     changes[0] += turn * (real + 1j * imaginary)
     phasor = scipy.signal.lfilter([1.0], [1.0, -turn], changes, axis=0)
     return m.noise[:, mem.EFFECTIVE] + np.abs(phasor) ** 2 @ sensors.omitted.T
+
+
+def samples_of(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]
+               ) -> tuple[Rows, tuple[CaptureEvent, ...]]:
+    """The samples that the pipeline makes of messages, and the events among them."""
+    clock, log, events = sampling.Clock(), sampling.EMPTY, []
+    for item in items:
+        if isinstance(item, CaptureEvent):
+            events.append(item)
+        else:
+            clock, log, _ = sampling.push(config, clock, log, item)
+    clock, log, _ = sampling.flush(config, clock, log)
+    assert clock.outputs == config.outputs  # the messages carry what the configuration names
+    return log.rows(0, log.end), tuple(events)
+
+
+def payload_at_end(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]) -> Payload:
+    """What is known of the payload after the last message, to the bit as by the pipeline (``test_structured``).
+
+    Nothing is identified: the model takes most of the time of the pipeline.
+    """
+    samples, events = samples_of(config, items)
+    return structured.estimate(config, run(config, samples, events))

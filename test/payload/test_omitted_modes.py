@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.signal
-from recording import BENDS
+from recording import BENDS, payload_at_end
 
-from flexmanip_ros import pipeline
 from flexmanip_ros.arm.linearization import MORE_SINES, omitted_modes
 from flexmanip_ros.parameters import (
     ArmParameters,
@@ -93,9 +92,7 @@ def test_precise_encoders_tell_the_payload_better_although_they_show_these_modes
     plant = PlantParameters(arm=replace(ARM, **{'modes': 5, **own}), payload_mass=20.0, snr_db=snr_db)
     capture = CaptureEvent(3_000_000_000, EventKind.CAPTURE)
     trajectory = simulator.simulate(plant, excitation.sequence(ExcitationParameters(), 5000), (capture,))
-    config = IdentifierParameters(arm=ARM, outputs=BENDS, model_rate=0.1)
-    found = [estimate.payload for estimate in pipeline.run(config, simulator.records(trajectory, (capture,)))][-1]
-    assert found is not None
+    found = payload_at_end(IdentifierParameters(arm=ARM, outputs=BENDS), simulator.records(trajectory, (capture,)))
     assert found.status is Status.TRACKING
     assert found.mass == pytest.approx(20.0, rel=0.003)
     assert found.lower < 20.0 < found.upper

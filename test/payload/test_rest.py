@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
-from recording import BENDS, event, rows_of
+from recording import BENDS, event, payload_at_end, rows_of
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.parameters import (
@@ -18,7 +19,7 @@ from flexmanip_ros.parameters import (
 )
 from flexmanip_ros.payload import capture_detection, structured
 from flexmanip_ros.payload import filter_state as mem
-from flexmanip_ros.simulation import excitation, simulator
+from flexmanip_ros.simulation import excitation, sensors, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, Status
 
 ARM = ArmParameters(damping_ratio=0.003)
@@ -26,12 +27,38 @@ OWN = {'joint_viscous_friction': (0.8, 0.8), 'joint_coulomb_friction': (0.15, 0.
 """Friction and rotors that nobody told the estimator of."""
 
 
-def after_rest(rest_s, rate, motion_s, events=(), seed=0, **own):
-    """An arm that rests, then moves by square waves of its torques."""
-    efforts = excitation.sequence(ExcitationParameters(rate=rate), round(motion_s * rate))
-    efforts = np.vstack([np.zeros((round(rest_s * rate), efforts.shape[1])), efforts])
+@cache
+def moved(plant, seconds, caught_s=None):
+    """The motion of an arm under square waves of its torques, without noise; caught_s: when it catches something."""
+    efforts = excitation.sequence(ExcitationParameters(rate=plant.rate), round(seconds * plant.rate))
+    return simulator.simulate(plant, efforts, () if caught_s is None else (event(caught_s),))
+
+
+def after_rest(rest_s, rate, motion_s, caught_s=None, seed=0, **own):
+    """An arm that rests, then moves by square waves of its torques: what it does is simulated once for all seeds.
+
+    Without torque it stays where it is, as exactly as if its rest had been simulated: the test below.
+    """
     plant = PlantParameters(arm=replace(ARM, modes=5, **own), rate=rate, payload_mass=20.0, seed=seed)
-    return simulator.simulate(plant, efforts, events)
+    motion = moved(replace(plant, noise='none', seed=0), max(motion_s, 1.0 / rate), caught_s)
+    still = round(rest_s * rate)
+    count = still + round(motion_s * rate)
+    position, velocity = (np.vstack([np.repeat(part[:1], still, axis=0), part])[:count]
+                          for part in (motion.position, motion.velocity))
+    sensors.read(plant, position, velocity, sensors.std_for_snr(position, velocity, plant.snr_db),
+                 sensors.normal(seed, count))
+    effort = np.vstack([np.zeros((still, motion.effort.shape[1])), motion.effort])[:count]
+    return simulator.Trajectory(np.round(np.arange(count) * 1e9 / rate).astype(np.int64), position, velocity, effort,
+                                motion.names)
+
+
+def test_an_arm_without_torque_rests_as_exactly_as_if_its_rest_had_been_simulated():
+    plant = PlantParameters(arm=replace(ARM, modes=5, **OWN), rate=200.0, payload_mass=20.0, seed=3)
+    efforts = excitation.sequence(ExcitationParameters(rate=200.0), 100)
+    efforts = np.vstack([np.zeros((60, efforts.shape[1])), efforts])
+    whole = simulator.simulate(plant, efforts, (event(0.6),))
+    for found, known in zip(after_rest(0.3, 200.0, 0.5, 0.3, 3, **OWN), whole, strict=True):
+        np.testing.assert_array_equal(found, known)
 
 
 def samples_of(trajectory):
@@ -48,10 +75,8 @@ def settings(**parameters):
 def test_an_arm_that_rested_learns_its_friction_and_rotors_from_two_hundred_samples_a_second(seed):
     rest_s = 10.0
     capture = CaptureEvent(round((rest_s + 3.0) * 1e9), EventKind.CAPTURE)
-    trajectory = after_rest(rest_s, 200.0, 6.0, (capture,), seed, **OWN)
-    config = IdentifierParameters(arm=ARM, model_rate=0.1)
-    found = [estimate.payload for estimate in pipeline.run(config, simulator.records(trajectory, (capture,)))][-1]
-    assert found is not None
+    trajectory = after_rest(rest_s, 200.0, 6.0, 3.0, seed, **OWN)
+    found = payload_at_end(IdentifierParameters(arm=ARM), simulator.records(trajectory, (capture,)))
     assert found.status is Status.TRACKING
     assert found.mass == pytest.approx(20.0, rel=0.01)
     assert found.lower < 20.0 < found.upper
@@ -60,10 +85,12 @@ def test_an_arm_that_rested_learns_its_friction_and_rotors_from_two_hundred_samp
 def test_the_first_motion_of_an_arm_with_friction_and_rotors_is_no_capture():
     rest_s = 5.0
     capture = CaptureEvent(round((rest_s + 3.0) * 1e9), EventKind.CAPTURE)
-    trajectory = after_rest(rest_s, 1000.0, 3.4, (capture,), **OWN)
+    made = after_rest(rest_s, 1000.0, 3.4, 3.0, **OWN)
+    effort = np.hstack([made.effort, np.zeros_like(made.effort)])
     config, findings = IdentifierParameters(arm=ARM), capture_detection.Findings()
-    for _ in capture_detection.with_detected(
-            capture_detection.watch(config), map(JointBlock.of, simulator.records(trajectory, ())), findings):
+    parts = made.stamp_ns, made.position, made.velocity, effort
+    blocks = [JointBlock(made.names, *(part[at:at + 20] for part in parts)) for at in range(0, len(effort), 20)]
+    for _ in capture_detection.with_detected(capture_detection.watch(config), blocks, findings):
         pass
     (found,) = findings.events
     assert abs(found.stamp_ns - capture.stamp_ns) <= 20e6

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recording import ARM, BENDS, RATES, altered, config, event, joined, record, rows_of, run
+from recording import ARM, BENDS, RATES, altered, config, event, joined, payload_at_end, record, rows_of, run
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.errors import ParameterError
@@ -64,13 +64,23 @@ def test_the_mass_on_a_small_arm_is_known_from_200_samples_a_second():
     plant = PlantParameters(arm=replace(SMALL, modes=4), rate=200.0, payload_mass=0.3)
     torques = ExcitationParameters(rate=200.0, amplitude=(0.3, 0.1))
     trajectory = simulator.simulate(plant, excitation.sequence(torques, 1000), (capture,))
-    found = None
-    for estimate in pipeline.run(IdentifierParameters(arm=SMALL), simulator.records(trajectory, (capture,))):
-        found = estimate.payload
-    assert found is not None
+    found = payload_at_end(IdentifierParameters(arm=SMALL), simulator.records(trajectory, (capture,)))
     assert found.status is Status.TRACKING
     assert found.mass == pytest.approx(0.3, rel=0.007)
     assert found.lower < 0.3 < found.upper
+
+
+def test_the_payload_without_a_model_has_the_bits_of_the_whole_pipeline():
+    """Other payload tests leave the model out by ``payload_at_end``."""
+    capture, settings = event(0.6), IdentifierParameters(arm=ARM)
+    trajectory = simulator.simulate(PlantParameters(arm=ARM), excitation.sequence(ExcitationParameters(), 1000),
+                                    (capture,))
+    items = list(simulator.records(trajectory, (capture,)))
+    *_, (ended, _) = pipeline.replay(settings, items)
+    found = pipeline.current(ended)
+    assert found.model is not None
+    assert found.payload == payload_at_end(settings, items)
+    assert found.payload.mass > 1.0
 
 
 def test_displacements_alone_are_enough():
@@ -317,10 +327,10 @@ OTHER_ARM = {'link_length': (2.0, 1.5), 'linear_density': (3.0, 2.0), 'bending_s
     (ArmParameters(damping_ratio=0.0), (45.0, 0.0), 20.0, 3)])
 def test_vibration_that_the_model_lacks_and_that_never_fades_is_not_taken_for_noise(arm, degrees, payload, seed):
     """Fourth differences show up to 40 times the noise of these sensors: the arm was TRACKING, 1.5 % off."""
-    capture = event(3.0)
+    capture = event(2.0)
     given = {'arm': arm, 'seed': seed, 'model': 'finite_element', 'elements': 10}
-    samples = record(6.0, (capture,), degrees, payload, **given)
-    clean = record(6.0, (capture,), degrees, payload, **given, noise='none')
+    samples = record(3.2, (capture,), degrees, payload, **given)
+    clean = record(3.2, (capture,), degrees, payload, **given, noise='none')
     settings = config(arm, payload=PayloadParameters(dynamics='linear', working_point=tuple(np.radians(degrees))))
     state = run(settings, samples, (capture,))
     assert structured.estimate(settings, state).status is Status.INCONSISTENT
@@ -329,7 +339,7 @@ def test_vibration_that_the_model_lacks_and_that_never_fades_is_not_taken_for_no
     assert np.all((bends < told) & (told < 1.5 * bends))
 
 
-@pytest.mark.parametrize('late_s', [-0.003, -0.001, 0.001, 0.003])
+@pytest.mark.parametrize('late_s', [-0.003, 0.003])
 def test_what_was_caught_at_an_instant_not_quite_known_is_in_its_interval(late_s):
     """Taken as exact, 3 ms cost 1 to 3 % after 0.25 s, outside the interval of every second one."""
     samples, settings = record(6.0, (event(3.0),)), config()
@@ -341,7 +351,7 @@ def test_what_was_caught_at_an_instant_not_quite_known_is_in_its_interval(late_s
         assert found.status is Status.TRACKING
 
 
-@pytest.mark.parametrize('late_s', [-0.002, -0.0005, 0.0005, 0.002])
+@pytest.mark.parametrize('late_s', [-0.002, 0.0005])
 def test_a_gripper_may_be_two_milliseconds_wrong_where_nothing_but_the_impact_tells_the_mass(late_s):
     """Taken as exact, half a millisecond put the mass 1 % off, 3 to 4 deviations, and 2 ms put it 5 % off."""
     arm, seconds = ArmParameters(damping_ratio=0.02), 4.5
@@ -494,7 +504,7 @@ def test_absurd_numbers_restart_the_filter_and_say_so(caught):
     assert found.status in (Status.DIVERGED, Status.INCONSISTENT, Status.WARMING_UP)
 
 
-@pytest.mark.parametrize('scale', [1e3, 1e6, 1e12])
+@pytest.mark.parametrize('scale', [1e3, 1e12])
 def test_signals_in_other_units_are_told_from_a_start(caught, scale):
     wrong = altered(caught, y=scale * caught.y, angles=scale * caught.angles)
     found = structured.estimate(config(), run(config(), wrong, (event(1.5),)))

@@ -120,7 +120,7 @@ def test_with_a_friction_of_a_tenth_of_the_torque_masses_are_trusted_and_as_far_
     """The rates of the joints are not measured. Without this noise a third of such estimates were outside."""
     errors = []
     for seed in (1, 2, 3):
-        state = run(CONFIG, record(4.5, (event(2.5),), arm=RUBBING, seed=seed), (event(2.5),))
+        state = run(CONFIG, record(3.5, (event(2.0),), arm=RUBBING, seed=seed), (event(2.0),))
         found = structured.estimate(CONFIG, state)
         assert found.status is Status.TRACKING
         assert found.mass == pytest.approx(20.0, rel=0.01)
