@@ -50,10 +50,10 @@ class Recorded(Threads):
 
 
 @cache
-def recording(count: int = 900) -> tuple[JointRecord | CaptureEvent, ...]:
+def recording(count: int = 900, capture: CaptureEvent = CAPTURE) -> tuple[JointRecord | CaptureEvent, ...]:
     efforts = excitation.sequence(ExcitationParameters(), count)
-    made = simulator.simulate(PlantParameters(), efforts, (CAPTURE,))
-    return tuple(simulator.records(made, (CAPTURE,)))
+    made = simulator.simulate(PlantParameters(), efforts, (capture,))
+    return tuple(simulator.records(made, (capture,)))
 
 
 @cache
@@ -97,7 +97,7 @@ def test_estimates_beside_threads_are_those_of_the_replay_bit_for_bit(pause: flo
 
 def test_an_estimate_with_every_sample_is_that_of_the_replay() -> None:
     config = replace(CONFIG, publish_rate=1000.0)
-    items = recording(560)
+    items = recording(340, CaptureEvent(300_000_000, EventKind.CAPTURE))  # the fit comes before it
     replayed = pipeline.run(config, items)
     assert [said(one) for one in live(items, 0.0, config)] == [said(one) for one in replayed]
 

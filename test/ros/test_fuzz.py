@@ -51,7 +51,7 @@ def test_one_number_that_is_out_of_range_in_a_good_message_makes_no_node_say_nan
 
 def test_after_all_of_it_the_identifier_claims_nothing_wrong_and_after_a_reset_the_truth(ros: Ros) -> None:
     bench = Bench(ros, 'rpbsid_identifier')
-    fuzz(bench, examples=100)
+    fuzz(bench, examples=60)
     for reset in (False, True):  # what was believed for a motion of the arm may stay in its memory without
         if reset:
             assert ros.call(Trigger, 'rpbsid_identifier/reset').success
