@@ -244,7 +244,7 @@ def test_runs_never_share_a_folder(tmp_path: Path) -> None:
 
 def test_a_full_disk_ends_the_recording_with_the_reason_and_keeps_what_was_written(tmp_path: Path) -> None:
     environment = {**os.environ, 'ROS_DOMAIN_ID': DOMAIN}
-    limit = 60_000  # bytes a file may have; the real error of a real write
+    limit = 120_000  # bytes a file may have; the real error of a real write
 
     def small_files() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
