@@ -102,8 +102,8 @@ def test_an_event_without_a_stamp_is_applied_on_arrival_and_reported(capsys, tmp
     assert '1 event arrived more than rewind_time after its stamp' in err
 
 
-@pytest.mark.parametrize('kind', list(EventKind))
-@pytest.mark.parametrize('at', [0, 600], ids=['latched', 'in the middle'])
+@pytest.mark.parametrize(('at', 'kind'), [(0, EventKind.CAPTURE), (600, EventKind.RELEASE)],
+                         ids=['latched', 'in the middle'])
 def test_an_event_stamped_long_before_the_recording_is_reported_with_what_to_do(capsys, tmp_path, kind, at):
     path = _bag(tmp_path / 'bag', _records(700), CaptureEvent(0, kind), at=at)
     page = tmp_path / 'report.html'

@@ -7,6 +7,7 @@ import io
 import json
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ CAPTURE = CaptureEvent(START + 1_200_000_000, EventKind.CAPTURE)
 PLANT = configure(PlantParameters, {'payload_mass': 20.0, 'snr_db': 40.0, 'noise': 'snr'})
 
 
-def records(seconds: float = 2.2) -> list[JointRecord]:
+def records(seconds: float = 1.7) -> list[JointRecord]:
     made = simulator.simulate(
         PLANT, excitation.sequence(ExcitationParameters(), round(seconds * PLANT.rate)), (CAPTURE,), START)
     return [item for item in simulator.records(made, ()) if isinstance(item, JointRecord)]
@@ -48,9 +49,25 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
     return status, seen.out, seen.err
 
 
-def test_a_capture_that_nobody_announced_is_found_and_its_payload_estimated(
-        unannounced: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, err = run(capsys, unannounced)
+class Reported(NamedTuple):
+    """How identify_bag with a report ended: its page, and what it printed."""
+
+    page: str
+    status: int
+    out: str
+    err: str
+
+
+@pytest.fixture(scope='module')
+def reported(unannounced: Path, tmp_path_factory: pytest.TempPathFactory) -> Reported:
+    page, out, err = tmp_path_factory.mktemp('reported') / 'report.html', io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        status = main([str(unannounced), '--report', str(page)])
+    return Reported(page.read_text(encoding='utf-8'), status, out.getvalue(), err.getvalue())
+
+
+def test_a_capture_that_nobody_announced_is_found_and_its_payload_estimated(reported: Reported) -> None:
+    _, status, out, err = reported
     assert (status, err) == (0, '')
     (at,) = re.findall(r'^events +found in the signals: capture at ([\d.]+) s$', out, re.MULTILINE)
     assert float(at) == pytest.approx(1.2, abs=0.02)
@@ -180,17 +197,8 @@ def test_event_topics_of_a_recording_are_known_without_reading_it_also_where_it_
     assert bag.event_topics(file) == ('/capture_event',)
 
 
-@pytest.fixture(scope='module')
-def reported(unannounced: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
-    """The report, and what the program prints with --json."""
-    page, out = tmp_path_factory.mktemp('reported') / 'report.html', io.StringIO()
-    with contextlib.redirect_stdout(out):
-        assert main([str(unannounced), '--report', str(page), '--json']) == 0
-    return page.read_text(encoding='utf-8'), out.getvalue()
-
-
-def test_the_report_opens_with_the_answer_then_pictures_then_tables(reported: tuple[str, str]) -> None:
-    text, _ = reported
+def test_the_report_opens_with_the_answer_then_pictures_then_tables(reported: Reported) -> None:
+    text = reported.page
     answer = text[text.index('Result</h2>'):text.index('<img')]
     assert re.search(r'Payload: [\d.]+ kg, 95 % interval [\d.]+ .. [\d.]+ kg, since 1\.2\d\d s', answer)
     assert 'found in the signals: capture at 1.2' in answer
@@ -199,6 +207,7 @@ def test_the_report_opens_with_the_answer_then_pictures_then_tables(reported: tu
     assert text.rindex('<img') < text.index('<table')
 
 
-def test_json_stays_the_last_line_and_has_the_time_of_the_capture_that_was_found(reported: tuple[str, str]) -> None:
-    _, out = reported
+def test_json_stays_the_last_line_and_has_the_time_of_the_capture_that_was_found(
+        unannounced: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, out, _ = run(capsys, unannounced, '--json')
     assert json.loads(out.splitlines()[-1])['capture_time_s'] == pytest.approx(1.2, abs=0.02)

@@ -55,6 +55,12 @@ def recording(tmp_path_factory):
     return record(tmp_path_factory.mktemp('bags') / 'oscillator', _oscillator())
 
 
+@pytest.fixture(scope='module')
+def estimates(recording):
+    """What the pipeline says about the recording."""
+    return list(pipeline.run(configure(IdentifierParameters, OTHER), bag.read(recording)))
+
+
 def _run(capsys, *arguments: object) -> tuple[int, str, str]:
     status = main([str(argument) for argument in arguments])
     seen = capsys.readouterr()
@@ -82,10 +88,9 @@ def test_without_json_the_result_is_written_for_people(recording, capsys):
     assert 'Hz' in out
 
 
-def test_a_table_holds_what_the_pipeline_says(recording, capsys, tmp_path):
+def test_a_table_holds_what_the_pipeline_says(recording, estimates, capsys, tmp_path):
     for name in ('out.csv', 'out.npz', 'OUT.CSV'):
         assert _run(capsys, recording, *SETTINGS, '--output', tmp_path / name)[0] == 0
-    estimates = list(pipeline.run(configure(IdentifierParameters, OTHER), bag.read(recording)))
     with np.load(tmp_path / 'out.npz', allow_pickle=False) as stored:
         assert stored['stamp_ns'].tolist() == [estimate.stamp_ns for estimate in estimates]
         assert stored['A'].shape == (len(estimates), 2, 2)
@@ -150,9 +155,8 @@ def test_an_interrupt_reports_and_writes_what_was_identified_until_then(recordin
     assert len((tmp_path / 'out.csv').read_text(encoding='utf-8').splitlines()) == 1 + 100
 
 
-def test_a_recording_of_the_estimates_holds_what_the_node_would_publish(recording, capsys, tmp_path):
+def test_a_recording_of_the_estimates_holds_what_the_node_would_publish(recording, estimates, capsys, tmp_path):
     assert _run(capsys, recording, *SETTINGS, '--output', tmp_path / 'out')[0] == 0
-    estimates = pipeline.run(configure(IdentifierParameters, OTHER), bag.read(recording))
     last = [estimate for estimate in estimates if estimate.model is not None and estimate.model_is_new][-1]
     store = get_typestore(Stores.ROS2_JAZZY)
     with Reader(tmp_path / 'out') as reader:

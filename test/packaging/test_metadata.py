@@ -11,6 +11,7 @@ import subprocess
 import sys
 import warnings
 import xml.etree.ElementTree as ElementTree
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -78,6 +79,7 @@ def declared() -> set[str]:
     return {element.text or '' for element in PACKAGE if element.tag.endswith('depend')}
 
 
+@cache
 def third_party() -> dict[str, set[str]]:
     """Return imported name -> files, of everything that is neither Python's own nor ours."""
     found: dict[str, set[str]] = {}

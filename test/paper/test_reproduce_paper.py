@@ -88,8 +88,8 @@ def test_every_figure_of_the_paper_is_on_the_page(reproduced):
     assert all(one.claim and one.measured for one in planned)
 
 
-def test_the_working_point_of_a_linear_plant_leaves_known_coupling_unbiased():
-    row = next(row for row in case_run.run(CASE, 1)[0] if row['method'] == 'known M_b')
+def test_the_working_point_of_a_linear_plant_leaves_known_coupling_unbiased(reproduced):
+    row = next(row for row in reproduced[1][0] if row['method'] == 'known M_b')
     assert abs(row['payload_mass_kg'] / 20.0 - 1.0) < 0.02
     assert row['covered']
 

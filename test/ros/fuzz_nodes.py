@@ -68,7 +68,8 @@ SUBJECTS = {
     'live_view': Subject(
         LiveView, {'port': 0}, {'joint_states': JointState, 'rpbsid_identifier/status': DiagnosticArray, **EVENTS}, {}),
     'excitation': Subject(
-        Excitation, {'clock': 'joint_states', 'shape': 'multisine'}, {'joint_states': JointState},
+        Excitation, {'clock': 'joint_states', 'shape': 'multisine', 'rate': 200.0, 'arm__modes': 1},
+        {'joint_states': JointState},
         {'effort_controller/commands': Float64MultiArray}),
 }
 

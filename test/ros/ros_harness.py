@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import cache
 from typing import Any, TypeVar
 
 import rclpy
@@ -15,7 +16,12 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
+from flexmanip_ros.ros.nodes import capture_trigger, rpbsid_identifier
 from flexmanip_ros.ros.rclpy_workarounds import make_executor
+
+# Kernels that are loaded stay loaded in a process: a node of the same configuration does not load them again.
+for _module in (capture_trigger, rpbsid_identifier):
+    _module.warm_up = cache(_module.warm_up)
 
 Found = TypeVar('Found', bound=Node)
 

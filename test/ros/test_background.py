@@ -8,6 +8,7 @@ import time
 import weakref
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cache
 
 import pytest
 from estimates import one_a_stamp
@@ -48,10 +49,19 @@ class Recorded(Threads):
         super().start(request)
 
 
-def recording(count: int = 900) -> list[JointRecord | CaptureEvent]:
+@cache
+def recording(count: int = 900, capture: CaptureEvent = CAPTURE) -> tuple[JointRecord | CaptureEvent, ...]:
     efforts = excitation.sequence(ExcitationParameters(), count)
-    made = simulator.simulate(PlantParameters(), efforts, (CAPTURE,))
-    return list(simulator.records(made, (CAPTURE,)))
+    made = simulator.simulate(PlantParameters(), efforts, (capture,))
+    return tuple(simulator.records(made, (capture,)))
+
+
+@cache
+def recordings() -> tuple[tuple[tuple[JointRecord | CaptureEvent, ...], list[tuple[str, bytes]]], ...]:
+    """A recording, and one with another capture that comes late, each with what its replay says."""
+    items = recording()
+    late = *items[:540], CaptureEvent(CAPTURE.stamp_ns + 50_000_000, CAPTURE.kind), *items[540:]
+    return tuple((run, [said(estimate) for estimate in pipeline.run(CONFIG, run)]) for run in (items, late))
 
 
 def live(items: Iterable[JointRecord | CaptureEvent], pause: float,
@@ -81,16 +91,13 @@ def said(estimate: Estimate) -> tuple[str, bytes]:
 
 @pytest.mark.parametrize('pause', [0.0, 0.0005])
 def test_estimates_beside_threads_are_those_of_the_replay_bit_for_bit(pause: float) -> None:
-    items = recording()
-    late = [*items[:540], CaptureEvent(CAPTURE.stamp_ns + 50_000_000, CAPTURE.kind), *items[540:]]
-    for run in (items, late):
-        replayed = list(pipeline.run(CONFIG, run))
-        assert [said(estimate) for estimate in live(run, pause)] == [said(one) for one in replayed]
+    for run, replayed in recordings():
+        assert [said(estimate) for estimate in live(run, pause)] == replayed
 
 
 def test_an_estimate_with_every_sample_is_that_of_the_replay() -> None:
     config = replace(CONFIG, publish_rate=1000.0)
-    items = recording(700)
+    items = recording(340, CaptureEvent(300_000_000, EventKind.CAPTURE))  # the fit comes before it
     replayed = pipeline.run(config, items)
     assert [said(one) for one in live(items, 0.0, config)] == [said(one) for one in replayed]
 

@@ -124,7 +124,7 @@ def test_mode_auto_finds_a_capture_and_tells_it_where_the_plant_does_not_listen(
     commanded = ros.listen(Header, 'capture_event', qos.latched())
     detected = ros.listen(Header, 'capture_detected', qos.latched())
     publisher = ros.publisher(JointState, 'joint_states', qos.sensor_output())
-    count, capture = 2600, CaptureEvent(START_NS + 2_100_000_000, EventKind.CAPTURE)
+    count, capture = 1700, CaptureEvent(START_NS + 1_200_000_000, EventKind.CAPTURE)
     run = simulator.simulate(PlantParameters(), sequence(ExcitationParameters(), count), (capture,), START_NS)
     for k, record in enumerate(simulator.records(run)):
         publisher.publish(to_message(record))

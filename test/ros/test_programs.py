@@ -37,8 +37,11 @@ def module(name: str) -> str:
     return 'flexmanip_ros.ros.demo' if name == 'demo' else f'flexmanip_ros.ros.nodes.{name}'
 
 
+DOMAIN = str(1 + (os.getpid() + 50) % 100)
+
+
 def start(name: str, *arguments: str) -> subprocess.Popen[str]:
-    environment = {**os.environ, 'ROS_DOMAIN_ID': str(1 + (os.getpid() + 50) % 100), 'MPLBACKEND': 'Agg'}
+    environment = {**os.environ, 'ROS_DOMAIN_ID': DOMAIN, 'MPLBACKEND': 'Agg'}
     return subprocess.Popen(
         [sys.executable, '-m', module(name), *arguments], env=environment, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE)
@@ -57,6 +60,12 @@ def signals() -> Iterator[None]:
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+@pytest.fixture
+def alone(signals: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep a demonstration in this process to a domain of its own."""
+    monkeypatch.setenv('ROS_DOMAIN_ID', DOMAIN)
 
 
 def call(name: str, *arguments: str) -> int:
@@ -159,11 +168,12 @@ def test_the_demonstration_is_seen_live_recorded_drawn_and_replayed_bit_for_bit(
     assert (folder / 'overview.png').stat().st_size > 20_000
 
 
-def test_a_demonstration_with_lost_samples_ends_at_once_and_records_what_was_offered(tmp_path: Path) -> None:
+def test_a_demonstration_with_lost_samples_ends_at_once_and_records_what_was_offered(
+        tmp_path: Path, alone: None, capfd: pytest.CaptureFixture[str]) -> None:
     began = time.monotonic()
-    code, out, err = run('demo', str(tmp_path), '--duration', '1', '--capture-time', '0.5', '--rate', '500',
-                         '--ros-args', '-p', 'plant_simulator:sensors.drop_probability:=0.2')
-    assert code == 0, out + err
+    code = call('demo', str(tmp_path), '--duration', '1', '--capture-time', '0.5', '--rate', '500',
+                '--ros-args', '-p', 'plant_simulator:sensors.drop_probability:=0.2')
+    assert code == 0, capfd.readouterr()
     assert time.monotonic() - began < DRAIN_TIMEOUT_S
     with Reader(tmp_path / 'run_001' / 'bag') as reader:
         latched = {item.topic.rpartition('/')[2]: item.ext.offered_qos_profiles[0].durability ==
@@ -172,14 +182,15 @@ def test_a_demonstration_with_lost_samples_ends_at_once_and_records_what_was_off
     assert latched == {name: name == 'capture_event' or name in messages.LATCHED for name in latched}
 
 
-def test_a_demonstration_whose_plant_fails_ends_with_the_reason(tmp_path: Path) -> None:
-    code, _, err = run('demo', str(tmp_path), '--ros-args', '-p', 'excitation:amplitude:=[1.0e7, 1.0e7]')
-    assert code == 1
-    assert err.splitlines()[-1].startswith('demo: the simulation diverged')
+def test_a_demonstration_whose_plant_fails_ends_with_the_reason(
+        tmp_path: Path, alone: None, capfd: pytest.CaptureFixture[str]) -> None:
+    assert call('demo', str(tmp_path), '--ros-args', '-p', 'excitation:amplitude:=[1.0e7, 1.0e7]') == 1
+    assert capfd.readouterr().err.splitlines()[-1].startswith('demo: the simulation diverged')
 
 
 def test_an_interrupted_demonstration_leaves_a_readable_bag(tmp_path: Path) -> None:
-    process = start('demo', str(tmp_path), '--duration', '60', '--rate', '500')
+    process = start('demo', str(tmp_path), '--duration', '60', '--rate', '500',
+                    '--ros-args', '-p', 'rpbsid_identifier:payload_method:=none')
     assert process.stdout is not None
     for line in process.stdout:
         if ' / 60.0 s' in line:
@@ -232,15 +243,15 @@ def test_runs_never_share_a_folder(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_ends_the_recording_with_the_reason_and_keeps_what_was_written(tmp_path: Path) -> None:
-    environment = {**os.environ, 'ROS_DOMAIN_ID': str(1 + (os.getpid() + 50) % 100)}
-    limit = 150_000  # bytes a file may have; the real error of a real write
+    environment = {**os.environ, 'ROS_DOMAIN_ID': DOMAIN}
+    limit = 120_000  # bytes a file may have; the real error of a real write
 
     def small_files() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     process = subprocess.run(
-        [sys.executable, '-m', 'flexmanip_ros.ros.demo', str(tmp_path), '--duration', '2',
-         '--capture-time', '1'],
+        [sys.executable, '-m', 'flexmanip_ros.ros.demo', str(tmp_path), '--duration', '1',
+         '--capture-time', '0.5', '--rate', '500', '--ros-args', '-p', 'rpbsid_identifier:payload_method:=none'],
         env=environment, text=True, capture_output=True, timeout=120, preexec_fn=small_files, check=False)
     assert process.returncode == 1, process.stdout + process.stderr
     assert 'free some space' in process.stdout
