@@ -103,7 +103,7 @@ def test_samples_whose_stamps_hardly_advance_do_not_fill_the_memory(
             item.header.stamp = time_message(10**18 + first + k)
         bench.send([('joint_states', item) for item in message])
         ros.wait(lambda until=first + 100: bench.node.state.counters.received >= until, what='samples to be taken')
-    assert 250 < bench.remembered() <= 700
+    assert 250 < bench.remembered() <= 600
 
 
 def test_an_estimate_of_the_wrong_size_changes_nothing(ros: Ros) -> None:
