@@ -242,4 +242,4 @@ def _collect(config: IdentifierParameters, blocks: list[JointBlock], events: lis
     borders = np.searchsorted(whole.stamp_ns, sorted(events)).tolist()
     a, b = max(pairwise([0, *borders, len(whole.stamp_ns)]), key=lambda pair: pair[1] - pair[0])
     return replace(whole, stamp_ns=whole.stamp_ns[a:b], u=whole.u[a:b], y=whole.y[a:b], angles=whole.angles[a:b],
-                   gap=whole.gap[a:b], missing=whole.missing[a:b]), clock.dt
+                   gap=whole.gap[a:b], missing=whole.missing[a:b], with_friction=None), clock.dt

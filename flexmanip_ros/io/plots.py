@@ -379,7 +379,7 @@ def validation_figure(scores: Scores, outputs: Sequence[str], *, has_arm: bool) 
 def signal_groups(made: Run) -> list[tuple[Array, list[str], str, str]]:
     """Return (columns, labels, title, unit) of the signals that belong in one plot."""
     found: dict[tuple[str, str, float], list[tuple[str, Array]]] = {}
-    for names, table in ((made.signals.inputs, made.signals.u), (made.signals.outputs, made.signals.y)):
+    for names, table in ((made.signals.inputs, made.signals.efforts), (made.signals.outputs, made.signals.y)):
         for k, name in enumerate(names):
             joint, _, field = name.rpartition('/')
             found.setdefault(_quantity(joint, field, made.has_arm), []).append((joint, table[:, k]))

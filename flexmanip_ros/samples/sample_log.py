@@ -206,7 +206,7 @@ class Rows:
 
     @property
     def u(self) -> Array:
-        """(N, r) inputs, each held from its stamp on [N m], less the ``friction``, zero where no rate is known."""
+        """(N, r) inputs, each held from its stamp on [N m], less the ``friction`` (zero where a rate is unknown)."""
         u = self._values(0, self.log.width.inputs)
         if not self.friction:
             return u
@@ -267,8 +267,9 @@ class Rows:
 class Signals:
     """The samples of a run as named columns, for pictures, tables and scores.
 
-    stamp_ns: (N,); u: (N, r); y: (N, m); angles: (N, 2) or (N, 0); gap: (N,) True where the
+    stamp_ns: (N,); u: (N, r) the inputs of the model; y: (N, m); angles: (N, 2) or (N, 0); gap: (N,) True where the
     motion before the sample is unknown; missing: (N,) not 0 where the message never came and values are interpolated.
+    with_friction: (N, r) the inputs of the messages; None: they are those of the model.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -279,6 +280,12 @@ class Signals:
     missing: NDArray[np.int64]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    with_friction: Array | None = None
+
+    @property
+    def efforts(self) -> Array:
+        """(N, r) inputs of the messages: those of the model and the Coulomb friction."""
+        return self.u if self.with_friction is None else self.with_friction
 
     @property
     def time(self) -> Array:

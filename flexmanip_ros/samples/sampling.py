@@ -259,9 +259,10 @@ def flush(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Sampled
 
 def signals(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Signals:
     """Return every row that the log holds, with the names of its columns. The inputs are ``without_friction``."""
-    rows = without_friction(config, log.rows(log.start, log.end))
+    measured = log.rows(log.start, log.end)
+    rows = without_friction(config, measured)
     return Signals(rows.stamp_ns, rows.u, rows.y, rows.angles, rows.gap, rows.missing, config.inputs,
-                   clock.outputs or config.outputs)
+                   clock.outputs or config.outputs, measured.u if rows.friction else None)
 
 
 def push_whole(config: IdentifierParameters, clock: Clock, log: SampleLog, block: JointBlock) -> Sampled:

@@ -92,8 +92,9 @@ def reads_rates(config: IdentifierParameters) -> bool:
 def without_friction(config: IdentifierParameters, rows: Rows) -> Rows:
     """Return the rows with the inputs less the given Coulomb friction of their joints, where the rates are measured.
 
-    A linear model has no such friction. With the whole torques as inputs its frequencies are off by percents. An input
-    and an angle belong to the same joint where they have its name. The friction is in units of the input.
+    A linear model has no such friction. With the whole torques as inputs its frequencies are off by 1 % where friction
+    is a tenth of the torque. An input and an angle belong to the same joint where they have its name. The friction is
+    in units of the input.
     """
     arm = config.arm
     if not rows.log.width.rates or not any(arm.joint_coulomb_friction):

@@ -292,8 +292,7 @@ def payload_bound(config: IdentifierParameters, signals: Signals, capture_time: 
     count = min(signals.stamp_ns.size - first, LONGEST)
     if count < RATE_WINDOW:
         return None
-    frictionless = (0.0,) * len(config.arm.link_length)  # the signals have inputs without it
-    config = replace(config, outputs=signals.outputs, arm=replace(config.arm, joint_coulomb_friction=frictionless))
+    config = replace(config, outputs=signals.outputs)
     extra = [k for k, name in enumerate(config.angles) if name not in signals.outputs]
     noise = np.sqrt(white_noise(np.hstack([signals.y[first:], signals.angles[first:][:, extra]])))
     if not (noise > 0.0).all():
@@ -302,7 +301,7 @@ def payload_bound(config: IdentifierParameters, signals: Signals, capture_time: 
     later = chords(config.arm, signals.angles[first + RATE_WINDOW - 1])
     rates = (later - theta) / ((RATE_WINDOW - 1) * dt)
     try:
-        found = float(cramer_rao.nonlinear(config, theta, mass, signals.u[first:], noise, dt, (count,), rates)[0])
+        found = float(cramer_rao.nonlinear(config, theta, mass, signals.efforts[first:], noise, dt, (count,), rates)[0])
     except ModelError:
         return None
     return found if np.isfinite(found) else None

@@ -8,6 +8,7 @@ from copy import deepcopy
 import numpy as np
 import pytest
 from estimates import one_a_stamp
+from recording import payloads_of
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm.linearization import frequencies, vibration_model
@@ -74,19 +75,15 @@ def before(messages: list[JointRecord | CaptureEvent]) -> structured.StructuredS
     return begun(messages)
 
 
-def payloads_of(items: Sequence[JointRecord | CaptureEvent]) -> list[Payload]:
+def payloads_later(items: Sequence[JointRecord | CaptureEvent]) -> list[Payload]:
     """What is known of the payload from 1 s after the capture on, at the publishing rate, and no model."""
-    config, rows, found = IdentifierParameters(), rows_of(items), []
-    state = begun(items, CAPTURE + 1000)
-    for first in range(CAPTURE + 1000, COUNT, 20):
-        found.append(structured.estimate(config, state))
-        state = structured.advance(config, state, rows.between(first, first + 20))
-    return [*found, structured.estimate(config, state)]
+    capture = CaptureEvent(CAPTURE * 1_000_000, EventKind.CAPTURE)
+    return payloads_of(IdentifierParameters(), rows_of(items), (capture,), CAPTURE + 1000)
 
 
 @pytest.fixture(scope='module')
 def whole(messages: list[JointRecord | CaptureEvent]) -> list[Payload]:
-    return payloads_of(messages)
+    return payloads_later(messages)
 
 
 def length(lost: np.ndarray) -> int:
@@ -106,7 +103,7 @@ def test_payload_and_modes_are_tracked_with_loss(
         messages: list[JointRecord | CaptureEvent], whole: list[Payload], lost: np.ndarray, wider: float) -> None:
     every_block_holds_one = length(lost) > 50  # of the model, which is not asked for then
     found = [] if every_block_holds_one else later(surviving(messages, lost))
-    payloads = (payloads_of(surviving(messages, lost)) if every_block_holds_one else
+    payloads = (payloads_later(surviving(messages, lost)) if every_block_holds_one else
                 [one.payload for one in found if one.payload is not None])
     assert np.mean([one.status is Status.TRACKING for one in payloads]) >= 0.95
     assert max(abs(one.mass - 20.0) / one.std for one in payloads) < 4.0

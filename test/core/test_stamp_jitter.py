@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from recording import payloads_of
 
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, IdentifierParameters, PlantParameters
-from flexmanip_ros.payload import structured
 from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import Rows
 from flexmanip_ros.samples.stamp_jitter import LEAST_GAIN, LOSS, Jitter
@@ -146,13 +146,7 @@ def test_a_payload_is_tracked_at_stamps_that_jitter_by_a_tenth_of_the_sample_tim
     effort = np.hstack([run.effort, np.zeros_like(run.effort)])
     config = IdentifierParameters()
     _, rows = _rows(JointBlock(run.names, stamps, run.position, run.velocity, effort), config)
-    caught = rows.log.row_at(event.stamp_ns, 0)
-    state = structured.advance(config, structured.init(config), rows.between(0, caught))
-    state, late = structured.event(config, state, event), []
-    state = structured.advance(config, state, rows.between(caught, 3000))
-    for row in range(3000, 5000, 20):
-        state = structured.advance(config, state, rows.between(row, row + 20))
-        late.append(structured.estimate(config, state))
+    late = payloads_of(config, rows, (event,), 3000)
     assert np.mean([payload.status is Status.TRACKING for payload in late]) > 0.95
     assert max(abs(payload.mass - 20.0) / payload.std for payload in late) < 3.5
     assert late[-1].mass == pytest.approx(20.0, rel=0.001)

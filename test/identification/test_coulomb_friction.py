@@ -13,6 +13,7 @@ from flexmanip_ros.arm.equations_of_motion import STICTION_RATE
 from flexmanip_ros.arm.linearization import frequencies, vibration_model
 from flexmanip_ros.arm.manipulator import chords
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, IdentifierParameters, PlantParameters
+from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.samples.signals import without_friction
 from flexmanip_ros.simulation import excitation, simulator
@@ -87,6 +88,13 @@ def test_inputs_are_the_efforts_less_the_friction_of_the_joint_of_that_name(gain
     np.testing.assert_allclose(rows.u, u - opposing[:, ::-1])
     np.testing.assert_array_equal(rows.since(1).u_y[:, :2], rows.u[1:])
     np.testing.assert_array_equal(without_friction(CONFIG, log.rows(0, 2)).u, u)
+
+
+def test_scores_have_the_inputs_of_the_model_and_pictures_and_bounds_the_efforts() -> None:
+    whole, known = (sampling.collect(config, messages(5000)) for config in (TOLD, CONFIG))
+    np.testing.assert_array_equal(whole.efforts, known.u)
+    np.testing.assert_allclose(
+        whole.efforts - whole.u, np.tanh(run().velocity[:, :2] / STICTION_RATE) * FRICTION, atol=1e-12)
 
 
 def test_without_measured_rates_the_inputs_are_the_efforts() -> None:

@@ -112,6 +112,17 @@ def samples_of(config: IdentifierParameters, items: Iterable[JointRecord | Captu
     return log.rows(0, log.end), tuple(events)
 
 
+def payloads_of(config: IdentifierParameters, samples: Rows, events: tuple[CaptureEvent, ...], since: int
+                ) -> list[Payload]:
+    """What is known of the payload after ``since`` samples, and after every 20 more: 50 times a second at 1 kHz."""
+    state = run(config, samples.between(0, since), events)
+    found = [structured.estimate(config, state)]
+    for row in range(since, len(samples), 20):
+        state = structured.advance(config, state, samples.between(row, min(row + 20, len(samples))))
+        found.append(structured.estimate(config, state))
+    return found
+
+
 def payload_at_end(config: IdentifierParameters, items: Iterable[JointRecord | CaptureEvent]) -> Payload:
     """What is known of the payload after the last message, to the bit as by the pipeline (``test_structured``).
 

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recording import BENDS, run, samples_of
+from recording import BENDS, payloads_of, samples_of
 
 from flexmanip_ros.arm.linearization import mass_matrix
 from flexmanip_ros.arm.manipulator import manipulator
 from flexmanip_ros.parameters import ArmParameters, ExcitationParameters, IdentifierParameters, PlantParameters
 from flexmanip_ros.payload import filter_state as mem
-from flexmanip_ros.payload import structured
 from flexmanip_ros.payload.interval import SHARE_ERROR, by_rotors, friction_error, judge
 from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.payload.structured_model import ROTOR_ERROR, build, rate_noise, sensors
@@ -104,10 +103,7 @@ def test_a_light_body_on_an_arm_of_more_shape_functions_and_much_friction_is_in_
                for item in simulator.records(simulator.simulate(plant, torques, (capture,)), (capture,)))
     config = IdentifierParameters(arm=told, outputs=BENDS)
     samples, events = samples_of(config, records)
-    state, late = run(config, samples.between(0, 4200), events), []
-    for row in range(4200, 5200, 20):  # the pipeline publishes at 50 Hz
-        state = structured.advance(config, state, samples.between(row, row + 20))
-        late.append(structured.estimate(config, state))
+    late = payloads_of(config, samples, events, 4200)
     assert all(found.status is Status.TRACKING for found in late)
     assert all(found.lower < mass < found.upper for found in late)
     assert late[-1].upper - late[-1].lower < 0.1 * mass
