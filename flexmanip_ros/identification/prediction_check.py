@@ -42,8 +42,8 @@ FOURTH = 0.6744897501960817 * math.sqrt(70.0)
 MEDIAN_SPREAD = 3.2
 """Relative standard deviation of ``white_noise`` from N samples of white noise, times the root of N."""
 CHANCE = 4.0
-"""Number of standard deviations (``MEDIAN_SPREAD``) by which the power of the residuals may exceed that of the white
-noise. A larger excess counts as an error of the model."""
+"""Number of standard deviations that count as chance: by which the power of the residuals exceeds that of the white
+noise (``MEDIAN_SPREAD``), and by which a damping ratio is below zero."""
 OFF, VAGUE = 0.02, 0.01
 """Largest relative error of a frequency beyond its 95 % interval, and largest relative standard deviation of one."""
 UNSHOWN = 0.1
@@ -294,6 +294,18 @@ def lacks_modes(oscillations: Sequence[Mode], bends: int) -> bool:
     return sum(abs(mode.damping_ratio) < DAMPED for mode in oscillations) < bends
 
 
+def gains_energy(oscillations: Sequence[Mode]) -> str:
+    """Return which low lightly damped mode has a damping ratio below zero beyond chance, or ''.
+
+    An arm dissipates energy, so each of its modes decays.
+    """
+    for mode in [mode for mode in oscillations if abs(mode.damping_ratio) < DAMPED][:MOST_MODES]:
+        if mode.damping_ratio < -CHANCE * mode.damping_ratio_std:
+            return (f'the mode at {mode.frequency_hz:.3g} Hz has a damping ratio of {mode.damping_ratio:.2g} +- '
+                    f'{mode.damping_ratio_std:.2g}, but an arm gains no energy')
+    return ''
+
+
 def is_early(found: Identified, since: float) -> bool:
     """Whether a model is of the first ``EARLY_S``. since: as in ``judged``."""
     return max(found.samples, since) * found.model.dt < EARLY_S
@@ -309,7 +321,8 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
     are those of ``decimation``; frequencies are not looked for in them, as right ones were not found (a mode 0.3 % off
     seemed to be 3.1 +- 1.3 % off).
 
-    INCONSISTENT: the predictions miss over half of the outputs' mean power, or the last samples show another frequency.
+    INCONSISTENT: the predictions miss over half of the outputs' mean power, the last samples show another frequency, or
+    a mode gains energy (``gains_energy``).
     ORDER_TOO_LOW: they miss too much of one output (``MISSED``). POORLY_EXCITED, in the first ``EARLY_S`` WARMING_UP: a
     mode of a model of one configuration is too uncertain, or the last samples do not show its frequency. Where the
     model should be one of every configuration, the same status means that it has fewer lightly damped modes than there
@@ -324,6 +337,15 @@ def judged(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int =
     with their intervals: such a fit is a mean over configurations, and the last samples alone tell the present one.
     As they do not tell it to 0.1 %, an error of ``PER_RAD`` times the drift counts as well.
     """
+    found = _predicting(found, rows, outputs, bends, turned, since, drift=drift, filtered=filtered)
+    if found.status is Status.TRACKING and (reason := gains_energy(modes(found))):
+        return found._replace(status=Status.INCONSISTENT, reason=reason)
+    return found
+
+
+def _predicting(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: int, turned: float, since: float, *,
+                drift: float, filtered: bool) -> Identified:
+    """Return the model with the status that everything but its damping gives, see ``judged``."""
     if found.status is not Status.TRACKING:
         return found
     gaps = np.flatnonzero(rows.gap[1:])

@@ -105,6 +105,16 @@ def test_a_damped_mode_is_tracking_only_if_its_damping_ratio_is_known(deviation:
     assert judged(early, u, y, since=9000.0).status is said  # it is no longer warming up: no later sample told anything
 
 
+@pytest.mark.parametrize(('ratio', 'said'), [(-0.034, Status.INCONSISTENT), (-0.02, Status.TRACKING)])
+def test_a_mode_that_gains_energy_beyond_four_deviations_is_none_of_an_arm(ratio: float, said: Status) -> None:
+    u, model, along = torques(), two_modes(5.6, 6.1, damping=ratio), np.zeros((44, 1))
+    along[15] = 1.0  # the damping of the second mode
+    growing = min(modes(tracking(model, 1e4, along)), key=lambda mode: mode.damping_ratio)
+    found = judged(tracking(model, 1e4, 0.006 / growing.damping_ratio_std * along), u, measured(model, u))
+    assert found.status is said
+    assert ('gains no energy' in found.reason) == (said is Status.INCONSISTENT)
+
+
 def test_a_mode_that_the_last_samples_do_not_show_is_not_tracking() -> None:
     u, model = torques(), two_modes(5.6, 8.2, damping=0.28)
     model = replace(model, C=model.C * [1.0, 1.0, 0.002, 0.002])
