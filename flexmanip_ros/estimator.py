@@ -16,7 +16,7 @@ from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.numerics.background import INLINE, Background
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, frequency, structured
-from flexmanip_ros.payload.arm_parameters import taught
+from flexmanip_ros.payload.arm_parameters import input_friction, taught
 from flexmanip_ros.samples.sample_log import Rows, SampleLog
 from flexmanip_ros.samples.signals import relative_angle, without_friction
 from flexmanip_ros.types import ArmParameter, Array, CaptureEvent, Estimate, Payload, Status
@@ -142,6 +142,11 @@ def payload(config: IdentifierParameters, state: PayloadEstimator) -> Payload | 
 def arm_parameters(config: IdentifierParameters, state: PayloadEstimator) -> tuple[ArmParameter, ...]:
     """Return the arm parameters learnt by the payload's estimator; empty where the payload is read from the model."""
     return taught(config, state.structured)
+
+
+def friction(config: IdentifierParameters, state: PayloadEstimator) -> tuple[float, ...]:
+    """Return the Coulomb friction of each joint in units of its input (L,) [N m], as the model's inputs go without."""
+    return input_friction(config, state.structured)
 
 
 PayloadReading = tuple[Payload | None, tuple[ArmParameter, ...]]

@@ -112,13 +112,12 @@ def advance(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog
     return replay
 
 
-def insert(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog, event: CaptureEvent,
-           first_ns: int, background: Background) -> EventReplay[E]:
-    """Take an event: let it wait for its stamp, rewind to it, or apply it now where it is too old for a rewind.
+def insert(config: IdentifierParameters, replay: EventReplay[E], event: CaptureEvent, first_ns: int) -> EventReplay[E]:
+    """Take an event: let it wait for its stamp, go back to before it, or apply it now where it is too old for that.
 
-    One that is too old, and has an event after it that was applied, is only counted: what the arm holds now is known
-    from the later event. One near another of its kind is that one, unless an event of the other kind lies between
-    them. first_ns: stamp of the first sample [ns].
+    After it went back, rows have to be taken again (``advance``). An event that is too old, and has an event after it
+    that was applied, is only counted: what the arm holds now is known from the later event. One near another of its
+    kind is that one, unless an event of the other kind lies between them. first_ns: stamp of the first sample [ns].
     """
     previous = replay.stamp_of(event.kind)
     if (previous is not None and abs(event.stamp_ns - previous) <= config.event_merge_time * 1e9
@@ -130,7 +129,7 @@ def insert(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog,
     if event.stamp_ns > replay.last_ns:
         return _wait(replay, event)
     if event.stamp_ns > replay.snapshots[0].before_ns:
-        return _rewind(config, replay, log, event, background)
+        return _rewind(replay, event)
     replay = replay._replace(late_events=replay.late_events + 1)
     if all(taken.stamp_ns <= first_ns for taken in replay.latest):
         return _restart(config, replay)
@@ -184,14 +183,12 @@ def _snapshot(config: IdentifierParameters, replay: EventReplay[E], log: SampleL
                            applied=tuple((row, e) for row, e in replay.applied if row >= kept[0].row))
 
 
-def _rewind(config: IdentifierParameters, replay: EventReplay[E], log: SampleLog, event: CaptureEvent,
-            background: Background) -> EventReplay[E]:
-    """Go back to the last snapshot not after the event, and take the rows and events again from there."""
+def _rewind(replay: EventReplay[E], event: CaptureEvent) -> EventReplay[E]:
+    """Go back to the last snapshot not after the event; ``advance`` then takes the rows and events again."""
     kept = tuple(one for one in replay.snapshots if one.before_ns < event.stamp_ns)
     back = kept[-1]
     again = sorted((*(e for row, e in replay.applied if row >= back.row), *replay.pending, event), key=_order)
-    before = replay._replace(
+    return replay._replace(
         estimator=back.estimator, cursor=back.row, last_ns=back.before_ns, snapshots=kept,
         applied=tuple((row, e) for row, e in replay.applied if row < back.row), pending=tuple(again),
         rewinds=replay.rewinds + 1)
-    return advance(config, before, log, replay.cursor, background)

@@ -158,8 +158,8 @@ def absorb(config: IdentifierParameters, items: Iterable[Item], background: Back
         if state.payload is not None:
             begun = state.payload.cursor if ahead is None else ahead.request.until
             if state.log.end - begun >= ABSORB_GROUP:
-                state = _joined(state, ahead, background)
-                ahead = _ahead(state, state.log.end, background, TRAILING)
+                state = _with_friction(_joined(state, ahead, background))
+                ahead = _ahead(state, _next_event(state, state.log.end), background, TRAILING)
         yield state
     state = _joined(state, ahead, background)
     if state.config is not None:
@@ -194,24 +194,35 @@ def catch_up(state: State, background: Background = INLINE, group: int = 1) -> t
     estimates: list[Estimate] = []
     if state.payload is None or state.identifier is None:
         return state, estimates
-    due = _due_rows(state)
-    if due:
-        request = _payload_request(state, due)
-        if len(due) > 1:
-            background.start(request)
-            state, steps = _models(state, due, background)
-            payload, readings, told = background.result(request)
-        else:
-            payload, readings, told = request.solve()  # meanwhile a thread may read the model
-            state, steps = _models(state, due, background)
-        state, estimates = _with_payloads(state._replace(payload=payload, told=told), steps, readings)
-        state = _without_old_rows(state)
+    while True:
+        state = _with_friction(state)
+        until = _next_event(state, state.log.end)
+        if due := _due_rows(state, until):
+            state, found = _estimates(state, due, background)
+            estimates += found
+        if until == state.log.end:
+            break
+        state = _advance(state, until, background)
     if state.log.end - _running(state)[2].cursor >= group:
         state = _advance(state, state.log.end, background)
     if state.pending is not None and state.log.end > state.pending.due:
         state, model = _take_model(state, background)
         estimates += model
     return state, estimates
+
+
+def _estimates(state: State, due: list[int], background: Background) -> tuple[State, list[Estimate]]:
+    """Let the estimators take the rows up to the last of ``due``; return the estimates that are due at these rows."""
+    request = _payload_request(state, due)
+    if len(due) > 1:
+        background.start(request)
+        state, steps = _models(state, due, background)
+        payload, readings, told = background.result(request)
+    else:
+        payload, readings, told = request.solve()  # meanwhile a thread may read the model
+        state, steps = _models(state, due, background)
+    state, estimates = _with_payloads(state._replace(payload=payload, told=told), steps, readings)
+    return _without_old_rows(state), estimates
 
 
 def run(config: IdentifierParameters, items: Iterable[Item]) -> Iterator[Estimate]:
@@ -329,12 +340,13 @@ def _sampled(config: IdentifierParameters, state: State, sampled: sampling.Sampl
 def _insert(state: State, event: CaptureEvent, background: Background) -> State:
     if state.payload is None or state.config is None:
         return state._replace(early=(*state.early, event))
-    if state.log.row_at(event.stamp_ns, state.log.start) < state.log.end:  # a late one may rewind what was taken
+    is_late = state.log.row_at(event.stamp_ns, state.log.start) < state.log.end
+    if is_late:  # it may rewind what was taken
         state = _advance(state, state.log.end, background)
     config, payload, identifier = _running(state)
-    given = state.log, event, state.first_ns, background
-    return state._replace(payload=event_replay.insert(config, payload, *given),
-                          identifier=event_replay.insert(config, identifier, *given))
+    state = state._replace(payload=event_replay.insert(config, payload, event, state.first_ns),
+                           identifier=event_replay.insert(config, identifier, event, state.first_ns))
+    return _advance(state, state.log.end, background) if is_late else state
 
 
 def _running(state: State) -> tuple[IdentifierParameters, EventReplay[PayloadEstimator], EventReplay[ModelEstimator]]:
@@ -376,7 +388,37 @@ def _joined(state: State, ahead: Ahead | None, background: Background) -> State:
 
 def _advance(state: State, until: int, background: Background) -> State:
     """Let both estimators take the rows up to ``until``."""
-    return _joined(state, _ahead(state, until, background), background)
+    while True:
+        state = _with_friction(state)
+        stop = _next_event(state, until)
+        state = _joined(state, _ahead(state, stop, background), background)
+        if stop == until:
+            return state
+
+
+def _next_event(state: State, until: int) -> int:
+    """Return the row of the next event before ``until`` that is after the next row, else ``until``.
+
+    There the identifier waits for the payload's estimator, see ``_with_friction``.
+    """
+    _, payload, _ = _running(state)
+    rows = (state.log.row_at(event.stamp_ns, payload.cursor) for event in payload.pending)
+    return min([until, *(row for row in rows if row > payload.cursor)])
+
+
+def _with_friction(state: State) -> State:
+    """Return the state whose log has the friction learned until now, if an event comes before the next row.
+
+    The identifier begins again at an event. From there on its inputs are without the Coulomb friction that the
+    payload's estimator learned before.
+    """
+    config, payload, _ = _running(state)
+    log = state.log
+    for event in payload.pending:
+        if payload.cursor == log.end or log.row_at(event.stamp_ns, payload.cursor) > payload.cursor:
+            break
+        log = log.with_friction(event.stamp_ns, estimator.friction(config, payload.estimator))
+    return state._replace(log=log)
 
 
 def _without_old_rows(state: State) -> State:
@@ -401,11 +443,11 @@ def _instant(state: State, stamp_ns: int, rate: float) -> int:
     return int((stamp_ns - state.first_ns) * rate * 1e-9 + ROUNDING)
 
 
-def _due_rows(state: State) -> list[int]:
-    """Return the rows not taken yet that are the first at or after an instant of ``publish_rate``."""
+def _due_rows(state: State, until: int) -> list[int]:
+    """Return the rows before ``until`` not taken yet that are the first at or after an instant of ``publish_rate``."""
     config, payload, _ = _running(state)
     cursor = payload.cursor
-    rows = state.log.rows(cursor, state.log.end)
+    rows = state.log.rows(cursor, until)
     if not len(rows) or _instant(state, int(rows.stamp_ns[-1]), config.publish_rate) <= state.published:
         return []  # no instant was passed, as after most messages that come one by one
     measured = np.flatnonzero(rows.missing == 0)

@@ -51,7 +51,8 @@ class ArmParameters:
         (0.0, 0.0), 'viscous friction of each joint', unit='N m s/rad', low=0.0, size=2, per_link=True)
     joint_coulomb_friction: tuple[float, ...] = parameter(
         (0.0, 0.0), 'Coulomb friction of each joint; where joint rates are measured, the identified model has '
-        'the efforts less this friction as inputs', unit='N m', low=0.0, size=2, per_link=True)
+        'the efforts less this friction as inputs, after an event less the learned one', unit='N m', low=0.0, size=2,
+        per_link=True)
     torque_gain: tuple[float, ...] = parameter(
         (1.0, 1.0), 'torque of each joint over the effort that is reported', low=0.1, high=10.0, size=2, per_link=True)
     bend_gain: tuple[float, ...] = parameter(

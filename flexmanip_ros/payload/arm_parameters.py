@@ -10,8 +10,8 @@ from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, flatte
 from flexmanip_ros.payload.filter_state import HELD, SANDWICH
 from flexmanip_ros.payload.interval import moves
 from flexmanip_ros.payload.process_model import Kind
-from flexmanip_ros.payload.structured import StructuredState
-from flexmanip_ros.types import ArmParameter
+from flexmanip_ros.payload.structured import StructuredState, estimate
+from flexmanip_ros.types import ArmParameter, Status
 
 NAMES = {
     Kind.STIFFNESS: 'link{}_bending_stiffness', Kind.DAMPING: 'link{}_damping_ratio',
@@ -62,6 +62,20 @@ def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple
             value += config.arm.rotor_inertia[link]
         found.append(ArmParameter(NAMES[kind].format(link + 1), value, std))
     return tuple(found)
+
+
+def input_friction(config: IdentifierParameters, state: StructuredState | None) -> tuple[float, ...]:
+    """Return the Coulomb friction of each joint, in units of its input (L,) [N m]: taught by the arm, else given.
+
+    Only an estimator that is TRACKING is believed.
+    """
+    torques, gains = config.arm.joint_coulomb_friction, config.arm.torque_gain
+    if state is not None and estimate(config, state).status is Status.TRACKING:
+        found = {one.name: one.value for one in taught(config, state)}
+        torques, gains = (
+            tuple(found.get(NAMES[kind].format(joint + 1), value) for joint, value in enumerate(values))
+            for kind, values in ((Kind.COULOMB, torques), (Kind.TORQUE_GAIN, gains)))
+    return tuple(max(torque, 0.0) / gain for torque, gain in zip(torques, gains, strict=True))
 
 
 def as_parameters(config: IdentifierParameters, found: Sequence[ArmParameter]) -> dict[str, Any]:

@@ -19,6 +19,8 @@ from flexmanip_ros.types import Array, Sample
 Kind = TypeVar('Kind', bound=np.generic)
 SMALLEST = 1024
 """Number of rows of the first buffer: about one second at 1 kHz."""
+MOST_FRICTIONS = 100
+"""Number of latest events of which the friction is kept. A rewind goes back over fewer."""
 
 
 class Width(NamedTuple):
@@ -41,6 +43,13 @@ class Friction(NamedTuple):
     """F [N m]."""
     rate: float
     """Rate [rad/s] at which 76 % of F act."""
+
+
+class FrictionSince(NamedTuple):
+    """Coulomb friction of each joint, in units of its input (L,) [N m], from a stamp on [ns]."""
+
+    stamp_ns: int
+    torques: tuple[float, ...]
 
 
 @dataclass(eq=False, slots=True)
@@ -73,6 +82,8 @@ class SampleLog:
     start: int = 0
     end: int = 0
     waiting: int = 0
+    friction: tuple[FrictionSince, ...] = ()
+    """The Coulomb friction that was learned before each of the latest events."""
     _buffer: _Buffer | None = None
 
     def rows(self, first: int, until: int) -> Rows:
@@ -116,7 +127,7 @@ class SampleLog:
             buffer.values[at - delay + skipped:stop - delay, :r] = u[skipped:]
         buffer.filled = stop + buffer.first
         end = max(self.end, buffer.filled - delay)
-        return SampleLog(self.width, self.start, end, buffer.filled - end, buffer)
+        return replace(self, end=end, waiting=buffer.filled - end, _buffer=buffer)
 
     def wait(self, raw: Sample) -> SampleLog:
         """Return the log with one more waiting row, whose inputs are its own (no ``delay``)."""
@@ -140,6 +151,11 @@ class SampleLog:
     def from_row(self, first: int) -> SampleLog:
         """Return the log without the rows before ``first``; their memory is freed with the next buffer."""
         return replace(self, start=min(max(first, self.start), self.end))
+
+    def with_friction(self, stamp_ns: int, torques: tuple[float, ...]) -> SampleLog:
+        """Return the log with the friction from a stamp on; see ``FrictionSince``. Forget what was noted for later."""
+        before = [one for one in self.friction if one.stamp_ns < stamp_ns]
+        return replace(self, friction=(*before[1 - MOST_FRICTIONS:], FrictionSince(stamp_ns, torques)))
 
     def _with_room(self, count: int) -> _Buffer:
         """Return a buffer that may be written after the last row, with room for ``count`` rows."""

@@ -274,15 +274,16 @@ def push_whole(config: IdentifierParameters, clock: Clock, log: SampleLog, block
     return Sampled(clock, log, reset)
 
 
-def collect(config: IdentifierParameters, items: Iterable[JointRecord | JointBlock | CaptureEvent]) -> Signals:
-    """Return the signals of a whole recording."""
+def collect(config: IdentifierParameters, items: Iterable[JointRecord | JointBlock | CaptureEvent],
+            friction: tuple[float, ...] | None = None) -> Signals:
+    """Return the signals of a whole recording. friction: that of ``without_friction`` (L,); None: the given one."""
     clock, log = Clock(), EMPTY
     for item in items:
         if not isinstance(item, CaptureEvent):
             block = item if isinstance(item, JointBlock) else JointBlock.of(item)
             clock, log, _ = push_whole(config, clock, log, block)
     clock, log, _ = flush(config, clock, log)
-    return signals(config, clock, log)
+    return signals(config, clock, log if friction is None else log.with_friction(0, friction))
 
 
 _REPEATED = Rejection('repeated_stamp', 'header stamps do not advance',

@@ -90,18 +90,22 @@ def reads_rates(config: IdentifierParameters) -> bool:
 
 
 def without_friction(config: IdentifierParameters, rows: Rows) -> Rows:
-    """Return the rows with the inputs less the given Coulomb friction of their joints, where the rates are measured.
+    """Return the rows with the inputs less the Coulomb friction of their joints, where the rates are measured.
 
-    A linear model has no such friction. With the whole torques as inputs its frequencies are off by 1 % where friction
-    is a tenth of the torque. An input and an angle belong to the same joint where they have its name. The friction is
-    in units of the input.
+    The friction is the one that the log has for the first row (``SampleLog.friction``), else the given one. A linear
+    model has no such friction. With the whole torques as inputs its frequencies are off by 1 % where friction is a
+    tenth of the torque. An input and an angle belong to the same joint where they have its name.
     """
     arm = config.arm
-    if not rows.log.width.rates or not any(arm.joint_coulomb_friction):
+    torques = tuple(torque / gain for torque, gain in zip(arm.joint_coulomb_friction, arm.torque_gain, strict=True))
+    if rows.log.friction and len(rows):
+        first_ns = int(rows.stamp_ns[0])
+        torques = next((one.torques for one in reversed(rows.log.friction) if one.stamp_ns <= first_ns), torques)
+    if not rows.log.width.rates or not any(torques):
         return rows
     inputs, angles = ([name.rpartition('/')[0] for name in names] for names in (config.inputs, config.angles))
     return replace(rows, friction=tuple(
-        Friction(inputs.index(name), joint, arm.joint_coulomb_friction[joint] / arm.torque_gain[joint], STICTION_RATE)
+        Friction(inputs.index(name), joint, torques[joint], STICTION_RATE)
         for joint, name in enumerate(angles) if name in inputs))
 
 

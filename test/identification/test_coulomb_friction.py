@@ -1,4 +1,4 @@
-"""Coulomb friction that is given is no input of the model: a linear model has no such friction."""
+"""Coulomb friction, given or learned, is no input of the model: a linear model has no such friction."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flexmanip_ros.samples import sampling
 from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.samples.signals import without_friction
 from flexmanip_ros.simulation import excitation, simulator
-from flexmanip_ros.types import Estimate, JointBlock, Status
+from flexmanip_ros.types import CaptureEvent, Estimate, EventKind, JointBlock, Status
 
 FRICTION = (1.0, 0.5)
 PLANT = PlantParameters(arm=ArmParameters(joint_coulomb_friction=FRICTION), seed=1)
@@ -25,6 +25,10 @@ CONFIG = IdentifierParameters(  # other names than the default: the angles are r
     payload_method='none', inputs=('shoulder/effort', 'elbow/effort'),
     angles=('shoulder/position', 'elbow/position'),
     outputs=('link1_bend/position', 'link2_bend/position', 'link1_bend/velocity', 'link2_bend/velocity'))
+LEARNING = replace(  # friction alone: with everything learned a run takes three times as long
+    CONFIG, payload_method='structured', payload=replace(CONFIG.payload, learn=('coulomb_friction',)))
+EVENT = CaptureEvent(3_000_000_000, EventKind.RELEASE)
+"""An event that changes nothing: the arm is empty before and after it. The models begin again."""
 TOLD = replace(CONFIG, arm=replace(CONFIG.arm, joint_coulomb_friction=FRICTION))
 
 
@@ -49,6 +53,16 @@ def readings(config: IdentifierParameters, size: int = 5000) -> list[Estimate]:
             if estimate is not None and estimate.model_is_new and estimate.stamp_ns > 5_000_000_000]
 
 
+@cache
+def learned(size: int, end_s: int = 12, late: int = 0) -> tuple[pipeline.State, list[Estimate]]:
+    """The last state, and the models from 4 s on, where the event comes this number of blocks after its stamp."""
+    items: list[pipeline.Item] = list(messages(size)[:1000 * end_s // size])
+    items.insert(EVENT.stamp_ns // (size * 1_000_000) + late if late else 0, EVENT)
+    found = list(pipeline.replay(LEARNING, items))
+    return found[-1][0], [estimate for _, estimate in found if estimate is not None and estimate.model_is_new
+                          and estimate.stamp_ns > 4_000_000_000]
+
+
 def errors(estimates: list[Estimate]) -> np.ndarray:
     """Relative errors (N, 2) of the two lowest frequencies, at the angles of the half second before."""
     made, found = run(), []
@@ -69,6 +83,30 @@ def test_told_its_friction_the_model_is_right_to_a_third_of_a_percent_and_truste
 
 def test_untold_it_is_further_off() -> None:
     assert np.median(np.abs(errors(readings(CONFIG))), axis=0)[0] > 3.0 * np.median(np.abs(errors(readings(TOLD))))
+
+
+def test_untold_it_is_as_right_from_an_event_on_as_the_arm_taught_its_friction_before() -> None:
+    state, found = learned(500)
+    (since,) = state.log.friction
+    assert since.stamp_ns == EVENT.stamp_ns
+    np.testing.assert_allclose(since.torques, FRICTION, rtol=0.02)
+    late = [estimate for estimate in found if estimate.stamp_ns > EVENT.stamp_ns + 5_000_000_000]
+    assert np.mean([estimate.model_status is Status.TRACKING for estimate in late]) > 0.9
+    assert np.max(np.abs(errors(late))) < 0.003
+
+
+def test_learned_friction_gives_the_same_bits_where_the_event_comes_late_and_where_no_estimate_is_made() -> None:
+    state, late = learned(50, end_s=6, late=3)
+    for one, other in zip(learned(500)[1], late, strict=False):
+        assert one.model is not None
+        assert other.model is not None
+        np.testing.assert_array_equal(np.hstack([one.model.A, one.model.B]), np.hstack([other.model.A, other.model.B]))
+    assert len(late) > 8
+    *_, last = pipeline.absorb(LEARNING, [EVENT, *messages(500)[:12]])
+    assert last.log.friction == state.log.friction
+    ends = [pipeline.current(one) for one in (state, last)]
+    assert all(end is not None and end.model is not None for end in ends)
+    np.testing.assert_array_equal(*(end.model.A for end in ends if end is not None and end.model is not None))
 
 
 def test_blocks_of_any_size_give_the_same_bits() -> None:
@@ -93,8 +131,10 @@ def test_inputs_are_the_efforts_less_the_friction_of_the_joint_of_that_name(gain
 def test_scores_have_the_inputs_of_the_model_and_pictures_and_bounds_the_efforts() -> None:
     whole, known = (sampling.collect(config, messages(5000)) for config in (TOLD, CONFIG))
     np.testing.assert_array_equal(whole.efforts, known.u)
-    np.testing.assert_allclose(
-        whole.efforts - whole.u, np.tanh(run().velocity[:, :2] / STICTION_RATE) * FRICTION, atol=1e-12)
+    opposing = np.tanh(run().velocity[:, :2] / STICTION_RATE) * FRICTION
+    np.testing.assert_allclose(whole.efforts - whole.u, opposing, atol=1e-12)
+    twice = sampling.collect(TOLD, messages(5000), (2.0 * FRICTION[0], 2.0 * FRICTION[1]))
+    np.testing.assert_allclose(twice.efforts - twice.u, 2.0 * opposing, atol=1e-12)
 
 
 def test_without_measured_rates_the_inputs_are_the_efforts() -> None:
