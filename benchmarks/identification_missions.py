@@ -3,9 +3,10 @@
 A controlled arm catches an object of 0.5 to 60 kg, carries it to random angles and lets go, eight times in 128 s. The
 controller's torques are all the excitation there is, and the arm rests between the moves. Cases: an arm with a damping
 ratio of 0.005, with noise of encoders and gauges (0.02 mm, 1 mrad/s), with 25 dB, with 5 % of the messages lost, and
-with friction in the joints and rotors, told and not told; and an arm at 100 Hz under a multisine. A payload is wrong where its interval
-does not hold the mass; a model, where the band of a frequency misses the truth by three times its width, or a mode is
-not there. Truth: the linearized arm at the angles of the last half second. Use: identification_missions.py
+with friction in the joints and rotors, told and not told; and an arm at 100 Hz under a multisine. A payload is wrong
+where its interval does not hold the mass; a model, where the band of a frequency misses the truth by three times its
+width, or a mode is not there. Truth: the linearized arm at the angles of the last half second. Use:
+identification_missions.py
 """
 
 from __future__ import annotations
