@@ -228,13 +228,17 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
                 event_callbacks=watch, qos_overriding_options=qos.overridable())
 
     def each_joint_state(self, take: Callable[[bytes], None], losses: diagnostics.LossCounter | None = None) -> None:
-        """Subscribe to the joint states, serialized; ``take`` gets each while the node is active, and is timed."""
+        """Subscribe to the joint states, serialized; ``take`` gets each while the node is active, and is timed.
+
+        losses: counts the lost ones, for a node that needs each.
+        """
         def timed(raw: bytes) -> None:
             if self.active:
                 with self.meter.timed():
                     take(raw)
 
-        self.subscription(JointState, 'joint_states', timed, qos.sensor_input(), raw=True, losses=losses)
+        profile = qos.sensor_input() if losses is None else qos.gapless_input()
+        self.subscription(JointState, 'joint_states', timed, profile, raw=True, losses=losses)
 
     def each_event(self, take: Callable[[str, Header], None]) -> None:
         """Subscribe to both topics of events; ``take`` gets topic and message.
@@ -254,7 +258,7 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
     def waiting_joint_states(self, losses: diagnostics.LossCounter) -> rclpy_workarounds.Batches:
         """Subscribe to the joint states, which wait, serialized, until they are taken."""
         made = rclpy_workarounds.Batches(self, self.subscription(
-            JointState, 'joint_states', lambda raw: None, qos.sensor_input(), raw=True, losses=losses), losses.note)
+            JointState, 'joint_states', lambda raw: None, qos.gapless_input(), raw=True, losses=losses), losses.note)
         self._unknown_to_rclpy.callback(made.give_back, self)
         return made
 

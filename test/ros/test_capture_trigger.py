@@ -8,6 +8,7 @@ from collections.abc import Callable
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from joint_states import START_NS, joint_state
+from rclpy.parameter import Parameter
 from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
@@ -140,10 +141,10 @@ def test_mode_auto_finds_a_capture_and_tells_it_where_the_plant_does_not_listen(
 class Auto:
     """The trigger in mode auto, with the diagnostics that it published."""
 
-    def __init__(self, ros: Ros) -> None:
+    def __init__(self, ros: Ros, *more: Parameter) -> None:
         self.ros = ros
         self.heard = ros.listen(DiagnosticArray, '/diagnostics', 10)
-        self.node = ros.managed(CaptureTrigger(context=ros.context, overrides=overrides(mode='auto')))
+        self.node = ros.managed(CaptureTrigger(context=ros.context, overrides=[*overrides(mode='auto'), *more]))
         self.states = ros.publisher(JointState, 'joint_states', qos.sensor_output())
 
     def send(self, *samples: int, start_ns: int = START_NS) -> None:
@@ -197,7 +198,8 @@ def test_whatever_finds_a_capture_was_loaded_by_the_warm_up() -> None:
 
 def test_mode_auto_counts_what_it_lost_while_it_was_held_up_and_warns(
         ros: Ros, log: Callable[[str], str]) -> None:
-    auto, release = Auto(ros), threading.Event()
+    shallow = Parameter('qos_overrides./joint_states.subscription.depth', value=1000)
+    auto, release = Auto(ros, shallow), threading.Event()
     auto.send(*range(600))
     spun = auto.ros._of(auto.node)
     spun.jobs.append(release.wait)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable
 
 import numpy as np
 from identifier_harness import CAPTURE, START_NS, Live, recording, replayed
+from joint_states import joint_state
 from ros_harness import Ros, overrides
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
@@ -38,6 +40,18 @@ def honest(payload: Payload, truth: float) -> bool:
 def announce(ros: Ros, live: Live) -> None:
     live.events.publish(conversions.to_message(CAPTURE))
     ros.wait(lambda: live.node.state.payload is None or live.node.state.payload.latest)
+
+
+def test_an_identifier_that_computes_for_seconds_loses_no_joint_state(ros: Ros) -> None:
+    """As the fits of an arm with Coulomb friction do."""
+    live, release = Live(ros, payload_method='none'), threading.Event()
+    live.send(*recording(300))
+    live.ros._of(live.node).jobs.append(release.wait)
+    for k in range(300, 4000):
+        live.joint_states.publish(joint_state(k))
+    release.set()
+    ros.wait(lambda: live.node.state.counters.received + live.node.losses.lost >= 4000)
+    assert (live.node.state.counters.received, live.node.losses.lost) == (4000, 0)
 
 
 def test_a_publisher_that_dies_and_returns_is_a_gap_and_no_loss(ros: Ros) -> None:

@@ -1,6 +1,6 @@
 """Node ``rpbsid_identifier``: model, modes and payload of the arm, one recursive step per joint state.
 
-subscribes  joint_states      sensor_msgs/JointState  best effort, depth 1000; matched by name
+subscribes  joint_states      sensor_msgs/JointState  best effort, depth 30 000; matched by name
             capture_event     std_msgs/Header         an event commanded or known
             capture_detected  std_msgs/Header         an event inferred from the signals
 publishes   ~/model           std_msgs/Float64MultiArray  [[A, B, K], [C, D, I]]; latched
@@ -61,7 +61,7 @@ ARM_RATE = 25.0
 LONGEST_WAIT_S = 0.02
 """Longest time that messages wait until they are taken [s]: the time between two estimates at 50 Hz."""
 MOST_AT_ONCE = 100
-"""Largest number of messages that a callback takes, 0.1 s at 1 kHz, of up to 1000 that may wait.
+"""Largest number of messages that a callback takes, 0.1 s at 1 kHz, of up to 30 000 that may wait.
 
 Signals and services wait for the end of the callback.
 """
