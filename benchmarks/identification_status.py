@@ -148,7 +148,8 @@ def readings(case: Case) -> tuple[list[Estimate], Signals]:
     for item in case.items:
         state, ready = pipeline.step(case.config, state, item)
         found += [estimate for estimate in ready if estimate.model_is_new and estimate.model is not None]
-    return found, sampling.collect(case.config, case.items if case.whole is None else case.whole)
+    whole = case.items if case.whole is None else case.whole
+    return found, sampling.collect(case.config, whole, state.friction)
 
 
 def row_of(case: Case) -> dict[str, Any]:

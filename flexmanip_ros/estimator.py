@@ -145,7 +145,7 @@ def arm_parameters(config: IdentifierParameters, state: PayloadEstimator) -> tup
 
 
 def friction(config: IdentifierParameters, state: PayloadEstimator) -> tuple[float, ...]:
-    """Return the Coulomb friction of each joint in units of its input (L,) [N m], as the model's inputs go without."""
+    """Return the Coulomb friction of each joint in units of its input (L,) [N m]; the model's inputs are without it."""
     return input_friction(config, state.structured)
 
 

@@ -100,6 +100,11 @@ class State(NamedTuple):
         return self.clock.counters
 
     @property
+    def friction(self) -> tuple[float, ...] | None:
+        """Learned Coulomb friction that the inputs of the model are without (L,) [N m]; None: they have the given."""
+        return self.log.friction[-1].torques if self.log.friction else None
+
+    @property
     def next_due_ns(self) -> int | None:
         """Stamp of the sample with which the next estimate is due [ns], if no sample is missing; None while unknown."""
         last_ns, dt_ns = self.clock.last_ns, self.clock.dt * 1e9
@@ -189,7 +194,8 @@ def catch_up(state: State, background: Background = INLINE, group: int = 1) -> t
 
     The payload's estimator takes the rows up to each instant of ``publish_rate``. Where the estimate that is due there
     needs a new model, the identifier takes the same rows. Where several estimates are due, as in a replay, payload and
-    models are estimated in parallel. Finally both estimators take the remaining rows, if these are ``group`` or more.
+    models are estimated in parallel, up to the next event. Finally both estimators take the remaining rows, if these
+    are ``group`` or more.
     """
     estimates: list[Estimate] = []
     if state.payload is None or state.identifier is None:
@@ -403,7 +409,7 @@ def _next_event(state: State, until: int) -> int:
     """
     _, payload, _ = _running(state)
     rows = (state.log.row_at(event.stamp_ns, payload.cursor) for event in payload.pending)
-    return min([until, *(row for row in rows if row > payload.cursor)])
+    return min(until, next((row for row in rows if row > payload.cursor), until))
 
 
 def _with_friction(state: State) -> State:

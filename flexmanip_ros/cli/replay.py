@@ -134,7 +134,7 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     last = pipeline.current(state)
     summary = summarize(state, last, time.perf_counter() - started)
     scores = None
-    signals = messages.signals(state) if messages.is_kept else None
+    signals = messages.signals(state.friction) if messages.is_kept else None
     if request.validate_from is not None and signals is not None:
         progress.phase('scoring the model')
         scores = whole_recording.score(
@@ -302,10 +302,9 @@ class Messages:
         if used.any():
             yield block if used.all() else block.part(used)
 
-    def signals(self, state: pipeline.State) -> Signals:
-        """Return the samples of the recording, held-out ones included. The inputs are those of the state's model."""
-        learned = state.log.friction
-        return sampling.collect(self._request.config, self._blocks, learned[-1].torques if learned else None)
+    def signals(self, friction: tuple[float, ...] | None = None) -> Signals:
+        """Return the samples of the recording, held-out ones included. friction: see ``pipeline.State.friction``."""
+        return sampling.collect(self._request.config, self._blocks, friction)
 
     def angles_held(self, signals: Signals) -> Array:
         """Return the identified angles since the last event (N, 2) [rad]; (0, 2) where none were read."""
