@@ -7,10 +7,11 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 SENSOR_DEPTH = 1000
 """Queue depth for joint states, a second at 1 kHz: a reader that stalls loses nothing (depths 5-10 lost 5-30 %)."""
-GAPLESS_DEPTH = 30_000
-"""The same for a node that computes with each of them, half a minute at 1 kHz. With Coulomb friction the fits keep the
-identifier up to 19 s behind (docs/lab/payload.md, cost). With a second it lost half of all messages, and after each gap
-the fits began again. Only messages that wait take memory."""
+GAPLESS_DEPTH = 5000
+"""The same for a node that computes with each of them. Fast DDS keeps no more, whatever the depth (its default limit
+``max_samples``). With Coulomb friction a fit computes for up to 6 s (docs/lab/payload.md, cost). With a queue of 1000
+the identifier lost half of all messages, and after each gap the fits began again. Only messages that wait take memory.
+"""
 
 
 # Each of these is called for a new profile, because a QoS override changes the profile that it is given.

@@ -10,6 +10,7 @@ import math
 import signal
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -29,6 +30,9 @@ from flexmanip_ros.cli.console import is_postponed, send_again
 
 POLL_S = 0.1
 """Longest wait inside the executor [s], hence the longest time before an idle node handles a signal."""
+MOST_WAITING = 30_000
+"""Largest number of messages that wait in a ``Batches``, half a minute at 1 kHz: with Coulomb friction the fits keep
+the identifier up to 19 s behind (docs/lab/payload.md, cost). A message takes about a kilobyte."""
 AGAIN_S = 1.0
 """Time after which a signal that has not ended the process yet is sent again [s]."""
 LONGEST_END_S = 10.0
@@ -151,29 +155,36 @@ class Batches:
     hundred times a second takes 3 %. rclpy has no subscription without a callback, so this one is removed from its
     node after its creation.
 
+    Fast DDS keeps at most 5000 messages, whatever the depth of the queue. So ``take`` first moves all of them into a
+    queue of its own (``MOST_WAITING``).
+
     note: gets the sequence number of each message that is taken.
     """
 
     def __init__(self, node: Node, subscription: Subscription, note: Callable[[int | None], None]) -> None:
         self._subscription, self._note = subscription, note
+        self._waiting = deque[tuple[Any, Any]](maxlen=MOST_WAITING)
         node._subscriptions.remove(subscription)
         node._wake_executor()  # an executor on another thread may have added the subscription
 
     @property
     def depth(self) -> int:
-        """Largest number of messages that can wait."""
+        """Largest number of messages that can wait in the middleware."""
         return max(int(self._subscription.qos_profile.depth), 1)
 
     def take(self) -> Iterator[tuple[Any, Any]]:
-        """Yield each waiting message with its message info, at most as many as the queue can hold."""
+        """Yield each waiting message with its message info, the oldest first."""
         subscription = self._subscription
         with subscription.handle:
             for _ in range(self.depth):
                 taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
                 if taken is None:
-                    return
-                self._note(sequence_number(taken[1]))
-                yield taken
+                    break
+                self._waiting.append(taken)
+        while self._waiting:
+            taken = self._waiting.popleft()
+            self._note(sequence_number(taken[1]))
+            yield taken
 
     def give_back(self, node: Node) -> None:
         """Return the subscription to its node, so that a following ``destroy_node`` destroys it."""

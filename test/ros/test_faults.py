@@ -42,16 +42,25 @@ def announce(ros: Ros, live: Live) -> None:
     ros.wait(lambda: live.node.state.payload is None or live.node.state.payload.latest)
 
 
-def test_an_identifier_that_computes_for_seconds_loses_no_joint_state(ros: Ros) -> None:
-    """As the fits of an arm with Coulomb friction do."""
-    live, release = Live(ros, payload_method='none'), threading.Event()
+def test_an_identifier_that_computes_for_seconds_loses_no_joint_state_and_takes_no_event_for_one_of_another_clock(
+        ros: Ros, log: Callable[[str], str]) -> None:
+    """As the fits of an arm with Coulomb friction do. 12 s wait here, more than the middleware keeps."""
+    live = Live(ros, payload_method='none')
     live.send(*recording(300))
-    live.ros._of(live.node).jobs.append(release.wait)
-    for k in range(300, 4000):
-        live.joint_states.publish(joint_state(k))
-    release.set()
-    ros.wait(lambda: live.node.state.counters.received + live.node.losses.lost >= 4000)
-    assert (live.node.state.counters.received, live.node.losses.lost) == (4000, 0)
+    for first in range(300, 12_300, 4000):
+        release = threading.Event()
+        live.ros._of(live.node).jobs.append(release.wait)
+        for k in range(first, first + 4000):
+            live.joint_states.publish(joint_state(k))
+        if first == 8300:
+            live.events.publish(conversions.to_message(CaptureEvent(START_NS + 12_000_000_000, EventKind.CAPTURE)))
+        taken = live.node.state.counters.received
+        release.set()
+        ros.wait(lambda taken=taken: live.node.state.counters.received > taken)
+    assert 'after the last sample' not in log('capture_event: capture at')
+    ros.wait(lambda: live.node.state.counters.received + live.node.losses.lost >= 12_300, timeout=60.0)
+    assert (live.node.state.counters.received, live.node.losses.lost) == (12_300, 0)
+    assert live.node.state.stamp_of(EventKind.CAPTURE) == START_NS + 12_000_000_000
 
 
 def test_a_publisher_that_dies_and_returns_is_a_gap_and_no_loss(ros: Ros) -> None:

@@ -5,7 +5,7 @@ mode time     the first sample starts the count; events come at `capture_time` a
               announced `lead_time` ahead, so that every node applies it at the same stamp
 mode auto     events are found in the signals and go out on `capture_detected` (the services work too)
 
-subscribes  joint_states      sensor_msgs/JointState  best effort, depth 30 000; its stamps are the clock
+subscribes  joint_states      sensor_msgs/JointState  best effort, depth 5000; its stamps are the clock
 publishes   capture_event     std_msgs/Header         stamp: the instant, frame_id: capture | release
             capture_detected  std_msgs/Header         the same, for what mode auto inferred (both latched)
             /diagnostics      diagnostic_msgs/DiagnosticArray  1 Hz

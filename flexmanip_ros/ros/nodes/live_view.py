@@ -2,7 +2,7 @@
 
 It only listens: nothing on the page moves the arm or changes another node. The address of the page is in the log.
 
-subscribes  joint_states      sensor_msgs/JointState  best effort, depth 30 000; matched by name
+subscribes  joint_states      sensor_msgs/JointState  best effort, depth 5000; matched by name
             capture_event     std_msgs/Header         an event commanded or known
             capture_detected  std_msgs/Header         an event inferred from the signals
             rpbsid_identifier/status  diagnostic_msgs/DiagnosticArray  payload, modes, and what they are worth

@@ -1,6 +1,6 @@
 """Node ``rpbsid_identifier``: model, modes and payload of the arm, one recursive step per joint state.
 
-subscribes  joint_states      sensor_msgs/JointState  best effort, depth 30 000; matched by name
+subscribes  joint_states      sensor_msgs/JointState  best effort, depth 5000; matched by name
             capture_event     std_msgs/Header         an event commanded or known
             capture_detected  std_msgs/Header         an event inferred from the signals
 publishes   ~/model           std_msgs/Float64MultiArray  [[A, B, K], [C, D, I]]; latched
@@ -61,7 +61,7 @@ ARM_RATE = 25.0
 LONGEST_WAIT_S = 0.02
 """Longest time that messages wait until they are taken [s]: the time between two estimates at 50 Hz."""
 MOST_AT_ONCE = 100
-"""Largest number of messages that a callback takes, 0.1 s at 1 kHz, of up to 30 000 that may wait.
+"""Largest number of messages that a callback takes, 0.1 s at 1 kHz, of up to 35 000 that may wait.
 
 Signals and services wait for the end of the callback.
 """
@@ -286,7 +286,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
         return min(wait_s, longest_s)
 
     def _on_event(self, topic: str, message: Header) -> None:
-        self._take_samples()  # the samples before the event
+        is_latest = self._take_samples() < MOST_AT_ONCE  # else samples from before the event still wait
         try:
             event = capture_event(message).heard_on(topic)
         except FlexmanipError as error:
@@ -298,7 +298,7 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             return
         words = f'{topic}: {event.kind.value} at {event.stamp_ns * 1e-9:.6f}'
         last_ns = self.state.clock.last_ns
-        if last_ns is not None and abs(event.stamp_ns - last_ns) > FAR_EVENT_NS:
+        if is_latest and last_ns is not None and abs(event.stamp_ns - last_ns) > FAR_EVENT_NS:
             where = 'before' if event.stamp_ns < last_ns else 'after'
             self.log_throttled('far event', f'{words}, {abs(event.stamp_ns - last_ns) * 1e-9:.0f} s {where} the last '
                                'sample: stamp an event with the time of its samples', is_error=False)
