@@ -48,8 +48,9 @@ def test_an_identifier_that_computes_for_seconds_loses_no_joint_state_and_takes_
     live = Live(ros, payload_method='none')
     live.send(*recording(300))
     for first in range(300, 12_300, 4000):
-        release = threading.Event()
-        live.ros._of(live.node).jobs.append(release.wait)
+        held, release = threading.Event(), threading.Event()
+        live.ros._of(live.node).jobs.append(lambda held=held, release=release: (held.set(), release.wait()))
+        ros.wait(held.is_set)  # else the node may be within a callback that began before the messages came
         for k in range(first, first + 4000):
             live.joint_states.publish(joint_state(k))
         if first == 8300:
