@@ -163,8 +163,8 @@ def absorb(config: IdentifierParameters, items: Iterable[Item], background: Back
         if state.payload is not None:
             begun = state.payload.cursor if ahead is None else ahead.request.until
             if state.log.end - begun >= ABSORB_GROUP:
-                state = _with_friction(_joined(state, ahead, background))
-                ahead = _ahead(state, _next_event(state, state.log.end), background, TRAILING)
+                state, until = _to_next_event(_joined(state, ahead, background), state.log.end)
+                ahead = _ahead(state, until, background, TRAILING)
         yield state
     state = _joined(state, ahead, background)
     if state.config is not None:
@@ -201,8 +201,7 @@ def catch_up(state: State, background: Background = INLINE, group: int = 1) -> t
     if state.payload is None or state.identifier is None:
         return state, estimates
     while True:
-        state = _with_friction(state)
-        until = _next_event(state, state.log.end)
+        state, until = _to_next_event(state, state.log.end)
         if due := _due_rows(state, until):
             state, found = _estimates(state, due, background)
             estimates += found
@@ -395,36 +394,27 @@ def _joined(state: State, ahead: Ahead | None, background: Background) -> State:
 def _advance(state: State, until: int, background: Background) -> State:
     """Let both estimators take the rows up to ``until``."""
     while True:
-        state = _with_friction(state)
-        stop = _next_event(state, until)
+        state, stop = _to_next_event(state, until)
         state = _joined(state, _ahead(state, stop, background), background)
         if stop == until:
             return state
 
 
-def _next_event(state: State, until: int) -> int:
-    """Return the row of the next event before ``until`` that is after the next row, else ``until``.
+def _to_next_event(state: State, until: int) -> tuple[State, int]:
+    """Return the row up to which both estimators may go: that of the next event, ``until`` at most.
 
-    There the identifier waits for the payload's estimator, see ``_with_friction``.
-    """
-    _, payload, _ = _running(state)
-    rows = (state.log.row_at(event.stamp_ns, payload.cursor) for event in payload.pending)
-    return min(until, next((row for row in rows if row > payload.cursor), until))
-
-
-def _with_friction(state: State) -> State:
-    """Return the state whose log has the friction learned until now, if an event comes before the next row.
-
-    The identifier begins again at an event. From there on its inputs are without the Coulomb friction that the
-    payload's estimator learned before.
+    At an event the identifier begins again, and from there on its inputs are without the Coulomb friction that the
+    payload's estimator learned before. So it waits there for that estimator. Where events come before the next row, the
+    log of the state returned has the friction learned until now.
     """
     config, payload, _ = _running(state)
-    log = state.log
-    for event in payload.pending:
-        if payload.cursor == log.end or log.row_at(event.stamp_ns, payload.cursor) > payload.cursor:
-            break
+    log, cursor = state.log, payload.cursor
+    for event in payload.pending if cursor < log.end else ():
+        row = log.row_at(event.stamp_ns, cursor)
+        if row > cursor:
+            return state._replace(log=log), min(row, until)
         log = log.with_friction(event.stamp_ns, estimator.friction(config, payload.estimator))
-    return state._replace(log=log)
+    return state._replace(log=log), until
 
 
 def _without_old_rows(state: State) -> State:

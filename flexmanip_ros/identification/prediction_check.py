@@ -272,13 +272,18 @@ def with_errors(found: Identified, errors: Array) -> Identified:
         (k, 1j * logs[k].imag * error / QUANTILE) for k, error in zip(chosen, errors.tolist(), strict=True)])
 
 
+def lightly_damped(oscillations: Sequence[Mode]) -> list[Mode]:
+    """Return the modes damped by less than ``DAMPED``, or growing by less."""
+    return [mode for mode in oscillations if abs(mode.damping_ratio) < DAMPED]
+
+
 def uncertain(oscillations: Sequence[Mode]) -> str:
     """Return which frequency of a low lightly damped mode, or damping ratio of any low mode, is too uncertain, or ''.
 
     A mode damped above ``DAMPED`` may have an uncertain frequency, but no uncertain damping ratio: a mode that the
     samples do not contain may also drift to such a damping.
     """
-    for mode in [mode for mode in oscillations if abs(mode.damping_ratio) < DAMPED][:MOST_MODES]:
+    for mode in lightly_damped(oscillations)[:MOST_MODES]:
         if mode.frequency_std_hz > VAGUE * mode.frequency_hz:
             return (f'the frequency of the mode at {mode.frequency_hz:.3g} Hz has a standard deviation of '
                     f'{100.0 * mode.frequency_std_hz / mode.frequency_hz:.2g} %')
@@ -291,7 +296,7 @@ def uncertain(oscillations: Sequence[Mode]) -> str:
 
 def lacks_modes(oscillations: Sequence[Mode], bends: int) -> bool:
     """Whether there are fewer lightly damped modes than measured bends: a mode that died out is not in the samples."""
-    return sum(abs(mode.damping_ratio) < DAMPED for mode in oscillations) < bends
+    return len(lightly_damped(oscillations)) < bends
 
 
 def gains_energy(oscillations: Sequence[Mode]) -> str:
@@ -299,7 +304,7 @@ def gains_energy(oscillations: Sequence[Mode]) -> str:
 
     An arm dissipates energy, so each of its modes decays.
     """
-    for mode in [mode for mode in oscillations if abs(mode.damping_ratio) < DAMPED][:MOST_MODES]:
+    for mode in lightly_damped(oscillations)[:MOST_MODES]:
         if mode.damping_ratio < -CHANCE * mode.damping_ratio_std:
             return (f'the mode at {mode.frequency_hz:.3g} Hz has a damping ratio of {mode.damping_ratio:.2g} +- '
                     f'{mode.damping_ratio_std:.2g}, but an arm gains no energy')

@@ -96,12 +96,12 @@ def without_friction(config: IdentifierParameters, rows: Rows) -> Rows:
     model has no such friction. With the whole torques as inputs its frequencies are off by 1 % where friction is a
     tenth of the torque. An input and an angle belong to the same joint where they have its name.
     """
-    arm = config.arm
-    torques = tuple(torque / gain for torque, gain in zip(arm.joint_coulomb_friction, arm.torque_gain, strict=True))
-    if rows.log.friction and len(rows):
-        first_ns = int(rows.stamp_ns[0])
-        torques = next((one.torques for one in reversed(rows.log.friction) if one.stamp_ns <= first_ns), torques)
-    if not rows.log.width.rates or not any(torques):
+    if not rows.log.width.rates or not len(rows):
+        return rows
+    arm, first_ns = config.arm, int(rows.stamp_ns[0])
+    given = tuple(torque / gain for torque, gain in zip(arm.joint_coulomb_friction, arm.torque_gain, strict=True))
+    torques = next((one.torques for one in reversed(rows.log.friction) if one.stamp_ns <= first_ns), given)
+    if not any(torques):
         return rows
     inputs, angles = ([name.rpartition('/')[0] for name in names] for names in (config.inputs, config.angles))
     return replace(rows, friction=tuple(
