@@ -144,8 +144,8 @@ def arm_parameters(config: IdentifierParameters, state: PayloadEstimator) -> tup
     return taught(config, state.structured)
 
 
-def friction(config: IdentifierParameters, state: PayloadEstimator) -> tuple[float, ...]:
-    """Return the Coulomb friction of each joint in units of its input (L,) [N m]; the model's inputs are without it."""
+def friction(config: IdentifierParameters, state: PayloadEstimator) -> tuple[float, ...] | None:
+    """Return the learned Coulomb friction of each joint in units of its input (L,) [N m]; None while not TRACKING."""
     return input_friction(config, state.structured)
 
 

@@ -64,17 +64,18 @@ def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple
     return tuple(found)
 
 
-def input_friction(config: IdentifierParameters, state: StructuredState | None) -> tuple[float, ...]:
-    """Return the Coulomb friction of each joint, in units of its input (L,) [N m]: taught by the arm, else given.
+def input_friction(config: IdentifierParameters, state: StructuredState | None) -> tuple[float, ...] | None:
+    """Return the Coulomb friction of each joint, in units of its input (L,) [N m]; None unless TRACKING.
 
-    Only an estimator that is TRACKING is believed.
+    What the arm does not teach is as it was given.
     """
-    torques, gains = config.arm.joint_coulomb_friction, config.arm.torque_gain
-    if state is not None and estimate(config, state).status is Status.TRACKING:
-        found = {one.name: one.value for one in taught(config, state)}
-        torques, gains = (
-            tuple(found.get(NAMES[kind].format(joint + 1), value) for joint, value in enumerate(values))
-            for kind, values in ((Kind.COULOMB, torques), (Kind.TORQUE_GAIN, gains)))
+    if state is None or estimate(config, state).status is not Status.TRACKING:
+        return None
+    found = {one.name: one.value for one in taught(config, state)}
+    torques, gains = (
+        [found.get(NAMES[kind].format(joint + 1), value) for joint, value in enumerate(values)]
+        for kind, values in ((Kind.COULOMB, config.arm.joint_coulomb_friction),
+                             (Kind.TORQUE_GAIN, config.arm.torque_gain)))
     return tuple(max(torque, 0.0) / gain for torque, gain in zip(torques, gains, strict=True))
 
 

@@ -83,7 +83,7 @@ class SampleLog:
     end: int = 0
     waiting: int = 0
     friction: tuple[FrictionSince, ...] = ()
-    """The Coulomb friction that was learned before each of the latest events."""
+    """The Coulomb friction learned before each of the latest events at which the payload was TRACKING."""
     _buffer: _Buffer | None = None
 
     def rows(self, first: int, until: int) -> Rows:
@@ -152,10 +152,12 @@ class SampleLog:
         """Return the log without the rows before ``first``; their memory is freed with the next buffer."""
         return replace(self, start=min(max(first, self.start), self.end))
 
-    def with_friction(self, stamp_ns: int, torques: tuple[float, ...]) -> SampleLog:
-        """Return the log with the friction from a stamp on; see ``FrictionSince``. Forget what was noted for later."""
-        before = [one for one in self.friction if one.stamp_ns < stamp_ns]
-        return replace(self, friction=(*before[1 - MOST_FRICTIONS:], FrictionSince(stamp_ns, torques)))
+    def with_friction(self, stamp_ns: int, torques: tuple[float, ...] | None) -> SampleLog:
+        """Return the log with the friction from a stamp on; None: that before it stays. Forget what was noted later."""
+        known = [one for one in self.friction if one.stamp_ns < stamp_ns]
+        if torques is not None:
+            known.append(FrictionSince(stamp_ns, torques))
+        return replace(self, friction=tuple(known[-MOST_FRICTIONS:]))
 
     def _with_room(self, count: int) -> _Buffer:
         """Return a buffer that may be written after the last row, with room for ``count`` rows."""

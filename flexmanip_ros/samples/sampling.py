@@ -283,7 +283,7 @@ def collect(config: IdentifierParameters, items: Iterable[JointRecord | JointBlo
             block = item if isinstance(item, JointBlock) else JointBlock.of(item)
             clock, log, _ = push_whole(config, clock, log, block)
     clock, log, _ = flush(config, clock, log)
-    return signals(config, clock, log if friction is None else log.with_friction(0, friction))
+    return signals(config, clock, log.with_friction(0, friction))
 
 
 _REPEATED = Rejection('repeated_stamp', 'header stamps do not advance',

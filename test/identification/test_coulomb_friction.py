@@ -95,6 +95,15 @@ def test_untold_it_is_as_right_from_an_event_on_as_the_arm_taught_its_friction_b
     assert np.max(np.abs(errors(late))) < 0.003
 
 
+def test_what_was_learned_before_an_event_holds_at_a_later_one_at_which_the_payload_is_not_known() -> None:
+    capture = CaptureEvent(EVENT.stamp_ns + 20_000_000, EventKind.CAPTURE)
+    release = CaptureEvent(capture.stamp_ns + 10_000_000, EventKind.RELEASE)
+    *_, state = pipeline.absorb(LEARNING, [EVENT, capture, release, *messages(500)[:7]])
+    assert {since.stamp_ns for since in state.log.friction} <= {EVENT.stamp_ns, capture.stamp_ns}
+    assert state.friction is not None
+    np.testing.assert_allclose(state.friction, FRICTION, rtol=0.02)
+
+
 def test_learned_friction_gives_the_same_bits_where_the_event_comes_late_and_where_no_estimate_is_made() -> None:
     state, late = learned(50, end_s=6, late=3)
     for one, other in zip(learned(500)[1], late, strict=False):
