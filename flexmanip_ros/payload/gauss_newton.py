@@ -89,7 +89,7 @@ def begin_iteration(motion: ProcessModel, m: mem.FilterState) -> None:
     nx, used = m.x.size, m.counts[mem.USED]
     m.score[mem.COST] = 0.0
     m.score[mem.LOG_DETERMINANT] = 0.0
-    m.counts[mem.LINEARIZED] = has_torque_noise(motion, m)
+    expect_torque_noise(motion, m)
     m.torque_noise[1], m.noise[:, mem.FIT] = 0.0, 0.0
     m.g[:], m.batch[:], m.N[:], m.B[:] = 0.0, 0.0, 0.0, 0.0
     for i in range(motion.effort.size):
@@ -101,12 +101,33 @@ def begin_iteration(motion: ProcessModel, m: mem.FilterState) -> None:
         m.score[mem.COST] += m.xi[i] * m.xi[i]
         for c in range(used):
             m.Sr[i, c] = m.S0[i, c]
-            m.Sr[i, used + c] = m.S0[i, c]
-        m.Sr[i, 2 * used] = -departure
+        for c in range(used, m.Sr.shape[1]):
+            m.Sr[i, c] = 0.0
     expect_noise(m)
     m.counts[mem.ITERATED] = 0
     m.counts[mem.MEASURED] = 0
     m.counts[mem.ITERATING] = 1
+
+
+@inner
+def expect_torque_noise(motion: ProcessModel, m: mem.FilterState) -> None:
+    """Take the noise of the torques from the filter's estimate of the friction, where the iteration is to read more.
+
+    An iteration over the same samples keeps it, as costs are compared; those with another noise are not.
+    """
+    filtered, first = has_torque_noise(motion, m), m.x.size - motion.kind.size
+    same = m.counts[mem.AGAIN] == 1 or m.counts[mem.REJECTED] > 0 or m.counts[mem.BEFORE] == m.counts[mem.STORED]
+    same &= m.counts[mem.BEFORE] > 0 and m.counts[mem.EFFORTS] != mem.COMPARED
+    if same and filtered == (m.counts[mem.FILTERED] == 1):
+        return
+    for i in range(m.friction.size):
+        m.friction[i] = motion.coulomb[i]
+    for c in range(motion.kind.size):
+        if motion.kind[c] == COULOMB:
+            m.friction[motion.link[c]] = max(m.x[first + c], 0.0)
+    if filtered or m.counts[mem.FILTERED] == 1:
+        m.score[mem.COST_BEFORE] = 1e300
+    m.counts[mem.FILTERED] = filtered
 
 
 @inner
@@ -155,22 +176,18 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: mem.Fil
         m.gradient[i] = m.g[i] - m.xi[i]
         for c in range(i + 1):
             m.normal[i, c] = m.N[i, c]
-    # by the trajectory: a linearized filter explains residuals of one that is far from the minimum
-    ratio = m.score[mem.COST] / (nx + m.noise.shape[0] * m.counts[mem.MEASURED])
-    fits = ratio < FITS
     enough = CONVERGED * m.counts[mem.ITERATED]
     # two steps may undo each other for ever where the valley bends
     still = m.counts[mem.BEFORE] == m.counts[mem.ITERATED] and m.score[mem.COST_BEFORE] - m.score[mem.COST] < enough
     free = m.score[mem.LAMBDA] <= first_damping(m)  # a strongly damped step gains little wherever it is taken
     m.counts[mem.BEFORE] = m.counts[mem.ITERATED]
     m.score[mem.COST_BEFORE] = m.score[mem.COST]
-    rejected = are_efforts_noisy(m)
+    fits = cost_ratio(m) < FITS
+    rejected = are_efforts_noisy(sensors, m)
     if not rejected:
         judge_residuals(m)
     m.score[mem.LAMBDA] = m.score[mem.LAMBDA] / FADING if m.score[mem.LAMBDA] > FADED * first_damping(m) else 0.0
-    if m.counts[mem.HELD] == 1 and not fits:
-        # with s times the noise, which explains the residuals, the cost's second derivative is that of s I + N
-        m.score[mem.LAMBDA] = max(m.score[mem.LAMBDA], ratio - 1.0)
+    m.score[mem.LAMBDA] = max(m.score[mem.LAMBDA], noise_damping(m))
     m.counts[mem.REJECTED] = 0
     m.counts[mem.ITERATING] = 0
     if not damped_step(motion, sensors, m):
@@ -200,12 +217,12 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: mem.Fil
             forward(m.N, m.Sr[i, :used])
             for c in range(nx):
                 m.S[i, c] = m.Sr[i, c] if c < used else 0.0
-        # its linearization holds near the minimum, and where its innovations are those of the noise
-        if m.counts[mem.LINEARIZED] == 1 and (part == 1.0 or m.score[mem.MISFIT] < FITS):
-            for i in range(nx):
-                m.x[i] = m.xr[i] + m.Sr[i, 2 * used]
-                for c in range(used):
-                    m.S[i, c] = m.Sr[i, used + c]
+        if m.counts[mem.FILTERED] == 1:  # the covariance given xi
+            sensors.noise[:] = 0.0
+            for i in range(2 * sensors.H.shape[1]):
+                for c in range(2 * sensors.H.shape[1]):
+                    sensors.noise[i, c] = m.Sr[i, used + c]
+            absorb_noise(m.S, sensors.noise, sensors.W)
         if m.counts[mem.HELD] == 0:
             m.score[mem.SANDWICH] = sandwich(sensors, m)
         else:
@@ -220,18 +237,26 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: mem.Fil
 
 
 @inner
-def are_efforts_noisy(m: mem.FilterState) -> bool:
+def are_efforts_noisy(sensors: MeasurementModel, m: mem.FilterState) -> bool:
     """Compare efforts that act on the arm as reported with noisy ones; True: the noisy ones fit better.
 
-    The likelihood is that of the innovations of the linearized filter, at the greatest over a factor of all variances:
-    -2 log p = sum of log(variance / r) + N log(mean of innovation^2 r / variance) of each sensor.
+    Their evidence is that of the least cost Q of the linearized fit, at the greatest over a common factor of all
+    variances: -2 log p = M log(Q / M) + log det(I + N) + sum of log(s / r), M the number of innovations, s their
+    variances, r those of the measurements.
     """
-    if m.counts[mem.LINEARIZED] == 0:
+    if m.counts[mem.FILTERED] == 0:
         return False
-    count = max(m.counts[mem.MEASURED], 1)
-    value = m.score[mem.LOG_DETERMINANT]
-    for i in range(m.noise.shape[0]):
-        value += count * np.log(max(m.noise[i, mem.FIT], 1e-300) / count)
+    count, L, step = max(m.counts[mem.MEASURED], 1) * m.noise.shape[0], sensors.L, sensors.f
+    for i in range(m.x.size):
+        step[i] = m.gradient[i]
+        for c in range(i + 1):
+            L[i, c] = m.normal[i, c]
+    if not factor_information(L):
+        return False
+    forward(L, step)
+    value = count * np.log(max(m.score[mem.COST] - dot(step, step), 1e-300) / count) + m.score[mem.LOG_DETERMINANT]
+    for i in range(m.x.size):
+        value += 2.0 * np.log(L[i, i])
     compared = m.counts[mem.EFFORTS] == mem.COMPARED
     if compared:
         m.counts[mem.EFFORTS] = mem.EXACT if value < m.score[mem.LIKELIHOOD] else mem.CONFIRMED
@@ -246,8 +271,7 @@ def sandwich(sensors: MeasurementModel, m: mem.FilterState) -> float:
 
     The variance by batch means (sandwich of Huber and White): where the residuals are no white noise, the gradient is
     a sum of parts b of batches that are nearly independent, so the variance of xi by them is W B W, W = (I + N)^-1,
-    B = sum b b'. The fit says W N W instead, and where the friction has process noise, m.S more by what that adds. The
-    factor is the mean over payload and arm parameters of the ratio.
+    B = sum b b'. The fit says W N W instead. The factor is the mean over payload and arm parameters of the ratio.
     """
     nx, row = m.x.size, sensors.f
     length = BATCH * sensors.block
@@ -259,9 +283,8 @@ def sandwich(sensors: MeasurementModel, m: mem.FilterState) -> float:
         for c in range(nx):
             row[c] = m.S0[i, c]
         forward(m.N, row)
-        more = dot(m.S[i], m.S[i]) - dot(row, row) if m.counts[mem.LINEARIZED] == 1 else 0.0
         backward(m.N, row)
-        said = dot(row, m.S0[i]) - dot(row, row) + more
+        said = dot(row, m.S0[i]) - dot(row, row)
         found = 0.0
         for a in range(nx):
             for b in range(a):
@@ -346,7 +369,7 @@ def close_horizon(motion: ProcessModel, sensors: MeasurementModel, m: mem.Filter
     """
     empty = m.counts[mem.HELD] == 0 and m.counts[mem.STORED] < mem.HORIZON
     again = empty and evidence_against_delays(motion, sensors, m) > VERY_STRONG
-    noisy = m.counts[mem.EFFORTS] == mem.NOISY and m.counts[mem.LINEARIZED] == 1 and m.effort_noise.any()
+    noisy = m.counts[mem.EFFORTS] == mem.NOISY and m.counts[mem.FILTERED] == 1 and m.effort_noise.any()
     if empty and not again and noisy:
         m.counts[mem.EFFORTS] = mem.COMPARED
         m.counts[mem.ITERATING] = 0
@@ -392,6 +415,23 @@ def phase_std(motion: ProcessModel, m: mem.FilterState, duration: float) -> floa
     angle = min(STEP_ANGLE / motion.substeps * duration, 1.0 / max(ratio, 1e-9))
     deviation: float = 0.5 * angle * np.sqrt(square)
     return deviation
+
+
+@inner
+def cost_ratio(m: mem.FilterState) -> float:
+    """Return the cost of the last accepted iteration over that of the noise assumed."""
+    ratio: float = m.score[mem.COST_BEFORE] / (m.x.size + m.noise.shape[0] * m.counts[mem.MEASURED])
+    return ratio
+
+
+@inner
+def noise_damping(m: mem.FilterState) -> float:
+    """Return the damping of a fit after a capture whose residuals exceed the noise assumed; 0: they do not.
+
+    With s times the noise, which explains the residuals, the cost's second derivative is that of s I + N.
+    """
+    ratio = cost_ratio(m)
+    return ratio - 1.0 if m.counts[mem.HELD] == 1 and ratio >= FITS else 0.0
 
 
 @inner

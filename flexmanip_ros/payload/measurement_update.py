@@ -82,7 +82,7 @@ class MeasurementModel(NamedTuple):
     f: Array
     """(nx,) scratch."""
     wide: Array
-    """(2 nx + 1,) scratch."""
+    """(2 nx,) scratch."""
     L: Array
     """(nx, nx) scratch."""
     W: Array
