@@ -75,9 +75,10 @@ $(VENV)/.benchmark: requirements/benchmark.txt $(VENV)/.development
 demo: setup
 	@$(BIN)/demo $(DEMO_ARGS)
 
-# Four parts side by side: nodes, which often wait; programs and tools; the payload; and what else computes. Nodes go
-# first, as their tests measure time. The other three take about as long as each other, so no core is idle in the end.
-NODES := test/ros
+# Four parts side by side, which take about as long as each other, so no core is idle in the end: nodes, which often
+# wait, with controller, files and golden results; programs and tools; the payload; and what else computes. Nodes go
+# first, as their tests measure time.
+NODES := test/ros test/control test/golden test/io
 PROGRAMS := test/cli test/view test/studies test/paper test/packaging
 PAYLOAD := test/payload
 test: setup $(VENV)/.development
