@@ -22,7 +22,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
 # Elements of ``counts``.
 (HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, MOVED, SEEN, BEFORE,
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
- IN_SPECTRUM, SPECTRA, FILTERED, EFFORTS, RESTS) = range(25)
+ IN_SPECTRUM, SPECTRA, LINEARIZED, EFFORTS, RESTS) = range(25)
 # Elements of ``score``.
 (SHIFT, DOUBT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES, SANDWICH,
  MISFIT, EXCESS, LOG_DETERMINANT, LIKELIHOOD) = range(14)
@@ -57,7 +57,7 @@ class FilterState(NamedTuple):
     ITERATING: an iteration is under way; ITERATED, MEASURED: samples that it has read, and those of them that were not
     missing; BEFORE: samples of the last accepted iteration; REJECTED: steps rejected since then; AGAIN: the next one
     reads the same samples, as it has not converged; TRIED: iterations over the same samples so far; REFITS: fits begun
-    again since the event; FILTERED: its residuals are innovations of a Kalman filter; EFFORTS: NOISY: their white
+    again since the event; LINEARIZED: the iteration carries a linearized Kalman filter; EFFORTS: NOISY: their white
     part is taken for noise; COMPARED: the iteration takes it for true; EXACT: it fits better so; CONFIRMED: it does
     not; RESTS: RESTING: the samples since the event tell nothing yet of the payload, so no fit reads them and the
     horizon slides along, IN_BATCH counts the samples since it slid; SLIDES: it is due; BEGINS_TO_MOVE: the last sample
@@ -71,10 +71,11 @@ class FilterState(NamedTuple):
     iteration, COST_BEFORE: of the last accepted one; LAMBDA: damping of Levenberg and Marquardt; MOVES: mean of the
     squared moves of payload and arm parameters, over the variance that the filter says, see ``judge_moves``; SANDWICH:
     factor, at least 1, by which the variances of the last fit of the empty arm are too small, see ``sandwich``; MISFIT:
-    power of the residuals of the last accepted iteration over the noise assumed; EXCESS: by how many deviations of
-    chance it exceeds the white noise, see ``judge_residuals``; LOG_DETERMINANT: sum of the logarithms of the variances
-    of the innovations over those of the noise, in this iteration; LIKELIHOOD: -2 times the logarithm of the evidence of
-    the last accepted iteration."""
+    power of the residuals of the last accepted iteration (of the innovations where there is a linearized filter) over
+    the noise assumed; EXCESS: by how many deviations of chance it exceeds the white noise, see ``judge_residuals``;
+    LOG_DETERMINANT: sum of the logarithms of the variances of the innovations of the linearized filter over those of
+    the noise, in this iteration; LIKELIHOOD: -2 times the logarithm of the likelihood of the last accepted
+    iteration."""
     moved: Array
     """(nx, 2) mean and variance of payload and arm parameters when their moves were last judged, with the process noise
     since then in the variance; see ``judge_moves``."""
@@ -93,7 +94,8 @@ class FilterState(NamedTuple):
     xr: Array
     """(nx,) present state of the trajectory about which the Gauss-Newton iteration linearizes."""
     Sr: Array
-    """(nx, 2 nx) its derivative by xi (USED columns), then the square root of its covariance given xi (2 n columns)."""
+    """(nx, 2 nx + 1) its derivative by xi (USED columns); then, of the linearized filter, square root of the covariance
+    (USED columns) and mean departure from it (one column)."""
     N: Array
     """(nx, nx) information gathered in the iteration."""
     g: Array
@@ -104,9 +106,7 @@ class FilterState(NamedTuple):
     """(nx, nx) sum over the batches of b b', b the part of the gradient that comes from one batch; lower triangle."""
     torque_noise: Array
     """(2, L) variance of the torque of each joint [N^2 m^2], summed over the samples since its process noise was added:
-    in the filter, and in the iteration."""
-    friction: Array
-    """(L,) Coulomb friction whose noise the iteration assumes [N m]."""
+    in the filter, and in the linearized one."""
     effort_noise: Array
     """(L,) variance of the white part of each reported effort [N^2 m^2]."""
     rate_noise: Array
@@ -126,10 +126,10 @@ def memory(nx: int, m: int, links: int) -> FilterState:
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)),
         spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(25, dtype=np.int64), score=np.zeros(14),
         moved=np.zeros((nx, 2)), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
-        normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, 2 * nx)),
+        normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, 2 * nx + 1)),
         N=np.zeros((nx, nx)), g=np.zeros(nx), batch=np.zeros(nx), B=np.zeros((nx, nx)),
-        torque_noise=np.zeros((2, links)), friction=np.zeros(links), effort_noise=np.zeros(links),
-        rate_noise=np.zeros(links), ringing=np.zeros((3, 3, links)), innovation=np.zeros((m, 2)), power=np.ones(m))
+        torque_noise=np.zeros((2, links)), effort_noise=np.zeros(links), rate_noise=np.zeros(links),
+        ringing=np.zeros((3, 3, links)), innovation=np.zeros((m, 2)), power=np.ones(m))
 
 
 OF_HORIZON = ('x0', 'S0', 'xi', 'accepted', 'normal', 'gradient', 'xr', 'Sr', 'N', 'g', 'batch', 'B')

@@ -89,7 +89,7 @@ def begin_iteration(motion: ProcessModel, m: mem.FilterState) -> None:
     nx, used = m.x.size, m.counts[mem.USED]
     m.score[mem.COST] = 0.0
     m.score[mem.LOG_DETERMINANT] = 0.0
-    expect_torque_noise(motion, m)
+    m.counts[mem.LINEARIZED] = has_torque_noise(motion, m)
     m.torque_noise[1], m.noise[:, mem.FIT] = 0.0, 0.0
     m.g[:], m.batch[:], m.N[:], m.B[:] = 0.0, 0.0, 0.0, 0.0
     for i in range(motion.effort.size):
@@ -101,33 +101,12 @@ def begin_iteration(motion: ProcessModel, m: mem.FilterState) -> None:
         m.score[mem.COST] += m.xi[i] * m.xi[i]
         for c in range(used):
             m.Sr[i, c] = m.S0[i, c]
-        for c in range(used, m.Sr.shape[1]):
-            m.Sr[i, c] = 0.0
+            m.Sr[i, used + c] = m.S0[i, c]
+        m.Sr[i, 2 * used] = -departure
     expect_noise(m)
     m.counts[mem.ITERATED] = 0
     m.counts[mem.MEASURED] = 0
     m.counts[mem.ITERATING] = 1
-
-
-@inner
-def expect_torque_noise(motion: ProcessModel, m: mem.FilterState) -> None:
-    """Take the noise of the torques from the filter's estimate of the friction, where the iteration is to read more.
-
-    An iteration over the same samples keeps it, as costs are compared; those with another noise are not.
-    """
-    filtered, first = has_torque_noise(motion, m), m.x.size - motion.kind.size
-    same = m.counts[mem.AGAIN] == 1 or m.counts[mem.REJECTED] > 0 or m.counts[mem.BEFORE] == m.counts[mem.STORED]
-    same &= m.counts[mem.BEFORE] > 0 and m.counts[mem.EFFORTS] != mem.COMPARED
-    if same and filtered == (m.counts[mem.FILTERED] == 1):
-        return
-    for i in range(m.friction.size):
-        m.friction[i] = motion.coulomb[i]
-    for c in range(motion.kind.size):
-        if motion.kind[c] == COULOMB:
-            m.friction[motion.link[c]] = max(m.x[first + c], 0.0)
-    if filtered or m.counts[mem.FILTERED] == 1:
-        m.score[mem.COST_BEFORE] = 1e300
-    m.counts[mem.FILTERED] = filtered
 
 
 @inner
@@ -182,8 +161,9 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: mem.Fil
     free = m.score[mem.LAMBDA] <= first_damping(m)  # a strongly damped step gains little wherever it is taken
     m.counts[mem.BEFORE] = m.counts[mem.ITERATED]
     m.score[mem.COST_BEFORE] = m.score[mem.COST]
+    # by the trajectory: a linearized filter explains residuals of one that is far from the minimum
     fits = cost_ratio(m) < FITS
-    rejected = are_efforts_noisy(sensors, m)
+    rejected = are_efforts_noisy(m)
     if not rejected:
         judge_residuals(m)
     m.score[mem.LAMBDA] = m.score[mem.LAMBDA] / FADING if m.score[mem.LAMBDA] > FADED * first_damping(m) else 0.0
@@ -217,12 +197,12 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: mem.Fil
             forward(m.N, m.Sr[i, :used])
             for c in range(nx):
                 m.S[i, c] = m.Sr[i, c] if c < used else 0.0
-        if m.counts[mem.FILTERED] == 1:  # the covariance given xi
-            sensors.noise[:] = 0.0
-            for i in range(2 * sensors.H.shape[1]):
-                for c in range(2 * sensors.H.shape[1]):
-                    sensors.noise[i, c] = m.Sr[i, used + c]
-            absorb_noise(m.S, sensors.noise, sensors.W)
+        # its linearization holds near the minimum, and where its innovations are those of the noise
+        if m.counts[mem.LINEARIZED] == 1 and (part == 1.0 or m.score[mem.MISFIT] < FITS):
+            for i in range(nx):
+                m.x[i] = m.xr[i] + m.Sr[i, 2 * used]
+                for c in range(used):
+                    m.S[i, c] = m.Sr[i, used + c]
         if m.counts[mem.HELD] == 0:
             m.score[mem.SANDWICH] = sandwich(sensors, m)
         else:
@@ -237,26 +217,18 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: mem.Fil
 
 
 @inner
-def are_efforts_noisy(sensors: MeasurementModel, m: mem.FilterState) -> bool:
+def are_efforts_noisy(m: mem.FilterState) -> bool:
     """Compare efforts that act on the arm as reported with noisy ones; True: the noisy ones fit better.
 
-    Their evidence is that of the least cost Q of the linearized fit, at the greatest over a common factor of all
-    variances: -2 log p = M log(Q / M) + log det(I + N) + sum of log(s / r), M the number of innovations, s their
-    variances, r those of the measurements.
+    The likelihood is that of the innovations of the linearized filter, at the greatest over a factor of all variances:
+    -2 log p = sum of log(variance / r) + N log(mean of innovation^2 r / variance) of each sensor.
     """
-    if m.counts[mem.FILTERED] == 0:
+    if m.counts[mem.LINEARIZED] == 0:
         return False
-    count, L, step = max(m.counts[mem.MEASURED], 1) * m.noise.shape[0], sensors.L, sensors.f
-    for i in range(m.x.size):
-        step[i] = m.gradient[i]
-        for c in range(i + 1):
-            L[i, c] = m.normal[i, c]
-    if not factor_information(L):
-        return False
-    forward(L, step)
-    value = count * np.log(max(m.score[mem.COST] - dot(step, step), 1e-300) / count) + m.score[mem.LOG_DETERMINANT]
-    for i in range(m.x.size):
-        value += 2.0 * np.log(L[i, i])
+    count = max(m.counts[mem.MEASURED], 1)
+    value = m.score[mem.LOG_DETERMINANT]
+    for i in range(m.noise.shape[0]):
+        value += count * np.log(max(m.noise[i, mem.FIT], 1e-300) / count)
     compared = m.counts[mem.EFFORTS] == mem.COMPARED
     if compared:
         m.counts[mem.EFFORTS] = mem.EXACT if value < m.score[mem.LIKELIHOOD] else mem.CONFIRMED
@@ -271,7 +243,8 @@ def sandwich(sensors: MeasurementModel, m: mem.FilterState) -> float:
 
     The variance by batch means (sandwich of Huber and White): where the residuals are no white noise, the gradient is
     a sum of parts b of batches that are nearly independent, so the variance of xi by them is W B W, W = (I + N)^-1,
-    B = sum b b'. The fit says W N W instead. The factor is the mean over payload and arm parameters of the ratio.
+    B = sum b b'. The fit says W N W instead, and where the friction has process noise, m.S more by what that adds. The
+    factor is the mean over payload and arm parameters of the ratio.
     """
     nx, row = m.x.size, sensors.f
     length = BATCH * sensors.block
@@ -283,8 +256,9 @@ def sandwich(sensors: MeasurementModel, m: mem.FilterState) -> float:
         for c in range(nx):
             row[c] = m.S0[i, c]
         forward(m.N, row)
+        more = dot(m.S[i], m.S[i]) - dot(row, row) if m.counts[mem.LINEARIZED] == 1 else 0.0
         backward(m.N, row)
-        said = dot(row, m.S0[i]) - dot(row, row)
+        said = dot(row, m.S0[i]) - dot(row, row) + more
         found = 0.0
         for a in range(nx):
             for b in range(a):
@@ -369,7 +343,7 @@ def close_horizon(motion: ProcessModel, sensors: MeasurementModel, m: mem.Filter
     """
     empty = m.counts[mem.HELD] == 0 and m.counts[mem.STORED] < mem.HORIZON
     again = empty and evidence_against_delays(motion, sensors, m) > VERY_STRONG
-    noisy = m.counts[mem.EFFORTS] == mem.NOISY and m.counts[mem.FILTERED] == 1 and m.effort_noise.any()
+    noisy = m.counts[mem.EFFORTS] == mem.NOISY and m.counts[mem.LINEARIZED] == 1 and m.effort_noise.any()
     if empty and not again and noisy:
         m.counts[mem.EFFORTS] = mem.COMPARED
         m.counts[mem.ITERATING] = 0

@@ -82,7 +82,7 @@ class MeasurementModel(NamedTuple):
     f: Array
     """(nx,) scratch."""
     wide: Array
-    """(2 nx,) scratch."""
+    """(2 nx + 1,) scratch."""
     L: Array
     """(nx, nx) scratch."""
     W: Array

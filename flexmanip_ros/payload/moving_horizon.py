@@ -6,9 +6,9 @@ samples since the event again (at most ``HORIZON``), ``ROWS`` for each new sampl
 filter, its minimum replaces the filter's state, and the next iteration is linearized there. The arrival cost is the
 state at the event, with mean x0 and covariance S0 S0'.
 
-Where torques have process noise, that of Coulomb friction or of the reported efforts, the residuals are the innovations
-of a Kalman filter with it, which begins at xi with no covariance (prediction-error method; Ljung, System
-Identification, 1999, sec. 7.4).
+The fit knows no process noise. Where torques have some, that of Coulomb friction or of the reported efforts, a
+linearized Kalman filter with it runs about the trajectory of each iteration. Near the minimum, and where it explains
+the samples, its state replaces that of the filter.
 """
 
 import numpy as np
@@ -116,36 +116,33 @@ def choose_rates(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterS
 
 
 @inner
-def gather_torque_noise(
-    motion: ProcessModel, m: mem.FilterState, coulomb: Array, variance: Array, noisy: bool,
-) -> None:
+def gather_torque_noise(motion: ProcessModel, m: mem.FilterState, variance: Array, noisy: bool) -> None:
     """Add to variance (L,) that of each torque over a sample [N^2 m^2]; ``predict`` was just called.
 
-    coulomb: (L,) Coulomb friction [N m]; noisy: whether reported efforts have noise. The share of the friction has
-    d^2 / cosh^2(rate / (WAVES STICTION_RATE)): a joint that slides has all of it, one near rest has waves of the links'
-    bending in its rate.
+    noisy: whether reported efforts have noise. The share of Coulomb friction has d^2 / cosh^2(rate /
+    (WAVES STICTION_RATE)): a joint that slides has the whole friction, one near rest has waves of the links' bending in
+    its rate.
     """
     for i in range(variance.size):
         rate, std = motion.rate[i], MEASURED_SHARE
         if np.isnan(rate):
             rate, std = motion.work.net[1, i], MODELLED_SHARE
-        friction = coulomb[i] * std / np.cosh(rate / (WAVES * STICTION_RATE))
+        friction = motion.coulomb[i] * std / np.cosh(rate / (WAVES * STICTION_RATE))
         variance[i] += friction * friction + (m.effort_noise[i] if noisy else 0.0)
 
 
 @merged
 def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, table: Array) -> int:
-    """Take one sample since the event into the iteration: N += f f' / s, g += f e / s.
+    """Take one sample since the event into the iteration: N += f f' / r, g += f e / r.
 
-    table: (N, 1 + 3 L + m), the rows before the event that a late torque needs, then the first sample after it. e is
-    the innovation of a measurement given xi, s its variance, f its derivative by xi; the cost is the sum of e^2 / s.
-    Without noise of the torques s is the variance r of the measurement. Return the number of integration steps; 0: this
-    trajectory is given up, the step was too long.
+    table: (N, 1 + 3 L + m), the rows before the event that a late torque needs, then the first sample after it. The
+    cost is the sum of e^2 / r. Return the number of integration steps; 0: this trajectory is given up, the step was too
+    long.
     """
     k = m.counts[mem.ITERATED] + sensors.reach - 1
     sample = table[k]
-    n, nx, used, filtered = sensors.H.shape[1], m.x.size, m.counts[mem.USED], m.counts[mem.FILTERED] == 1
-    columns = used + 2 * n if filtered else used
+    n, nx, used, linearized = sensors.H.shape[1], m.x.size, m.counts[mem.USED], m.counts[mem.LINEARIZED] == 1
+    columns = 2 * used + 1 if linearized else used
     first, f = 1 + 3 * motion.effort.size, sensors.wide[:columns]
     rows = table[k + 1 - sensors.reach:k + 1]
     note_change(sensors, m.ringing[2], sample[1:1 + motion.effort.size])
@@ -160,23 +157,19 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: mem.Filte
         own = m.noise[i, mem.EFFECTIVE]
         r = own + omitted_variance(sensors.omitted, i, m.ringing[2])
         e = sample[first + i] - observe(sensors, i, n, m.xr, m.Sr, f, motion.k[0])
-        variance = r + dot(f[used:], f[used:])
-        weight = 1.0 / variance
+        weight = 1.0 / r
         m.score[mem.COST] += e * e * weight
         for a in range(used):
             scaled = weight * f[a]
             m.g[a] += scaled * e
             for b in range(a + 1):
                 m.N[a, b] += scaled * f[b]
-        m.noise[i, mem.FIT] += e * e * own * weight
-        if filtered:
-            update_trajectory(m, f, e, r, variance)
+        m.noise[i, mem.FIT] += (update_linearized(m, f, e, r) if linearized else e * e) * own / r
     m.counts[mem.ITERATED] += 1
-    if filtered:
-        noisy = m.counts[mem.EFFORTS] in (mem.NOISY, mem.CONFIRMED)
-        gather_torque_noise(motion, m, m.friction, m.torque_noise[1], noisy)
+    if linearized:
+        gather_torque_noise(motion, m, m.torque_noise[1], m.counts[mem.EFFORTS] in (mem.NOISY, mem.CONFIRMED))
         if m.counts[mem.ITERATED] % sensors.kicks_every == 0:
-            diffuse_trajectory(motion, sensors, m)
+            diffuse_linearized(motion, sensors, m)
     if measured and m.counts[mem.HELD] == 0 and m.counts[mem.MEASURED] % (BATCH * sensors.block) == 0:
         for a in range(used):
             for b in range(a + 1):
@@ -192,39 +185,38 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: mem.Filte
 
 
 @inner
-def update_trajectory(m: mem.FilterState, f: Array, e: float, r: float, variance: float) -> None:
-    """Update the trajectory with the innovation e of a measurement (Potter): its state, its derivative by xi, its root.
+def update_linearized(m: mem.FilterState, f: Array, e: float, r: float) -> float:
+    """Update the linearized filter with a measurement (Potter); return the squared innovation, scaled to variance r.
 
-    f: (USED + 2 n,) derivative of the measurement by xi, then m.Sr' h, h that by the state; r: variance of the
-    measurement; variance: of the innovation. The parameters p are those of xi and stay.
+    Its state is the departure from the trajectory of the iteration. f: (2 USED + 1,) m.Sr' h, h the derivative of the
+    measurement by the state; e: departure of the measurement from the trajectory; r: its variance.
     """
-    used, states = m.counts[mem.USED], f.size - m.counts[mem.USED]
-    own = f[used:]
+    used = m.counts[mem.USED]
+    own = f[used:2 * used]
+    e -= f[2 * used]
+    variance = dot(own, own) + r
     gamma = 1.0 / (1.0 + np.sqrt(r / variance))
-    for i in range(states):
-        row = m.Sr[i]
-        gain = dot(own, row[used:f.size]) / variance
-        m.xr[i] += gain * e
-        for c in range(used):
-            row[c] -= gain * f[c]
+    for i in range(m.x.size):
+        gain = dot(own, m.Sr[i, used:2 * used]) / variance
+        m.Sr[i, 2 * used] += gain * e
         gain *= gamma
-        for c in range(states):
-            row[used + c] -= gain * own[c]
+        for c in range(used):
+            m.Sr[i, used + c] -= gain * own[c]
     m.score[mem.LOG_DETERMINANT] += np.log(variance / r)
+    return float(e * e / variance * r)
 
 
 @inner
-def diffuse_trajectory(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) -> None:
-    """Add the process noise of the torques over the last samples to the covariance of the trajectory given xi."""
-    used, states, root = m.counts[mem.USED], 2 * sensors.H.shape[1], sensors.L
-    root[:] = 0.0
-    for i in range(states):
-        for c in range(states):
-            root[i, c] = m.Sr[i, used + c]
+def diffuse_linearized(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) -> None:
+    """Add the process noise of the torques over the last samples to the linearized filter."""
+    nx, used, root = m.x.size, m.counts[mem.USED], sensors.L
+    for i in range(nx):
+        for c in range(nx):
+            root[i, c] = m.Sr[i, used + c] if c < used else 0.0
     add_torque_noise(motion, sensors, m.torque_noise[1])
     absorb_noise(root, sensors.kicks, sensors.W_kicks)
-    for i in range(states):
-        for c in range(states):
+    for i in range(nx):
+        for c in range(used):
             m.Sr[i, used + c] = root[i, c]
 
 
@@ -351,18 +343,18 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState,
         if m.counts[mem.ITERATING] == 0:
             before = m.counts[mem.BEFORE]
             if last:
-                # until the step is within one standard deviation (Newton decrement): the filter goes on from here. With
-                # noise of the torques no step is: the gradient lacks how the gains of the Kalman filter depend on xi.
+                # until the step is within one standard deviation (Newton decrement): the filter goes on from here. A
+                # trajectory without noise of the torques misses samples that have it, so that its step may never be;
+                # the linearized filter goes on from it once the payload is at rest.
                 short = dot(m.g, m.gradient) < 1.0 and m.score[mem.LAMBDA] <= noise_damping(m)
-                enough = m.counts[mem.FILTERED] == 1 and at_rest(m)
+                enough = m.counts[mem.LINEARIZED] == 1 and at_rest(m)
                 due = before < m.counts[mem.STORED] or m.counts[mem.EFFORTS] == mem.COMPARED or not (short or enough)
             else:
                 more = max(before // GROWTH, 1) if m.score[mem.SHIFT] < AT_REST else 1
                 due = m.counts[mem.AGAIN] == 1 or m.counts[mem.STORED] >= before + more
             if not due:
                 break
-            sought = m.counts[mem.AGAIN] == 0 or not m.effort_noise.any()  # one cost is compared with another
-            if sought and m.counts[mem.EFFORTS] == mem.NOISY and m.counts[mem.STORED] >= TELLS:
+            if m.counts[mem.EFFORTS] == mem.NOISY and m.counts[mem.STORED] >= TELLS:
                 find_effort_noise(sensors, m, table)
             begin_iteration(motion, m)
         until = m.counts[mem.BEFORE]
@@ -509,7 +501,7 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, ta
         m.counts[mem.IN_A_ROW] = 0
         m.innovation[:, 0] = 0.0
     m.counts[mem.SINCE_NOISE] += 1
-    gather_torque_noise(motion, m, motion.coulomb, m.torque_noise[0], m.counts[mem.EFFORTS] != mem.EXACT)
+    gather_torque_noise(motion, m, m.torque_noise[0], m.counts[mem.EFFORTS] != mem.EXACT)
     # before that an empty arm's friction may be anything
     told = m.counts[mem.HELD] == 1 or m.counts[mem.STORED] >= TELLS
     if told and m.counts[mem.SINCE_NOISE] % sensors.kicks_every == 0 and has_torque_noise(motion, m):

@@ -248,7 +248,7 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         modelled=np.zeros(links, dtype=np.bool_), opened=np.array([size, *range(size)]),
         bounds=allocate_bounds(size, nx), p=np.zeros(size), a=np.zeros(n), k=np.zeros((20, n)), dq=np.zeros((n, n)),
         dqd=np.zeros((n, n)), dp=np.zeros((n, 4)), G=np.zeros((n, 2 * size)), F=np.zeros((n, 2 * n)),
-        X=np.zeros((2 * n, 2 * n)), Y=np.zeros((n, n)), scratch=spread_scratch(n, size, 2 * nx))
+        X=np.zeros((2 * n, 2 * n)), Y=np.zeros((n, n)), scratch=spread_scratch(n, size, 2 * nx + 1))
     return made._replace(prior=priors(config, made, M), given=_given(config.arm, made))
 
 
@@ -282,7 +282,7 @@ def sensors(config: IdentifierParameters, model: Model, dt: float, angles: Array
                             kicks_every=max(1, block // 4),
                             noise_every=max(1, round(0.01 * config.payload.memory_time / dt)),
                             diffusion=diffusion(config, model), noise=np.zeros((nx, nx)), kicks=np.zeros((nx, links)),
-                            f=np.zeros(nx), wide=np.zeros(2 * nx), L=np.zeros((nx, nx)), W=np.zeros((nx, 2 * nx)),
+                            f=np.zeros(nx), wide=np.zeros(2 * nx + 1), L=np.zeros((nx, nx)), W=np.zeros((nx, 2 * nx)),
                             W_kicks=np.zeros((nx, nx + links)))
 
 

@@ -1,4 +1,4 @@
-"""Process noise of the torques, by Coulomb friction and noisy efforts, and the Kalman filter of a fit with it."""
+"""Process noise of the torques, by Coulomb friction and noisy efforts, and the filter that carries it along a fit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from flexmanip_ros.arm.equations_of_motion import STICTION_RATE
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured
-from flexmanip_ros.payload.gauss_newton import TRUSTED
 from flexmanip_ros.payload.measurement_update import observe
 from flexmanip_ros.payload.moving_horizon import MODELLED_SHARE, WAVES, choose_rates
 from flexmanip_ros.payload.process_model import Kind, predict
@@ -31,37 +30,27 @@ def noisily_reported(rows: Rows, seed: int = 1) -> Rows:
     return altered(rows, u=rows.u + np.random.default_rng(seed).normal(0.0, EFFORT_STD, rows.u.shape))
 
 
-def handed_over(config: IdentifierParameters, samples: Rows
-                ) -> tuple[structured.StructuredState, structured.StructuredState]:
-    """Return the states before and after a sample at which the filter goes on from a fit with noise of the torques.
-
-    Its step is a whole one, which no bound of a parameter shortens.
-    """
-    state = structured.init(config)
+def handed_over(samples: Rows) -> tuple[structured.StructuredState, structured.StructuredState]:
+    """Return the states before and after a sample at which the filter goes on from a fit with noise of the torques."""
+    state = structured.init(CONFIG)
     for k in range(len(samples)):
-        before, state = state, structured.advance(config, state, samples.between(k, k + 1))
+        before, state = state, structured.advance(CONFIG, state, samples.between(k, k + 1))
         if before.memory is None or state.memory is None or state.memory.counts[mem.STORED] < 150:
             continue
         m, newest = state.memory, int(before.memory.counts[mem.STORED]) + 1
-        if m.counts[mem.FILTERED] and not m.counts[mem.ITERATING] and m.counts[mem.BEFORE] == newest:
-            information = np.tril(m.normal) + np.tril(m.normal, -1).T
-            if np.allclose((np.eye(m.x.size) + information) @ m.g, m.gradient, atol=1e-6):
-                return before, state
+        if m.counts[mem.LINEARIZED] and not m.counts[mem.ITERATING] and m.counts[mem.BEFORE] == newest:
+            return before, state
     raise AssertionError('no fit reached the newest sample')
 
 
 def kalman(before: structured.StructuredState, state: structured.StructuredState, samples: Rows
-           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what textbook Kalman filters say, linearized about the trajectory of the last iteration.
-
-    The mean of one whose prior is its xi with no covariance, which is that trajectory; then mean and covariance of one
-    with the prior of the event.
-    """
+           ) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and covariance of a textbook Kalman filter, linearized about the trajectory of the last iteration."""
     m, sensors, motion = state.memory, state.sensors, state.model.motion
     table, _ = structured.input_table(before, samples.between(before.cursor, state.cursor))
     n, nx, links = sensors.H.shape[1], m.x.size, motion.effort.size
     known = ~m.S0.any(axis=1)
-    x, given, P = m.x0 + m.S0 @ m.accepted, np.zeros((nx, nx)), m.S0 @ m.S0.T
+    x, P = m.x0 + m.S0 @ m.accepted, m.S0 @ m.S0.T
     d = m.x0 - x
     variance, f = np.zeros(links), np.zeros(nx)
     r = noise_of_rows(state, table[sensors.reach - 1:, 1:1 + links])
@@ -70,46 +59,38 @@ def kalman(before: structured.StructuredState, state: structured.StructuredState
         F = np.diag(np.where(known, 0.0, 1.0))
         rows = table[row + 1 - sensors.reach:row + 1]
         assert predict(motion, x, F, nx, rows, sensors.period, table[row, 0])
-        d, given, P = F @ d, F @ given @ F.T, F @ P @ F.T
+        d, P = F @ d, F @ P @ F.T
         for i in range(len(m.noise)):
             e = table[row, 1 + 3 * links + i] - observe(sensors, i, n, x, np.eye(nx), f, motion.k[0])
-            gain, v = given @ f / (f @ given @ f + r[k, i]), f @ P @ f + r[k, i]
-            d, P = d + P @ f * (e - f @ d) / v - gain * e, P - np.outer(P @ f, f @ P) / v
-            x, given = x + gain * e, given - np.outer(gain, f @ given)
-        variance += (m.friction * MODELLED_SHARE / np.cosh(motion.work.net[1] / (WAVES * STICTION_RATE))) ** 2
+            v = f @ P @ f + r[k, i]
+            d, P = d + P @ f * (e - f @ d) / v, P - np.outer(P @ f, f @ P) / v
+        variance += (motion.coulomb * MODELLED_SHARE / np.cosh(motion.work.net[1] / (WAVES * STICTION_RATE))) ** 2
         variance += m.effort_noise
         if (k + 1) % sensors.kicks_every == 0:
             L = np.tril(motion.work.M)
             np.fill_diagonal(L, 1.0 / np.diag(L))
             kicks = np.linalg.solve(L @ L.T, motion.work.B) * sensors.period
-            for covariance in (given, P):
-                covariance[n:2 * n, n:2 * n] += kicks @ np.diag(variance) @ kicks.T
+            P[n:2 * n, n:2 * n] += kicks @ np.diag(variance) @ kicks.T
             variance[:] = 0.0
-    return x, x + d, P
-
-
-# few parameters with a bound that the samples do not exclude
-LITTLE = replace(CONFIG, payload=replace(CONFIG.payload, learn=('stiffness', 'damping', 'coulomb_friction')))
+    return x + d, P
 
 
 @pytest.mark.parametrize('samples', [record(2.5, arm=RUBBING), noisily_reported(record(1.0, arm=ARM))],
                          ids=['friction', 'noisy efforts'])
-def test_a_step_of_the_fit_leads_to_what_a_kalman_filter_with_the_prior_of_the_event_says(samples: Rows) -> None:
-    before, state = handed_over(LITTLE, samples)
+def test_the_filter_goes_on_from_a_kalman_filter_linearized_about_the_trajectory_of_the_fit(samples: Rows) -> None:
+    before, state = handed_over(samples)
     m = state.memory
-    trajectory, mean, covariance = kalman(before, state, samples)
-    part = min(1.0, TRUSTED / np.sqrt(m.g @ m.gradient))  # the filter takes no more of a step than it can tell
-    mean = trajectory + part * (mean - trajectory)
+    mean, covariance = kalman(before, state, samples)
     std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     found = m.S @ m.S.T
     np.testing.assert_allclose((m.x - mean) / std, 0.0, atol=1e-5)
     np.testing.assert_allclose(found / np.outer(std, std), covariance / np.outer(std, std), atol=1e-5)
 
 
-def test_steps_of_the_torque_are_no_noise_so_an_arm_without_friction_has_no_filter_in_its_fits() -> None:
+def test_steps_of_the_torque_are_no_noise_so_an_arm_without_friction_carries_no_linearized_filter() -> None:
     state = structured.advance(CONFIG, structured.init(CONFIG), record(1.0, arm=ARM))
     assert not state.memory.effort_noise.any()
-    assert state.memory.counts[mem.FILTERED] == 0
+    assert state.memory.counts[mem.LINEARIZED] == 0
 
 
 def test_the_noise_of_the_reported_efforts_is_found_and_stays_noise_when_it_does_not_act_on_the_arm() -> None:
