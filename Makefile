@@ -76,9 +76,9 @@ demo: setup
 	@$(BIN)/demo $(DEMO_ARGS)
 
 # Four parts side by side, which take about as long as each other, so no core is idle in the end: nodes, which often
-# wait, with controller, files and golden results; programs and tools; the payload; and what else computes. Nodes go
-# first, as their tests measure time.
-NODES := test/ros test/control test/golden test/io
+# wait, with controller, files, plant and golden results; programs and tools; the payload; and what else computes. Nodes
+# go first, as their tests measure time.
+NODES := test/ros test/control test/golden test/io test/plant
 PROGRAMS := test/cli test/view test/studies test/paper test/packaging
 PAYLOAD := test/payload
 test: setup $(VENV)/.development
