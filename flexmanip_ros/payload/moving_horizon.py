@@ -345,7 +345,8 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState,
             if last:
                 # until the step is within one standard deviation (Newton decrement): the filter goes on from here. A
                 # trajectory without noise of the torques misses samples that have it, so that its step may never be;
-                # the linearized filter goes on from it once the payload is at rest.
+                # the linearized filter goes on from it once the payload is at rest. The iteration that takes a white
+                # part of the efforts for true (COMPARED) is always due.
                 short = dot(m.g, m.gradient) < 1.0 and m.score[mem.LAMBDA] <= noise_damping(m)
                 enough = m.counts[mem.LINEARIZED] == 1 and at_rest(m)
                 due = before < m.counts[mem.STORED] or m.counts[mem.EFFORTS] == mem.COMPARED or not (short or enough)
