@@ -79,13 +79,16 @@ def _parser() -> console.Parser:
 
 
 def _main(given: argparse.Namespace) -> int:
+    from flexmanip_ros.io.bag import Topics, check
+
+    config = load(IdentifierParameters, NODE, given.params, given.set) if given.suggest is None else None
+    check(given.bag)  # what follows takes a second to import
     from flexmanip_ros.cli.replay import Request, check_places, identify, places
-    from flexmanip_ros.io.bag import Topics
     from flexmanip_ros.io.outputs import check_apart
 
     check_apart({'--suggest': given.suggest, **places(given)}, given.params, given.bag)
     topics = Topics(given.joint_states, tuple(given.capture_event or Topics().events), given.capture_event is not None)
-    if given.suggest is not None:
+    if config is None:
         from flexmanip_ros.cli.suggest import given_values, suggest
 
         check_places(given)  # the search takes a minute; ``identify`` checks them too late
@@ -93,8 +96,6 @@ def _main(given: argparse.Namespace) -> int:
                                 given.validate_from, given.horizon,
                                 [at for at in (given.capture_time, given.release_time) if at is not None])
         print('\n'.join(lines), flush=True)
-    else:
-        config = load(IdentifierParameters, NODE, given.params, given.set)
     request = Request(
         given.bag, config, topics, capture_time=given.capture_time, release_time=given.release_time,
         detect=given.detect, validate_from=given.validate_from, horizon=given.horizon, smooth=given.smooth,

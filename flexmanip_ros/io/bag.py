@@ -202,6 +202,11 @@ def read_blocks(path: str | Path, topics: Topics | None = None, progress: Progre
     recording.check()
 
 
+def check(path: str | Path) -> None:
+    """Raise BagError for a path that cannot be a bag. Nothing is read."""
+    _Recording(Path(path), Topics())
+
+
 def event_topics(path: str | Path, topics: Topics | None = None) -> tuple[str, ...]:
     """Return the event topics of a bag, with or without messages on them.
 

@@ -12,10 +12,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from numba import njit, typeof, types
+from numba._dynfunc import make_function
 from numba.core import cgutils
-from numba.core.codegen import ll
+from numba.core.codegen import JITCodeLibrary, ll
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler_machinery import register_pass
+from numba.core.typed_passes import NativeLowering
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import lower_builtin, register_jitable
+from numba.extending import lower_builtin
 
 Function = TypeVar('Function', bound=Callable[..., Any])
 Types = tuple[Any, ...]
@@ -43,22 +47,12 @@ def inlined(function: Function) -> Function:
 
 
 def inner(function: Function) -> Function:
-    """Compile a function into the kernels that call it, and nowhere else; Python runs it as it is written.
-
-    There is no code that unpacks arguments from Python, which takes longer to compile than a short function itself.
-    """
-    made: Function = register_jitable(forceinline=True, **_OPTIONS)(function)
-    return made
-
-
-def merged(function: Function) -> Function:
-    """Put the text of a function into the one kernel that calls it, before anything is compiled.
-
-    The compiler optimizes all that a function calls once more with each of its callers, so the callers of the equations
-    of motion are merged into one function. Each merge copies the whole text, so a function that calls no kernel is
-    ``inner`` instead.
-    """
-    return _compiled(function, inline='always')
+    """Compile a function into the kernels that call it, and nowhere else; Python runs it as it is written."""
+    options = _OPTIONS | {'pipeline_class': _Inner, 'forceinline': True, 'no_cpython_wrapper': True}
+    compiled: Any = njit(**options)(function)
+    infer_global(function, types.Dispatcher(compiled))
+    vars(function)['compiled'] = compiled  # numba's type refers to it, but does not keep it
+    return function
 
 
 def library(function: Function) -> Function:
@@ -86,6 +80,48 @@ def _compiled(function: Function, **more: Any) -> Function:
     return compiled
 
 
+class _Text(JITCodeLibrary):
+    """LLVM's text of an ``inner`` function. The kernels that it is linked into are optimized, and made machine code."""
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _LowerToText(NativeLowering):
+    """numba's last pass, which makes machine code of every function, for one that needs none."""
+
+    _name = 'lower_to_text'
+
+    def run_pass(self, state: Any) -> bool:
+        """Write LLVM's text. Its callers know the function by an object of Python; there is nothing to run."""
+        flags, context = state.flags, state.targetctx
+        state.library = _Text(context.codegen(), state.func_id.func_qualname)
+        state.flags = flags.copy()  # numba has them in the keys of a dictionary
+        state.flags.no_compile = True
+        super().run_pass(state)
+        state.flags, made = flags, state.cr
+        known = make_function(made.fndesc.lookup_module(), made.fndesc.qualname, '', 0, made.env, (state.library,))
+        context.insert_user_function(known, made.fndesc, [state.library])
+        state.cr = made._replace(cfunc=known)
+        return True
+
+
+class _Inner(CompilerBase):
+    """How numba compiles an ``inner`` function."""
+
+    def define_pipelines(self) -> list[Any]:
+        """Return numba's passes, the last of which is our own."""
+        passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        passes.passes = [(_LowerToText if one is NativeLowering else one, name) for one, name in passes.passes]
+        passes.finalize()
+        return [passes]
+
+
 class Separate:
     """A kernel that is compiled once: the kernels that call it call its machine code.
 
@@ -94,8 +130,9 @@ class Separate:
     before its callers are linked. Compiling a caller compiles it; loading a caller loads it (``_Needed``).
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.kernel: Any = _compiled(function)
+    def __init__(self, function: Callable[..., Any], *, from_python: bool) -> None:
+        self.kernel: Any = _compiled(function, no_cpython_wrapper=not from_python)
+        self._run = self.kernel if from_python else function
         self.__name__, self.__doc__, self.__module__ = function.__name__, function.__doc__, function.__module__
         calls = type(f'calls_of_{self.__name__}', (AbstractTemplate,),
                      {'key': self, 'generic': lambda _, arguments, named: self._typed(arguments)})
@@ -104,7 +141,7 @@ class Separate:
 
     def __call__(self, *arguments: Any) -> Any:
         """Run it, called from Python."""
-        return self.kernel(*arguments)
+        return self._run(*arguments)
 
     def compile(self, arguments: Types) -> Any:
         """Compile it for arguments of these types, and define its symbol; return the type of its result."""
@@ -147,17 +184,24 @@ def _load(module: str, name: str, arguments: Types) -> _Needed:
 
 
 def separate(function: Function) -> Function:
-    """Compile a kernel once, for all kernels that call it.
+    """Compile a kernel once, for all kernels that call it; Python runs it as it is written.
 
     For kernels that take seconds to compile and microseconds to run. They must raise nothing, as their callers do not
     look for it.
     """
-    made: Any = Separate(function)
+    made: Any = Separate(function, from_python=False)
     called: Function = made
     return called
 
 
-COMPILED = re.compile(r'^@(kernel|separate|inlined|inner|merged|library)$', re.MULTILINE)
+def separate_kernel(function: Function) -> Function:
+    """Compile a separate kernel that Python calls as well."""
+    made: Any = Separate(function, from_python=True)
+    called: Function = made
+    return called
+
+
+COMPILED = re.compile(r'^@(kernel|separate|separate_kernel|inlined|inner|library)$', re.MULTILINE)
 IMPORT = re.compile(r'^ *from ([\w.]+) import (\([^)]*\)|.*)$', re.MULTILINE)
 CONSTANT = re.compile(r'\b[A-Z][A-Z_]+\b')
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.numerics.compiled import inner, kernel, library
+from flexmanip_ros.numerics.compiled import inner, kernel, library, separate
 from flexmanip_ros.types import Array
 
 
@@ -71,7 +71,7 @@ def absorb_measurement(
             S[i, c] -= gain * f[c]
 
 
-@kernel
+@separate
 def absorb_noise(S: Array, noise: Array, W: Array) -> None:
     """Overwrite S with lower L, L L' = S S' + noise noise', by Householder reflections.
 
@@ -111,7 +111,7 @@ def absorb_noise(S: Array, noise: Array, W: Array) -> None:
             S[i, c] = W[i, c] if c < own else 0.0
 
 
-@kernel
+@separate
 def factor_information(N: Array) -> bool:
     """Overwrite the lower triangle of N with the Cholesky factor of I + N; False when it is not finite."""
     nx = N.shape[0]
@@ -131,7 +131,7 @@ def factor_information(N: Array) -> bool:
     return True
 
 
-@kernel
+@separate
 def forward(L: Array, b: Array) -> None:
     """Overwrite b with L^-1 b."""
     for r in range(b.size):
@@ -141,7 +141,7 @@ def forward(L: Array, b: Array) -> None:
         b[r] = value / L[r, r]
 
 
-@kernel
+@separate
 def backward(L: Array, b: Array) -> None:
     """Overwrite b with L'^-1 b."""
     for r in range(b.size - 1, -1, -1):

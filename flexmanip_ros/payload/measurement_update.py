@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flexmanip_ros.numerics.compiled import inlined, inner, separate
+from flexmanip_ros.numerics.compiled import inner, separate
 from flexmanip_ros.numerics.square_root import absorb_measurement, dot, project
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.types import Array
@@ -308,7 +308,7 @@ def most_white(sensor: Array, count: int) -> float:
     return most
 
 
-@inlined
+@inner
 def misfit(noise: Array, rate: NDArray[np.bool_], most: int) -> float:
     """Innovation power over white noise, sensors weighted by their information on the payload; nan: there is none yet.
 

@@ -14,7 +14,7 @@ the samples, its state replaces that of the filter.
 import numpy as np
 
 from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, solve
-from flexmanip_ros.numerics.compiled import inner, merged, separate
+from flexmanip_ros.numerics.compiled import inner, separate, separate_kernel
 from flexmanip_ros.numerics.square_root import absorb_noise, dot, least_distance
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.gauss_newton import (
@@ -131,7 +131,7 @@ def gather_torque_noise(motion: ProcessModel, m: mem.FilterState, variance: Arra
         variance[i] += friction * friction + (m.effort_noise[i] if noisy else 0.0)
 
 
-@merged
+@inner
 def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, table: Array) -> int:
     """Take one sample since the event into the iteration: N += f f' / r, g += f e / r.
 
@@ -316,7 +316,7 @@ def rests(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) -
     return True
 
 
-@merged
+@inner
 def iterate(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, table: Array) -> bool:
     """Let the Gauss-Newton iteration take a few samples (``ROWS``); when the horizon closes, until it converges."""
     stored = m.counts[mem.STORED]
@@ -411,7 +411,7 @@ def fails(m: mem.FilterState) -> bool:
     return failed
 
 
-@separate
+@inner
 def excess_bias(motion: ProcessModel, m: mem.FilterState) -> float:
     """Return the mass that an empty arm seems to hold, in deviations by its moves and the error of its inertia."""
     mass = m.x.size - motion.kind.size
@@ -442,7 +442,7 @@ def strays(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) 
     return bool(left)
 
 
-@separate
+@separate_kernel
 def keep_possible(motion: ProcessModel, m: mem.FilterState, chance: float) -> None:
     """Move the state to the most likely one within the bounds of p (constrained filter of Simon and Chia, 2002).
 
@@ -479,7 +479,7 @@ def diffuse(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState,
     m.score[mem.NOW] = 0.0
 
 
-@merged
+@inner
 def take(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, table: Array, k: int) -> bool:
     """Take the sample in row k of the table; False when numbers left the finite range.
 

@@ -15,7 +15,7 @@ from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, balance, inerti
 from flexmanip_ros.arm.jacobian import add_body_forces, complete_jacobian, force_jacobian, solve_columns
 from flexmanip_ros.arm.late_torque import late_torque
 from flexmanip_ros.arm.manipulator import Manipulator, Workspace
-from flexmanip_ros.numerics.compiled import inner, kernel, separate
+from flexmanip_ros.numerics.compiled import inner, separate, separate_kernel
 from flexmanip_ros.numerics.square_root import Bounds, dot, multiply, ordered_dot
 from flexmanip_ros.types import Array
 
@@ -522,7 +522,7 @@ def note_opened(motion: ProcessModel, S: Array, used: int) -> None:
     motion.opened[0] = count
 
 
-@separate
+@separate_kernel
 def predict(
     motion: ProcessModel, x: Array, S: Array, used: int, rows: Array, period: float, duration: float,
 ) -> int:
@@ -720,7 +720,7 @@ def series(motion: ProcessModel, h: float, count: int, part: tuple[float, float]
         weight *= j + 1
 
 
-@kernel
+@separate
 def spread(
     flow: Array, G: Array, opened: NDArray[np.int64], S: Array, used: int, scratch: Array, h: float, count: int,
 ) -> None:

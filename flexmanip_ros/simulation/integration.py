@@ -7,7 +7,7 @@ from scipy.integrate import DOP853
 
 from flexmanip_ros.arm.equations_of_motion import acceleration, hold
 from flexmanip_ros.arm.manipulator import Manipulator, Workspace
-from flexmanip_ros.numerics.compiled import kernel, merged
+from flexmanip_ros.numerics.compiled import inner, kernel
 from flexmanip_ros.types import Array
 
 LIMIT = 1e6
@@ -36,7 +36,7 @@ ROUGH = Method(np.diag([0.5, 0.5, 1.0], -1), np.array([1.0, 2.0, 2.0, 1.0]) / 6.
 """Method of fourth order, for Coulomb friction: a higher order is no more accurate where the friction changes sign."""
 
 
-@merged
+@inner
 def runge_kutta(
     arm: Manipulator, payload: Array, held: Array, x: Array, effort: Array, h: float, steps: int,
     stages: Array, weights: Array, scratch: Array, work: Workspace,

@@ -54,15 +54,19 @@ def test_every_file_with_a_compiled_function_is_watched() -> None:
 
 
 SEPARATE = """
-from flexmanip_ros.numerics.compiled import kernel, separate
+from flexmanip_ros.numerics.compiled import inner, kernel, separate
+
+@inner
+def power(count):
+    return 2.0 ** count
 
 @separate
 def halve(x, count):
-    return x / 2.0 ** count
+    return x / power(count)
 
 @kernel
 def twice(x):
-    return halve(x, 1) + halve(x, 2)
+    return halve(x, 1) + halve(x, 2) * power(0)
 """
 
 
@@ -70,7 +74,8 @@ def test_a_kernel_from_the_cache_brings_the_separate_kernels_that_it_calls(tmp_p
     (tmp_path / 'halves.py').write_text(SEPARATE)
     environment = os.environ | {'PYTHONPATH': os.pathsep.join((str(tmp_path), *sys.path)),
                                 'NUMBA_CACHE_DIR': str(tmp_path)}
-    call = 'import halves; print(halves.twice(8.0), halves.halve(8.0, 1), sum(halves.twice.stats.cache_hits.values()))'
+    call = ('import halves; '
+            'print(halves.twice(8.0), halves.halve(8.0, halves.power(0)), sum(halves.twice.stats.cache_hits.values()))')
     said = [subprocess.run([sys.executable, '-c', call], env=environment, capture_output=True, text=True, check=True,
                            timeout=100).stdout.split() for _ in range(2)]
     assert said == [['6.0', '4.0', '0'], ['6.0', '4.0', '1']]
