@@ -19,7 +19,7 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
 from numba.core.typed_passes import NativeLowering
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import lower_builtin
+from numba.extending import lower_builtin, register_jitable
 
 Function = TypeVar('Function', bound=Callable[..., Any])
 Types = tuple[Any, ...]
@@ -48,11 +48,8 @@ def inlined(function: Function) -> Function:
 
 def inner(function: Function) -> Function:
     """Compile a function into the kernels that call it, and nowhere else; Python runs it as it is written."""
-    options = _OPTIONS | {'pipeline_class': _Inner, 'forceinline': True, 'no_cpython_wrapper': True}
-    compiled: Any = njit(**options)(function)
-    infer_global(function, types.Dispatcher(compiled))
-    vars(function)['compiled'] = compiled  # numba's type refers to it, but does not keep it
-    return function
+    made: Function = register_jitable(pipeline_class=_Inner, forceinline=True, **_OPTIONS)(function)
+    return made
 
 
 def library(function: Function) -> Function:
