@@ -21,7 +21,7 @@ NODES = (
     'plant_simulator', 'excitation', 'capture_trigger', 'rpbsid_identifier', 'payload_controller', 'payload_adapter',
 )
 # What the offline programs import; rosdep's names for the same are in package.xml.
-LIBRARIES = ('numpy', 'scipy', 'numba>=0.68', 'matplotlib', 'PyYAML', 'rich', 'rosbags', 'lz4',
+LIBRARIES = ('numpy', 'scipy', 'numba>=0.59', 'matplotlib', 'PyYAML', 'rich', 'rosbags', 'lz4',
              'backports.zstd; python_version < "3.14"',
              'scikit-fem')  # reproduce_paper alone; it has no rosdep key
 # rclpy and the messages as wheels (Linux x86-64); nobody needs them who has sourced a ROS installation.
