@@ -76,12 +76,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _play(options: argparse.Namespace) -> int:
+    from flexmanip_ros.io.bag import Topics, check
+
+    config = load(IdentifierParameters, 'rpbsid_identifier', options.params, options.set)
+    check(options.bag)  # what follows takes a second to import
     from flexmanip_ros.cli.replay import Request
-    from flexmanip_ros.io.bag import Topics
     from flexmanip_ros.view.screen import Screen, of_identifier, page
     from flexmanip_ros.view.server import Server
 
-    config = load(IdentifierParameters, 'rpbsid_identifier', options.params, options.set)
     screen = Screen(of_identifier(config, Path(options.bag).name))
     with console.progress('identifying', 'messages') as progress, console.announced():
         fault = read(Request(options.bag, config, Topics(options.joint_states)), screen, progress)
