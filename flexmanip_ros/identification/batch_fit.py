@@ -41,8 +41,8 @@ PIECES = 16
 """Number of pieces of a stretch whose gradients are compared, see ``_widening``; also the effective sample size where
 residuals are correlated, see ``_with_constant``."""
 LARGE_MEAN = 0.5
-"""Mean of an output, in its standard deviations, above which subspace models of signals that are not centred are poor
-starting points: with 1 the poles of a random system of order 3 were real instead of complex."""
+"""Mean of a signal, in its standard deviations, above which subspace models of signals that are not centred are poor
+starting points: with 1 of an output the poles of a random system of order 3 were real instead of complex."""
 
 
 class Recursion(NamedTuple):
@@ -268,18 +268,17 @@ def _with_constant(samples: Array, best: Attempt | None, likeliest: Callable[[],
     """Free a constant where the likelihood gains more than its price.
 
     best: fit without one, if any; likeliest: makes the best fit with one. It is called where that may be far from
-    ``best``: where a constant pays from there, and where an output has a large mean (``LARGE_MEAN``). Modes above the
+    ``best``: where a constant pays from there, and where a signal has a large mean (``LARGE_MEAN``). Modes above the
     order and an arm that turns leave correlated residuals. So the stretch counts as ``PIECES`` independent samples:
     this effective sample size takes the place of N in Schwarz's criterion.
     """
     if best is None:
         return likeliest()
-    n, r = len(best.fit.theta.A), best.fit.theta.D.shape[1]
+    n = len(best.fit.theta.A)
     begin = best.fit.theta._replace(B=np.hstack([best.fit.theta.B, np.zeros((n, 1))]))
     other, price = descend(*scaled(samples, best.scale, begin), begin, best.structure, ITERATIONS), _price(n, PIECES)
     found = [] if other is None else [best._replace(fit=other, cost=best.cost - best.fit.cost + other.cost)]
-    Y = samples[:, r:]
-    far = np.abs(np.nanmean(Y, axis=0)) > LARGE_MEAN * np.nanstd(Y, axis=0)
+    far = np.abs(np.nanmean(samples, axis=0)) > LARGE_MEAN * np.nanstd(samples, axis=0)
     if far.any() or (found and found[0].cost + price < best.cost):
         again = likeliest()
         found += [] if again is None else [again]

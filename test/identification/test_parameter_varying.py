@@ -281,7 +281,7 @@ def test_no_fit_begins_while_the_links_swing_by_more_than_a_fifth_of_a_radian(ru
     assert refined is not None
     rows = run.state.log.rows(run.state.log.end - 1024, run.state.log.end)
     bends, turns = rows.y - rows.y.mean(axis=0), rows.angles - rows.angles.mean(axis=0)
-    share = np.linalg.lstsq(bends, turns)[0]
+    share = np.linalg.lstsq(bends, turns, rcond=None)[0]
 
     def begun(factor: float) -> Varying | None:
         """Begin a fit with so many times the bends, and the angles by which the links swing with them."""
