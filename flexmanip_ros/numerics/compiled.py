@@ -78,7 +78,11 @@ def _compiled(function: Function, **more: Any) -> Function:
 
 
 class _Text(JITCodeLibrary):
-    """LLVM's text of an ``inner`` function. The kernels that it is linked into are optimized, and made machine code."""
+    """LLVM's text of an ``inner`` function.
+
+    numba optimizes each function with all that it calls and makes machine code of it, although its callers take the
+    text. Both are left out here: they are done once, with the kernels that the text is linked into.
+    """
 
     def _optimize_final_module(self) -> None:
         pass
@@ -90,12 +94,12 @@ class _Text(JITCodeLibrary):
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _LowerToText(NativeLowering):
-    """numba's last pass, which makes machine code of every function, for one that needs none."""
+    """The pass in which numba makes machine code of a function, without that."""
 
     _name = 'lower_to_text'
 
     def run_pass(self, state: Any) -> bool:
-        """Write LLVM's text. Its callers know the function by an object of Python; there is nothing to run."""
+        """Write LLVM's text. Callers find it by an object that stands for the compiled function and must not be run."""
         flags, context = state.flags, state.targetctx
         state.library = _Text(context.codegen(), state.func_id.func_qualname)
         state.flags = flags.copy()  # numba has them in the keys of a dictionary
@@ -112,7 +116,7 @@ class _Inner(CompilerBase):
     """How numba compiles an ``inner`` function."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return numba's passes, the last of which is our own."""
+        """Return numba's passes, one of which is our own."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
         passes.passes = [(_LowerToText if one is NativeLowering else one, name) for one, name in passes.passes]
         passes.finalize()
