@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -160,6 +161,20 @@ def test_imports_without(libraries: set[str], parts: str) -> None:
         cwd=ROOT, capture_output=True, text=True, check=False,
     )
     assert result.returncode == 0, result.stderr[-2000:]
+
+
+@pytest.mark.parametrize(('code', 'threads', 'warned'), [
+    ('import numpy, flexmanip_ros', {}, True),
+    ('import flexmanip_ros, numpy', {}, False),
+    ('import numpy, flexmanip_ros', {'OMP_NUM_THREADS': '2'}, False),
+], ids=['after numpy', 'before numpy', 'where the user has chosen'])
+def test_an_import_after_numpy_says_that_its_threads_cost_time(
+    code: str, threads: dict[str, str], warned: bool,
+) -> None:
+    own = {name: value for name, value in os.environ.items() if not name.endswith('_NUM_THREADS')}
+    result = subprocess.run([sys.executable, '-c', code], cwd=ROOT, env={**own, **threads}, capture_output=True,
+                            text=True, check=True)
+    assert ('Import flexmanip_ros first' in result.stderr) is warned, result.stderr
 
 
 @cache
