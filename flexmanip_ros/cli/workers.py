@@ -33,7 +33,6 @@ KEY = 'run'
 SETTLING_TIME = 1.0
 """Time after a capture in a recording from which on the error counts [s], as in the paper."""
 
-THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 AHEAD = 4
 """Number of runs submitted per worker, so that no worker waits for its next run."""
 ANSWER_TIME = 10.0
@@ -148,8 +147,6 @@ def processes(work: Work, tasks: Iterable[Task], count: int) -> Iterator[Outcome
     A worker that dies (killed, out of memory) costs at most the run it was doing: the runs under way are done again,
     each alone, so that it is known which one kills its worker.
     """
-    for name in THREADS:
-        os.environ.setdefault(name, '1')  # one run per core leaves no core for more threads
     waiting = iter(tasks)
     spawn = multiprocessing.get_context('spawn')
     turn = spawn.Lock()
