@@ -16,8 +16,9 @@ BIN := $(VENV)/bin
 DOCS := .venv-docs
 JAZZY := .venv-jazzy
 QUIETLY := -m pip --disable-pip-version-check --quiet --quiet
-# Python compiles a module when it is first imported. To compile all of them took half of the time of an installation.
-LOCKED := install --no-compile --require-hashes -r
+# Python compiles a module when it is first imported. To compile all of them took half of the time of an installation. A
+# lock names every dependency, so pip need not look for them in the packages (a sixth of its time).
+LOCKED := install --no-compile --no-deps --require-hashes -r
 PIP := $(BIN)/python $(QUIETLY)
 
 # A sourced ROS must not mix its libraries with the locked ones in the venv.

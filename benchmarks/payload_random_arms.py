@@ -3,8 +3,8 @@
 No case is chosen by hand: each run draws friction, rotors, gains, offsets, a dead time, a floating base, the object
 and its motion, form and size of the torques, the sample rate, the noise, the rates that are measured, the angles and
 the instant of the capture. The estimator is told the ideal arm and the constants of its base. The simulated arm has two
-sines a link more than the estimator. Runs 0 to 119 were looked at while the estimator was developed, later ones once
-(docs/lab/payload.md, "Arms that were never looked at").
+sines a link more than the estimator. Runs 0 to 119 and 1000 to 1059 were looked at while the estimator was developed,
+others once (docs/lab/payload.md, "Arms that were never looked at").
 
 Use: python benchmarks/payload_random_arms.py [--runs 300] [--first 0]
 """

@@ -10,7 +10,7 @@ from flexmanip_ros.types import Array
 HORIZON = 4096
 """Largest number of samples after an event that the moving-horizon estimation reads again."""
 ENOUGH = 512
-"""Samples after which it ends once it has converged."""
+"""Least number of samples after which it ends once it has converged."""
 TONES = 32
 """Frequencies at which the spectrum of each sensor is taken."""
 

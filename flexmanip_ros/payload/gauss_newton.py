@@ -40,7 +40,10 @@ AT_REST = 0.5
 CONVERGED = 0.02
 """Decrease of the cost for each sample below which a step counts as converged, and the horizon may grow."""
 FITS = 1.5
-"""Cost over that of the noise assumed up to which a step counts as converged, too: the next one reads more."""
+"""Cost over that of the noise assumed up to which a short step counts as converged, too: the next one reads more."""
+PERIODS = 3
+"""Least number of slowest periods in a horizon. With fewer, friction and delays are so unsure that a filter linearized
+once goes astray from them: at 2 kHz 512 samples are 1.8 periods, and one of 20 random arms was lost."""
 TRUSTED = 2.0
 """Standard deviations by which a step of the moving-horizon estimation moves the filter's state at most."""
 LEVENBERG = 1.0
@@ -173,6 +176,9 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: mem.Fil
     if not damped_step(motion, sensors, m):
         return False
     gained = dot(m.g, m.gradient)
+    # The step promises to lower the cost by this; noise alone by as much as there are unknowns (mean of chi-squared). A
+    # fit that lags behind reads more first.
+    fits &= gained < nx or m.counts[mem.ITERATED] < m.counts[mem.STORED]
     # the simplest model is given up by chance, so not before it has converged
     fits &= m.counts[mem.REFITS] > 0 or m.score[mem.EXCESS] < BY_CHANCE
     m.counts[mem.AGAIN] = 0 if fits or (free and (still or gained < enough)) else 1
@@ -210,7 +216,7 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: mem.Fil
         variance = dot(m.S[payload], m.S[payload])
         m.score[mem.SHIFT] = abs(shift) / np.sqrt(max(variance, 1e-300))
         m.score[mem.DOUBT] = np.sqrt(variance + shift * shift) / max(m.x[payload], 1e-300)
-        if (m.counts[mem.ITERATED] >= mem.ENOUGH and gained < 0.5 * nx and m.score[mem.SHIFT] < AT_REST
+        if (m.counts[mem.ITERATED] >= enough_samples(sensors) and gained < 0.5 * nx and m.score[mem.SHIFT] < AT_REST
                 and phase_std(motion, m, sensors.period * m.counts[mem.ITERATED]) < LINEAR):
             close_horizon(motion, sensors, m)
     return True
@@ -406,6 +412,12 @@ def noise_damping(m: mem.FilterState) -> float:
     """
     ratio = cost_ratio(m)
     return ratio - 1.0 if m.counts[mem.HELD] == 1 and ratio >= FITS else 0.0
+
+
+@inner
+def enough_samples(sensors: MeasurementModel) -> int:
+    """Return the number of samples after which a fit that has converged closes the horizon."""
+    return int(max(mem.ENOUGH, PERIODS * BATCH * sensors.block))
 
 
 @inner

@@ -26,6 +26,7 @@ from flexmanip_ros.payload.gauss_newton import (
     UNFIT,
     begin_iteration,
     close_horizon,
+    enough_samples,
     finish_iteration,
     has_torque_noise,
     noise_damping,
@@ -60,8 +61,11 @@ ROWS, ROWS_TIME = 8, 1e-3
 time, in proportion to their sample time, and a fit must not take longer with them."""
 CLOSING = 16_384
 """Rows that are read again at most when the horizon closes: a fit of an empty arm takes up to ten times all of them."""
-LATEST = 1024
-"""Samples after which the horizon closes although the fit has not come to rest: by then those have that ever will."""
+LATEST = 2
+"""Times ``enough_samples`` after which the horizon closes although the fit has not come to rest: by then those have
+that ever will."""
+LONGEST_SLIDE = 1024
+"""Largest number of samples by which the horizon of an arm at rest slides: it must hold some slides."""
 WORK = 4
 """Largest mean number of integration steps for each row that is read again, over that of an arm without friction: a
 joint that sticks takes three, wrong parameters may take hundreds."""
@@ -278,9 +282,10 @@ def fourth_difference(table: Array, k: int, column: int) -> float:
 
 
 @inner
-def at_rest(m: mem.FilterState) -> bool:
+def at_rest(sensors: MeasurementModel, m: mem.FilterState) -> bool:
     """Whether the last iteration over all samples so far hardly moved the payload."""
-    return bool(m.counts[mem.BEFORE] >= mem.ENOUGH and m.score[mem.SHIFT] < AT_REST and m.counts[mem.AGAIN] == 0)
+    return bool(m.counts[mem.BEFORE] >= enough_samples(sensors) and m.score[mem.SHIFT] < AT_REST
+                and m.counts[mem.AGAIN] == 0)
 
 
 @inner
@@ -293,7 +298,7 @@ def tells(motion: ProcessModel, m: mem.FilterState) -> bool:
 @inner
 def slide_length(sensors: MeasurementModel) -> int:
     """Return the number of samples by which the horizon of an arm at rest slides: most of the slowest period."""
-    return int(min(BATCH * sensors.block, LATEST))
+    return int(min(BATCH * sensors.block, LONGEST_SLIDE))
 
 
 @inner
@@ -327,8 +332,8 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState,
         return True
     if rests(motion, sensors, m):
         return True
-    converged, last = at_rest(m), stored + 1 == mem.HORIZON
-    if stored + 1 >= LATEST:
+    converged, last = at_rest(sensors, m), stored + 1 == mem.HORIZON
+    if stored + 1 >= LATEST * enough_samples(sensors):
         last |= not converged or phase_std(motion, m, sensors.period * m.counts[mem.STORED]) < LINEAR
     if last and converged:  # the filter goes on from there
         close_horizon(motion, sensors, m)
@@ -348,7 +353,7 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState,
                 # the linearized filter goes on from it once the payload is at rest. The iteration that takes a white
                 # part of the efforts for true (COMPARED) is always due.
                 short = dot(m.g, m.gradient) < 1.0 and m.score[mem.LAMBDA] <= noise_damping(m)
-                enough = m.counts[mem.LINEARIZED] == 1 and at_rest(m)
+                enough = m.counts[mem.LINEARIZED] == 1 and at_rest(sensors, m)
                 due = before < m.counts[mem.STORED] or m.counts[mem.EFFORTS] == mem.COMPARED or not (short or enough)
             else:
                 more = max(before // GROWTH, 1) if m.score[mem.SHIFT] < AT_REST else 1

@@ -346,8 +346,8 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     if state.white.size:
         m.noise[:, [mem.WHITE, mem.LEVEL]] = state.white
     structured_model.guess_noise(m, FIRST_LOOK)
-    # the simplest arm first; then all that may be learned, with late signals and without in turn, from another start
-    if state.refits > 1:
+    # the simplest arm first; then all that may be learned, with late signals and without in turn
+    if state.refits:
         structured_model.expect_rotors_and_friction(model, m)
     if state.refits % 2 == 0:
         structured_model.take_as_known(model, m, Kind.MODE if state.refits else Kind.DAMPING)

@@ -480,7 +480,7 @@ def first(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Arr
 
 
 def expect_rotors_and_friction(model: Model, m: mem.FilterState) -> None:
-    """Begin with rotors and friction that are a prior deviation above those given: another start of a fit that failed.
+    """Begin with rotors and friction that are a prior deviation above those given, once the simplest arm has failed.
 
     From a rotor of zero the effect of one is steep and soon saturates, so a fit may end in a minimum without it.
     """

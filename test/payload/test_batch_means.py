@@ -67,7 +67,7 @@ def factor_of(found: np.ndarray, state: structured.StructuredState) -> float:
 
 def test_the_factor_is_the_variance_by_batch_means_over_that_of_the_fit() -> None:
     """Computed from all samples at once. The arm has modes beyond those of the model."""
-    arm = replace(ARM, modes=5, torque_gain=(1.02, 1.02), bend_gain=(0.99, 0.99))
+    arm = replace(ARM, modes=5, damping_ratio=0.001)
     before, state = closing(samples := record(3.2, arm=arm))
     m = state.memory
     factor = factor_of(scores(before, state, samples), state)
