@@ -2,12 +2,13 @@
 # lock.sh: write the *.txt locks (every version and hash, for Python 3.11 to 3.13) from the *.in lists.
 set -eu
 cd "$(dirname "$0")/.."
-# Extras stay: pip takes the newest coverage[toml] where coverage alone is locked, and fails without its hash.
+# colcon asks for what measures the coverage of tests. Nothing here does, and numba imports it in every process (0.07 s).
 compile() {
     oldest=$1
     shift
     UV_PYTHON_DOWNLOADS=never uv pip compile --quiet --universal --python-version "$oldest" --fork-strategy fewest \
         --generate-hashes --no-strip-extras --no-annotate --no-emit-index-url \
+        --no-emit-package coverage --no-emit-package pytest-cov \
         --custom-compile-command requirements/lock.sh "$@"
 }
 compile 3.11 requirements/runtime.in --output-file requirements/runtime.txt

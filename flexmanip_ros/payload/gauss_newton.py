@@ -41,9 +41,10 @@ CONVERGED = 0.02
 """Decrease of the cost for each sample below which a step counts as converged, and the horizon may grow."""
 FITS = 1.5
 """Cost over that of the noise assumed up to which a short step counts as converged, too: the next one reads more."""
-PERIODS = 3
-"""Least number of slowest periods in a horizon. With fewer, friction and delays are so unsure that a filter linearized
-once goes astray from them: at 2 kHz 512 samples are 1.8 periods, and one of 20 random arms was lost."""
+LEAST_BLOCKS = 24
+"""Least number of blocks, tenths of the slowest period, in a horizon. With fewer, friction and delays are so unsure that
+a filter linearized once goes astray from them: at 2 kHz 512 samples are 1.4 periods, and one of 20 random arms was
+lost."""
 TRUSTED = 2.0
 """Standard deviations by which a step of the moving-horizon estimation moves the filter's state at most."""
 LEVENBERG = 1.0
@@ -417,7 +418,7 @@ def noise_damping(m: mem.FilterState) -> float:
 @inner
 def enough_samples(sensors: MeasurementModel) -> int:
     """Return the number of samples after which a fit that has converged closes the horizon."""
-    return int(max(mem.ENOUGH, PERIODS * BATCH * sensors.block))
+    return int(max(mem.ENOUGH, LEAST_BLOCKS * sensors.block))
 
 
 @inner
