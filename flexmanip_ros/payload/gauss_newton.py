@@ -42,8 +42,8 @@ CONVERGED = 0.02
 FITS = 1.5
 """Cost over that of the noise assumed up to which a short step counts as converged, too: the next one reads more."""
 LEAST_BLOCKS = 24
-"""Least number of blocks, tenths of the slowest period, in a horizon. With fewer, friction and delays are so unsure that
-a filter linearized once goes astray from them: at 2 kHz 512 samples are 1.4 periods, and one of 20 random arms was
+"""Least number of blocks, tenths of the slowest period, in a horizon. With fewer, friction and delays are so unsure
+that a filter linearized once goes astray from them: at 2 kHz 512 samples are 1.4 periods, and one of 20 random arms was
 lost."""
 TRUSTED = 2.0
 """Standard deviations by which a step of the moving-horizon estimation moves the filter's state at most."""
