@@ -417,8 +417,11 @@ def noise_damping(m: mem.FilterState) -> float:
 
 @inner
 def enough_samples(sensors: MeasurementModel) -> int:
-    """Return the number of samples after which a fit that has converged closes the horizon."""
-    return int(max(mem.ENOUGH, LEAST_BLOCKS * sensors.block))
+    """Return the number of samples after which a fit that has converged closes the horizon.
+
+    At most half of the largest horizon, as twice as many samples close it unless it has converged (``LATEST``).
+    """
+    return int(min(max(mem.ENOUGH, LEAST_BLOCKS * sensors.block), mem.HORIZON // 2))
 
 
 @inner

@@ -66,7 +66,7 @@ def factor_of(found: np.ndarray, state: structured.StructuredState) -> float:
 
 
 def test_the_factor_is_the_variance_by_batch_means_over_that_of_the_fit() -> None:
-    """Computed from all samples at once. The arm has modes beyond those of the model."""
+    """Computed from all samples at once. The arm has more modes than the model, and a third of the damping."""
     arm = replace(ARM, modes=5, damping_ratio=0.001)
     before, state = closing(samples := record(3.2, arm=arm))
     m = state.memory

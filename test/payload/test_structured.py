@@ -572,6 +572,16 @@ def test_an_undamped_arm_is_known_without_bias():
     assert abs(np.mean(deviations)) < 3.0 / np.sqrt(len(deviations))
 
 
+def test_the_horizon_of_a_slow_arm_closes_with_a_fit_that_has_converged():
+    """At 0.5 Hz 2.4 slowest periods are 4752 samples, more than the largest horizon."""
+    arm = replace(ARM, bending_stiffness=tuple(EI / 120.0 for EI in ARM.bending_stiffness))
+    state = run(config(arm), record(4.0, arm=arm, peaks=(0.3, 0.15)))
+    m = state.memory
+    assert 24 * state.sensors.block > mem.HORIZON
+    assert m.counts[mem.STORED] == mem.HORIZON > m.counts[mem.BEFORE]
+    assert structured.estimate(config(arm), state).status is Status.TRACKING
+
+
 def test_what_noise_hides_of_an_arm_stays_in_its_intervals():
     """Noise as large as the motion: the fit comes to rest before it knows the phase of the fastest mode."""
     arm, normalised = ArmParameters(), []
