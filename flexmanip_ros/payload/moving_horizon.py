@@ -20,6 +20,7 @@ from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload.gauss_newton import (
     AT_REST,
     BY_CHANCE,
+    FITS,
     LINEAR,
     MOST_BIAS,
     TELLS,
@@ -349,11 +350,13 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState,
             before = m.counts[mem.BEFORE]
             if last:
                 # until the step is within one standard deviation (Newton decrement): the filter goes on from here. A
-                # trajectory without noise of the torques misses samples that have it, so that its step may never be;
-                # the linearized filter goes on from it once the payload is at rest. The iteration that takes a white
-                # part of the efforts for true (COMPARED) is always due.
+                # trajectory without noise of the torques misses samples that have it: a joint sticks a sample more or
+                # less. So neither its step nor its cost settles. There the linearized filter goes on from it, once that
+                # explains the samples and the payload is at rest. The iteration that takes a white part of the efforts
+                # for true (COMPARED) is always due.
                 short = dot(m.g, m.gradient) < 1.0 and m.score[mem.LAMBDA] <= noise_damping(m)
-                enough = m.counts[mem.LINEARIZED] == 1 and at_rest(sensors, m)
+                explained = m.counts[mem.LINEARIZED] == 1 and m.score[mem.MISFIT] < FITS
+                enough = explained and m.score[mem.SHIFT] < AT_REST
                 due = before < m.counts[mem.STORED] or m.counts[mem.EFFORTS] == mem.COMPARED or not (short or enough)
             else:
                 more = max(before // GROWTH, 1) if m.score[mem.SHIFT] < AT_REST else 1
