@@ -283,7 +283,7 @@ def current(state: State) -> Estimate | None:
     config, payload, identifier = _running(state)
     if payload.cursor == 0:
         return None
-    model = identifier.estimator._replace(rpbsid=rpbsid.finish(config, identifier.estimator.rpbsid))
+    model = identifier.estimator._replace(rpbsid=rpbsid.finish(identifier.estimator.rpbsid))
     request = estimator.ModelRequest(config, model, payload.last_ns, state.clock.dt, _latest(state, payload.cursor))
     estimate = request.solve()
     held = estimator.payload(config, payload.estimator)

@@ -230,7 +230,7 @@ def latest(config: IdentifierParameters, state: RpbsidState, since_ns: int, dt: 
     return log.rows(min(log.row_at(since_ns, first), log.end), log.end)
 
 
-def finish(config: IdentifierParameters, state: RpbsidState, background: Background = INLINE) -> RpbsidState:
+def finish(state: RpbsidState, background: Background = INLINE) -> RpbsidState:
     """Take the results of the fit and of the prediction under way now, as no sample follows."""
     if state.held is not None:
         state = state._replace(held=held_back.delivered(state.held, background))

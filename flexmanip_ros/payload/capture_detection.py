@@ -22,7 +22,7 @@ SETTLE = 0.5
 CONFIRM = 0.01
 """Time from an alarm to its report [s]; the samples in it serve to date the onset."""
 PEAK_MEMORY = 20.0
-"""Time in which a peak of the statistic is forgotten [s]."""
+"""Time constant with which a peak of the statistic fades [s]."""
 INDEPENDENT = 0.5
 """Samples for each test that counts as independent, for the false alarms; a test is over all onsets of the window."""
 SPEED, ACCELERATION, JERK = 0.3, 5.0, 200.0

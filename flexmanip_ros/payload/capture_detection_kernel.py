@@ -295,8 +295,8 @@ def advance(
     table: (N, 1 + 3 L + m), see ``structured.input_table``. While the horizon is open (fewer than ``HORIZON`` samples
     since the event), it begins with the first sample after it. The test ends at an alarm. hold: samples to be quiet at
     first; confirm: samples from an alarm to its return, so that it can be dated; fade: factor of the recent peak a
-    sample. A negative number -k - 1: at row k numbers left the finite range, or the horizon of an arm at rest is to
-    slide or to open (``RESTS``). One function for both, since each compiles the whole filter.
+    sample. A negative number -k - 1: at row k numbers left the finite range, a fit failed, or the horizon of an arm at
+    rest is to slide or to open (``RESTS``). One function for both, since each compiles the whole filter.
     """
     for k in range(first, table.shape[0]):
         if not take(motion, sensors, m, table, k):

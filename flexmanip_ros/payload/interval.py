@@ -19,7 +19,7 @@ UNTOLD = math.sqrt(0.5)
 """Deviation of an empty arm's payload over its prior deviation, above which samples tell less of it than the prior: it
 may hold something that was not announced."""
 FEW = 50
-"""Samples after an event before anything is claimed."""
+"""Samples after an event before anything is claimed, but that a fit was begun again and still does not fit."""
 POWER_LIMIT = 2.0
 """Innovation power over white noise beyond which the model does not fit."""
 UNKNOWN_POWER = 4.0

@@ -489,7 +489,7 @@ def diffuse(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState,
 
 @inner
 def take(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, table: Array, k: int) -> bool:
-    """Take the sample in row k of the table; False when numbers left the finite range.
+    """Take the sample in row k of the table; False: numbers left the finite range, or a fit failed.
 
     table: (N, 1 + 3 L + m), see ``capture_detection_kernel.advance``.
     """

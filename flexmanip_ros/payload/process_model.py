@@ -263,7 +263,7 @@ def nonnegative(motion: ProcessModel, c: int) -> bool:
 
 @inner
 def lower_bound(motion: ProcessModel, c: int) -> float:
-    """Return the lower bound of entry c of p: the mass matrix stays positive, damping and friction at least zero."""
+    """Return the lower bound of entry c of p: the mass matrix stays positive, ``nonnegative`` ones at least zero."""
     kind = motion.kind[c]
     low: float = -np.inf
     if kind == MASS:

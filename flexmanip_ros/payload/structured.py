@@ -540,10 +540,10 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
 
     before: the state before these rows.
 
-    The first fit estimates few parameters of the arm and a point mass; later ones all of ``payload.learn`` and a rigid
-    body. The object begins with its prior. The arm begins with what was learned before the event, or, if that fails
-    within ``FIRST_LOOK`` samples, with its given parameters. An empty arm that only seems to hold something begins with
-    what was learned.
+    The first fit estimates few parameters of the arm and a point mass; later ones all of ``payload.learn``, every
+    second one without late signals, and a rigid body. The object begins with its prior. The arm begins with what was
+    learned before the event, or, if that fails within ``FIRST_LOOK`` samples, with its given parameters. An empty arm
+    that only seems to hold something begins with what was learned.
     """
     model, _, m, *_ = state.running
     if m.counts[mem.RESTS] == mem.BEGINS_TO_MOVE:

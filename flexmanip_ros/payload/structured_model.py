@@ -66,8 +66,9 @@ class Signals(NamedTuple):
 def signals(config: IdentifierParameters) -> Signals | None:
     """Return what the configured names mean, or None where they do not describe the arm.
 
-    A name used in ``angles`` or ``inputs`` is a joint, in that order; any other is a bend sensor: of the link
-    its digits say when one ends in 1 and the other in 2, else in the order of appearance.
+    A name used in ``angles`` or ``inputs`` is a joint, in that order; any other is a bend sensor. Of two, each
+    belongs to the link that the first number in its name says, else to the links in the order of appearance. A single
+    one of a two-link arm needs that number.
     """
     joints, links = _names(config.angles) or _names(config.inputs), len(config.arm.link_length)
     bends = _in_order_of_links(_names(tuple(name for name in config.outputs

@@ -202,7 +202,7 @@ def _identified_error(search: Search, values: Mapping[str, Any]) -> float:
     borders = [0, *(search.count * part // PARTS for part in range(PARTS // 2, PARTS + 1))]
     for before, now, later in zip(borders, borders[1:], borders[2:], strict=False):
         state = rpbsid.advance(config, state, log.rows(before, now))
-        found = rpbsid.identified(config, rpbsid.finish(config, state), search.dt)
+        found = rpbsid.identified(config, rpbsid.finish(state), search.dt)
         if found is None:
             return np.inf
         powers += shape_search.powers(search, found.model, kept, config.decimation, config.past_window,

@@ -197,7 +197,7 @@ def _after(config: IdentifierParameters, rows: Rows) -> rpbsid.RpbsidState:
 
 def _configurations(config: IdentifierParameters, state: rpbsid.RpbsidState, dt: float) -> Configurations | None:
     """Return the model of every configuration after the last sample; None where it holds at one configuration only."""
-    state = rpbsid.finish(config, state)
+    state = rpbsid.finish(state)
     if state.refined is None or state.refined.varying is None:  # a model of one configuration may be singular
         return None
     found = rpbsid.identified(config, state, dt)

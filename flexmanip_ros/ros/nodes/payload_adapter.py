@@ -7,8 +7,8 @@ calls       the driver's service (`service`, `service_type`), whose request has 
             where it has places for them, centre of mass, inertia and transition time (UR, Franka);
             with `target_node` its SetParameters for `mass_parameter`
 
-A payload is sent once it has been trusted for `settle_time`, and again when its mass changed by
-`min_change`, its centre of mass or radius of gyration by `min_displacement`.
+A payload is sent once it has been trusted for `settle_time`, and again when its mass changed by more than
+`min_change` of it and more than `max_std`, its centre of mass or radius of gyration by more than `min_displacement`.
 """
 
 import importlib
