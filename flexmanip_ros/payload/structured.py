@@ -39,7 +39,7 @@ class StructuredState(NamedTuple):
     """Everything remembered; constant in size."""
 
     model: Model | None
-    """None when the configured signals cannot give a payload."""
+    """None when the configured signals, or samples as rare as these, cannot give a payload."""
     sensors: MeasurementModel | None = None
     memory: mem.FilterState | None = None
     begin: int | None = None
@@ -153,7 +153,10 @@ def advance(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
         begin = rows.first if state.begin is None else state.begin
         if rows.until - begin < FIRST_LOOK:
             return state._replace(begin=begin, cursor=rows.until)
-        state = _begin(config, state, rows.since(begin).between(begin, begin + FIRST_LOOK))
+        first = rows.since(begin).between(begin, begin + FIRST_LOOK)
+        if sample_time(first) * state.model.slowest > 0.5:  # below twice a frequency samples do not show it (Nyquist)
+            return state._replace(model=None, begin=None, cursor=rows.until)
+        state = _begin(config, state, first)
         rows = rows.since(begin + FIRST_LOOK)
     for broken, part in _parts(state, rows):
         if state.memory is None:  # it restarted meanwhile
@@ -329,9 +332,14 @@ def _refit(m: mem.FilterState) -> None:
     m.score[mem.LAMBDA] = 0.0
 
 
+def sample_time(rows: Rows) -> float:
+    """Return the median time between two rows [s]."""
+    return float(np.median(np.diff(rows.stamp_ns) * 1e-9))
+
+
 def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
     """Start the filter with its first rows, and take them and the events among them."""
-    dt = float(np.median(np.diff(rows.stamp_ns) * 1e-9))
+    dt = sample_time(rows)
     fewer = structured_model.sampled(config, dt)
     again = state.efforts is not None  # then the model is that of the first start, with its working point
     model = state.model if again or fewer is config else build(fewer)

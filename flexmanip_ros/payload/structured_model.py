@@ -101,6 +101,10 @@ def unobservable_reason(config: IdentifierParameters) -> str:
         return 'angles does not name the position of two joints'
     if not known.torques:
         return 'inputs does not name the effort of both joints, in the order of angles'
+    if config.payload_method == 'structured':
+        rate = 2.0 * min(pinned_frequencies(config.arm))
+        return (f'samples come less than {rate:.3g} times a second, twice the lowest frequency of a link: '
+                'check the unit of their stamps')
     if config.arm.base_mass:  # beyond here the method is block
         return 'the payload method block needs a fixed base'
     states = 2 * len(config.arm.link_length)

@@ -425,6 +425,18 @@ def test_signals_that_cannot_give_a_payload_are_unobservable(parameters):
     assert found.upper == np.inf
 
 
+def test_samples_below_twice_the_lowest_frequency_give_no_payload_and_the_reason_is_said():
+    settings = config()
+    signals = 1e-3 * np.random.default_rng(0).standard_normal((100, 8))
+    rows = log_of(signals[:, :2], signals[:, 2:6], signals[:, 6:], np.arange(100) * 200_000_000).rows(0, 100)
+    state = structured.event(settings, structured.advance(settings, structured.init(settings), rows), event(20.0))
+    found = structured.estimate(settings, state)
+    assert found.status is Status.UNOBSERVABLE
+    assert finite(found)
+    assert structured.first_needed(state) == 100
+    assert 'twice the lowest frequency' in structured_model.unobservable_reason(settings)
+
+
 @pytest.mark.parametrize('seed', [7, 15, 24, 26])
 def test_a_fit_to_fewer_than_fifty_samples_is_not_called_inconsistent(seed):
     arm = ArmParameters()
