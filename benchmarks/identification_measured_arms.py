@@ -46,7 +46,7 @@ def ours(u: np.ndarray, y: np.ndarray, half: int, values: dict[str, object]) -> 
         'outputs': [f'out{i}/position' for i in range(y.shape[1])], 'angles': [''], 'payload_method': 'none',
         **values})
     state = rpbsid.advance(config, rpbsid.init(config), log_of(u, y).rows(0, half))
-    found = rpbsid.identified(config, rpbsid.finish(config, state), DT)
+    found = rpbsid.identified(config, rpbsid.finish(state), DT)
     assert found is not None
     stamps = (np.arange(len(u)) * round(DT * 1e9)).astype(np.int64)
     signals = Signals(stamps, u, y, np.empty((len(u), 0)), np.zeros(len(u), dtype=bool), np.zeros(len(u), dtype=int),

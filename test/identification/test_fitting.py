@@ -36,7 +36,7 @@ def stepped() -> rpbsid.RpbsidState:
     run = start(CONFIG)
     for k in range(COUNT):
         run = run.feed(u[k:k + 1], y[k:k + 1])
-    return rpbsid.finish(CONFIG, run.state)
+    return rpbsid.finish(run.state)
 
 
 @given(st.lists(st.integers(1, 200), min_size=1, max_size=12))
@@ -48,7 +48,7 @@ def test_silence_and_refused_samples_in_any_grouping_give_the_same_bits(sizes: l
         size = sizes[turn % len(sizes)]
         run = run.feed(u[at:at + size], y[at:at + size])
         at, turn = at + size, turn + 1
-    assert same(rpbsid.finish(CONFIG, run.state), stepped())
+    assert same(rpbsid.finish(run.state), stepped())
 
 
 class Choosing:
@@ -75,7 +75,7 @@ def test_a_fit_made_at_once_or_when_its_turn_comes_gives_the_same_bits(at_once: 
     run, background = start(CONFIG), Choosing(at_once)
     for k in range(0, COUNT, 10):
         run = run.feed(u[k:k + 10], y[k:k + 10], background=background)
-    assert same(rpbsid.finish(CONFIG, run.state, background), stepped())
+    assert same(rpbsid.finish(run.state, background), stepped())
     assert background.started == background.taken > 3
 
 

@@ -38,7 +38,7 @@ def fed(config: IdentifierParameters, u: Array, y: Array, stamps: Array | None =
 
 
 def held(run: Run) -> held_back.HeldBack:
-    found = rpbsid.finish(run.config, run.state).held
+    found = rpbsid.finish(run.state).held
     assert found is not None
     return found
 

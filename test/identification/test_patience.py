@@ -47,7 +47,7 @@ def test_stamps_in_any_grouping_give_the_same_bits(decimation: int) -> None:
         parts = start(config)
         for k in range(0, len(u), size):
             parts = parts.feed(u[k:k + size], y[k:k + size], stamps[k:k + size])
-        states.append(rpbsid.finish(config, parts.state))
+        states.append(rpbsid.finish(parts.state))
     assert same(states[0], states[2])
     assert same(states[1], states[2])
 

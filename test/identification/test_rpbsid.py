@@ -53,7 +53,7 @@ def test_steps_and_one_advance_give_the_same_bits(choice):
         after = stepped.feed(u[k:k + 1], y[k:k + 1])
         assert same(before, stepped.state), 'a step leaves the state it was given as it was'
         stepped = after
-    finished = (rpbsid.finish(config, one.state) for one in (stepped, run(config, u, y)))
+    finished = (rpbsid.finish(one.state) for one in (stepped, run(config, u, y)))
     assert same(*finished)
 
 
@@ -83,7 +83,7 @@ def test_offsets_of_sensors_and_torques_change_no_model(offsets: list[float]):
     size = np.concatenate([u.std(axis=0), y.std(axis=0)]) * offsets
     config = configuration(2, 3, order=3, past_window=6, future_window=3)
     plain, moved = (
-        identified(config, rpbsid.finish(config, run(config, u + du, y + dy).state), 0.01)
+        identified(config, rpbsid.finish(run(config, u + du, y + dy).state), 0.01)
         for du, dy in ((0.0, 0.0), (size[:2], size[2:])))
     response = markov(plain.model, 10)
     assert np.abs(markov(moved.model, 10) - response).max() < 2e-3 * np.abs(response).max()  # a parameter more
