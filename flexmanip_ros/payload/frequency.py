@@ -2,8 +2,8 @@
 
 The frequencies f_i(m) of the arm at its working point fall as the payload m grows, ever more slowly. The payload is
 where the misfit sum_i ((f_i(m) - f_i) / std_i)^2 is least. Its 95 % interval is the profile-likelihood interval: the
-payloads whose misfit is at most 3.84 above the least, times the least of two modes where that is above 1. So it may
-reach to infinity on one side.
+payloads whose misfit is at most 3.84 max(1, least / (modes - 1)) above the least. So it may reach to infinity on one
+side.
 """
 
 import math

@@ -153,10 +153,7 @@ def advance(config: IdentifierParameters, state: StructuredState, rows: Rows) ->
         begin = rows.first if state.begin is None else state.begin
         if rows.until - begin < FIRST_LOOK:
             return state._replace(begin=begin, cursor=rows.until)
-        first = rows.since(begin).between(begin, begin + FIRST_LOOK)
-        if sample_time(first) * state.model.slowest > 0.5:  # below twice a frequency samples do not show it (Nyquist)
-            return state._replace(model=None, begin=None, cursor=rows.until)
-        state = _begin(config, state, first)
+        state = _begin(config, state, rows.since(begin).between(begin, begin + FIRST_LOOK))
         rows = rows.since(begin + FIRST_LOOK)
     for broken, part in _parts(state, rows):
         if state.memory is None:  # it restarted meanwhile
@@ -332,14 +329,11 @@ def _refit(m: mem.FilterState) -> None:
     m.score[mem.LAMBDA] = 0.0
 
 
-def sample_time(rows: Rows) -> float:
-    """Return the median time between two rows [s]."""
-    return float(np.median(np.diff(rows.stamp_ns) * 1e-9))
-
-
 def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
-    """Start the filter with its first rows, and take them and the events among them."""
-    dt = sample_time(rows)
+    """Start the filter with its first rows, and take them and the events among them; not where they are too rare."""
+    dt = float(np.median(np.diff(rows.stamp_ns) * 1e-9))
+    if dt > structured_model.longest_sample_time(config.arm):
+        return state._replace(model=None, begin=None, cursor=rows.until)
     fewer = structured_model.sampled(config, dt)
     again = state.efforts is not None  # then the model is that of the first start, with its working point
     model = state.model if again or fewer is config else build(fewer)

@@ -102,7 +102,7 @@ def unobservable_reason(config: IdentifierParameters) -> str:
     if not known.torques:
         return 'inputs does not name the effort of both joints, in the order of angles'
     if config.payload_method == 'structured':
-        rate = 2.0 * min(pinned_frequencies(config.arm))
+        rate = 1.0 / longest_sample_time(config.arm)
         return (f'samples come less than {rate:.3g} times a second, twice the lowest frequency of a link: '
                 'check the unit of their stamps')
     if config.arm.base_mass:  # beyond here the method is block
@@ -155,6 +155,11 @@ class Model(NamedTuple):
     def body(self) -> int:
         """Number of states that describe the payload: 1 for a point mass, 4 for a rigid body."""
         return int(np.count_nonzero(self.motion.kind <= int(Kind.INERTIA)))
+
+
+def longest_sample_time(arm: ArmParameters) -> float:
+    """Return the longest time between samples that show how the slowest link moves, half its period (Nyquist) [s]."""
+    return 0.5 / min(pinned_frequencies(arm))
 
 
 def sampled(config: IdentifierParameters, dt: float) -> IdentifierParameters:
