@@ -19,7 +19,7 @@ from flexmanip_ros.payload.capture_detection_kernel import filtered
 from flexmanip_ros.payload.gauss_newton import MOST_BIAS
 from flexmanip_ros.payload.interval import POWER_LIMIT, innovation_power, judge
 from flexmanip_ros.payload.measurement_update import MeasurementModel
-from flexmanip_ros.payload.moving_horizon import STARTS, excess_bias, keep_possible
+from flexmanip_ros.payload.moving_horizon import MOST_REFITS, STARTS, excess_bias, keep_possible
 from flexmanip_ros.payload.process_model import Kind, predict
 from flexmanip_ros.payload.structured_model import Model, build, sensors
 from flexmanip_ros.samples.sample_log import Rows
@@ -171,7 +171,7 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     if state.model is None:
         return state
     if state.memory is None:
-        refits = 0 if event.kind is EventKind.CAPTURE else state.refits
+        refits = 0 if event.kind is EventKind.CAPTURE else min(state.refits, MOST_REFITS)
         return state._replace(early=(*state.early, (state.cursor, event)), refits=refits)
     model, sensors, memory, efforts, _ = state.running
     m = mem.copy(memory)
@@ -212,6 +212,7 @@ def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, even
         _forget_payload(model, m)
         opened[payload, 0] = structured_model.EMPTY_STD * model.motion.scale + 0.3 * before
         m.counts[mem.HELD] = 0
+        m.counts[mem.REFITS] = min(m.counts[mem.REFITS], MOST_REFITS)  # what is left is fitted once more
     m.S[:] = structured_model.widen(m.S, np.hstack([columns, opened]))
     if m.counts[mem.STORED] < mem.HORIZON and m.counts[mem.SEEN] >= UNTAUGHT:  # guessed from the first samples
         structured_model.guess_noise(m, int(m.counts[mem.SEEN]))
@@ -309,11 +310,14 @@ def _fit_empty_arm_again(config: IdentifierParameters, model: Model, m: mem.Filt
 
 
 def _begin_horizon(model: Model, m: mem.FilterState) -> None:
-    """Begin a new moving horizon here: the present state is its arrival cost."""
+    """Begin a new moving horizon here: the present state is its arrival cost.
+
+    After too many fits that failed it stays closed: reading its rows again takes seconds, and the next fails as well.
+    """
     keep_possible(model.motion, m, 0.0)  # over a whole horizon a damping ratio below zero explodes
     m.x0[:], m.S0[:] = m.x, m.S
     m.ringing[1] = m.ringing[0]
-    m.counts[mem.STORED] = 0
+    m.counts[mem.STORED] = mem.HORIZON if m.counts[mem.REFITS] > MOST_REFITS else 0
     m.counts[mem.RESTS] = mem.MOVES_ABOUT
     _refit(m)
 
@@ -370,6 +374,8 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
         state = event(config, _part(config, state, rows, row), item)
     if state.memory is not None:  # the capture with which ``restart`` begins again is no new one
         state.memory.counts[mem.REFITS] = state.refits
+        if state.refits > MOST_REFITS:
+            state.memory.counts[mem.STORED] = mem.HORIZON
     return _part(config, state, rows, rows.until)
 
 
@@ -545,7 +551,9 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
     The first fit estimates few parameters of the arm and a point mass; later ones all of ``payload.learn``, every
     second one without late signals, and a rigid body. The object begins with its prior. The arm begins with what was
     learned before the event, or, if that fails within ``FIRST_LOOK`` samples, with its given parameters. An empty arm
-    that only seems to hold something begins with what was learned.
+    that only seems to hold something begins with what was learned. Numbers that leave the finite range while the
+    horizon is open count as a fit that failed. After more than ``MOST_REFITS`` the filter goes on without a fit until
+    the next event, as none ever fits with signals in other units.
     """
     model, _, m, *_ = state.running
     if m.counts[mem.RESTS] == mem.BEGINS_TO_MOVE:
@@ -554,6 +562,7 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
         return _slide(state)
     refits = int(m.counts[mem.REFITS])
     unfit = refits > before.running.memory.counts[mem.REFITS]
+    refits += not unfit and m.counts[mem.STORED] < mem.HORIZON
     if unfit and refits <= STARTS and m.counts[mem.HELD] and model.body > 1 and m.counts[mem.STORED] < mem.HORIZON:
         m = mem.copy(m)
         _open_body(config, model, m)

@@ -19,6 +19,7 @@ from flexmanip_ros.parameters import (
 )
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured, structured_model
+from flexmanip_ros.payload.moving_horizon import MOST_REFITS
 from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.simulation import excitation, simulator
@@ -434,7 +435,7 @@ def test_samples_below_twice_the_lowest_frequency_give_no_payload_and_the_reason
     assert found.status is Status.UNOBSERVABLE
     assert finite(found)
     assert structured.first_needed(state) == 100
-    assert 'twice the lowest frequency' in structured_model.unobservable_reason(settings)
+    assert 'twice the lowest frequency' in structured_model.unobservable(settings)[0]
 
 
 @pytest.mark.parametrize('seed', [7, 15, 24, 26])
@@ -514,6 +515,19 @@ def test_absurd_numbers_restart_the_filter_and_say_so(caught):
     found = structured.estimate(settings, state)
     assert finite(found)
     assert found.status in (Status.DIVERGED, Status.INCONSISTENT, Status.WARMING_UP)
+
+
+@pytest.mark.parametrize('failed', [MOST_REFITS - 1, MOST_REFITS])
+def test_after_too_many_failed_fits_no_horizon_opens_until_the_next_event(caught, failed):
+    settings = config()
+    state = structured.advance(settings, structured.init(settings), caught.between(0, 300))
+    state.memory.counts[mem.REFITS] = failed
+    state = structured.restart(settings, state, state, caught.between(299, 300))
+    state = structured.advance(settings, state, caught.between(300, 400))
+    assert (state.memory.counts[mem.STORED] == mem.HORIZON) == (failed == MOST_REFITS)
+    for kind in EventKind:
+        again = structured.event(settings, state, event(0.4)._replace(kind=kind))
+        assert again.memory.counts[mem.STORED] == 0
 
 
 @pytest.mark.parametrize('scale', [1e3, 1e12])
