@@ -225,8 +225,8 @@ def with_payload(config: IdentifierParameters, estimate: Estimate, payload: Payl
     """Return the estimate of a model with the payload of the same sample; None: the payload is read from the model."""
     if payload is None:
         return estimate
-    status = estimate.status if estimate.model is None else _overall(config, estimate.model_status, payload)
-    return estimate._replace(payload=payload, status=status, payload_is_new=False)
+    return estimate._replace(payload=payload, status=_overall(config, estimate.model_status, payload),
+                             payload_is_new=False)
 
 
 def with_model_of(config: IdentifierParameters, stamp_ns: int, last: Estimate, payload: Payload | None

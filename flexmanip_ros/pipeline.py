@@ -287,9 +287,21 @@ def current(state: State) -> Estimate | None:
     request = estimator.ModelRequest(config, model, payload.last_ns, state.clock.dt, _latest(state, payload.cursor))
     estimate = request.solve()
     held = estimator.payload(config, payload.estimator)
-    if estimate.model is None:
-        return estimate._replace(payload=held)
-    return estimator.with_model_of(config, payload.last_ns, estimate, held)._replace(model_is_new=True)
+    return estimator.with_model_of(config, payload.last_ns, estimate, held)._replace(
+        model_is_new=estimate.model is not None)
+
+
+def taken(state: State) -> State:
+    """Return the state as if the messages had ended with the last row that the payload's estimator has taken.
+
+    A replay has rows that wait, up to ``ABSORB_GROUP``; one that is interrupted need not wait for these.
+    """
+    if state.payload is None:
+        return state
+    cursor, log = state.payload.cursor, state.log
+    left = int(np.count_nonzero(log.rows(cursor, log.end).missing == 0)) + log.waiting
+    counters = state.counters._replace(accepted=state.counters.accepted - left)
+    return state._replace(log=log.before(cursor), clock=state.clock._replace(counters=counters))
 
 
 def check_used(state: State) -> None:

@@ -29,6 +29,9 @@ POSTPONED_S = 0.05
 UNINTERRUPTED = ('llvmlite.', 'flexmanip_ros.io.bag_writer')
 """Modules in which no signal is handled. An exception in a callback of LLVM, which loads a kernel, is printed and lost,
 or ends the process with SIGSEGV; one between two writes to a recording leaves a file without its end."""
+BACKGROUND, END_S = 'background', 0.2
+"""First letters of the names of the threads of ``numerics.background``, and time given to one that was told to end [s].
+A thread in a kernel cannot be stopped."""
 MOST_RUNS, MOST_WORKERS = 1_000_000, 10_000
 """Largest numbers of runs in one command and of processes. The runs to do are listed first, in 0.2 kB each."""
 TRACEBACK = 'FLEXMANIP_TRACEBACK'
@@ -235,9 +238,18 @@ def run(prog: str, body: Callable[[], int]) -> int:
 
     That is 2 after an error of the package, of the file system or without memory, 130 when interrupted, 1 for a defect.
     """
+    signals: list[int] = []
+    status = _run(prog, body, signals)
+    if status == INTERRUPTED and signals:
+        _end_at_once(status)
+    return status
+
+
+def _run(prog: str, body: Callable[[], int], signals: list[int]) -> int:
+    """Run a program; return its exit status. signals: takes the number of each signal that interrupts it."""
     open_streams()
     try:  # around all of it, as a signal may come while a context manager ends
-        with _signals_as_interrupt(), warnings.catch_warnings():
+        with _signals_as_interrupt(signals), warnings.catch_warnings():
             warnings.simplefilter('ignore')  # the status reports numbers out of range; stderr is for one line
             status = body()
             sys.stdout.flush()  # at the end of the process an error of it would be a traceback and status 120
@@ -264,6 +276,17 @@ def run(prog: str, body: Callable[[], int]) -> int:
                            f'please report it with the recording ({TRACEBACK}=1 shows where)', DEFECT)
 
 
+def _end_at_once(status: int) -> None:
+    """End this process where a background thread still computes: Python would wait for it, for seconds to minutes."""
+    for thread in threading.enumerate():
+        if thread.name.startswith(BACKGROUND):
+            thread.join(END_S)
+            if thread.is_alive():
+                sys.stdout.flush()
+                sys.stderr.flush()
+                os._exit(status)
+
+
 def _drop_output() -> None:
     """Send what is left of stdout nowhere: Python would write it at the end of the process, and fail again."""
     with suppress(OSError):  # it is not a file
@@ -288,10 +311,11 @@ def send_again(number: int, seconds: float) -> None:
 
 
 @contextmanager
-def _signals_as_interrupt() -> Iterator[None]:
-    """Raise KeyboardInterrupt on SIGINT and on SIGTERM, so that both write the results so far."""
+def _signals_as_interrupt(signals: list[int]) -> Iterator[None]:
+    """Raise KeyboardInterrupt on SIGINT and on SIGTERM, so that both write the results so far; note their numbers."""
     def interrupt(number: int, frame: FrameType | None) -> None:
         if not is_postponed(number, frame):
+            signals.append(number)
             raise KeyboardInterrupt
 
     try:

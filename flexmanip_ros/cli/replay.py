@@ -123,7 +123,9 @@ def identify(request: Request, progress: Report | None = None) -> Result:
             raise MissingSignalError(
                 err.problem, f"{err.remedy}, or let 'identify_bag {request.bag} --suggest FILE.yaml' choose") from err
         except KeyboardInterrupt:
-            messages.fault, interrupted = BagError('interrupted', 'the messages until then are reported'), True
+            background.close(wait=False)
+            state, interrupted = pipeline.taken(state), True
+            messages.fault = BagError('interrupted', 'the messages until then are reported')
         if interrupted and state.counters.accepted == 0:
             raise KeyboardInterrupt
         if messages.fault is not None and state.counters.accepted == 0:  # an existing output file stays

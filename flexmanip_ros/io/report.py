@@ -162,7 +162,7 @@ def _answer(config: IdentifierParameters, summary: Summary, modes: Sequence[Mode
         held = '' if since is None else f', since {since:.3f} s' if since >= 0.0 else ', since before the first sample'
         if summary.release_time_s is not None and since is None:
             held = f', since the release at {summary.release_time_s:.3f} s'
-        parts.append(f'<p class="answer">Payload: {escape(summary.payload_text())}{held}.</p>')
+        parts.append(f'<p class="answer">Payload: {escape(summary.payload_text(config))}{held}.</p>')
     if events:
         parts.append(f'<p>Captures and releases: {escape(events)}.</p>')
     look = '' if status is Status.TRACKING else ' class="changed"'

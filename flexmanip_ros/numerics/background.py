@@ -71,12 +71,17 @@ class Threads:
             self._taken.pop(next(iter(self._taken)))
         return future.result()
 
-    def close(self) -> None:
-        """Drop every request; wait for those that are being solved. Later requests are solved by ``result``."""
+    def close(self, wait: bool = True) -> None:
+        """Drop every request; wait for those that are being solved. Later requests are solved by ``result``.
+
+        wait: False does not wait for them, as a kernel may run for seconds and cannot be stopped.
+        """
+        if self._closed:
+            return
         self._closed = True
         self._awaited.clear()
         self._taken.clear()
-        self._pool.shutdown(cancel_futures=True)
+        self._pool.shutdown(wait, cancel_futures=True)
 
 
 class Deferred(Threads):

@@ -91,26 +91,27 @@ def signals(config: IdentifierParameters) -> Signals | None:
     return Signals(tuple(roles), angles, torques)
 
 
-def unobservable_reason(config: IdentifierParameters) -> str:
-    """Return why these signals give no payload, in words."""
-    known = signals(config)
+def unobservable(config: IdentifierParameters) -> tuple[str, str]:
+    """Return why these signals give no payload, and what to do about it, in words."""
+    known, names = signals(config), 'name the torques, angles and bends of both links in inputs, angles and outputs'
     if known is None:
         return ('the outputs are not those of a two-link arm: a name that is in neither inputs nor angles is a bend '
-                'sensor, of which there may be two, and no output may be an effort')
+                'sensor, of which there may be two, and no output may be an effort', names)
     if not known.angles:
-        return 'angles does not name the position of two joints'
+        return 'angles does not name the position of two joints', names
     if not known.torques:
-        return 'inputs does not name the effort of both joints, in the order of angles'
+        return 'inputs does not name the effort of both joints, in the order of angles', names
     if config.payload_method == 'structured':
         rate = 1.0 / longest_sample_time(config.arm)
-        return (f'samples come less than {rate:.3g} times a second, twice the lowest frequency of a link: '
-                'check the unit of their stamps')
+        return (f'samples come less than {rate:.3g} times a second, twice the lowest frequency of a link',
+                'check the unit of their stamps, or sample faster')
+    structured = 'set payload_method to structured'
     if config.arm.base_mass:  # beyond here the method is block
-        return 'the payload method block needs a fixed base'
+        return 'the payload method block needs a fixed base', structured
     states = 2 * len(config.arm.link_length)
     if config.order % states:
-        return f'the payload method block needs an order that {states} divides'
-    return 'the outputs are not bends that show every mode of the links'
+        return f'the payload method block needs an order that {states} divides', f'set order to a multiple of {states}'
+    return 'the outputs are not bends that show every mode of the links', structured
 
 
 def _names(of: tuple[str, ...]) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ import numpy as np
 from flexmanip_ros.identification.realization import suggested_order
 from flexmanip_ros.messages import DiagnosticStatus
 from flexmanip_ros.parameters import IdentifierParameters
-from flexmanip_ros.payload.structured_model import unobservable_reason
+from flexmanip_ros.payload.structured_model import unobservable
 from flexmanip_ros.samples.sampling import Clock
 from flexmanip_ros.samples.signals import Rejection
 from flexmanip_ros.types import Estimate, Status
@@ -318,8 +318,8 @@ ADVICE = {
     Status.POORLY_EXCITED: 'move the arm, or raise the torque (node excitation)',
     Status.ILL_CONDITIONED: 'lower order or past_window',
     Status.ORDER_TOO_LOW: 'raise order (suggested_order in /diagnostics)',
-    Status.INCONSISTENT: 'check the parameters of the arm; announce each capture and release, or set '
-                         'trigger_mode:=auto at launch',
+    Status.INCONSISTENT: 'check the parameters of the arm and the units of the signals (rad, m, N m); announce each '
+                         'capture and release, or set trigger_mode:=auto at launch',
     Status.UNOBSERVABLE: 'correct inputs, outputs and angles, or set payload_method to none',
     Status.DIVERGED: 'check units and signs of the signals, and the times of events',
 }
@@ -331,8 +331,11 @@ UNANNOUNCED = ('nothing is known of the payload and no capture was announced: pu
 
 def status_line(config: IdentifierParameters, status: Status, reason: str) -> str:
     """Return a status with its meaning, its reason where that is known, and what to do about it."""
-    reason = unobservable_reason(config) if status is Status.UNOBSERVABLE else reason
-    return f'status {status.name}: {status.value}{": " if reason else ""}{reason}; {ADVICE[status]}'
+    advice = ADVICE[status]
+    if status is Status.UNOBSERVABLE:
+        reason, remedy = unobservable(config)
+        advice = f'{remedy}, or set payload_method to none'
+    return f'status {status.name}: {status.value}{": " if reason else ""}{reason}; {advice}'
 
 
 def report_estimate(report: Report, estimate: Estimate | None, order: int) -> None:

@@ -148,6 +148,10 @@ class SampleLog:
         """Return the log without the waiting rows."""
         return replace(self, waiting=0)
 
+    def before(self, until: int) -> SampleLog:
+        """Return the log without the rows from ``until`` on, waiting ones included."""
+        return replace(self, end=until, waiting=0)
+
     def from_row(self, first: int) -> SampleLog:
         """Return the log without the rows before ``first``; their memory is freed with the next buffer."""
         return replace(self, start=min(max(first, self.start), self.end))

@@ -18,7 +18,7 @@ from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification.prediction_check import white_noise
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import cramer_rao
-from flexmanip_ros.payload.structured_model import unobservable_reason
+from flexmanip_ros.payload.structured_model import unobservable
 from flexmanip_ros.samples.sample_log import Signals
 from flexmanip_ros.studies.whole_recording import Smoothed
 from flexmanip_ros.types import QUANTILE, Array, Estimate, EventKind, Mode, Payload, Status
@@ -29,7 +29,7 @@ ADVICE: Mapping[Status, str] = {
     Status.POORLY_EXCITED: 'move the arm more, or raise the torque',
     Status.ILL_CONDITIONED: 'lower the order or the past window',
     Status.ORDER_TOO_LOW: 'raise the order',
-    Status.INCONSISTENT: 'check the parameters arm.* and the time of the capture',
+    Status.INCONSISTENT: 'check the units of the signals (rad, m, N m), the parameters arm.* and the times of events',
     Status.UNOBSERVABLE: 'add the torques, angles and bends of both links to inputs, outputs and angles',
     Status.DIVERGED: 'check the units of the signals, the parameters arm.* and the times of events',
 }
@@ -45,7 +45,8 @@ def status_text(status: Status, config: IdentifierParameters | None = None, know
     """
     reason, advice = f': {known}' if known else '', ADVICE[status]
     if status is Status.UNOBSERVABLE and config is not None:
-        reason = f': {unobservable_reason(config)}'
+        why, advice = unobservable(config)
+        reason = f': {why}'
     if status is Status.INCONSISTENT and config is not None and config.payload_method == 'none':
         advice = MODEL_ADVICE
     return f'{status.value.partition(";")[0]}{reason}; {advice}'
@@ -87,13 +88,13 @@ class Summary:
         left_out = {'model_status', 'reason', *(['smoothed'] if self.smoothed is None else [])}
         return {item.name: _json(getattr(self, item.name)) for item in fields(self) if item.name not in left_out}
 
-    def payload_text(self) -> str:
+    def payload_text(self, config: IdentifierParameters | None = None) -> str:
         """Return payload and interval in words; where they are not reliable, the reason and what to do next."""
         if self.payload_ci95_kg is None:
             return 'not estimated'
         status = Status[self.status]
         mass, (low, high) = self.payload_mass_kg, self.payload_ci95_kg
-        reason = '' if status is Status.TRACKING else status_text(status)
+        reason = '' if status is Status.TRACKING else status_text(status, config)
         if mass is None or low is None or high is None:
             return f'not known: {reason or "its interval is unbounded; record for longer, while the arm moves"}'
         interval = f'95 % interval {low:.6g} .. {high:.6g} kg'
@@ -121,7 +122,8 @@ def result_rows(summary: Summary, config: IdentifierParameters, modes: Sequence[
 
     modes: of the last estimate, with their deviations; events: what was found in the signals.
     """
-    found = [('samples', f'{summary.samples}, {summary.gaps} gaps, sample time {_text(summary.sample_time_s)} s, '
+    dt = 'unknown' if summary.sample_time_s is None else f'{summary.sample_time_s:.6g} s'
+    found = [('samples', f'{summary.samples}, {summary.gaps} gaps, sample time {dt}, '
               f'identified in {summary.wall_s:.2f} s'), *([('events', events)] if events else ())]
     found += [(name, f'at {time:.3f} s{", before the first sample" if time < 0.0 else ""}') for name, time in (
         ('capture', summary.capture_time_s), ('release', summary.release_time_s)) if time is not None]
@@ -134,7 +136,7 @@ def result_rows(summary: Summary, config: IdentifierParameters, modes: Sequence[
         found.append((f'mode {k + 1}',
                       f'{mode.frequency_hz:.4f}{spread} Hz, damping ratio {mode.damping_ratio:.4f}'))
     if summary.payload_ci95_kg is not None:
-        found.append(('payload', summary.payload_text()))
+        found.append(('payload', summary.payload_text(config)))
         if summary.consistency is not None and summary.payload_std_kg is not None:
             found.append(('residuals', f'power {summary.consistency:.6g} times that of the noise (1: noise only)'))
     for words, values in (('simulation', summary.vaf_simulation_percent),

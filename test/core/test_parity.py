@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from contextlib import closing
 
 import numpy as np
@@ -127,6 +128,17 @@ def test_what_is_read_while_the_payload_takes_its_rows_changes_no_bit(
     assert last.counters == ended.counters
     assert last.counters.resets == again
     assert bits(pipeline.current(last)) == bits(pipeline.current(ended))
+
+
+def test_an_interrupted_replay_gives_the_bits_of_the_messages_whose_rows_were_taken(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline, 'ABSORB_GROUP', 100)
+    *_, state = itertools.islice(pipeline.absorb(CONFIG, _in_blocks(RECORDS, 50)), 7)
+    early = pipeline.taken(state)
+    count = early.counters.accepted
+    assert 0 < count < state.counters.accepted
+    *_, ended = pipeline.absorb(CONFIG, RECORDS[:count])
+    assert bits(pipeline.current(early)) == bits(pipeline.current(ended))
 
 
 def test_every_fit_after_a_capture_gives_the_same_bits_live_and_replayed() -> None:

@@ -16,7 +16,7 @@ from flexmanip_ros.identification.uncertainty import Identified
 from flexmanip_ros.parameters import ArmParameters, IdentifierParameters, configure
 from flexmanip_ros.payload import block_extraction
 from flexmanip_ros.payload.block_extraction import estimate, extend_range, masses, to_modal
-from flexmanip_ros.payload.structured_model import unobservable_reason
+from flexmanip_ros.payload.structured_model import unobservable
 from flexmanip_ros.samples.sample_log import log_of
 from flexmanip_ros.types import StateSpace, Status
 
@@ -107,7 +107,7 @@ def test_an_arm_on_a_floating_base_is_not_taken_for_one_on_a_fixed_base():
     theta, config = np.radians([60.0, 45.0]), _config(arm__base_mass=700.0, arm__base_inertia=180.0)
     found = estimate(config, _sharp(vibration_model(config.arm, theta, 20.0, 1)), theta, NOWHERE)
     assert found.status is Status.UNOBSERVABLE
-    assert unobservable_reason(config) == 'the payload method block needs a fixed base'
+    assert unobservable(config)[0] == 'the payload method block needs a fixed base'
 
 
 @pytest.mark.parametrize(('links', 'order', 'reason'), [
@@ -117,7 +117,7 @@ def test_an_arm_on_a_floating_base_is_not_taken_for_one_on_a_fixed_base():
 def test_what_the_method_lacks_is_said_for_one_link_and_for_two(links, order, reason):
     lists = ('link_length', 'linear_density', 'bending_stiffness')
     arm = ArmParameters(**{name: getattr(ArmParameters(), name)[:links] for name in lists})
-    assert unobservable_reason(IdentifierParameters(arm=arm, payload_method='block', order=order)) == reason
+    assert unobservable(IdentifierParameters(arm=arm, payload_method='block', order=order))[0] == reason
 
 
 @pytest.mark.parametrize('known', [False, True])

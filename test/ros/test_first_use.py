@@ -24,7 +24,7 @@ from flexmanip_ros.cli import console
 from flexmanip_ros.cli.suggest import file_text
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import yaml_text
-from flexmanip_ros.payload.structured_model import unobservable_reason
+from flexmanip_ros.payload.structured_model import unobservable
 from flexmanip_ros.ros import conversions, diagnostics, qos
 from flexmanip_ros.ros.diagnostics import WARN, LossCounter, Report
 from flexmanip_ros.ros.nodes.capture_trigger import CaptureTrigger
@@ -192,7 +192,7 @@ def test_an_unannounced_capture_is_hinted_at_once(ros: Ros, log: Callable[[str],
     ({'inputs': ('joint1/effort',)}, 'effort of both joints'),
 ])
 def test_signals_that_give_no_payload_are_explained(changes: dict[str, Any], words: str) -> None:
-    assert words in unobservable_reason(IdentifierParameters(**changes))
+    assert words in unobservable(IdentifierParameters(**changes))[0]
 
 
 def test_a_second_capture_without_a_release_is_said_to_add_an_object(ros: Ros) -> None:
