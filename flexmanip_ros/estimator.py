@@ -11,7 +11,7 @@ import numpy as np
 from flexmanip_ros import event_replay
 from flexmanip_ros.event_replay import EventReplay
 from flexmanip_ros.identification import held_back, parameter_varying, prediction_check, rpbsid
-from flexmanip_ros.identification.factor import FILLED, REJECTED, USED
+from flexmanip_ros.identification.factor import FILLED, REJECTED, SEEN, USED
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.numerics.background import INLINE, Background
 from flexmanip_ros.parameters import IdentifierParameters
@@ -195,7 +195,8 @@ class ModelRequest:
         """Return the estimate with model and modes, and with the payload where it is read from them."""
         config, identifier, rows = self.config, self.identifier, without_friction(self.config, self.rows)
         payload: Payload | None = None
-        found, without = _identified(config, identifier.rpbsid, self.dt, rows)
+        elapsed = round((self.stamp_ns - identifier.since_ns) * 1e-9 / self.dt) if self.dt > 0.0 else 0
+        found, without, reason = _identified(config, identifier.rpbsid, self.dt, rows, elapsed)
         if found is not None:
             role = parameter_varying.roles(config)
             turned, drift = turning(config, identifier.turned, rows)
@@ -210,7 +211,7 @@ class ModelRequest:
         if config.payload_method == 'block' and found is not None:
             payload = block_extraction.estimate(config, found, identifier.angles, identifier.configuration_range)
         if found is None:
-            return Estimate(self.stamp_ns, without, None, (), payload, model_status=without)
+            return Estimate(self.stamp_ns, without, None, (), payload, model_status=without, reason=reason)
         oscillations = modes(found)
         if config.payload_method == 'frequency':
             payload = frequency.estimate(config, oscillations, identifier.angles, identifier.configuration_range)
@@ -251,16 +252,21 @@ def _overall(config: IdentifierParameters, model: Status, payload: Payload | Non
     return model
 
 
-def _identified(config: IdentifierParameters, state: rpbsid.RpbsidState, dt: float, rows: Rows
-                ) -> tuple[Identified | None, Status]:
-    """Return the model, and the status to publish while there is none.
+def _identified(config: IdentifierParameters, state: rpbsid.RpbsidState, dt: float, rows: Rows, elapsed: int
+                ) -> tuple[Identified | None, Status, str]:
+    """Return the model, and status and reason to publish while there is none.
 
     WARMING_UP: there are too few samples. POORLY_EXCITED: the signals are constant, or the regression is singular.
+    elapsed: time since the last event in samples.
     """
     try:
         found = rpbsid.identified(config, state, dt, rows)
     except np.linalg.LinAlgError:  # signals that are almost constant, or vary in one direction only
-        return None, Status.POORLY_EXCITED
+        return None, Status.POORLY_EXCITED, ''
     parameters = config.past_window * (len(config.inputs) + len(config.outputs)) + len(config.inputs)
-    enough = state.counts[FILLED] > 2 * parameters + config.past_window
-    return found, Status.POORLY_EXCITED if enough else Status.WARMING_UP
+    enough = 2 * parameters + config.past_window
+    if state.counts[FILLED] > enough:
+        return found, Status.POORLY_EXCITED, ''
+    lossy = state.counts[USED] == 0 and min(elapsed, state.counts[SEEN]) > enough
+    return found, Status.WARMING_UP, '' if not lossy else (
+        f'no {config.past_window + 1} samples in a row came without a loss (lower past_window)')

@@ -277,16 +277,23 @@ def lightly_damped(oscillations: Sequence[Mode]) -> list[Mode]:
     return [mode for mode in oscillations if abs(mode.damping_ratio) < DAMPED]
 
 
+def vague(oscillations: Sequence[Mode]) -> str:
+    """Return which frequency has a standard deviation above ``VAGUE`` of itself, or ''."""
+    for mode in oscillations:
+        if mode.frequency_std_hz > VAGUE * mode.frequency_hz:
+            return (f'the frequency of the mode at {mode.frequency_hz:.3g} Hz has a standard deviation of '
+                    f'{100.0 * mode.frequency_std_hz / mode.frequency_hz:.2g} %')
+    return ''
+
+
 def uncertain(oscillations: Sequence[Mode]) -> str:
     """Return which frequency of a low lightly damped mode, or damping ratio of any low mode, is too uncertain, or ''.
 
     A mode damped above ``DAMPED`` may have an uncertain frequency, but no uncertain damping ratio: a mode that the
     samples do not contain may also drift to such a damping.
     """
-    for mode in lightly_damped(oscillations)[:MOST_MODES]:
-        if mode.frequency_std_hz > VAGUE * mode.frequency_hz:
-            return (f'the frequency of the mode at {mode.frequency_hz:.3g} Hz has a standard deviation of '
-                    f'{100.0 * mode.frequency_std_hz / mode.frequency_hz:.2g} %')
+    if reason := vague(lightly_damped(oscillations)[:MOST_MODES]):
+        return reason
     for mode in oscillations[:MOST_MODES]:
         if mode.damping_ratio_std > LOOSE:
             return (f'the damping ratio of the mode at {mode.frequency_hz:.3g} Hz has a standard deviation of '

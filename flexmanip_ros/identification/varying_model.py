@@ -7,7 +7,7 @@ import numpy as np
 
 from flexmanip_ros.identification import parameter_varying as lpv
 from flexmanip_ros.identification.batch_fit import BLOCK
-from flexmanip_ros.identification.prediction_check import MOST_SKEW, VAGUE
+from flexmanip_ros.identification.prediction_check import MOST_SKEW, vague
 from flexmanip_ros.identification.uncertainty import Identified, Tangent, modes
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Rows
@@ -23,7 +23,7 @@ degrees."""
 MISSED = 0.5
 """Largest share of an output's amplitude that the predictions of the last blocks may miss."""
 EARLY = 16
-"""Number of blocks below which a frequency above ``VAGUE`` means WARMING_UP, not POORLY_EXCITED."""
+"""Number of blocks below which a frequency that is ``vague`` means WARMING_UP, not POORLY_EXCITED."""
 
 
 class Configurations(NamedTuple):
@@ -78,19 +78,21 @@ class Configurations(NamedTuple):
             singular_values=self.singular_values, excitation=self.excitation,
             condition=self.condition, innovation_power=self.innovation_power, status=Status.TRACKING,
             refined=True, samples=float(v.blocks * BLOCK), configurations=self)
-        return found._replace(status=judge(found, v))
+        status, reason = judge(found, v)
+        return found._replace(status=status, reason=reason)
 
 
-def judge(found: Identified, v: lpv.Varying) -> Status:
-    """Return the status, from the predictions of samples before they were fitted and from the deviations."""
-    if float(v.share.max()) > MISSED:
-        return Status.INCONSISTENT
+def judge(found: Identified, v: lpv.Varying) -> tuple[Status, str]:
+    """Return status and reason, from the predictions of samples before they were fitted and from the deviations."""
+    missed = float(v.share.max())
+    if missed > MISSED:
+        return Status.INCONSISTENT, f'predictions of new samples miss {100.0 * missed:.0f} % of the size of an output'
     oscillations = modes(found)
     if len(oscillations) < len(v.scale_y):
-        return Status.INCONSISTENT
-    if any(mode.frequency_std_hz > VAGUE * mode.frequency_hz for mode in oscillations):
-        return Status.WARMING_UP if v.blocks < EARLY else Status.POORLY_EXCITED
-    return Status.TRACKING
+        return Status.INCONSISTENT, 'the model has fewer modes than there are displacements'
+    if reason := vague(oscillations):
+        return Status.WARMING_UP if v.blocks < EARLY else Status.POORLY_EXCITED, reason
+    return Status.TRACKING, ''
 
 
 def unmodelled(v: lpv.Varying, G: Array) -> tuple[Array, Array]:

@@ -168,7 +168,7 @@ def _answer(config: IdentifierParameters, summary: Summary, modes: Sequence[Mode
     look = '' if status is Status.TRACKING else ' class="changed"'
     parts.append(f'<p{look}>Status: {escape(status_text(status, config, summary.status_reason))}.</p>')
     if summary.model_status not in (summary.status, Status.TRACKING.name):
-        model = status_text(Status[summary.model_status], known=summary.reason)
+        model = status_text(Status[summary.model_status], known=summary.reason, of_model=True)
         parts.append(f'<p class="changed">Model: {escape(model)}.</p>')
     found = [mode for mode in modes if np.isfinite(mode.frequency_hz)]
     if found:

@@ -35,19 +35,20 @@ ADVICE: Mapping[Status, str] = {
 }
 """What a user can do next, for each status."""
 MODEL_ADVICE = 'check inputs and outputs, or let --suggest choose order and windows'
-"""The same for a model of which no payload is asked, and which is INCONSISTENT."""
+"""The same for a model that is INCONSISTENT."""
 
 
-def status_text(status: Status, config: IdentifierParameters | None = None, known: str = '') -> str:
+def status_text(status: Status, config: IdentifierParameters | None = None, known: str = '', *, of_model: bool = False
+                ) -> str:
     """Return a status in words, with its reason where that is known or the configuration shows it, and what to do next.
 
-    known: the reason that came with the estimate, if any.
+    known: the reason that came with the estimate, if any; of_model: the status is that of the model alone.
     """
     reason, advice = f': {known}' if known else '', ADVICE[status]
     if status is Status.UNOBSERVABLE and config is not None:
         why, advice = unobservable(config)
         reason = f': {why}'
-    if status is Status.INCONSISTENT and config is not None and config.payload_method == 'none':
+    if status is Status.INCONSISTENT and (of_model or (config is not None and config.payload_method == 'none')):
         advice = MODEL_ADVICE
     return f'{status.value.partition(";")[0]}{reason}; {advice}'
 
@@ -129,7 +130,7 @@ def result_rows(summary: Summary, config: IdentifierParameters, modes: Sequence[
         ('capture', summary.capture_time_s), ('release', summary.release_time_s)) if time is not None]
     found.append(('status', f'{summary.status}: {status_text(Status[summary.status], config, summary.status_reason)}'))
     if summary.model_status not in (summary.status, Status.TRACKING.name):
-        model = status_text(Status[summary.model_status], known=summary.reason)
+        model = status_text(Status[summary.model_status], known=summary.reason, of_model=True)
         found.append(('model', f'{summary.model_status}: {model}'))
     for k, mode in enumerate(modes):
         spread = f' +- {QUANTILE * mode.frequency_std_hz:.2g}' if mode.frequency_std_hz > 0.0 else ''
