@@ -41,14 +41,21 @@ $(foreach folder,$(VENV) $(DOCS) $(JAZZY),$(shell requirements/make_venv.sh --dr
 help:
 	@sed -n 's/^#   make/  make/p' Makefile
 
-setup: $(VENV)/.warm
+# The kernels need five of the libraries. They compile while the others are installed.
+setup:
+	@$(MAKE) --no-print-directory -j2 $(VENV)/.warm $(VENV)/.package
 
 $(VENV)/.python:
 	@requirements/make_venv.sh $(VENV)
 	@touch $@
 
-$(VENV)/.runtime: requirements/runtime.txt | $(VENV)/.python
-	@echo 'Installing the locked dependencies (about a minute the first time)'
+$(VENV)/.compiler: requirements/runtime.txt | $(VENV)/.python
+	@echo 'Installing the locked dependencies'
+	@awk '/^(llvmlite|numba|numpy|pyyaml|scipy)==/, !/\\$$/' $< > $@.txt
+	@$(PIP) $(LOCKED) $@.txt
+	@touch $@
+
+$(VENV)/.runtime: requirements/runtime.txt $(VENV)/.compiler
 	@$(PIP) $(LOCKED) $<
 	@touch $@
 
@@ -58,7 +65,7 @@ $(VENV)/.package: setup.py setup.cfg package.xml pyproject.toml $(SHARED) $(VENV
 	@$(PIP) install --no-deps --no-build-isolation --editable .
 	@touch $@
 
-$(VENV)/.warm: $(SOURCES) $(VENV)/.package
+$(VENV)/.warm: $(SOURCES) $(VENV)/.compiler
 	@echo 'Compiling the kernels'
 	@$(BIN)/python -m flexmanip_ros.cli.warm_up
 	@touch $@
