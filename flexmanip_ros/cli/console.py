@@ -29,9 +29,9 @@ POSTPONED_S = 0.05
 UNINTERRUPTED = ('llvmlite.', 'flexmanip_ros.io.bag_writer')
 """Modules in which no signal is handled. An exception in a callback of LLVM, which loads a kernel, is printed and lost,
 or ends the process with SIGSEGV; one between two writes to a recording leaves a file without its end."""
-BACKGROUND, END_S = 'background', 0.2
-"""First letters of the names of the threads of ``numerics.background``, and time given to one that was told to end [s].
-A thread in a kernel cannot be stopped."""
+END_S = 0.2
+"""Time given to a background thread that was told to end [s]; one that is idle ends in milliseconds, one in a kernel
+cannot be stopped."""
 MOST_RUNS, MOST_WORKERS = 1_000_000, 10_000
 """Largest numbers of runs in one command and of processes. The runs to do are listed first, in 0.2 kB each."""
 TRACEBACK = 'FLEXMANIP_TRACEBACK'
@@ -278,8 +278,10 @@ def _run(prog: str, body: Callable[[], int], signals: list[int]) -> int:
 
 def _end_at_once(status: int) -> None:
     """End this process where a background thread still computes: Python would wait for it, for seconds to minutes."""
+    from flexmanip_ros.numerics.background import NAME
+
     for thread in threading.enumerate():
-        if thread.name.startswith(BACKGROUND):
+        if thread.name.startswith(NAME):
             thread.join(END_S)
             if thread.is_alive():
                 sys.stdout.flush()

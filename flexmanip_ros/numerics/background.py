@@ -34,6 +34,8 @@ THREADS = 2
 """Threads: one for a fit, which takes up to a second, one for the models computed meanwhile, each in 1 to 3 ms."""
 REPLAY_THREADS = 3
 """Threads of a replay: one more, for the payload."""
+NAME = 'background'
+"""First letters of the names of these threads."""
 KEPT = 8
 """Number of requests kept with their results after these were taken. A late event rewinds the estimator by 0.2 s and
 needs the results of that time again: at most a fit and, where every estimate has a model of its own, the models of the
@@ -44,7 +46,7 @@ class Threads:
     """Solves requests on other threads, with the same bits as ``INLINE``. A node or a program owns it, not the core."""
 
     def __init__(self, threads: int = THREADS) -> None:
-        self._pool = ThreadPoolExecutor(threads, 'background')
+        self._pool = ThreadPoolExecutor(threads, NAME)
         self._awaited: dict[Request, Future[Any]] = {}
         self._taken: dict[Request, Future[Any]] = {}
         self._closed = False
