@@ -67,15 +67,15 @@ class FilterState(NamedTuple):
     squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
     EMPTY_ARM_BIAS: payload that the arm seemed to hold before the event, when it was empty, in the filter's standard
     deviations; EXCESS_BIAS: the same over the deviation that its moves give, with the error of the inertia, or that for
-    which the empty arm is fitted again, until a horizon closes (``close_horizon``); COST: of the samples read in this
-    iteration, COST_BEFORE: of the last accepted one; LAMBDA: damping of Levenberg and Marquardt; MOVES: mean of the
-    squared moves of payload and arm parameters, over the variance that the filter says, see ``judge_moves``; SANDWICH:
-    factor, at least 1, by which the variances of the last fit of the empty arm are too small, see ``sandwich``; MISFIT:
-    power of the residuals of the last accepted iteration (of the innovations where there is a linearized filter) over
-    the noise assumed; EXCESS: by how many deviations of chance it exceeds the white noise, see ``judge_residuals``;
-    LOG_DETERMINANT: sum of the logarithms of the variances of the innovations of the linearized filter over those of
-    the noise, in this iteration; LIKELIHOOD: -2 times the logarithm of the likelihood of the last accepted
-    iteration."""
+    which the empty arm is fitted again, until a horizon closes (``close_horizon``), infinite where no fit explained the
+    empty arm; COST: of the samples read in this iteration, COST_BEFORE: of the last accepted one; LAMBDA: damping of
+    Levenberg and Marquardt; MOVES: mean of the squared moves of payload and arm parameters, over the variance that the
+    filter says, see ``judge_moves``; SANDWICH: factor, at least 1, by which the variances of the last fit of the empty
+    arm are too small, see ``sandwich``; MISFIT: power of the residuals of the last accepted iteration (of the
+    innovations where there is a linearized filter) over the noise assumed; EXCESS: by how many deviations of chance it
+    exceeds the white noise, see ``judge_residuals``; LOG_DETERMINANT: sum of the logarithms of the variances of the
+    innovations of the linearized filter over those of the noise, in this iteration; LIKELIHOOD: -2 times the logarithm
+    of the likelihood of the last accepted iteration."""
     moved: Array
     """(nx, 2) mean and variance of payload and arm parameters when their moves were last judged, with the process noise
     since then in the variance; see ``judge_moves``."""

@@ -364,7 +364,7 @@ def close_horizon(motion: ProcessModel, sensors: MeasurementModel, m: mem.Filter
             m.counts[mem.EFFORTS] = mem.NOISY
         # a bias for which the empty arm's fit was begun again is no longer doubted where all that followed fits
         fits = m.score[mem.EXCESS] < BY_CHANCE and abs(m.score[mem.EMPTY_ARM_BIAS]) < MOST_BIAS
-        if m.counts[mem.HELD] == 0 or fits:
+        if m.counts[mem.HELD] == 0 or (fits and m.score[mem.EXCESS_BIAS] < np.inf):
             m.score[mem.EXCESS_BIAS] = 0.0
         return
     first = m.x.size - motion.kind.size

@@ -143,18 +143,19 @@ def test_a_wrong_arm_that_holds_something_from_the_first_sample_is_given_up(told
     assert structured.estimate(settings, later).status is Status.INCONSISTENT
 
 
-@pytest.mark.parametrize(('bias', 'seeming', 'soon', 'late'), [
-    (0.0, 0.0, Status.TRACKING, Status.TRACKING),
-    (6.0, 0.0, Status.INCONSISTENT, Status.TRACKING),
-    (6.0, 6.0, Status.INCONSISTENT, Status.INCONSISTENT)])
-def test_what_an_arm_catches_while_it_is_fitted_again_for_its_bias_is_not_trusted_before_all_fits(
-        bias, seeming, soon, late):
+@pytest.mark.parametrize(('failed', 'bias', 'seeming', 'soon', 'late'), [
+    (2, 0.0, 0.0, Status.TRACKING, Status.TRACKING),
+    (2, 6.0, 0.0, Status.INCONSISTENT, Status.TRACKING),
+    (2, 6.0, 6.0, Status.INCONSISTENT, Status.INCONSISTENT),
+    (3, 0.0, 0.0, Status.INCONSISTENT, Status.INCONSISTENT)])
+def test_what_an_arm_catches_is_not_trusted_before_all_fits_and_never_where_no_fit_explained_the_empty_arm(
+        failed, bias, seeming, soon, late):
     capture = event(0.6)
     samples = record(2.5, (capture,))
     state = run(config(), samples.between(0, 600))
     m = mem.copy(state.memory)
     assert m.counts[mem.STORED] < mem.HORIZON
-    m.counts[mem.REFITS] = 2
+    m.counts[mem.REFITS] = failed
     m.score[mem.EXCESS_BIAS] = bias  # in deviations, by the fit before this one
     payload = state.model.payload
     m.x[payload] += seeming * np.linalg.norm(m.S[payload])  # and by this one
@@ -165,6 +166,16 @@ def test_what_an_arm_catches_while_it_is_fitted_again_for_its_bias_is_not_truste
     caught = structured.advance(config(), caught, samples.since(900))
     assert caught.memory.counts[mem.STORED] == mem.HORIZON
     assert structured.estimate(config(), caught).status is late
+
+
+def test_what_an_arm_catches_that_floats_and_was_told_to_be_fixed_is_never_trusted():
+    capture = event(3.0)
+    samples = record(4.6, (capture,), arm=replace(ARM, base_mass=700.0, base_inertia=180.0))
+    state = structured.advance(config(), structured.init(config()), samples.between(0, 3000))
+    state = structured.event(config(), state, capture)
+    for begin in range(3000, 4600, 20):
+        state = structured.advance(config(), state, samples.between(begin, begin + 20))
+        assert structured.estimate(config(), state).status is not Status.TRACKING
 
 
 def test_an_arm_that_holds_an_object_nobody_told_of_is_never_trusted():
