@@ -54,8 +54,8 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         g = max(g, 1.0 + float(m.score[mem.SHIFT]) ** 2)
     restless = math.sqrt(g * max(1.0, consistency / POWER_LIMIT))
     widening = max(restless, abs(float(m.score[mem.EMPTY_ARM_BIAS])) / FREE_BIAS)
-    status = Status.TRACKING
-    if consistency > POWER_LIMIT or restless > WIDENING_LIMIT or abs(m.score[mem.EXCESS_BIAS]) > MOST_BIAS:
+    status, doubted = Status.TRACKING, abs(m.score[mem.EXCESS_BIAS]) > MOST_BIAS
+    if consistency > POWER_LIMIT or restless > WIDENING_LIMIT or doubted:
         status = Status.INCONSISTENT
     failed = bool(m.counts[mem.REFITS]) and status is Status.INCONSISTENT  # a fit before it fitted no better
     too_few = m.counts[mem.SINCE_EVENT] < FEW or (status is Status.INCONSISTENT and is_fitted_to_few(m))
@@ -78,7 +78,7 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     moved = by_rotors(model, m)
     spread += moved @ moved.T
     spread[0, 0] += (friction_error(model, m, peak) * (max(float(body[0]), 0.0) + model.motion.scale)) ** 2
-    if consistency > (POWER_LIMIT if m.counts[mem.REFITS] else UNKNOWN_POWER):
+    if doubted or consistency > (POWER_LIMIT if m.counts[mem.REFITS] else UNKNOWN_POWER):
         return Payload(max(float(body[0]), 0.0), math.inf, 0.0, math.inf, consistency, status)
     known_point = model.body > 1 and not spread[1:, 1:].any()
     if model.body > 1 and not known_point:
