@@ -203,9 +203,8 @@ def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, even
     opened = np.zeros((m.x.size, model.body))
     if kind is EventKind.CAPTURE:
         if not held:
-            is_another = not m.counts[mem.LEARNED] and is_another_arm(m)
             _forget_payload(model, m)  # the arm was empty: its payload was the bias of the model
-            if is_another:
+            if not m.counts[mem.LEARNED] and is_another_arm(m):
                 m.score[mem.EXCESS_BIAS] = math.inf
             m.counts[mem.LEARNED] = m.counts[mem.SEEN] >= UNTAUGHT
         # a point first, but one that joins a body makes a body
