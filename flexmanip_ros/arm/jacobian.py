@@ -141,6 +141,82 @@ def add_body_forces(arm: Manipulator, q: Array, qdd: Array, dp: Array, work: Wor
 
 
 @inner
+def add_mass_forces(
+    arm: Manipulator, i: int, q: Array, qd: Array, qdd: Array, A: Array, change: Array, nominal: Array, G: Array,
+    at: int, work: Workspace,
+) -> None:
+    """Add to column ``at`` of G (n, c) the inertial forces of a change of link i's masses.
+
+    change: relative change of its density, and change of the mass at its end [kg]; nominal: (P,) its masses; A: (2,)
+    acceleration of its root. Call it right after ``force_jacobian``: it reads work.J, work.P and the mass in work.F.
+    """
+    n, k = q.size, arm.kappa
+    o = arm.length.size + i * k
+    c, s, w, wd = np.cos(q[i]), np.sin(q[i]), qd[i], qdd[i]
+    re, rn = c * A[0] + s * A[1], c * A[1] - s * A[0]
+    eta, etad, etadd, shortening, phi = q[o:o + k], qd[o:o + k], qdd[o:o + k], arm.G[i], arm.phi[i]
+    shortening_gradient(shortening, eta, work.gradient[0])
+    shortening_gradient(shortening, etad, work.gradient[1])
+    shortening_gradient(shortening, etadd, work.gradient[2])
+    fe, fn, end = 0.0, 0.0, nominal.size - 1
+    for p in range(end + 1):
+        by_eta, by_rate, by_acceleration = work.gradient[0, p], work.gradient[1, p], work.gradient[2, p]
+        x, y, xd, yd, xdd, ydd = arm.place[i, p], 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(k):
+            x -= 0.5 * by_eta[j] * eta[j]
+            xd -= by_eta[j] * etad[j]
+            xdd -= by_rate[j] * etad[j] + by_acceleration[j] * eta[j]
+            y += phi[p, j] * eta[j]
+            yd += phi[p, j] * etad[j]
+            ydd += phi[p, j] * etadd[j]
+        m = change[0] * nominal[p] if p < end else change[1]
+        Ae = m * (xdd - 2.0 * yd * w - y * wd - x * w * w + re)
+        An = m * (ydd + 2.0 * xd * w + x * wd - y * w * w + rn)
+        fe += Ae
+        fn += An
+        G[i, at] += x * An - y * Ae
+        for j in range(k):
+            G[o + j, at] += phi[p, j] * An - by_eta[j] * Ae
+    fx, fy = c * fe - s * fn, s * fe + c * fn
+    for r in range(n):
+        G[r, at] += work.J[i, 0, r] * fx + work.J[i, 1, r] * fy
+        if arm.floating:  # the translation of the base, from conservation of momentum
+            G[r, at] -= (work.P[0, r] * fx + work.P[1, r] * fy) / work.F[2]
+
+
+@inner
+def add_length_forces(
+    arm: Manipulator, i: int, q: Array, qd: Array, qdd: Array, change: float, payload: float, is_part: bool, G: Array,
+    at: int, work: Workspace,
+) -> None:
+    """Add to column ``at`` of G (n, c) the inertial forces of a change [m] of where link i + 1 is mounted on link i.
+
+    The next link and what it carries then have another Jacobian and another acceleration. payload: its mass [kg];
+    is_part: of the forces, the part of an additional qdd (qd is zero). Call it right after ``force_jacobian``.
+    """
+    n, c, s, w, wd = q.size, np.cos(q[i]), np.sin(q[i]), qd[i], qdd[i]
+    x, y = -s * wd - c * w * w, c * wd - s * w * w
+    own, carried = 0.0, payload
+    for p in range(arm.mass.shape[1]):
+        own += arm.mass[i, p]
+        carried += arm.mass[i + 1, p]
+    fx, fy = work.load[0], work.load[1]
+    if is_part:
+        fx, fy = 0.0, 0.0
+    for r in range(n):
+        px = work.P[0, r] - work.first[i, 0, r] - own * work.J[i, 0, r]
+        py = work.P[1, r] - work.first[i, 1, r] - own * work.J[i, 1, r]
+        if arm.floating:
+            px -= carried / work.F[2] * work.P[0, r]
+            py -= carried / work.F[2] * work.P[1, r]
+        if is_part:
+            fx += px * qdd[r]
+            fy += py * qdd[r]
+        G[r, at] += change * (px * x + py * y)
+    G[i, at] += change * (c * fy - s * fx)
+
+
+@inner
 def tip_load_jacobian(arm: Manipulator, i: int, q: Array, left: Array, right: Array, work: Workspace) -> None:
     """Add the force work.F at the tip of link i, with its derivatives Fq and Fv, to its rows of left and right."""
     k = arm.kappa
@@ -309,6 +385,8 @@ def force_jacobian(
     payload_jacobian(arm, payload, q, qd, qdd, left, right, dp, work)
     for back in range(links):
         i = links - 1 - back
+        if i == 0:
+            work.load[0], work.load[1] = work.F[0], work.F[1]
         tip_load_jacobian(arm, i, q, left, right, work)
         link_jacobian(arm, i, q, qd, qdd, left, right, work)
     if arm.floating:

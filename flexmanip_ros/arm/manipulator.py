@@ -202,6 +202,8 @@ class Workspace(NamedTuple):
     Fq: Array
     """(2, n) derivative with respect to q of the force that a link passes on to the link before."""
     Fv: Array
+    load: Array
+    """(2,) force on the tip of link 1 by what it carries."""
     turn: Array
     """(n,) gradient of the angle of the tip's cross-section."""
     B: Array
@@ -221,7 +223,7 @@ def workspace(arm: Manipulator) -> Workspace:
         block=np.zeros((k + 1, k + 1)), gradient=np.zeros((3, arm.mass.shape[1], k)), elastic=np.zeros(n),
         tangent=np.zeros((k, k)),
         A=np.zeros((links + 1, 2)), Aq=np.zeros((links + 1, 2, n)), Av=np.zeros((links + 1, 2, n)),
-        Fq=np.zeros((2, n)), Fv=np.zeros((2, n)), turn=np.zeros(n), B=np.zeros((n, links)),
+        Fq=np.zeros((2, n)), Fv=np.zeros((2, n)), load=np.zeros(2), turn=np.zeros(n), B=np.zeros((n, links)),
         net=np.zeros((3, links)), held=np.zeros((2, n)))
 
 

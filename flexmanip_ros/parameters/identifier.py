@@ -41,6 +41,12 @@ class PayloadParameters:
     model_error: float = parameter(
         0.003, "relative error of the arm's inertia that widens the interval where a sensor shows more than its noise",
         low=0.0, high=1.0)
+    length_std: float = parameter(
+        0.0, 'method structured: relative standard deviation to which the lengths of the links are known; 0: exactly',
+        low=0.0, high=0.1)
+    mass_std: float = parameter(
+        0.0, 'method structured: the same of the densities of the links and of the masses at the joint and the tip; '
+        'the empty arm refines them', low=0.0, high=0.1)
     object: str = parameter(
         'body', 'method structured: point, the object is a mass at the tip; body, it has a centre of mass and an '
         'inertia, which are estimated too', choices=('point', 'body'))
@@ -59,6 +65,9 @@ class PayloadParameters:
         if unknown:
             raise ParameterError(f"parameter 'payload.learn' names {', '.join(map(repr, unknown))}",
                                  f"choose from {', '.join(LEARNABLE)}")
+        if self.dynamics == 'linear' and (self.length_std or self.mass_std):
+            raise ParameterError("payload.length_std and payload.mass_std need payload.dynamics 'nonlinear'",
+                                 'leave them at 0: a linear plant takes its lengths and masses as exact')
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,7 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     moved = by_rotors(model, m)
     spread += moved @ moved.T
     spread[0, 0] += (friction_error(model, m, peak) * (max(float(body[0]), 0.0) + model.motion.scale)) ** 2
+    spread[0, 0] += (2.0 * config.payload.length_std * max(float(body[0]), 0.0)) ** 2  # by that of the last link
     if doubted or consistency > (POWER_LIMIT if m.counts[mem.REFITS] else UNKNOWN_POWER):
         return Payload(max(float(body[0]), 0.0), math.inf, 0.0, math.inf, consistency, status)
     known_point = model.body > 1 and not spread[1:, 1:].any()

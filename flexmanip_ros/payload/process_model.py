@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexmanip_ros.arm.equations_of_motion import STICTION_RATE, balance, inertial_forces, solve
-from flexmanip_ros.arm.jacobian import add_body_forces, complete_jacobian, force_jacobian, solve_columns
+from flexmanip_ros.arm.jacobian import (
+    add_body_forces,
+    add_length_forces,
+    add_mass_forces,
+    complete_jacobian,
+    force_jacobian,
+    solve_columns,
+)
 from flexmanip_ros.arm.late_torque import late_torque
 from flexmanip_ros.arm.manipulator import Manipulator, Workspace
 from flexmanip_ros.numerics.compiled import inner, separate, separate_kernel
@@ -57,34 +64,36 @@ class Kind(IntEnum):
     """Its inertia about the tip [kg m^2]."""
     POINT = 4
     """Angle between the links at which a linear plant stays, less that of ``freeze`` [rad]."""
-    STIFFNESS = 5
+    CONSTANT = 5
+    """Error of the given lengths, densities and masses along a principal axis, over its deviation."""
+    STIFFNESS = 6
     """Logarithm of EI over its nominal value."""
-    DAMPING = 6
+    DAMPING = 7
     """Damping ratio."""
-    VISCOUS = 7
+    VISCOUS = 8
     """Viscous friction of a joint [N m s/rad]."""
-    COULOMB = 8
+    COULOMB = 9
     """Coulomb friction of a joint [N m]."""
-    ROTOR = 9
+    ROTOR = 10
     """Rotor inertia of a joint [kg m^2]."""
-    TORQUE_GAIN = 10
+    TORQUE_GAIN = 11
     """Logarithm of torque over reported effort."""
-    BEND_GAIN = 11
+    BEND_GAIN = 12
     """Logarithm of measured over true bend."""
-    BEND_OFFSET = 12
+    BEND_OFFSET = 13
     """Measured bend of a straight link [m]."""
-    MODE = 13
+    MODE = 14
     """Logarithm of the stiffness of a mode beyond the first over what its link's stiffness gives; number link k + j."""
-    TORQUE_DELAY = 14
+    TORQUE_DELAY = 15
     """Dead time from the reported efforts to the torques of all joints [s]."""
-    TORQUE_LAG = 15
+    TORQUE_LAG = 16
     """Time constant from the effort of a joint to its torque [s]."""
-    BEND_DELAY = 16
+    BEND_DELAY = 17
     """Age of all bends in a sample beyond that of the angles [s]."""
 
 
 # for the compiled functions, to which an enumeration is no constant
-(MASS, FIRST_X, FIRST_Y, INERTIA, POINT, STIFFNESS, DAMPING, VISCOUS, COULOMB, ROTOR, TORQUE_GAIN, BEND_GAIN,
+(MASS, FIRST_X, FIRST_Y, INERTIA, POINT, CONSTANT, STIFFNESS, DAMPING, VISCOUS, COULOMB, ROTOR, TORQUE_GAIN, BEND_GAIN,
  BEND_OFFSET, MODE, TORQUE_DELAY, TORQUE_LAG, BEND_DELAY) = (int(kind) for kind in Kind)
 
 
@@ -121,6 +130,12 @@ class ProcessModel(NamedTuple):
     """Mass [kg] at the tip of the empty arm: that of the tip and a third of the last link."""
     considered: float
     """Deviation [kg] of the mass that an empty arm seems to hold, by the error of its inertia (``model_error``)."""
+    masses: Array
+    """(L, P) nominal ``Manipulator.mass``."""
+    lengths: Array
+    """(L,) nominal ``Manipulator.length``."""
+    constants: Array
+    """(c, L, 3) errors of the arm, see ``structured_model.constant_errors``."""
     least: Array
     """(2,) mass m_a [kg] and inertia I_a [kg m^2], both negative. The mass matrix stays positive for every payload with
     (m - m_a) (I - I_a) >= |h|^2 and m >= m_a / 2, h its first moments."""
@@ -188,6 +203,8 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
             payload[kind] = value
         elif kind == POINT:
             motion.point[0] = value
+        elif kind == CONSTANT:
+            change_constants(motion, i, value)
         elif kind == STIFFNESS:
             factor_EI = np.exp(value)
             for j in range(k):
@@ -214,6 +231,19 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
             motion.late[:, 0] = value
         elif kind == TORQUE_LAG:
             motion.late[i, 1] = value
+
+
+@inner
+def change_constants(motion: ProcessModel, axis: int, value: float) -> None:
+    """Change masses and lengths of the arm by ``value`` deviations along a principal axis of their errors."""
+    mass, length, end = motion.arm.mass, motion.arm.length, motion.masses.shape[1] - 1
+    for i in range(length.size):
+        error, nominal = motion.constants[axis, i], motion.masses[i]
+        before = motion.lengths[i] if axis == 0 else length[i]
+        length[i] = before + value * error[2] * motion.lengths[i]
+        for p in range(end + 1):
+            before = nominal[p] if axis == 0 else mass[i, p]
+            mass[i, p] = before + value * (error[0] * nominal[p] if p < end else error[1])
 
 
 @inner
@@ -440,6 +470,8 @@ def balance_columns(motion: ProcessModel, q: Array, qd: Array, qdd: Array, first
             for r in range(n):
                 for t in range(n):
                     G[r, at] += turned_mass(motion, r, t) * qdd[t]
+        elif kind == CONSTANT:
+            constant_column(motion, q, qd, qdd, i, at, first > 0)
         elif kind == STIFFNESS:
             for j in range(k):
                 G[o + j, at] = motion.work.elastic[o + j] if first == 0 else arm.stiffness[o + j] * q[o + j]
@@ -475,6 +507,30 @@ def balance_columns(motion: ProcessModel, q: Array, qd: Array, qdd: Array, first
             if force != 0.0:
                 for r in range(n):
                     G[r, at] = force * motion.work.B[r, i]
+
+
+@inner
+def constant_column(
+    motion: ProcessModel, q: Array, qd: Array, qdd: Array, axis: int, at: int, is_slope: bool,
+) -> None:
+    """Fill column ``at`` of motion.G with the derivative of the forces by a principal axis of the constants' errors.
+
+    is_slope: q, qd and qdd are slopes over the step; the part that qdd adds at the mean state motion.k[16] is taken.
+    """
+    arm, work, place, rate, A = motion.arm, motion.work, q, qd, motion.k[7]
+    if is_slope:
+        place, rate = motion.k[16], motion.k[9]
+        rate[:] = 0.0
+    for i in range(arm.length.size):
+        for side in range(2):
+            A[side] = ordered_dot(work.J[i, side], qdd) if is_slope else work.A[i, side]
+            if is_slope and arm.floating:
+                A[side] -= ordered_dot(work.P[side], qdd) / work.F[2]
+        error = motion.constants[axis, i]
+        add_mass_forces(arm, i, place, rate, qdd, A, error, motion.masses[i], motion.G, at, work)
+        if error[2] != 0.0:
+            add_length_forces(arm, i, place, rate, qdd, error[2] * motion.lengths[i], motion.payload[0], is_slope,
+                              motion.G, at, work)
 
 
 @inner

@@ -213,6 +213,7 @@ def learned(config: IdentifierParameters) -> tuple[tuple[Kind, int], ...]:
     entries = [(kind, 0) for kind in body]
     if config.payload.dynamics == 'linear' and not config.payload.working_point and len(config.arm.link_length) == 2:
         entries.append((Kind.POINT, 0))
+    entries += [(Kind.CONSTANT, axis) for axis in range(len(constant_errors(config)))]
     given = {name for name, neutral in (('torque_gain', 1.0), ('bend_gain', 1.0), ('bend_offset', 0.0),
                                         ('torque_delay', 0.0), ('torque_lag', 0.0), ('bend_delay', 0.0))
              if np.any(np.array(getattr(config.arm, name)) != neutral)}
@@ -241,7 +242,7 @@ def motion(config: IdentifierParameters) -> ProcessModel:
     nx = 2 * n + size
     unit = manipulator(replace(config.arm, damping_ratio=0.5)).damping / 0.5
     arm = nominal._replace(**{name: getattr(nominal, name).copy() for name in (
-        'stiffness', 'damping', 'viscous', 'coulomb', 'rotary')})
+        'mass', 'length', 'stiffness', 'damping', 'viscous', 'coulomb', 'rotary')})
     M, frozen = straight(nominal), config.payload.dynamics == 'linear'
     if frozen:  # no forces of higher order than the displacements
         arm = arm._replace(along=np.zeros_like(arm.along))
@@ -251,8 +252,10 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         link=np.array([link for _, link in kinds], dtype=np.int64), prior=np.zeros(size), given=np.zeros(size),
         frozen=frozen, M0=np.zeros((n, n)), Mp=np.zeros((4, n, n)), Mt=np.zeros((5, n, n)), point=np.zeros(1),
         stiffness=nominal.stiffness, damping=unit, rotary=nominal.rotary, scale=lightest,
-        considered=config.payload.model_error * lightest, least=_least(nominal, M, lightest),
-        least_rotor=-0.25 * _inertias_at_joints(nominal, M), substeps=STEP_ANGLE / fastest_mode(config.arm),
+        considered=config.payload.model_error * lightest,
+        masses=nominal.mass, lengths=nominal.length, constants=constant_errors(config),
+        least=_least(nominal, M, lightest), least_rotor=-0.25 * _inertias_at_joints(nominal, M),
+        substeps=STEP_ANGLE / fastest_mode(config.arm),
         payload=np.zeros(4), effort=np.zeros(links), gain=np.ones(links), late=np.zeros((links, 2)),
         slope=np.zeros((links, 2)), driven=np.zeros(links), coulomb=nominal.coulomb.copy(),
         share=np.full(links, np.nan), rate=np.full(links, np.nan),
@@ -370,7 +373,8 @@ def priors(config: IdentifierParameters, motion: ProcessModel, M: Array) -> Arra
     """
     L = np.array(config.arm.link_length)
     J = np.array([M[i:L.size, i:L.size].sum() for i in range(L.size)])  # inertia beyond each joint, about it
-    alike = {Kind.MASS: EMPTY_STD * motion.scale, Kind.POINT: POINT_STD, Kind.STIFFNESS: config.payload.stiffness_std,
+    alike = {Kind.MASS: EMPTY_STD * motion.scale, Kind.POINT: POINT_STD, Kind.CONSTANT: 1.0,
+             Kind.STIFFNESS: config.payload.stiffness_std,
              Kind.DAMPING: config.payload.damping_std, Kind.TORQUE_GAIN: GAIN_STD, Kind.BEND_GAIN: GAIN_STD,
              Kind.TORQUE_DELAY: LATE_STD, Kind.TORQUE_LAG: LATE_STD, Kind.BEND_DELAY: LATE_STD}
     by_joint = {Kind.VISCOUS: VISCOUS_STD * J, Kind.COULOMB: COULOMB_STD * J, Kind.ROTOR: ROTOR_STD * J,
@@ -381,6 +385,33 @@ def priors(config: IdentifierParameters, motion: ProcessModel, M: Array) -> Arra
     fixed = {kind for name, kind in LEARNED.items() if name not in config.payload.learn}
     return np.array([0.0 if kind in fixed else by_joint[kind][link] if kind in by_joint else alike.get(kind, 0.0)
                      for kind, link in zip(map(Kind, motion.kind), motion.link, strict=True)])
+
+
+def constant_errors(config: IdentifierParameters) -> Array:
+    """Return errors of the arm (c, L, 3), one for a deviation along each principal axis of those of its constants.
+
+    Of each link: relative error of its density, that of the mass at its end [kg], and relative error of its length
+    where the next link is mounted. The constants are independent, with the relative deviations ``payload.length_std``
+    and ``payload.mass_std``.
+
+    A link that is longer by e moves as one of the given length whose displacements are smaller by 1 + e: by similarity
+    its density is larger by (1 + e)^3, the mass at its end by (1 + e)^2, and the length of the link before smaller by
+    1 + e. Its stiffness is smaller by 1 + e and the gain of its bends larger by 1 + e; these are learned.
+    """
+    arm, length, mass = config.arm, config.payload.length_std, config.payload.mass_std
+    links = len(arm.link_length)
+    ends = [*[arm.joint_mass] * (links - 1), arm.tip_mass]
+    errors = np.zeros((3, links, links, 3))
+    for i, end in enumerate(ends):
+        errors[0, i, i] = 3.0 * length, 2.0 * length * end, length if i + 1 < links else 0.0
+        if i:
+            errors[0, i, i - 1, 2] = -length
+        errors[1, i, i, 0], errors[2, i, i, 1] = mass, mass * end
+    flat = errors.reshape(3 * links, 3 * links)
+    used = flat.any(axis=0)
+    axes = np.zeros((int(used.sum()), 3 * links))
+    axes[:, used] = np.linalg.qr(flat[:, used])[1]
+    return axes.reshape(-1, links, 3)
 
 
 def _given(arm: ArmParameters, motion: ProcessModel) -> Array:
@@ -502,6 +533,8 @@ def expect_rotors_and_friction(model: Model, m: mem.FilterState) -> None:
 def take_as_known(model: Model, m: mem.FilterState, beyond: Kind = Kind.DAMPING) -> None:
     """Take the entries of p beyond a kind as given, where an unknown object hides them; modes stay uncertain."""
     taken = (model.motion.kind > beyond) & (model.motion.kind != Kind.MODE)
+    if Kind.CONSTANT in model.motion.kind:
+        taken &= ~np.isin(model.motion.kind, (Kind.TORQUE_GAIN, Kind.BEND_GAIN))
     m.x[model.payload:][taken] = model.motion.given[taken]
     m.S[model.payload:][taken] = 0.0
 

@@ -318,8 +318,9 @@ ADVICE = {
     Status.POORLY_EXCITED: 'move the arm, or raise the torque (node excitation)',
     Status.ILL_CONDITIONED: 'lower order or past_window',
     Status.ORDER_TOO_LOW: 'raise order (suggested_order in /diagnostics)',
-    Status.INCONSISTENT: 'check the parameters of the arm and the units of the signals (rad, m, N m); announce each '
-                         'capture and release, or set trigger_mode:=auto at launch',
+    Status.INCONSISTENT: 'check the parameters of the arm and the units of the signals (rad, m, N m); say how well '
+                         'lengths and masses are known (payload.length_std, payload.mass_std); announce each capture '
+                         'and release, or set trigger_mode:=auto at launch',
     Status.UNOBSERVABLE: 'correct inputs, outputs and angles, or set payload_method to none',
     Status.DIVERGED: 'check units and signs of the signals, and the times of events',
 }

@@ -15,6 +15,7 @@ from flexmanip_ros.payload.structured_model import build, freeze, motion
 SHORT = {
     'arm.link_length': [1.0, 0.8], 'arm.linear_density': [1.0, 0.8], 'arm.bending_stiffness': [120.0, 60.0],
     'arm.joint_mass': 1.5, 'arm.tip_mass': 0.8}
+UNSURE = {'payload.length_std': 0.002, 'payload.mass_std': 0.01}
 TORQUE = np.array([2.0, -0.8])
 
 
@@ -27,8 +28,9 @@ def arm():
 
 def placed(dynamics: str, angles: np.ndarray):
     """The short arm, a linear plant at these chord angles."""
+    unsure = UNSURE if dynamics == 'nonlinear' else {}
     settings = configure(IdentifierParameters, {
-        **SHORT, 'payload.dynamics': dynamics, 'arm.angle_convention': 'chord'})
+        **SHORT, **unsure, 'payload.dynamics': dynamics, 'arm.angle_convention': 'chord'})
     model = build(settings)
     freeze(settings, model, angles)
     model.motion.effort[:] = TORQUE
@@ -44,7 +46,8 @@ def bent(arm, n: int) -> np.ndarray:
     x[2:2 + size.size] = rng.normal(size=size.size) * 5e-3 * size
     x[n + 2:n + 2 + size.size] = rng.normal(size=size.size) * 0.5 * size
     values = {Kind.MASS: 0.7, Kind.FIRST_X: 0.05, Kind.FIRST_Y: 0.02, Kind.INERTIA: 0.02, Kind.STIFFNESS: 0.02,
-              Kind.DAMPING: 0.01, Kind.VISCOUS: 0.05, Kind.COULOMB: 0.02, Kind.ROTOR: 0.01, Kind.TORQUE_GAIN: 0.03}
+              Kind.DAMPING: 0.01, Kind.VISCOUS: 0.05, Kind.COULOMB: 0.02, Kind.ROTOR: 0.01, Kind.TORQUE_GAIN: 0.03,
+              Kind.CONSTANT: 0.8}
     x[2 * n:] = [values.get(Kind(kind), 0.0) for kind in arm.kind]
     process_model.set_parameters(arm, x)
     return x
@@ -170,6 +173,7 @@ def test_the_spread_moves_as_the_matrix_exponential_says(arm, sticks):
 def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(dynamics):
     arm = placed(dynamics, np.array([1.0, 0.6]))
     assert (Kind.POINT in arm.kind) == (dynamics == 'linear')
+    assert (Kind.CONSTANT in arm.kind) == (dynamics == 'nonlinear')
     n = arm.arm.stiffness.size
     x = bent(arm, n)
     low, high = np.zeros(n), np.zeros(n)
@@ -203,7 +207,7 @@ def test_a_linear_plant_whose_links_stay_at_another_angle_moves_as_one_that_was_
     {}, {'arm.base_mass': 700.0, 'arm.base_inertia': 180.0, 'arm.base_joint_offset': [0.3, 0.1]}],
     ids=['pinned', 'floating'])
 def test_what_is_learned_moves_a_vibration_that_turns_by_a_radian_in_a_sample_as_far_as_the_motion_does(base):
-    arm = motion(configure(IdentifierParameters, base))
+    arm = motion(configure(IdentifierParameters, {**base, **UNSURE}))
     n = arm.arm.stiffness.size
     assert 1e-3 / arm.substeps > 0.5  # a step is at most two radians of the fastest mode
     x = bent(arm, n)
@@ -222,6 +226,39 @@ def test_what_is_learned_moves_a_vibration_that_turns_by_a_radian_in_a_sample_as
         found = spread[:2 * n, 2 * n + c] / size
         # held over a sample, a rotor is 3 % off, a first moment 1 %
         assert np.linalg.norm(found - exact) <= 0.003 * np.linalg.norm(exact), Kind(arm.kind[c]).name
+
+
+def test_an_arm_with_other_lengths_and_masses_moves_as_the_given_one_with_errors_of_its_constants():
+    """To first order: a link that is longer by e has displacements that are larger by 1 + e."""
+    sines = {**SHORT, **UNSURE, 'arm.shape_functions': 'sines', 'arm.modes': 5}  # no mode is slowed by a mass of its own
+    longer, denser, heavier = np.array([[1.0, -2.0], [3.0, 2.0], [-1.5, 2.5]]) * 1e-4
+    given = motion(configure(IdentifierParameters, sines))
+    true = motion(configure(IdentifierParameters, {
+        **sines, 'arm.link_length': np.array(SHORT['arm.link_length']) * (1.0 + longer),
+        'arm.linear_density': np.array(SHORT['arm.linear_density']) * (1.0 + denser),
+        'arm.joint_mass': 1.5 * (1.0 + heavier[0]), 'arm.tip_mass': 0.8 * (1.0 + heavier[1])}))
+    n, modes = given.arm.stiffness.size, given.arm.kappa
+    size = np.concatenate([np.ones(2), np.repeat(1.0 + longer, modes)])
+
+    def accelerations(arm, mass, factor, stiffness, constants):
+        x = np.zeros(2 * n + arm.kind.size)
+        x[:2 * n] = bent(given, n)[:2 * n] * np.tile(factor, 2)
+        p = x[2 * n:]
+        p[arm.kind == Kind.MASS], p[arm.kind == Kind.STIFFNESS], p[arm.kind == Kind.CONSTANT] = (
+            mass, stiffness, constants)
+        arm.effort[:] = TORQUE
+        process_model.set_parameters(arm, x)
+        return linearize(arm, x)
+
+    errors = np.array([[3.0 * longer[0] + denser[0], 1.5 * (2.0 * longer[0] + heavier[0]), longer[0] - longer[1]],
+                       [3.0 * longer[1] + denser[1], 0.8 * (2.0 * longer[1] + heavier[1]), 0.0]]).ravel()
+    axes = given.constants.reshape(-1, errors.size).T
+    along = np.linalg.lstsq(axes, errors, rcond=None)[0]
+    np.testing.assert_allclose(axes @ along, errors, atol=1e-12)
+    exact = accelerations(true, 0.7, size, 0.0, 0.0) / size
+    without = accelerations(given, 0.7, np.ones(n), 0.0, np.zeros(along.size))
+    found = accelerations(given, 0.7 * (1.0 + 2.0 * longer[1]), np.ones(n), -longer, along)
+    assert np.linalg.norm(found - exact) < 0.01 * np.linalg.norm(exact - without)
 
 
 @pytest.mark.parametrize(('begin', 'end'), [

@@ -270,6 +270,23 @@ FINITE_ELEMENT = {'torque_convention': 'paper', 'angle_convention': 'chord', 'sh
                   'shape_functions': 'sines', 'modes': 3}
 
 
+@pytest.mark.parametrize(('longer', 'heavier'), [((-0.01, 0.01), (0.0, 0.0)), ((0.01, -0.005), (0.02, -0.01))])
+def test_lengths_and_masses_wrong_by_one_per_cent_are_learned_where_they_are_known_to_one_per_cent(longer, heavier):
+    arm = replace(ARM, link_length=tuple(3.0 * (1.0 + e) for e in longer), joint_mass=10.0 * (1.0 + heavier[0]),
+                  tip_mass=10.0 * (1.0 + heavier[1]))
+    samples = record(4.0, (event(1.5),), arm=arm)
+    unsure = config(payload=PayloadParameters(length_std=0.01, mass_std=0.01))
+    found = structured.estimate(unsure, run(unsure, samples, (event(1.5),)))
+    assert found.status is Status.TRACKING
+    assert found.mass == pytest.approx(20.0, rel=0.03)
+    assert found.lower < 20.0 < found.upper < 1.1 * found.lower
+
+
+def test_a_linear_plant_takes_its_lengths_and_masses_as_exact():
+    with pytest.raises(ParameterError, match='nonlinear'):
+        PayloadParameters(dynamics='linear', mass_std=0.01)
+
+
 @pytest.mark.parametrize(('damping', 'elements', 'payload', 'degrees', 'seed'), [
     (0.0, 10, 20.0, (45.0, 0.0), 0), (0.0, 10, 20.0, (45.0, 0.0), 1), (0.0, 10, 5.0, (60.0, 45.0), 2),
     (0.0, 4, 100.0, (45.0, 0.0), 3), (0.003, 10, 20.0, (45.0, 0.0), 4)])
