@@ -27,6 +27,8 @@ def joint_names(links: int) -> tuple[str, ...]:
     return (*(f'joint{i + 1}' for i in range(links)), *(f'link{i + 1}_bend' for i in range(links)))
 
 
+LONGEST_BLOCK = 10_000
+"""Largest number of samples that one call of a compiled function simulates: some tenths of a second."""
 REHEARSAL_TIME = 6.0
 """Seconds of the rehearsal that finds the signal levels, with the capture half way (the paper's run)."""
 
@@ -164,7 +166,7 @@ def simulate(
         if event is not None and first < count:
             state = (attach if event.kind is EventKind.CAPTURE else release)(config, state)
         while first < last:
-            end = first + 1 if state.taking_left else last
+            end = first + 1 if state.taking_left else min(first + LONGEST_BLOCK, last)  # an interrupt ends it between blocks
             state, *parts = _advance(config, state, efforts[first:end])
             rows[first:end] = np.hstack(parts)
             first = end

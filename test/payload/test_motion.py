@@ -230,7 +230,7 @@ def test_what_is_learned_moves_a_vibration_that_turns_by_a_radian_in_a_sample_as
 
 def test_an_arm_with_other_lengths_and_masses_moves_as_the_given_one_with_errors_of_its_constants():
     """To first order: a link that is longer by e has displacements that are larger by 1 + e."""
-    sines = {**SHORT, **UNSURE, 'arm.shape_functions': 'sines', 'arm.modes': 5}  # no mode is slowed by a mass of its own
+    sines = {**SHORT, **UNSURE, 'arm.shape_functions': 'sines', 'arm.modes': 5}  # no mode has a mass added
     longer, denser, heavier = np.array([[1.0, -2.0], [3.0, 2.0], [-1.5, 2.5]]) * 1e-4
     given = motion(configure(IdentifierParameters, sines))
     true = motion(configure(IdentifierParameters, {

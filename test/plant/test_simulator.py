@@ -64,6 +64,21 @@ def test_any_sequence_of_events_gives_the_same_bits(moments: list[int], ramp: fl
         assert np.array_equal(record.velocity, run.velocity[k])
 
 
+def test_a_long_run_is_simulated_in_blocks_between_which_an_interrupt_ends_it(monkeypatch) -> None:
+    whole = simulator.simulate(CLEAN, WAVES[:900], (CAPTURE,))
+    sizes, advance = [], simulator._advance
+
+    def counted(config, state, efforts):
+        sizes.append(len(efforts))
+        return advance(config, state, efforts)
+
+    monkeypatch.setattr(simulator, '_advance', counted)
+    monkeypatch.setattr(simulator, 'LONGEST_BLOCK', 70)
+    in_blocks = simulator.simulate(CLEAN, WAVES[:900], (CAPTURE,))
+    assert max(sizes) == 70
+    np.testing.assert_array_equal(in_blocks.position, whole.position)
+
+
 def test_steps_do_not_change_the_state_they_start_from() -> None:
     start = simulator.init(CLEAN)
     _, first = simulator.step(CLEAN, start, np.array([10.0, 5.0]))
