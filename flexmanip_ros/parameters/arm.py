@@ -273,6 +273,14 @@ class DemoParameters:
                 raise ParameterError(
                     f"parameter '{name}' is {getattr(self, name):g} s",
                     f'it must come before the end of the run ({self.duration:g} s)')
+        check_order(self)
+
+
+def check_order(config: Any) -> None:
+    """Raise ParameterError where a release is set before its capture, or at the same time."""
+    if 0.0 <= config.release_time <= config.capture_time:
+        raise ParameterError(f"parameter 'release_time' is {config.release_time:g} s",
+                             f'it must come after the capture ({config.capture_time:g} s); capture_time -1: none')
 
 
 def settings(config: DemoParameters) -> dict[str, dict[str, Any]]:

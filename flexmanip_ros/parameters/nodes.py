@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field
 
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.parameters.arm import ArmParameters
+from flexmanip_ros.parameters.arm import ArmParameters, check_order
 from flexmanip_ros.parameters.field import check_all, fit_links, parameter
 from flexmanip_ros.parameters.identifier import PayloadParameters, fit_signals
 
@@ -142,9 +142,11 @@ class TriggerParameters:
         'service', 'service: on request; time: at set times after the first sample; auto: when the signals show it',
         choices=('service', 'time', 'auto'))
     capture_time: float = parameter(
-        3.0, 'time of the capture after the first sample (mode time); negative: no capture', unit='s', low=-1.0)
+        3.0, 'time of the capture after the first sample (mode time); negative: no capture', unit='s', low=-1.0,
+        high=1e9)
     release_time: float = parameter(
-        -1.0, 'time of the release after the first sample (mode time); negative: no release', unit='s', low=-1.0)
+        -1.0, 'time of the release after the first sample (mode time); negative: no release', unit='s', low=-1.0,
+        high=1e9)
     lead_time: float = parameter(
         0.5, 'an event at a set time is announced this long before its stamp, so that every node knows it in time',
         unit='s', low=0.0, high=10.0)
@@ -171,6 +173,8 @@ class TriggerParameters:
     def __post_init__(self) -> None:
         check_all(self)
         fit_signals(self, len(self.arm.link_length))
+        if self.mode == 'time':
+            check_order(self)
 
 
 WINDOWS = (5, 10, 30)

@@ -76,6 +76,17 @@ def test_each_node_refuses_a_signal_that_is_none(cls: type, signals: list[str], 
         configure(cls, {'inputs': signals})
 
 
+@pytest.mark.parametrize(('times', 'words'), [
+    ({'capture_time': 1e300}, "'capture_time' is 1e+300 s; give a value from -1 to 1e+09 s"),
+    ({'release_time': 1e300}, "'release_time' is 1e+300 s; give a value from -1 to 1e+09 s"),
+    ({'capture_time': 2.0, 'release_time': 2.0}, "'release_time' is 2 s; it must come after the capture (2 s)"),
+])
+def test_a_time_that_no_stamp_holds_or_a_release_that_does_not_follow_its_capture_is_refused(
+        times: dict[str, float], words: str) -> None:
+    with pytest.raises(ParameterError, match=re.escape(words)):
+        configure(parameters.TriggerParameters, {'mode': 'time', **times})
+
+
 def test_an_empty_text_stands_for_the_empty_list_that_ros_cannot_write() -> None:
     assert configure(IdentifierParameters, {'angles': ['']}).angles == ()
 

@@ -49,6 +49,11 @@ def test_nothing_is_announced_before_its_lead_time(ros: Ros) -> None:
     assert node.announced == 0
 
 
+def test_mode_time_without_a_time_says_that_no_event_comes(ros: Ros, log: Callable[[str], str]) -> None:
+    ros.managed(CaptureTrigger(context=ros.context, overrides=overrides(mode='time', capture_time=-1.0)))
+    log('ready: mode time, no event: capture_time and release_time are negative')
+
+
 def test_a_looped_recording_starts_the_count_again(ros: Ros) -> None:
     node = ros.managed(CaptureTrigger(context=ros.context, overrides=overrides(
         mode='time', capture_time=0.01, lead_time=0.0)))

@@ -94,7 +94,8 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         config = self.config
         if config.mode == 'time':
             plan = (('capture', config.capture_time), ('release', config.release_time))
-            return 'mode time' + ''.join(f', {name} after {seconds:g} s' for name, seconds in plan if seconds >= 0.0)
+            times = ''.join(f', {name} after {seconds:g} s' for name, seconds in plan if seconds >= 0.0)
+            return f'mode time{times or ", no event: capture_time and release_time are negative"}'
         return f'mode {config.mode}' + (f', signals {", ".join(config.outputs)}' if config.mode == 'auto' else '')
 
     def activated(self) -> None:
