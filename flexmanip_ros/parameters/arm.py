@@ -90,12 +90,12 @@ class ArmParameters:
 
     def __post_init__(self) -> None:
         check_all(self)
-        fit_links(self, len(self.link_length))
+        fit_links(self, len(self.link_length), 'arm.')
         if self.base_mass and not self.base_inertia:
-            raise ParameterError(f"parameter 'base_mass' is {self.base_mass} kg, but 'base_inertia' is 0",
-                                 'give the inertia of the floating base, or base_mass 0 for a fixed one')
+            raise ParameterError(f"parameter 'arm.base_mass' is {self.base_mass} kg, but 'arm.base_inertia' is 0",
+                                 'give the inertia of the floating base, or arm.base_mass 0 for a fixed one')
         if self.base_mass and any(self.gravity):
-            raise ParameterError("parameters 'base_mass' and 'gravity' are both set",
+            raise ParameterError("parameters 'arm.base_mass' and 'arm.gravity' are both set",
                                  'a base that floats falls freely: leave gravity out')
 
 
@@ -188,8 +188,8 @@ class PlantParameters:
 
     def __post_init__(self) -> None:
         check_all(self)
-        for group in (self, self.sensors, self.actuators):
-            fit_links(group, len(self.arm.link_length))
+        for group, name in ((self, ''), (self.sensors, 'sensors.'), (self.actuators, 'actuators.')):
+            fit_links(group, len(self.arm.link_length), name)
         if self.arm.bend_delay < 0.0:
             raise ParameterError(f"parameter 'arm.bend_delay' is {self.arm.bend_delay} s",
                                  'a simulated arm shows bends late or in time: give 0 or more')

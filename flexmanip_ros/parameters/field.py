@@ -141,11 +141,11 @@ def check_all(config: Any) -> None:
             object.__setattr__(config, leaf.name, check(leaf, getattr(config, leaf.name)))
 
 
-def fit_links(config: Any, links: int) -> None:
+def fit_links(config: Any, links: int, group: str = '') -> None:
     """Give each parameter that is declared per link as many values as links; for use in ``__post_init__``.
 
     A default of two links loses the values of the second one where there is no second link. Raises ParameterError where
-    a list that was given has another size.
+    a list that was given has another size. group: such as 'arm.', before the names in an error.
     """
     for leaf in leaves(type(config)):
         if not leaf.per_link or '.' in leaf.name:
@@ -155,9 +155,14 @@ def fit_links(config: Any, links: int) -> None:
         if value == leaf.default:
             value = of_links(value, links)
         if len(value) != wanted:
-            raise ParameterError(f"parameter '{leaf.name}' has {len(value)} elements, but arm.link_length has {links}",
-                                 f'give {wanted} {WANTED[leaf.kind][1]}')
+            raise ParameterError(f"parameter '{group}{leaf.name}' has {counted(len(value), 'elements')}, "
+                                 f'but arm.link_length has {links}', f'give {counted(wanted, WANTED[leaf.kind][1])}')
         object.__setattr__(config, leaf.name, value)
+
+
+def counted(count: int, what: str) -> str:
+    """Return a count with its noun, such as '1 number' or '2 numbers'; what: the plural."""
+    return f'{count} {what.removesuffix("s") if count == 1 else what}'
 
 
 def of_links(values: tuple[Any, ...], links: int) -> tuple[Any, ...]:
@@ -177,7 +182,8 @@ def check(leaf: Leaf, value: Any) -> Any:
         items = ()  # ROS cannot write an empty list of a known type; [''] stands for it
     if leaf.size is not None and len(items) != leaf.size and not (
             leaf.per_link and len(items) * LINKS == leaf.size):
-        raise ParameterError(f"parameter '{leaf.name}' has {len(items)} elements", f'give {leaf.size} {wanted}')
+        raise ParameterError(f"parameter '{leaf.name}' has {counted(len(items), 'elements')}",
+                             f'give {leaf.size} {wanted}')
     return items
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters.arm import ArmParameters
-from flexmanip_ros.parameters.field import check_all, of_links, parameter
+from flexmanip_ros.parameters.field import check_all, counted, of_links, parameter
 
 FIELDS = ('position', 'velocity', 'effort')
 """Arrays of a JointState that a signal NAME/FIELD may name."""
@@ -159,8 +159,9 @@ class IdentifierParameters:
         links = len(self.arm.link_length)
         fit_signals(self, links)
         if len(self.payload.working_point) not in (0, links):
-            raise ParameterError(f"parameter 'payload.working_point' has {len(self.payload.working_point)} elements",
-                                 f'give {links}, or [] for the measured ones')
+            raise ParameterError(
+                f"parameter 'payload.working_point' has {counted(len(self.payload.working_point), 'elements')}",
+                f'give {links}, or [] for the measured ones')
         if self.payload.dynamics == 'linear' and self.arm.base_mass:
             raise ParameterError("parameter 'payload.dynamics' is 'linear', but arm.base_mass is set",
                                  'choose nonlinear: a linear plant has no floating base')
@@ -168,7 +169,7 @@ class IdentifierParameters:
             if not getattr(self, group):
                 raise ParameterError(f"parameter '{group}' is empty", 'name at least one NAME/FIELD')
         if self.angles and len(self.angles) != links:
-            raise ParameterError(f"parameter 'angles' names {len(self.angles)} signals",
+            raise ParameterError(f"parameter 'angles' names {counted(len(self.angles), 'signals')}",
                                  f"name one for each joint ({links}), or [''] for none")
         if self.state_basis == 'tracked' and self.estimator != 'paper':
             raise ParameterError("parameter 'state_basis' is 'tracked'",

@@ -76,6 +76,22 @@ def test_each_node_refuses_a_signal_that_is_none(cls: type, signals: list[str], 
         configure(cls, {'inputs': signals})
 
 
+@pytest.mark.parametrize(('values', 'words'), [
+    ({'arm.link_length': [1.0], 'arm.hub_inertia': [1.0, 2.0]},
+     "parameter 'arm.hub_inertia' has 2 elements, but arm.link_length has 1; give 1 number"),
+    ({'arm.hub_inertia': [1.0]}, "'arm.hub_inertia' has 1 element, but arm.link_length has 2; give 2 numbers"),
+    ({'sensors.bias': [0.1] * 4}, "'sensors.bias' has 4 elements, but arm.link_length has 2; give 8 numbers"),
+    ({'arm.base_mass': 1.0}, "'arm.base_mass' is 1.0 kg, but 'arm.base_inertia' is 0"),
+    ({'arm.gravity': [1.0]}, "'arm.gravity' has 1 element; give 2 numbers"),
+    ({'arm.base_mass': 1.0, 'arm.base_inertia': 1.0, 'arm.gravity': [0.0, 1.0]},
+     "parameters 'arm.base_mass' and 'arm.gravity' are both set"),
+])
+def test_an_error_names_a_parameter_with_its_group_and_counts_in_plain_english(
+        values: dict[str, object], words: str) -> None:
+    with pytest.raises(ParameterError, match=re.escape(words)):
+        configure(parameters.PlantParameters, values)
+
+
 @pytest.mark.parametrize(('times', 'words'), [
     ({'capture_time': 1e300}, "'capture_time' is 1e+300 s; give a value from -1 to 1e+09 s"),
     ({'release_time': 1e300}, "'release_time' is 1e+300 s; give a value from -1 to 1e+09 s"),
