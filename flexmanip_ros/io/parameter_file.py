@@ -64,13 +64,10 @@ def parse(text: str, what: str) -> Any:
         raise ParameterError(f'{what} is not valid YAML{place}: {reason}', 'correct that line') from err
 
 
-def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, Any]:
-    """Return the parameters a file gives to ``node``, nested groups flattened with dots.
+def sections(path: str | Path) -> dict[str, Any]:
+    """Return the parameters in each section of a file by the name of the section, nested; an empty file has none.
 
-    Sections named ``/**``, ``node``, ``/ns/node`` or with wildcards apply; later ones win. Sections of other nodes are
-    ignored, and so are parameters of other nodes in a section for every node. An empty file gives no values. A file
-    without any section for ``node`` is an error unless ``optional``. So is a list such as [1, 2.0] in any section, with
-    which no node starts. Raises ParameterError naming the file.
+    Raises ParameterError naming the file; also for a list such as [1, 2.0] in any section, with which no node starts.
     """
     where = f"parameter file '{path}'"
     try:
@@ -85,23 +82,38 @@ def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, An
     document = parse(text, where)
     if document is None:
         return {}
-    sections = dict(_sections(document, '', where))
-    if not sections:
-        raise ParameterError(f"{where} has no 'ros__parameters'", f"write '{node}: {{ros__parameters: {{...}}}}'")
-    for section in sections.values():
+    found = dict(_sections(document, '', where))
+    if not found:
+        raise ParameterError(f"{where} has no 'ros__parameters'", "write '/**: {ros__parameters: {...}}'")
+    for section in found.values():
         _reject_mixed(section, where)
-    chosen = [name for name in sections if name.rpartition('/')[2] in (node, '*', '**')]
-    if not chosen and not optional:
-        near = difflib.get_close_matches(node, [name.rpartition('/')[2] for name in sections], n=1)
-        hint = f" ('{near[0]}' is close)" if near else ''
-        raise ParameterError(f"{where} is for {', '.join(sorted(sections))}, not for {node}{hint}",
-                             f"add a section '{node}' or '/**'")
+    return found
+
+
+def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, Any]:
+    """Return the parameters a file gives to ``node``, nested groups flattened with dots.
+
+    Sections named ``/**``, ``node``, ``/ns/node`` or with wildcards apply; later ones win. Sections of other nodes are
+    ignored, and so are parameters of other nodes in a section for every node. An empty file gives no values. A file
+    without any section for ``node`` is an error unless ``optional``. Raises ParameterError naming the file.
+    """
+    found = sections(path)
+    chosen = [name for name in found if name.rpartition('/')[2] in (node, '*', '**')]
+    if found and not chosen and not optional:
+        raise _of_others(path, found, node)
     values: dict[str, Any] = {}
     for name in chosen:
-        flat = _flatten(sections[name], where)
+        flat = _flatten(found[name], f"parameter file '{path}'")
         foreign = package_names() - {leaf.name for leaf in leaves(NODES[node])} if name.endswith('*') else ()
         values.update((key, value) for key, value in flat.items() if not STANDARD.match(key) and key not in foreign)
     return values
+
+
+def _of_others(path: str | Path, found: Iterable[str], node: str) -> ParameterError:
+    near = difflib.get_close_matches(node.rpartition('/')[2], [name.rpartition('/')[2] for name in found], n=1)
+    hint = f" ('{near[0]}' is close)" if near else ''
+    return ParameterError(f"parameter file '{path}' is for {', '.join(sorted(found))}, not for {node}{hint}",
+                          f"add a section '{node}' or '/**'")
 
 
 def _sections(tree: Any, prefix: str, where: str) -> Iterable[tuple[str, Any]]:

@@ -7,6 +7,7 @@ import faulthandler
 import gc
 import inspect
 import math
+import re
 import signal
 import threading
 import time
@@ -21,12 +22,15 @@ import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.context import Context
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.subscription import Subscription
 
 from flexmanip_ros.cli.console import is_postponed, send_again
+from flexmanip_ros.errors import ParameterError
+from flexmanip_ros.io.parameter_file import sections
 
 POLL_S = 0.1
 """Longest wait inside the executor [s], hence the longest time before an idle node handles a signal."""
@@ -253,8 +257,18 @@ def _raise(error: BaseException) -> None:
 def first_line(error: BaseException) -> str:
     """Return the first line of an error without source locations: rcl puts paths of its build machine there.
 
-    rcl refuses a list such as [1, 2.0] without saying what to do, which is added.
+    Of unknown arguments rclpy gives the names alone. Of a parameter file rcl does not say that it does not exist, or
+    what is wrong with its YAML, and of a list such as [1, 2.0] not what to do. That is added.
     """
+    if isinstance(error, rclpy_implementation.UnknownROSArgsError):
+        return (f'unknown ROS arguments {error}; after --ros-args give -p NAME:=VALUE, --params-file FILE.yaml, '
+                '-r FROM:=TO or --log-level LEVEL')
+    file = re.search(r"params file: '--params-file (.+?)'\. Error", str(error))
+    if file:
+        try:
+            sections(file[1])
+        except ParameterError as clearer:
+            return str(clearer)
     text = str(error).strip().splitlines()
     line = (text[0] if text else type(error).__name__).split(', at ./')[0].split(', at /')[0]
     is_mixed = 'Sequence should be of same type' in str(error)

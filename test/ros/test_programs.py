@@ -90,7 +90,9 @@ def test_help_says_what_it_is_with_its_parameters(
 @pytest.mark.parametrize(('name', 'arguments', 'said'), [
     ('capture_trigger', ['--ros-args', '-p', 'mode:=magic'], 'choose one of service, time, auto'),
     ('excitation', ['--ros-args', '-p', 'amplitud:=[1.0, 1.0]'], "did you mean 'amplitude'?"),
-    ('plant_simulator', ['--ros-args', '--params-file', 'nowhere.yaml'], 'nowhere.yaml'),
+    ('plant_simulator', ['--ros-args', '--params-file', 'nowhere.yaml'],
+     "plant_simulator: parameter file 'nowhere.yaml' does not exist; check the path"),
+    ('plant_simulator', ['--ros-args', '--foo'], "unknown ROS arguments ['--foo']; after --ros-args give -p"),
     ('plant_simulator', ['--ros-args', '-p', 'arm.link_length:=[1, 2.0]'], 'each number with a point such as 1.0'),
     ('rpbsid_identifier', ['--ros-args', '-p', 'future_window:=30'], 'cannot exceed past_window (10)'),
     ('rpbsid_identifier', ['--nonsense'], 'unrecognized arguments: --nonsense'),
@@ -107,6 +109,19 @@ def test_bad_input_ends_with_one_clear_line_and_code_2(
     assert said in err
     assert 'usage:' not in err
     assert 'Traceback' not in err
+
+
+@pytest.mark.parametrize(('text', 'said'), [
+    ('plant_simulator:\n  ros__parameters:\n\trate: 100.0\n', "' is not valid YAML in line 3: found character '\\t'"),
+    ('/**: {ros__parameters: {arm: {link_length: [1, 2.0]}}}', 'write [1.0, 2.0]'),
+])
+def test_a_parameter_file_that_ros_cannot_read_is_named_with_what_is_wrong(
+        text: str, said: str, tmp_path: Path, signals: None, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / 'plant.yaml').write_text(text, encoding='utf-8')
+    assert call('plant_simulator', '--ros-args', '--params-file', str(tmp_path / 'plant.yaml')) == 2
+    (line,) = (line for line in capfd.readouterr().err.splitlines() if line.startswith('plant_simulator: '))
+    assert f"parameter file '{tmp_path / 'plant.yaml'}" in line
+    assert said in line
 
 
 def test_a_process_says_it_too() -> None:
