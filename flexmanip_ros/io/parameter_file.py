@@ -109,6 +109,15 @@ def read(path: str | Path, node: str, *, optional: bool = False) -> dict[str, An
     return values
 
 
+def check_names(path: str | Path, node: str) -> None:
+    """Raise ParameterError where a file has sections, but none that ROS gives to the node of this full name."""
+    found = sections(path)
+    patterns = (re.escape('/' + name.removeprefix('/')) for name in found)
+    if found and not any(re.fullmatch(name.replace(r'/\*\*', r'(/\w+)*').replace(r'/\*', r'/\w+'), node)
+                         for name in patterns):
+        raise _of_others(path, found, node)
+
+
 def _of_others(path: str | Path, found: Iterable[str], node: str) -> ParameterError:
     near = difflib.get_close_matches(node.rpartition('/')[2], [name.rpartition('/')[2] for name in found], n=1)
     hint = f" ('{near[0]}' is close)" if near else ''

@@ -36,11 +36,12 @@ from flexmanip_ros.cli import console
 from flexmanip_ros.errors import FlexmanipError, ParameterError
 from flexmanip_ros.event_replay import MOST_EVENTS
 from flexmanip_ros.io import cdr
+from flexmanip_ros.io.parameter_file import check_names
 from flexmanip_ros.messages import Diagnostics
 from flexmanip_ros.parameters.document import help_text
 from flexmanip_ros.ros import diagnostics, qos, rclpy_workarounds
 from flexmanip_ros.ros.conversions import to_message
-from flexmanip_ros.ros.parameters import NodeParameters, arm_line
+from flexmanip_ros.ros.parameters import NodeParameters, arm_line, given_files
 from flexmanip_ros.samples.signals import Rejection
 
 Config = TypeVar('Config')
@@ -154,6 +155,11 @@ class FlexmanipNode(rclpy_workarounds.ManagedNode, Generic[Config]):
     @_logged
     def on_configure(self) -> None:
         """Create what the node needs and build its state."""
+        for path in given_files():
+            try:
+                check_names(path, self.get_fully_qualified_name())
+            except ParameterError as error:  # rclpy ignores such a file without a word
+                self.get_logger().warning(str(error))
         arm, is_doubtful = arm_line(self)
         if is_doubtful:
             self.get_logger().warning(arm)

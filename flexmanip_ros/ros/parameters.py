@@ -142,6 +142,13 @@ def _reject_unknown(node: Node, known: dict[str, Leaf]) -> None:
         raise ParameterError(f"unknown parameter '{name}'", suggestion(name, known))
 
 
+def given_files() -> list[str]:
+    """Return the parameter files of the command line."""
+    # launch_ros writes the parameters that stand in a launch file into temporary files named launch_params_*
+    return [path for option, path in pairwise(sys.argv)
+            if option == '--params-file' and not Path(path).name.startswith('launch_params_')]
+
+
 def arm_line(node: Any) -> tuple[str, bool]:
     """Return a log line on the arm parameters of a node and where they come from; empty for a node without an arm.
 
@@ -154,9 +161,7 @@ def arm_line(node: Any) -> tuple[str, bool]:
     given = any(name.startswith('arm.') for name in parameter_overrides(node))
     defaults = flatten(type(arm)())
     changed = [f'arm.{name}' for name, value in flatten(arm).items() if value != defaults[name]]
-    # launch_ros writes the parameters that stand in a launch file into temporary files named launch_params_*
-    files = [path for option, path in pairwise(sys.argv)
-             if option == '--params-file' and not Path(path).name.startswith('launch_params_')]
+    files = given_files()
     if given:
         origin = f'set at start: {", ".join(changed) or "the defaults"}'
         origin += f' (parameter files: {", ".join(files)})' if files else ''

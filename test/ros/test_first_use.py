@@ -132,6 +132,23 @@ def test_a_node_logs_its_arm_and_where_it_comes_from(
     assert next(line for line in said.splitlines() if 'other.yaml' in line).startswith('[WARN]')
 
 
+@pytest.mark.parametrize('section', ['/**', '/*/trigger', '/left/*', '/**/trigger', 'left/trigger', 'capture_trigger'])
+def test_a_node_warns_of_a_parameter_file_exactly_where_ros_gives_it_nothing_of_the_file(
+        ros: Ros, log: Callable[[str], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, section: str) -> None:
+    """The node is /left/trigger: its own name was remapped, so that a section capture_trigger is not for it."""
+    file = tmp_path / 'trigger.yaml'
+    file.write_text(f"'{section}': {{ros__parameters: {{lead_time: 0.3}}}}", encoding='utf-8')
+    arguments = ['--ros-args', '--params-file', str(file), '-r', '__ns:=/left', '-r', '__node:=trigger']
+    monkeypatch.setattr(sys, 'argv', ['capture_trigger', *arguments])
+    log('')
+    node = ros.managed(CaptureTrigger(context=ros.context, cli_args=arguments))
+    warning = (f"[left.trigger]: parameter file '{file}' is for {section}, not for /left/trigger "
+               f"('{section}' is close); add a section '/left/trigger' or '/**'")
+    is_read = node.config.lead_time == 0.3
+    assert is_read is (section != 'capture_trigger')
+    assert (warning in log('ready')) is not is_read
+
+
 def test_a_node_that_compiles_kernels_says_so_while_it_does(
         ros: Ros, log: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(console, 'PATIENCE', 1e-4)
