@@ -159,7 +159,7 @@ def arm_line(node: Any) -> tuple[str, bool]:
     if arm is None:
         return '', False
     given = any(name.startswith('arm.') for name in parameter_overrides(node))
-    defaults = flatten(type(arm)())
+    defaults = flatten(type(arm)(arm.link_length)) | {'link_length': type(arm).link_length}  # of as many links
     changed = [f'arm.{name}' for name, value in flatten(arm).items() if value != defaults[name]]
     files = given_files()
     if given:

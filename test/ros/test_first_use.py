@@ -126,6 +126,8 @@ def test_a_node_logs_its_arm_and_where_it_comes_from(
         'all defaults')
     ros.managed(CaptureTrigger(context=ros.context, namespace='two', overrides=overrides(arm__tip_mass=4.0)))
     log('4 kg at the tip; set at start: arm.tip_mass')
+    ros.managed(CaptureTrigger(context=ros.context, namespace='one_link', overrides=overrides(arm__link_length=[1.0])))
+    log('arm: link of 1 m, 5 kg/m, 5000 N m^2, mass 10 kg at the tip; set at start: arm.link_length\n')
     monkeypatch.setattr(sys, 'argv', ['capture_trigger', '--ros-args', '--params-file', 'other.yaml'])
     ros.managed(CaptureTrigger(context=ros.context, namespace='three'))
     said = log('all defaults: other.yaml sets no parameter arm.* of /three/capture_trigger')
