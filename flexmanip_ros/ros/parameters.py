@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io.parameter_file import STANDARD
 from flexmanip_ros.parameters import Leaf, check, configure, flatten, leaves
-from flexmanip_ros.parameters.document import limits, package_names
+from flexmanip_ros.parameters.document import limits, package_names, written
 from flexmanip_ros.parameters.field import LINKS, suggestion
 from flexmanip_ros.ros.rclpy_workarounds import declare, parameter_overrides
 
@@ -45,7 +45,12 @@ class NodeParameters(Generic[Config]):
         self._on_change = on_change
         self._check_change = check_change
         _reject_unknown(node, self._leaves)
-        self.config: Config = configure(cls, {leaf.name: _declare(node, leaf) for leaf in leaves(cls)})
+        given = {leaf.name: _declare(node, leaf) for leaf in leaves(cls)}
+        self.config: Config = configure(cls, given)
+        cut = [f'{name} {written(self._leaves[name], value)}' for name, value in flatten(self.config).items()
+               if name in parameter_overrides(node) and value != given[name]]
+        if cut:  # lists that equal the default of two links, see ``fit_links``
+            node.get_logger().info(f'one link: of each list the values of a second one are left out: {", ".join(cut)}')
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._apply)
 

@@ -134,6 +134,15 @@ def test_a_node_logs_its_arm_and_where_it_comes_from(
     assert next(line for line in said.splitlines() if 'other.yaml' in line).startswith('[WARN]')
 
 
+def test_what_an_arm_of_one_link_leaves_out_of_given_lists_is_logged(ros: Ros, log: Callable[[str], str]) -> None:
+    log('')
+    ros.managed(CaptureTrigger(context=ros.context, overrides=overrides(
+        arm__link_length=[1.0], arm__hub_inertia=[0.0, 0.0], inputs=['joint1/effort', 'joint2/effort'])))
+    said = log('one link: of each list the values of a second one are left out: inputs [joint1/effort], '
+               'arm.hub_inertia [0.0]\n')
+    assert said.count('left out') == 1
+
+
 @pytest.mark.parametrize('section', ['/**', '/*/trigger', '/left/*', '/**/trigger', 'left/trigger', 'capture_trigger'])
 def test_a_node_warns_of_a_parameter_file_exactly_where_ros_gives_it_nothing_of_the_file(
         ros: Ros, log: Callable[[str], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, section: str) -> None:
