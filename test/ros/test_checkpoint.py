@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from identifier_harness import CAPTURE, Live, recording, replayed
 from ros_harness import Ros, overrides
 
@@ -68,13 +69,13 @@ def test_a_state_that_cannot_be_saved_is_logged_once_while_it_runs_and_at_the_en
     log(f'the last state was not saved: {problem}')
 
 
-def test_a_checkpoint_file_in_no_folder_is_refused_when_the_node_is_configured(
-        ros: Ros, tmp_path: Path, log: Callable[[str], str]) -> None:
-    node = ros.add(RpbsidIdentifier(context=ros.context, overrides=overrides(
-        checkpoint_file=str(tmp_path / 'none' / 'state'))))
+@pytest.mark.parametrize(('file', 'wrong'), [('none/state', "none' is no folder"), ('', "' is a folder")])
+def test_a_checkpoint_file_that_is_a_folder_or_in_none_is_refused_when_the_node_is_configured(
+        ros: Ros, tmp_path: Path, log: Callable[[str], str], file: str, wrong: str) -> None:
+    node = ros.add(RpbsidIdentifier(context=ros.context, overrides=overrides(checkpoint_file=str(tmp_path / file))))
     log('')
     ros.run(node, lambda: node.autostart() and ros.helper.get_logger().error('it started'))
-    assert 'it started' not in log(f"checkpoint_file cannot be written: '{tmp_path / 'none'}' is no folder")
+    assert 'it started' not in log(f'{wrong}; give a file in a folder that exists')
 
 
 def test_a_state_of_other_parameters_or_damaged_or_old_is_not_used_and_the_node_starts_anew(

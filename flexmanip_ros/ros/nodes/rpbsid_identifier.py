@@ -171,12 +171,12 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
     def start(self) -> None:
         """Compile or load every kernel before the first sample; begin with nothing known, or from a checkpoint.
 
-        Raises ParameterError when the folder of ``checkpoint_file`` does not exist.
+        Raises ParameterError when ``checkpoint_file`` is a folder, or in none.
         """
-        folder = Path(self.config.checkpoint_file).parent
-        if self.config.checkpoint_file and not folder.is_dir():
-            raise ParameterError(f"checkpoint_file cannot be written: '{folder}' is no folder",
-                                 'make it, or give another checkpoint_file')
+        path = Path(self.config.checkpoint_file)
+        if self.config.checkpoint_file and (path.is_dir() or not path.parent.is_dir()):
+            wrong = f"'{path}' is a folder" if path.is_dir() else f"'{path.parent}' is no folder"
+            raise ParameterError(f'checkpoint_file cannot be written: {wrong}', 'give a file in a folder that exists')
         warm_up(self.config)
         self._forget()
         self._checkpoints = CheckpointWriter(self.config) if self.config.checkpoint_file else None
