@@ -159,8 +159,8 @@ class Batches:
     hundred times a second takes 3 %. rclpy has no subscription without a callback, so this one is removed from its
     node after its creation.
 
-    Fast DDS keeps at most 5000 messages, whatever the depth of the queue. So ``take`` first moves all of them into a
-    queue of its own (``MOST_WAITING``).
+    Fast DDS keeps at most 5000 messages, whatever the depth of the queue. So ``fetch`` moves all of them into a queue
+    of its own (``MOST_WAITING``), which ``take`` does first.
 
     note: gets the sequence number of each message that is taken.
     """
@@ -176,8 +176,8 @@ class Batches:
         """Largest number of messages that can wait in the middleware."""
         return max(int(self._subscription.qos_profile.depth), 1)
 
-    def take(self) -> Iterator[tuple[Any, Any]]:
-        """Yield each waiting message with its message info, the oldest first."""
+    def fetch(self) -> int:
+        """Move the messages that wait in the middleware into the queue; return how many the queue then holds."""
         subscription = self._subscription
         with subscription.handle:
             for _ in range(self.depth):
@@ -185,6 +185,11 @@ class Batches:
                 if taken is None:
                     break
                 self._waiting.append(taken)
+        return len(self._waiting)
+
+    def take(self) -> Iterator[tuple[Any, Any]]:
+        """Yield each waiting message with its message info, the oldest first."""
+        self.fetch()
         while self._waiting:
             taken = self._waiting.popleft()
             self._note(sequence_number(taken[1]))

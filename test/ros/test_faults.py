@@ -64,6 +64,25 @@ def test_an_identifier_that_computes_for_seconds_loses_no_joint_state_and_takes_
     assert live.node.state.stamp_of(EventKind.CAPTURE) == START_NS + 12_000_000_000
 
 
+def test_joint_states_that_wait_after_a_block_are_not_said_to_have_ceased(ros: Ros) -> None:
+    live = Live(ros, payload_method='none')
+    live.send(*recording(50))
+    waiting = live.node._joint_states
+
+    def blocked() -> None:
+        for k in range(50, 80):
+            live.joint_states.publish(joint_state(k))
+        ros.wait(lambda: waiting.fetch() == 30)
+        live.node.meter.window()  # as long as the block was, the node took no message
+        live.node.diagnose()
+
+    ros.run(live.node, blocked)
+    said = message_with(live, 'wait: ')
+    assert said.startswith('30 messages of joint_states wait: publish joint states less often')
+    assert 'no joint_states' not in said
+    ros.wait(lambda: live.node.state.counters.received == 80)
+
+
 def test_a_publisher_that_dies_and_returns_is_a_gap_and_no_loss(ros: Ros) -> None:
     live = Live(ros)
     samples = recording(1100)

@@ -380,7 +380,11 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             values.update(late_events=events.late_events, repeated_events=events.repeated_events,
                           rewinds=events.rewinds, outliers=identifier.estimator.outliers)
         if self.active and values['rate_hz'] == 0.0:
-            report.silent('joint_states')
+            if waiting := self._joint_states.fetch():  # the node, not the arm, was silent
+                report.worse(diagnostics.WARN,
+                             f'{diagnostics.number(waiting, "message")} of joint_states wait: {FASTER}')
+            else:
+                report.silent('joint_states')
         report.busy(FASTER)
         if self.rejected:
             report.worse(diagnostics.ERROR, f'{diagnostics.number(self.rejected, "message")} rejected: {self.problem}')
