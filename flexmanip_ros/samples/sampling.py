@@ -46,6 +46,9 @@ NEVER = 6.0
 """Standard deviations of a stamp that chance does not reach in years: 1e-9."""
 OF_LAYOUT = ('missing_signal', 'unequal_sizes')
 """Outcomes that all messages of a block share, as they follow from names and array lengths."""
+SIMULATED_NS = 10**17
+"""Stamp that no simulated clock reaches, three years [ns]. After a larger one a stamp of 0 was not filled in; it is not
+the start of another run."""
 RELEARN = 20
 """Number of consecutive irregular intervals after which the sample time is learned again."""
 
@@ -290,6 +293,8 @@ _REPEATED = Rejection('repeated_stamp', 'header stamps do not advance',
                       'use a publisher that fills header.stamp with the time of each sample')
 _LATE = Rejection('late_stamp', 'a header stamp is older than the one before',
                   'publish in the order of the stamps')
+_UNSTAMPED = Rejection('late_stamp', 'a header stamp is 0, as where a publisher does not fill it in',
+                       'make each publisher of the joint states fill in header.stamp')
 _AHEAD = Rejection('late_stamp', 'one header stamp was far ahead of those before and after it',
                    'check the clock of the publisher')
 
@@ -316,6 +321,8 @@ def _fault(channels: Channels, record: JointRecord | JointBlock) -> Rejection | 
 def _on_clock(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sample) -> Sampled:
     """Place a sample. One with a stamp far ahead waits for the next, so that one wrong stamp does not reset the log."""
     candidate, last = clock.jump_candidate, clock.last_ns
+    if raw.stamp_ns == 0 and last is not None and last > SIMULATED_NS:
+        return Sampled(_reject(clock, _UNSTAMPED), log)
     if last is None or clock.interval_count == 0:
         return _placed(config, clock, log, raw)
     ahead = (raw.stamp_ns - last) * 1e-9

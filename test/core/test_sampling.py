@@ -224,6 +224,25 @@ def test_stamps_of_zero_are_explained() -> None:
     assert 'stamps do not advance' in state.rejection.problem
 
 
+@pytest.mark.parametrize('first', [0, 1, 30, 99])
+def test_messages_without_a_stamp_between_others_cost_nothing_but_themselves(first: int) -> None:
+    """Each of them was a jump back and the next message one ahead: all was forgotten at every second message."""
+    start_ns = 1_700_000_000 * 10**9
+    mixed = [record(k)._replace(stamp_ns=stamp_ns) for k in range(100)
+             for stamp_ns in (start_ns + k * DT, 0)[:1 + (k >= first)]]
+    state, samples, resets = drive(mixed)
+    assert (len(samples), resets, state.counters.late_stamp) == (100, 0, 100 - first)
+    assert state.rejection is not None
+    assert state.rejection.problem.startswith('a header stamp is 0')
+
+
+def test_a_simulated_clock_may_start_at_zero_and_start_again() -> None:
+    run = [record(k)._replace(stamp_ns=k * DT) for k in range(2000)]
+    for items, restarts in ((run, 0), ([*run, *run], 1)):
+        _, samples, resets = drive(items)
+        assert (samples[0].stamp_ns, len(samples), resets) == (0, 2000, restarts)
+
+
 def test_a_single_sample_before_a_pause_teaches_no_sample_time() -> None:
     config = IdentifierParameters()
     first, *later = [record(k) for k in (0, *range(1000, 1100))]
