@@ -28,7 +28,8 @@ def joint_names(links: int) -> tuple[str, ...]:
 
 
 LONGEST_BLOCK = 10_000
-"""Largest number of samples that one call of a compiled function simulates: some tenths of a second."""
+"""Largest number of samples that one call of a compiled function simulates, some tenths of a second: an interrupt waits
+for its end."""
 REHEARSAL_TIME = 6.0
 """Seconds of the rehearsal that finds the signal levels, with the capture half way (the paper's run)."""
 
@@ -166,7 +167,7 @@ def simulate(
         if event is not None and first < count:
             state = (attach if event.kind is EventKind.CAPTURE else release)(config, state)
         while first < last:
-            end = first + 1 if state.taking_left else min(first + LONGEST_BLOCK, last)  # an interrupt ends it between blocks
+            end = first + 1 if state.taking_left else min(first + LONGEST_BLOCK, last)
             state, *parts = _advance(config, state, efforts[first:end])
             rows[first:end] = np.hstack(parts)
             first = end
