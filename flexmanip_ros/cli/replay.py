@@ -192,7 +192,7 @@ class Messages:
         self.first_ns: int | None = None
         """Stamp of the first message that can become a sample."""
         self.events: list[CaptureEvent] = []
-        self._recorded: list[CaptureEvent] = []
+        self.recorded: list[CaptureEvent] = []
         """The events that are neither given nor found in the signals."""
         self.is_kept = (request.smooth or request.validate_from is not None or request.report is not None
                         or request.configurations is not None)
@@ -226,7 +226,7 @@ class Messages:
     def _noted(self, items: Iterable[JointBlock | CaptureEvent]) -> Iterator[JointBlock | CaptureEvent]:
         for item in items:
             if isinstance(item, CaptureEvent):
-                self._recorded.append(item)
+                self.recorded.append(item)
             yield item
 
     def far_events(self) -> list[str]:
@@ -235,7 +235,7 @@ class Messages:
         return [f'the stamp of a {event.kind.value} is {event.stamp_ns * 1e-9:.6f}, '
                 f'{(first_ns - event.stamp_ns) * 1e-9:.0f} s before the first sample: stamp an event with the time of '
                 f'its samples, or give --{event.kind.value}-time'
-                for event in self._recorded if first_ns - event.stamp_ns > FAR_EVENT_NS]
+                for event in self.recorded if first_ns - event.stamp_ns > FAR_EVENT_NS]
 
     def _watch(self) -> capture_detection.Watch | None:
         """Return the detector where events are to be looked for in the signals; say why where they are not.

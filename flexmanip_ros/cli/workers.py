@@ -21,12 +21,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from flexmanip_ros.cli import console
-from flexmanip_ros.errors import BagError, FlexmanipError
-from flexmanip_ros.io import bag
+from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.studies import trial
 from flexmanip_ros.studies.scenario import Scenario
-from flexmanip_ros.types import CaptureEvent, JointBlock
 
 KEY = 'run'
 """Name of the column with the key of a run. A study continues with the runs whose keys are not in its journal."""
@@ -83,28 +81,30 @@ def failed(task: Simulated | Recorded, error: BaseException) -> list[trial.Row]:
 
 
 def _recorded(task: Recorded) -> trial.Row:
+    from flexmanip_ros.cli.replay import Messages, Request  # runs of a scenario need none of what they import
+
+    messages = Messages(Request(task.path, task.config), console.Report())
+    items = list(messages)
+    if messages.fault is not None and not items:  # else the messages before the fault are identified
+        raise messages.fault
     truth = true_payload(Path(task.path))
-    items: list[JointBlock | CaptureEvent] = []
-    fault = ''
-    try:
-        items.extend(bag.read_blocks(task.path))
-    except BagError as error:  # the messages before the fault are identified
-        if not items:
-            raise
-        fault = str(error)
+    if truth is not None and messages.recorded:
+        truth = trial.held(messages.recorded, truth)
     row = trial.measure(task.config, items, truth, task.window, settled=SETTLING_TIME)
-    return {'bag': task.path, 'estimator': task.config.payload_method, **row, 'error': fault}
+    return {'bag': task.path, 'estimator': task.config.payload_method, **row, 'error': str(messages.fault or '')}
 
 
 def true_payload(path: Path) -> float | None:
-    """Return the mass in NAME.truth.json beside a recording, None when there is none."""
+    """Return the mass that NAME.truth.json beside a recording says is held at its end, None when there is none."""
     place = path.with_name(f'{path.stem if path.is_file() else path.name}.truth.json')
     try:
         found: Any = json.loads(place.read_text(encoding='utf-8'))
     except (OSError, ValueError):
         return None
     mass = found.get('payload_mass_kg') if isinstance(found, dict) else None
-    return float(mass) if isinstance(mass, (int, float)) else None
+    if not isinstance(mass, (int, float)):
+        return None
+    return float(mass) if found.get('release_time_s') is None else 0.0
 
 
 def recordings(folder: Path) -> list[Path]:

@@ -20,7 +20,7 @@ from flexmanip_ros.samples.sampling import collect
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.studies.results import payload_bound, relative_error_percent, summarize
 from flexmanip_ros.studies.scenario import Faults, Run, Scenario
-from flexmanip_ros.types import CaptureEvent, JointRecord, events_at
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, events_at
 
 Message = JointRecord | CaptureEvent
 
@@ -74,7 +74,8 @@ def trial(scenario: Scenario, seed: int) -> list[Row]:
             run = scenario.configuration(seed, name)
             row.update(drawn_columns(run.drawn))
             items = messages(scenario, run, seed)
-            row.update(measure(run.identifier, items, run.plant.payload_mass, scenario.window, bound=scenario.bound))
+            true_kg = held([item for item in items if isinstance(item, CaptureEvent)], run.plant.payload_mass)
+            row.update(measure(run.identifier, items, true_kg, scenario.window, bound=scenario.bound))
             row.update(frequency_columns(run, row))
         except Exception as error:  # a defect in one estimator must not end a study of thousands
             row['error'] = describe(error)
@@ -99,11 +100,17 @@ def messages(scenario: Scenario, run: Run, seed: int) -> list[JointRecord | Capt
     return inject(simulator.records(trajectory, events), scenario.faults, rng)
 
 
+def held(events: Iterable[CaptureEvent], mass: float) -> float:
+    """Return the mass [kg] that is held after the latest of some events, where an object of this mass is caught."""
+    last = max(events, key=lambda event: event.stamp_ns, default=None)
+    return mass if last is not None and last.kind is EventKind.CAPTURE else 0.0
+
+
 def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_kg: float | None,
             window: tuple[float, float], *, bound: bool = False, settled: float = 0.0) -> Row:
     """Run the identifier and return the columns of a row.
 
-    true_kg: mass of the object [kg]; None when unknown. window: start and end [s] of the mean error. It
+    true_kg: mass that is held at the end [kg]; None when unknown. window: start and end [s] of the mean error. It
     starts at the earliest ``settled`` seconds after the event from which on the true mass holds. bound: add the least
     standard deviation that the samples after the capture allow.
     """
@@ -127,18 +134,17 @@ def measure(config: IdentifierParameters, items: Sequence[pipeline.Item], true_k
             row[f'{kind.split("_")[0]}_{k + 1}'] = value
     row.update(payload_lower_kg=low, payload_upper_kg=high, us_per_sample=1e6 * wall / max(state.counters.accepted, 1))
     is_loaded = summary.held_since_s is not None
-    true = None if true_kg is None else (true_kg if is_loaded else 0.0)
-    row['payload_true_kg'] = true
-    row['covered'] = None if true is None or low is None or high is None else bool(low <= true <= high)
+    row['payload_true_kg'] = true_kg
+    row['covered'] = None if true_kg is None or low is None or high is None else bool(low <= true_kg <= high)
     changed = row['capture_time_s'] if is_loaded else row['release_time_s']
     begin = window[0] if changed is None else max(window[0], changed + settled)
     masses = np.array([
         estimate.payload.mass for estimate in estimates if estimate.payload is not None
         and begin <= (estimate.stamp_ns - state.first_ns) * 1e-9 <= window[1]], dtype=np.float64)
-    error = math.nan if true is None else relative_error_percent(masses, true)
+    error = math.nan if true_kg is None else relative_error_percent(masses, true_kg)
     row['error_percent'] = None if math.isnan(error) else error
     if bound and is_loaded and config.payload_method != 'none':
-        mass = row['payload_mass_kg'] if true is None else true
+        mass = row['payload_mass_kg'] if true_kg is None else true_kg
         row['bound_std_kg'] = None if mass is None else payload_bound(
             config, collect(config, items), row['capture_time_s'], mass, state.clock.dt)
     return row

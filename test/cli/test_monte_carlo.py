@@ -14,7 +14,8 @@ import pytest
 from quick_study import SCENARIO, rows_of, run, without_cost
 from recordings import record
 
-from flexmanip_ros.cli import workers
+from flexmanip_ros.cli import identify_bag, simulate_bag, workers
+from flexmanip_ros.io import bag
 from flexmanip_ros.types import JointRecord
 
 
@@ -86,6 +87,27 @@ def test_a_folder_of_recordings_is_a_study_and_a_broken_one_a_row(tmp_path):
     assert 'cannot be read' in rows['three.mcap']['error']
     assert rows['one']['samples'] == '300'
     assert workers.true_payload(folder / 'one') == 20.0
+
+
+def test_a_capture_that_nobody_announced_is_found_as_by_identify_bag_and_a_known_truth_stays(tmp_path, capsys):
+    assert simulate_bag.main([str(tmp_path / 'source'), '--duration', '4.5', '--set', 'arm.damping_ratio=0.003']) == 0
+    samples = [item for item in bag.read(tmp_path / 'source') if isinstance(item, JointRecord)]
+    folder = tmp_path / 'bags'
+    folder.mkdir()
+    for name, count in (('silent', 4500), ('before', 1500)):  # in the second one no estimator can see the object
+        record(folder / name, samples[:count])
+        (folder / f'{name}.truth.json').write_text('{"payload_mass_kg": 20.0}', encoding='utf-8')
+    arm = '--set=arm.damping_ratio=0.003'
+    assert run(folder, '--workers', 0, '--output', tmp_path / 'out.csv', arm) == 0
+    rows = {Path(row['run']).name: row for row in rows_of(tmp_path / 'out.csv')}
+    capsys.readouterr()
+    assert identify_bag.main([str(folder / 'silent'), '--json', arm]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found['capture_time_s'] == pytest.approx(3.0, abs=0.01)
+    assert [float(rows['silent'][name]) for name in ('capture_time_s', 'payload_mass_kg', 'payload_std_kg')] == [
+        found[name] for name in ('capture_time_s', 'payload_mass_kg', 'payload_std_kg')]
+    assert rows['silent']['covered'] == 'True'
+    assert (rows['before']['payload_true_kg'], rows['before']['covered']) == ('20.0', 'False')
 
 
 FRAGILE = '''
