@@ -59,6 +59,9 @@ def _main(given: argparse.Namespace) -> int:
         check_place(given.report, '.html', '.htm')  # so it is neither the table nor the scenario
     interrupted = False
     with Journal(given.output, identity) as journal:
+        versions: dict[Any, str] = {task.key: task.version for task in todo if isinstance(task, workers.Recorded)}
+        journal.rows = [row for row in journal.rows
+                        if versions.get(row.get(workers.KEY)) in (None, row.get(workers.VERSION))]
         done = {row.get(workers.KEY) for row in journal.rows}
         left = [task for task in todo if task.key not in done]
         if done:
@@ -97,7 +100,7 @@ def _plan(given: argparse.Namespace) -> tuple[Sequence[workers.Task], dict[str, 
         found = workers.recordings(source)
         if not found:
             raise ParameterError(f"folder '{given.source}' holds no recording", 'give a folder of rosbag2 recordings')
-        return ([workers.Recorded(str(path), config, (0.0, float('inf'))) for path in found],
+        return ([workers.Recorded(str(path), config, (0.0, float('inf')), workers.version(path)) for path in found],
                 {'recordings': str(source), 'parameters': _digest(flatten(config))})
     if given.runs < 1:
         raise ParameterError(f'--runs is {given.runs}', 'give at least 1')

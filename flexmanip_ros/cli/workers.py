@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import hashlib
 import importlib
 import json
 import multiprocessing
@@ -28,6 +29,8 @@ from flexmanip_ros.studies.scenario import Scenario
 
 KEY = 'run'
 """Name of the column with the key of a run. A study continues with the runs whose keys are not in its journal."""
+VERSION = 'version'
+"""Name of the column that tells a recording from another one at the same path, which is done again."""
 SETTLING_TIME = 1.0
 """Time after a capture in a recording from which on the error counts [s], as in the paper."""
 
@@ -62,6 +65,7 @@ class Recorded:
     path: str
     config: IdentifierParameters
     window: tuple[float, float]
+    version: str
 
     @property
     def key(self) -> str:
@@ -72,12 +76,17 @@ class Recorded:
 def work(task: Simulated | Recorded) -> list[trial.Row]:
     """Do one run and return its rows, each with the run's name."""
     rows = trial.trial(task.scenario, task.seed) if isinstance(task, Simulated) else [_recorded(task)]
-    return [{KEY: task.key, **row} for row in rows]
+    return [{**_names(task), **row} for row in rows]
 
 
 def failed(task: Simulated | Recorded, error: BaseException) -> list[trial.Row]:
     """Return the row of a run that failed."""
-    return [{KEY: task.key, 'error': trial.describe(error)}]
+    return [{**_names(task), 'error': trial.describe(error)}]
+
+
+def _names(task: Simulated | Recorded) -> trial.Row:
+    """Return the columns that name a run."""
+    return {KEY: task.key} if isinstance(task, Simulated) else {KEY: task.key, VERSION: task.version}
 
 
 def _recorded(task: Recorded) -> trial.Row:
@@ -96,15 +105,27 @@ def _recorded(task: Recorded) -> trial.Row:
 
 def true_payload(path: Path) -> float | None:
     """Return the mass that NAME.truth.json beside a recording says is held at its end, None when there is none."""
-    place = path.with_name(f'{path.stem if path.is_file() else path.name}.truth.json')
     try:
-        found: Any = json.loads(place.read_text(encoding='utf-8'))
+        found: Any = json.loads(_truth_path(path).read_text(encoding='utf-8'))
     except (OSError, ValueError):
         return None
     mass = found.get('payload_mass_kg') if isinstance(found, dict) else None
     if not isinstance(mass, (int, float)):
         return None
     return float(mass) if found.get('release_time_s') is None else 0.0
+
+
+def _truth_path(path: Path) -> Path:
+    return path.with_name(f'{path.stem if path.is_file() else path.name}.truth.json')
+
+
+def version(path: Path) -> str:
+    """Return what changes with the files of a recording and with that of its truth: their sizes and times."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    states = [(file.name, os.stat(file)) for file in (*files, _truth_path(path))
+              if os.path.isfile(file) and not file.name.endswith('-shm')]  # which sqlite makes while it reads
+    text = repr([(name, state.st_size, state.st_mtime_ns) for name, state in states])
+    return hashlib.sha256(text.encode('utf-8', 'surrogateescape')).hexdigest()[:16]
 
 
 def recordings(folder: Path) -> list[Path]:

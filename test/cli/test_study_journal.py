@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from quick_study import SCENARIO, rows_of, run, without_cost
+from recordings import write
+from rosbags.rosbag2 import StoragePlugin
 
 from flexmanip_ros.io.outputs import Journal
 
@@ -122,6 +126,29 @@ def test_an_interrupt_keeps_what_was_done_and_the_same_command_goes_on(scenario_
     assert done >= 2
     assert run(scenario_file, '--runs', done + 2, '--workers', 0, '--output', out) == 0
     assert [row['seed'] for row in rows_of(out)] == [str(seed) for seed in range(done + 2)]
+
+
+@pytest.mark.parametrize('storage', StoragePlugin)
+def test_a_recording_or_a_truth_that_was_replaced_is_done_again_and_the_others_are_not(tmp_path, capsys, storage):
+    folder = tmp_path / 'bags'
+    folder.mkdir()
+    settings = ['--set=payload_method=none', '--set=inputs=[joint1/effort]', '--set=outputs=[joint1/position]',
+                '--workers', 0, '--output', tmp_path / 'out.csv']
+    for name in ('kept', 'changed', 'weighed'):
+        write(folder / name, 300, storage, event_at=None)
+    assert run(folder, *settings) == 0
+    shutil.rmtree(folder / 'changed')
+    write(folder / 'changed', 200, storage, event_at=None)
+    (folder / 'weighed.truth.json').write_text('{"payload_mass_kg": 20.0}', encoding='utf-8')
+    for done in (1, 3):
+        capsys.readouterr()
+        assert run(folder, *settings) == 0
+        assert f'continuing: {done} of 3 runs are done already' in capsys.readouterr().err
+        rows = {Path(row['run']).name: row for row in rows_of(tmp_path / 'out.csv')}
+        assert {name: row['samples'] for name, row in rows.items()} == {
+            'kept': '300', 'changed': '200', 'weighed': '300'}
+        assert rows['weighed']['payload_true_kg'] == '20.0'
+        assert len(rows_of(tmp_path / 'out.csv')) == 3
 
 
 def test_overlapping_seeds_are_done_once(scenario_file, tmp_path):
