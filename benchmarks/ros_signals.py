@@ -102,6 +102,7 @@ SCENARIO = """
 name: signals
 duration: 2.0
 capture_time: 1.0
+window: [1.5, 2.0]
 """
 PROGRAMS = (
     Program('plant_simulator', 'plant_simulator', (), 3.0),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
@@ -42,10 +41,10 @@ class CaptureEvent(NamedTuple):
         return self._replace(std_s=DATING_STD_S) if topic.endswith('capture_detected') else self
 
 
-def events_at(start_ns: int, capture_s: float, release_s: float, end_s: float = math.inf) -> tuple[CaptureEvent, ...]:
-    """Return a capture and a release at times after a stamp [s]; leave out one with a time below 0 or from end_s on."""
+def events_at(start_ns: int, capture_s: float, release_s: float) -> tuple[CaptureEvent, ...]:
+    """Return a capture and a release at times after a stamp [s]; leave out one with a time below 0."""
     return tuple(CaptureEvent(start_ns + round(at * 1e9), kind) for at, kind in (
-        (capture_s, EventKind.CAPTURE), (release_s, EventKind.RELEASE)) if 0.0 <= at < end_s)
+        (capture_s, EventKind.CAPTURE), (release_s, EventKind.RELEASE)) if at >= 0.0)
 
 
 class JointRecord(NamedTuple):

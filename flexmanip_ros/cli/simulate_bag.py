@@ -77,18 +77,17 @@ def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.io.bag_writer import BagWriter
     from flexmanip_ros.io.outputs import check_place, write_text
     from flexmanip_ros.simulation import excitation, simulator
+    from flexmanip_ros.studies.scenario import events_in
     from flexmanip_ros.types import CaptureEvent, JointRecord
 
     plant, torque = configurations(given)
     if not 0.0 < given.duration <= 1e6:
         raise ParameterError(f'--duration is {given.duration:g}', 'give seconds above 0, up to 1e6')
     count = max(round(given.duration * plant.rate), 1)
-    events = simulator.on_samples(plant, _events(given), START_NS)
-    last_s = (count - 1) / plant.rate
-    for event in events:
-        if event.stamp_ns > START_NS + round(last_s * 1e9):  # no sample would show it
-            raise ParameterError(f'the {event.kind.value} comes after the last sample, which is at {last_s:g} s',
-                                 'give an earlier time or a longer --duration')
+    capture = given.capture_time
+    if capture is None:
+        capture = CAPTURE_TIME if given.duration > CAPTURE_TIME else -1.0
+    events = events_in(plant, given.duration, capture, given.release_time, START_NS, '--{}-time')
     target = Path(given.bag)
     if not target.name:
         raise BagError(f"'{given.bag}' is no name for a recording", 'give the name of a directory to make')
@@ -110,21 +109,6 @@ def _main(given: argparse.Namespace) -> int:
     empty = '' if events else ', the arm stays empty'
     print(f"wrote '{target}' ({count} samples, {given.duration:g} s{empty}) and '{truth_path}'")
     return console.SUCCESS
-
-
-def _events(given: argparse.Namespace) -> tuple[CaptureEvent, ...]:
-    """Return the events of the recording. Raises ParameterError where one that was asked for cannot happen in it."""
-    from flexmanip_ros.types import events_at
-
-    capture = CAPTURE_TIME if given.capture_time is None else given.capture_time
-    for name, at in (('--capture-time', given.capture_time), ('--release-time', given.release_time)):
-        if at is not None and at >= given.duration:
-            raise ParameterError(f'{name} is {at:g} s and the recording ends at {given.duration:g} s',
-                                 'give an earlier time or a longer --duration')
-    if given.release_time >= 0.0 and not 0.0 <= capture < given.release_time:
-        raise ParameterError(f'--release-time is {given.release_time:g} s and nothing is caught before',
-                             'give a --capture-time before it')
-    return events_at(START_NS, capture, given.release_time, given.duration)
 
 
 def truth(plant: PlantParameters, torque: ExcitationParameters, events: Sequence[CaptureEvent]) -> dict[str, Any]:

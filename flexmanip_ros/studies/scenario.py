@@ -13,6 +13,8 @@ import numpy as np
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure, leaves
 from flexmanip_ros.parameters.field import check_all, dotted, parameter
+from flexmanip_ros.simulation import simulator
+from flexmanip_ros.types import CaptureEvent, events_at
 
 GROUPS: Mapping[str, type] = {
     'plant': PlantParameters, 'excitation': ExcitationParameters, 'identifier': IdentifierParameters}
@@ -63,6 +65,9 @@ class Scenario:
             raise ParameterError(f'duration is {self.duration!r}', 'give seconds above 0')
         if not self.window[0] < self.window[1]:
             raise ParameterError(f'window is {list(self.window)}', 'give [from, to], seconds')
+        if self.window[1] <= 0.0 or self.window[0] >= self.duration:
+            raise ParameterError(f'window is {list(self.window)} and the run lasts from 0 to {self.duration:g} s',
+                                 'give a window in it')
         if not self.estimators:
             raise ParameterError('estimators is empty', 'name at least one')
         for name in self.vary:
@@ -92,7 +97,30 @@ class Scenario:
         arm = {name: value for name, value in groups['plant'].items() if name.startswith('arm.')}
         torque = for_plant(configure(ExcitationParameters, {**arm, **groups['excitation']}), plant)
         identifier = configure(IdentifierParameters, groups['identifier'])
-        return Run(plant, torque, identifier, capture, drawn)
+        events = events_in(plant, self.duration, capture, self.release_time)
+        return Run(plant, torque, identifier, events, drawn)
+
+
+def events_in(plant: PlantParameters, duration: float, capture: float, release: float, start_ns: int = 0,
+              option: str = '{}_time') -> tuple[CaptureEvent, ...]:
+    """Return the events of a simulated run, on its samples. Raises ParameterError for one that cannot happen in it.
+
+    capture, release: after the first sample [s]; below 0: never. option: how the user writes the time of a kind.
+    """
+    for kind, at in (('capture', capture), ('release', release)):
+        if at >= duration:
+            raise ParameterError(f'{option.format(kind)} is {at:g} s and the run ends at {duration:g} s',
+                                 'give an earlier time or a longer duration')
+    if release >= 0.0 and not 0.0 <= capture < release:
+        raise ParameterError(f'{option.format("release")} is {release:g} s and nothing is caught before',
+                             f'give a {option.format("capture")} before it')
+    events = simulator.on_samples(plant, events_at(start_ns, capture, release), start_ns)
+    last_s = (max(round(duration * plant.rate), 1) - 1) / plant.rate
+    for event in events:
+        if event.stamp_ns > start_ns + round(last_s * 1e9):  # no sample would show it
+            raise ParameterError(f'the {event.kind.value} comes after the last sample, which is at {last_s:g} s',
+                                 'give an earlier time or a longer duration')
+    return events
 
 
 def for_plant(torque: ExcitationParameters, plant: PlantParameters) -> ExcitationParameters:
@@ -108,7 +136,7 @@ class Run:
     plant: PlantParameters
     excitation: ExcitationParameters
     identifier: IdentifierParameters
-    capture_time: float
+    events: tuple[CaptureEvent, ...]
     drawn: Mapping[str, Any]
 
 

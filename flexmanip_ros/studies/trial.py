@@ -20,7 +20,7 @@ from flexmanip_ros.samples.sampling import collect
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.studies.results import payload_bound, relative_error_percent, summarize
 from flexmanip_ros.studies.scenario import Faults, Run, Scenario
-from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, events_at
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
 Message = JointRecord | CaptureEvent
 
@@ -74,7 +74,7 @@ def trial(scenario: Scenario, seed: int) -> list[Row]:
             run = scenario.configuration(seed, name)
             row.update(drawn_columns(run.drawn))
             items = messages(scenario, run, seed)
-            true_kg = held([item for item in items if isinstance(item, CaptureEvent)], run.plant.payload_mass)
+            true_kg = held(run.events, run.plant.payload_mass)
             row.update(measure(run.identifier, items, true_kg, scenario.window, bound=scenario.bound))
             row.update(frequency_columns(run, row))
         except Exception as error:  # a defect in one estimator must not end a study of thousands
@@ -93,11 +93,9 @@ def describe(error: BaseException) -> str:
 def messages(scenario: Scenario, run: Run, seed: int) -> list[JointRecord | CaptureEvent]:
     """Return the messages that the estimators of a run receive."""
     count = max(round(scenario.duration * run.plant.rate), 1)
-    events = simulator.on_samples(
-        run.plant, events_at(0, run.capture_time, scenario.release_time, scenario.duration))
-    trajectory = simulator.simulate(run.plant, excitation.sequence(run.excitation, count), events)
+    trajectory = simulator.simulate(run.plant, excitation.sequence(run.excitation, count), run.events)
     rng = np.random.default_rng([seed, 1 << 20])  # another random stream than those of `vary`
-    return inject(simulator.records(trajectory, events), scenario.faults, rng)
+    return inject(simulator.records(trajectory, run.events), scenario.faults, rng)
 
 
 def held(events: Iterable[CaptureEvent], mass: float) -> float:

@@ -150,6 +150,11 @@ def test_a_worker_that_dies_costs_only_its_run(tmp_path, monkeypatch):
     ('vary: {capture_time: {choice: [soon]}}', 'finite number'),
     ('capture_time: .nan', 'finite number'),
     ('window: [6, 4]', 'window'),
+    ('window: [6, 8]', 'window is [6.0, 8.0] and the run lasts from 0 to 6 s'),
+    ('capture_time: 9', 'capture_time is 9 s and the run ends at 6 s'),
+    ('capture_time: 5.9995', 'the capture comes after the last sample, which is at 5.999 s'),
+    ('release_time: 2', 'release_time is 2 s and nothing is caught before'),
+    ('release_time: 6', 'release_time is 6 s and the run ends at 6 s'),
     ('name: [1]', 'a word'),
     ('- a', 'names and values'),
 ])

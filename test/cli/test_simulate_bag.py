@@ -84,7 +84,7 @@ def test_parameters_come_from_the_file_then_set_then_named_arguments(tmp_path):
     (['--payload', '-1'], "parameter 'payload_mass'"),
     (['--duration', '0'], '--duration'),
     (['--params', 'nothing.yaml'], 'does not exist'),
-    (['--capture-time', '9'], 'the recording ends at 6 s'),
+    (['--capture-time', '9'], 'the run ends at 6 s'),
     (['--capture-time', '5.9995'], 'the capture comes after the last sample, which is at 5.999 s'),
     (['--release-time', '2'], 'nothing is caught before'),
     (['--capture-time', '-1', '--release-time', '2'], 'nothing is caught before'),
