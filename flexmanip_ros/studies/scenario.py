@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -80,6 +81,17 @@ class Scenario:
         # One random stream per name, so that a name's values do not depend on what else is varied.
         drawn = {name: _draw(how, np.random.default_rng([seed, crc32(name.encode('utf-8'))]))
                  for name, how in self.vary.items()}
+        try:
+            return self._run(seed, estimator, drawn)
+        except ParameterError as err:
+            named = [name for name in drawn if name.rpartition('.')[2] in re.findall(r'\w+', err.problem)]
+            if not named:
+                raise
+            raise ParameterError(f"{err.problem}, as 'vary' drew {' and '.join(named)} for seed {seed}",
+                                 err.remedy) from err
+
+    def _run(self, seed: int, estimator: str, drawn: Mapping[str, Any]) -> Run:
+        """Return what a run needs where these values are drawn."""
         groups: dict[str, dict[str, Any]] = {name: dict(getattr(self, name)) for name in GROUPS}
         capture = self.capture_time
         for name, value in drawn.items():
