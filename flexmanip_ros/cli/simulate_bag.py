@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from flexmanip_ros.cli import console
 from flexmanip_ros.errors import BagError, ParameterError
-from flexmanip_ros.io.parameter_file import load
+from flexmanip_ros.io.parameter_file import load, parse_overrides
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters, flatten
 from flexmanip_ros.parameters.document import help_text
 
@@ -61,12 +61,13 @@ def _parser() -> console.Parser:
 
 def configurations(given: argparse.Namespace) -> tuple[PlantParameters, ExcitationParameters]:
     """Return the parameters: named arguments win over --set, and --set over the file."""
-    from flexmanip_ros.studies.scenario import for_plant
+    from flexmanip_ros.studies.scenario import check_torque, for_plant
 
     plant_items = [item for item in given.set if not item.startswith(PREFIX)]
     plant_items += [f'{name}={value!r}' for name, value in (
         ('seed', given.seed), ('payload_mass', given.payload)) if value is not None]
     torque_items = [item.removeprefix(PREFIX) for item in given.set if item.startswith(PREFIX)]
+    check_torque(parse_overrides(torque_items))
     plant = load(PlantParameters, 'plant_simulator', given.params, plant_items, optional=True)
     torque_items.append(f'rate={plant.rate!r}')  # one torque per sample
     torque = load(ExcitationParameters, 'excitation', given.params, torque_items, optional=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 from zlib import crc32
@@ -21,6 +21,8 @@ GROUPS: Mapping[str, type] = {
     'plant': PlantParameters, 'excitation': ExcitationParameters, 'identifier': IdentifierParameters}
 DISTRIBUTIONS = ('uniform', 'normal', 'choice')
 CAPTURE_TIME = 'capture_time'
+FOLLOWING = ('arm', 'rate', 'initial_angles', 'payload_mass', 'snr_db')
+"""Parameters, or groups, of the torque whose values are those of the plant."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,7 @@ class Scenario:
         groups['identifier'].update(self.estimators[estimator])
         groups['plant'].setdefault('seed', seed)
         plant = configure(PlantParameters, groups['plant'])
+        check_torque(groups['excitation'])
         groups['excitation']['rate'] = plant.rate
         arm = {name: value for name, value in groups['plant'].items() if name.startswith('arm.')}
         torque = for_plant(configure(ExcitationParameters, {**arm, **groups['excitation']}), plant)
@@ -135,10 +138,16 @@ def events_in(plant: PlantParameters, duration: float, capture: float, release: 
     return events
 
 
+def check_torque(names: Iterable[str]) -> None:
+    """Raise ParameterError where one of the parameters given for the torque is one that follows the plant."""
+    for name in names:
+        if name.partition('.')[0] in FOLLOWING:
+            raise ParameterError(f"the torque's '{name}' follows the plant", f"give the plant's '{name}' instead")
+
+
 def for_plant(torque: ExcitationParameters, plant: PlantParameters) -> ExcitationParameters:
-    """Return the torque's parameters with the arm, start, payload and noise of the plant."""
-    return replace(torque, arm=plant.arm, initial_angles=plant.initial_angles,
-                   payload_mass=plant.payload_mass, snr_db=plant.snr_db)
+    """Return the torque's parameters with those that follow the plant."""
+    return replace(torque, **{name: getattr(plant, name) for name in FOLLOWING})
 
 
 @dataclass(frozen=True)

@@ -159,6 +159,9 @@ def test_a_worker_that_dies_costs_only_its_run(tmp_path, monkeypatch):
     ('release_time: 2', 'release_time is 2 s and nothing is caught before'),
     ('release_time: 6', 'release_time is 6 s and the run ends at 6 s'),
     ('name: [1]', 'a word'),
+    ('excitation: {rate: 500.0}', "the torque's 'rate' follows the plant; give the plant's 'rate' instead"),
+    ('excitation: {arm: {tip_mass: 3.0}}', "the torque's 'arm.tip_mass' follows the plant"),
+    ('vary: {excitation.payload_mass: {uniform: [1, 2]}}', "the torque's 'payload_mass' follows the plant"),
     ('- a', 'names and values'),
 ])
 def test_a_bad_scenario_is_one_line_and_exit_2(scenario_file, tmp_path, capsys, text, words):

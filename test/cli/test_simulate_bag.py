@@ -81,6 +81,8 @@ def test_parameters_come_from_the_file_then_set_then_named_arguments(tmp_path):
 @pytest.mark.parametrize(('arguments', 'words'), [
     (['--set', 'payload_mas=2'], "did you mean 'payload_mass'"),
     (['--set', 'excitation.shape=sine'], 'choose one of'),
+    (['--set', 'excitation.rate=500.0'], "the torque's 'rate' follows the plant; give the plant's 'rate' instead"),
+    (['--set', 'excitation.arm.tip_mass=3.0'], "give the plant's 'arm.tip_mass' instead"),
     (['--payload', '-1'], "parameter 'payload_mass'"),
     (['--duration', '0'], '--duration'),
     (['--params', 'nothing.yaml'], 'does not exist'),
