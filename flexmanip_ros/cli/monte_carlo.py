@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from flexmanip_ros.studies.trial import Row
 
 PROG = 'monte_carlo'
+RUNS = 100
+"""Number of runs of a scenario where none is given."""
 EXAMPLES = """examples:
   monte_carlo config/scenarios/capture.yaml --runs 100 --output capture.csv
   monte_carlo recordings/ --params my_arm.yaml --output recordings.csv
@@ -40,8 +42,9 @@ def _parser() -> console.Parser:
         PROG, 'Run a scenario with many seeds, or identify every recording in a folder; one row per run.', EXAMPLES)
     add = made.add_argument
     add('source', metavar='SCENARIO.yaml|FOLDER', help='scenario to repeat, or folder with recordings')
-    console.add_runs(made, 100, 'run the seeds FIRST .. FIRST+N-1')
-    add('--first-seed', type=console.whole, default=0, metavar='FIRST', help='first seed; default: 0')
+    console.add_runs(made, RUNS, 'run the seeds FIRST .. FIRST+N-1')
+    made.set_defaults(runs=None)  # so that one that is given is told from the default
+    add('--first-seed', type=console.whole, metavar='FIRST', help='first seed; default: 0')
     add('--output', default='study.csv', metavar='TABLE', help='table to write, .csv; default: study.csv')
     add('--report', metavar='REPORT.html', help='write a report: one HTML page with scores and figures')
     console.add_workers(made)
@@ -96,18 +99,22 @@ def _plan(given: argparse.Namespace) -> tuple[Sequence[workers.Task], dict[str, 
 
     source = Path(given.source).absolute()  # a worker may have another current directory
     if source.is_dir():
+        for option, value in (('--runs', given.runs), ('--first-seed', given.first_seed)):
+            if value is not None:
+                raise ParameterError(f'{option} is for a scenario', 'leave it away: each recording is identified once')
         config = load(IdentifierParameters, 'rpbsid_identifier', given.params, given.set)
         found = workers.recordings(source)
         if not found:
             raise ParameterError(f"folder '{given.source}' holds no recording", 'give a folder of rosbag2 recordings')
         return ([workers.Recorded(str(path), config, (0.0, float('inf')), workers.version(path)) for path in found],
                 {'recordings': str(source), 'parameters': _digest(flatten(config))})
-    if given.runs < 1:
-        raise ParameterError(f'--runs is {given.runs}', 'give at least 1')
+    runs = RUNS if given.runs is None else given.runs
+    if runs < 1:
+        raise ParameterError(f'--runs is {runs}', 'give at least 1')
     if given.params is not None:
         raise ParameterError('--params is for recordings', 'put the parameters into the scenario file')
     study = read_scenario(Path(given.source), given.set)
-    return ([workers.Simulated(study, given.first_seed + k) for k in range(given.runs)],
+    return ([workers.Simulated(study, (given.first_seed or 0) + k) for k in range(runs)],
             {'scenario': study.name, 'parameters': _digest(asdict(study))})
 
 

@@ -110,6 +110,14 @@ def test_a_capture_that_nobody_announced_is_found_as_by_identify_bag_and_a_known
     assert (rows['before']['payload_true_kg'], rows['before']['covered']) == ('20.0', 'False')
 
 
+@pytest.mark.parametrize('option', ['--runs', '--first-seed'])
+def test_what_is_for_a_scenario_alone_is_refused_with_a_folder(tmp_path, capsys, option):
+    (tmp_path / 'one.mcap').write_bytes(b'not a recording')
+    assert run(tmp_path, option, 100, '--output', tmp_path / 'out.csv') == 2
+    assert f'{option} is for a scenario; leave it away' in capsys.readouterr().err
+    assert not (tmp_path / 'out.csv.journal').exists()
+
+
 FRAGILE = '''
 import os
 from flexmanip_ros.errors import FlexmanipError
