@@ -96,6 +96,7 @@ def _main(given: argparse.Namespace) -> int:
 def _plan(given: argparse.Namespace) -> tuple[Sequence[workers.Task], dict[str, Any]]:
     """Return the tasks that the arguments ask for, and the identity of the study for its journal."""
     from flexmanip_ros.cli import workers
+    from flexmanip_ros.io.bag import COMPRESSED, STORAGE
 
     source = Path(given.source).absolute()  # a worker may have another current directory
     if source.is_dir():
@@ -108,6 +109,8 @@ def _plan(given: argparse.Namespace) -> tuple[Sequence[workers.Task], dict[str, 
             raise ParameterError(f"folder '{given.source}' holds no recording", 'give a folder of rosbag2 recordings')
         return ([workers.Recorded(str(path), config, (0.0, float('inf')), workers.version(path)) for path in found],
                 {'recordings': str(source), 'parameters': _digest(flatten(config))})
+    if source.is_file() and source.name.endswith((*STORAGE, *COMPRESSED)):
+        raise ParameterError(f"'{given.source}' is a recording", 'give its folder; each recording in it is identified')
     runs = RUNS if given.runs is None else given.runs
     if runs < 1:
         raise ParameterError(f'--runs is {runs}', 'give at least 1')

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from quick_study import SCENARIO, rows_of, run, without_cost
-from recordings import record
+from recordings import record, write
 
 from flexmanip_ros.cli import identify_bag, simulate_bag, workers
 from flexmanip_ros.io import bag
@@ -116,6 +116,13 @@ def test_what_is_for_a_scenario_alone_is_refused_with_a_folder(tmp_path, capsys,
     assert run(tmp_path, option, 100, '--output', tmp_path / 'out.csv') == 2
     assert f'{option} is for a scenario; leave it away' in capsys.readouterr().err
     assert not (tmp_path / 'out.csv.journal').exists()
+
+
+def test_a_file_of_a_recording_is_told_from_a_scenario(tmp_path, capsys):
+    path = next(write(tmp_path / 'one').glob('*.mcap'))
+    assert run(path, '--output', tmp_path / 'out.csv') == 2
+    assert capsys.readouterr().err == (
+        f"monte_carlo: '{path}' is a recording; give its folder; each recording in it is identified\n")
 
 
 FRAGILE = '''
