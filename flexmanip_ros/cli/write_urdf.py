@@ -61,8 +61,12 @@ COLOURS = ('0.20 0.45 0.70 1', '0.85 0.50 0.15 1')
 def urdf(arm: ArmParameters, segments: int = 12) -> str:
     """Return the description as XML text, for encoder angles. segments: number of segments of each link.
 
-    Raises ModelError for fewer than two segments.
+    Raises ModelError for fewer than two segments and for chord angles.
     """
+    if arm.angle_convention == 'chord':
+        raise ModelError("the joints of a URDF turn by encoder angles, and arm.angle_convention is 'chord'",
+                         'publish encoder angles and give arm.angle_convention encoder; chord angles are drawn by '
+                         'live_view, and in RViz by the markers of the identifier')
     if segments < 2:
         raise ModelError(f'{segments} segments cannot bend', 'draw at least two segments a link')
     robot = ET.Element('robot', name='flexible_arm')

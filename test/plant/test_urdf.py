@@ -87,6 +87,15 @@ def test_one_segment_cannot_bend() -> None:
         urdf(ARM, segments=1)
 
 
+def test_an_arm_of_chord_angles_is_refused_as_its_joints_would_be_drawn_wrong(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert write_urdf.main(['--set', 'arm.angle_convention=chord']) == 2
+    told = capsys.readouterr()
+    assert told.out == ''
+    assert 'publish encoder angles and give arm.angle_convention encoder' in told.err
+
+
 def test_more_segments_than_any_viewer_draws_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     """A hundred million of them would fill the memory before anything is written."""
     with pytest.raises(SystemExit, match='2'):
