@@ -44,11 +44,13 @@ def _parser() -> console.Parser:
 
 
 def _main(given: argparse.Namespace) -> int:
-    from flexmanip_ros.io.outputs import check_apart, write_text
+    from flexmanip_ros.io.outputs import check_apart, check_place, write_text
 
+    if given.output is not None:
+        check_place(given.output)
     check_apart({'--output': given.output}, given.params)
     text = urdf(load_arm(given.params, given.set), given.segments)
-    if given.output:
+    if given.output is not None:
         write_text(given.output, text)
     else:
         print(text, end='')

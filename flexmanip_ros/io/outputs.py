@@ -265,10 +265,10 @@ class Journal:
     """
 
     def __init__(self, path: str | Path, identity: Mapping[str, Any]) -> None:
+        check_place(path, '.csv')
         self.path = Path(path)
         self.journal = self.path.with_name(self.path.name + '.journal')
         self.rows: list[Row] = []
-        check_place(self.path, '.csv')
         head = json.dumps({'study': identity}, sort_keys=True)
         is_new = not self.journal.exists()
         if is_new and self.path.exists():

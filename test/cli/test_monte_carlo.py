@@ -125,6 +125,12 @@ def test_a_file_of_a_recording_is_told_from_a_scenario(tmp_path, capsys):
         f"monte_carlo: '{path}' is a recording; give its folder; each recording in it is identified\n")
 
 
+@pytest.mark.parametrize('place', ['.', ''])
+def test_a_table_without_a_name_is_one_line(scenario_file, capsys, place):
+    assert run(scenario_file, '--output', place) == 2
+    assert capsys.readouterr().err == f"monte_carlo: '{place}' is a directory; give a file name\n"
+
+
 FRAGILE = '''
 import os
 from flexmanip_ros.errors import FlexmanipError

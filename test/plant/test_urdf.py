@@ -113,6 +113,13 @@ def test_the_program_writes_what_the_library_makes(
     assert 'arm.modes' in capsys.readouterr().err
 
 
+@pytest.mark.parametrize('place', ['.', '/', ''])
+def test_a_place_that_is_no_file_is_one_line(place: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert write_urdf.main(['--output', place]) == 2
+    told = capsys.readouterr()
+    assert (told.out, told.err) == ('', f"write_urdf: '{place}' is a directory; give a file name\n")
+
+
 def test_the_program_needs_no_library_of_recordings(tmp_path: Path) -> None:
     code = "import sys; sys.modules['rosbags'] = None; from flexmanip_ros.cli import write_urdf; " \
            "sys.exit(write_urdf.main(['--output', sys.argv[1]]))"
