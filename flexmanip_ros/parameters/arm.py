@@ -16,7 +16,8 @@ class ArmParameters:
     """One or two flexible links, a joint before each, a mass at the tip; symbols as in docs/notation.md."""
 
     link_length: tuple[float, ...] = parameter(
-        (3.0, 3.0), 'length of each link; one value: an arm of one link', unit='m', low=SMALLEST, size=2, per_link=True)
+        (3.0, 3.0), 'length of each link; one value: an arm of one link', unit='m', low=SMALLEST, high=1e6, size=2,
+        per_link=True)
     linear_density: tuple[float, ...] = parameter(
         (5.0, 5.0), 'mass per length of each link', unit='kg/m', low=SMALLEST, size=2, per_link=True)
     bending_stiffness: tuple[float, ...] = parameter(

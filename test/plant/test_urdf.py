@@ -111,6 +111,8 @@ def test_the_program_writes_what_the_library_makes(
     assert target.read_text() == urdf(ArmParameters(), 4)
     assert write_urdf.main(['--set', 'arm.modes=many']) == 2
     assert 'arm.modes' in capsys.readouterr().err
+    assert write_urdf.main(['--set', 'arm.link_length=[1e120, 1.0]']) == 2
+    assert "'arm.link_length' is 1e+120 m; give a value from 1e-09 to 1e+06 m" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('place', ['.', '/', ''])
