@@ -39,7 +39,7 @@ TABLES = ('.csv', '.npz')
 def write_file(path: str | Path, fill: Callable[[Any], Any]) -> None:
     """Write a file whole or not at all; an older one stays until the new one is complete."""
     path = Path(path)
-    partial = path.with_name(f'.{path.name}.part')
+    partial = path.parent / f'.{path.name}.part'
     try:
         with partial.open('wb') as file:
             fill(file)

@@ -116,9 +116,12 @@ def test_a_save_that_fails_keeps_the_old_state_and_leaves_no_scraps(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match='cannot be written'):
-        checkpoint.save(tmp_path / 'no' / 'such' / 'folder', 1)
+@pytest.mark.parametrize('place', ['no/such/folder', '.'])
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(CheckpointError, match=f"'{place}' cannot be written"):
+        checkpoint.save(place, 1)
+    assert not list(tmp_path.iterdir())
 
 
 WHOLE = checkpoint.encode(stepped(pipeline.init(), items(40))[0])
