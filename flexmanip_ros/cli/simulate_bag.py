@@ -61,17 +61,16 @@ def _parser() -> console.Parser:
 
 def configurations(given: argparse.Namespace) -> tuple[PlantParameters, ExcitationParameters]:
     """Return the parameters: named arguments win over --set, and --set over the file."""
-    from flexmanip_ros.studies.scenario import check_torque, for_plant
+    from flexmanip_ros.studies.scenario import for_plant
 
     plant_items = [item for item in given.set if not item.startswith(PREFIX)]
     plant_items += [f'{name}={value!r}' for name, value in (
         ('seed', given.seed), ('payload_mass', given.payload)) if value is not None]
     torque_items = [item.removeprefix(PREFIX) for item in given.set if item.startswith(PREFIX)]
-    check_torque(parse_overrides(torque_items))
     plant = load(PlantParameters, 'plant_simulator', given.params, plant_items, optional=True)
-    torque_items.append(f'rate={plant.rate!r}')  # one torque per sample
-    torque = load(ExcitationParameters, 'excitation', given.params, torque_items, optional=True)
-    return plant, for_plant(torque, plant)
+    rate = f'rate={plant.rate!r}'  # one torque per sample, also where the file says otherwise
+    torque = load(ExcitationParameters, 'excitation', given.params, [rate, *torque_items], optional=True)
+    return plant, for_plant(torque, plant, parse_overrides(torque_items))
 
 
 def _main(given: argparse.Namespace) -> int:

@@ -12,7 +12,14 @@ from zlib import crc32
 import numpy as np
 
 from flexmanip_ros.errors import ParameterError
-from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure, leaves
+from flexmanip_ros.parameters import (
+    ExcitationParameters,
+    IdentifierParameters,
+    PlantParameters,
+    configure,
+    flatten,
+    leaves,
+)
 from flexmanip_ros.parameters.field import check_all, dotted, parameter
 from flexmanip_ros.simulation import simulator
 from flexmanip_ros.types import CaptureEvent, events_at
@@ -68,7 +75,8 @@ class Scenario:
             raise ParameterError(f'duration is {self.duration!r}', 'give seconds above 0')
         if not self.window[0] < self.window[1]:
             raise ParameterError(f'window is {list(self.window)}', 'give [from, to], seconds')
-        if self.window[1] <= 0.0 or self.window[0] >= self.duration:
+        is_given = self.window != type(self).window
+        if is_given and (self.window[1] <= 0.0 or self.window[0] >= self.duration):
             raise ParameterError(f'window is {list(self.window)} and the run lasts from 0 to {self.duration:g} s',
                                  'give a window in it')
         if not self.estimators:
@@ -107,11 +115,12 @@ class Scenario:
         groups['identifier'].update(self.estimators[estimator])
         groups['plant'].setdefault('seed', seed)
         plant = configure(PlantParameters, groups['plant'])
-        check_torque(groups['excitation'])
-        groups['excitation']['rate'] = plant.rate
         arm = {name: value for name, value in groups['plant'].items() if name.startswith('arm.')}
-        torque = for_plant(configure(ExcitationParameters, {**arm, **groups['excitation']}), plant)
+        own = groups['excitation']
+        torque = for_plant(configure(ExcitationParameters, {'rate': plant.rate, **arm, **own}), plant, own)
         identifier = configure(IdentifierParameters, groups['identifier'])
+        if capture == type(self).capture_time >= self.duration:  # it was not given
+            capture = -1.0
         events = events_in(plant, self.duration, capture, self.release_time)
         return Run(plant, torque, identifier, events, drawn)
 
@@ -138,16 +147,17 @@ def events_in(plant: PlantParameters, duration: float, capture: float, release: 
     return events
 
 
-def check_torque(names: Iterable[str]) -> None:
-    """Raise ParameterError where one of the parameters given for the torque is one that follows the plant."""
-    for name in names:
-        if name.partition('.')[0] in FOLLOWING:
+def for_plant(torque: ExcitationParameters, plant: PlantParameters, given: Iterable[str] = ()) -> ExcitationParameters:
+    """Return the torque's parameters with those that follow the plant.
+
+    Raises ParameterError where one of these was ``given`` another value.
+    """
+    made = replace(torque, **{name: getattr(plant, name) for name in FOLLOWING})
+    before, after = flatten(torque), flatten(made)
+    for name in given:
+        if before[name] != after[name]:
             raise ParameterError(f"the torque's '{name}' follows the plant", f"give the plant's '{name}' instead")
-
-
-def for_plant(torque: ExcitationParameters, plant: PlantParameters) -> ExcitationParameters:
-    """Return the torque's parameters with those that follow the plant."""
-    return replace(torque, **{name: getattr(plant, name) for name in FOLLOWING})
+    return made
 
 
 @dataclass(frozen=True)
