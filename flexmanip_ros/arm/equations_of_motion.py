@@ -110,6 +110,9 @@ def assemble_link(
     tip[1, i] += c * x
     b[0] = a[0] + c * (xdd - x * w * w) - s * (2.0 * xd * w)
     b[1] = a[1] + s * (xdd - x * w * w) + c * (2.0 * xd * w)
+    if i + 1 < links:
+        b[0] -= arm.gravity[i + 1, 0] - arm.gravity[i, 0]
+        b[1] -= arm.gravity[i + 1, 1] - arm.gravity[i, 1]
 
 
 @inner
@@ -163,7 +166,7 @@ def assemble(
         for t in range(r + 1):
             M[r, t] = arm.rotary[r, t]
     work.F[0], work.F[1], work.F[2] = 0.0, 0.0, arm.base[0]
-    work.a[0, 0], work.a[0, 1] = -arm.gravity[0], -arm.gravity[1]
+    work.a[0, 0], work.a[0, 1] = -arm.gravity[0, 0], -arm.gravity[0, 1]
     if arm.floating:
         c, s = np.cos(q[n - 1]), np.sin(q[n - 1])
         x, y = c * arm.base[1] - s * arm.base[2], s * arm.base[1] + c * arm.base[2]

@@ -42,6 +42,9 @@ def move_station(arm: Manipulator, i: int, q: Array, qd: Array, qdd: Array, work
     e, f = xdd - x * w * w, 2.0 * xd * w + x * wd
     A[0] = work.A[i, 0] + c * e - s * f
     A[1] = work.A[i, 1] + s * e + c * f
+    if i + 1 < arm.length.size:
+        A[0] -= arm.gravity[i + 1, 0] - arm.gravity[i, 0]
+        A[1] -= arm.gravity[i + 1, 1] - arm.gravity[i, 1]
     Aq[0, i] += -s * e - c * f
     Aq[1, i] += c * e - s * f
     e, f = -2.0 * x * w, 2.0 * xd
@@ -214,6 +217,21 @@ def add_length_forces(
             fy += py * qdd[r]
         G[r, at] += change * (px * x + py * y)
     G[i, at] += change * (c * fy - s * fx)
+
+
+@inner
+def add_weight(arm: Manipulator, i: int, change: float, nominal: Array, G: Array, at: int, work: Workspace) -> None:
+    """Add to column ``at`` of G (n, c) the forces of a relative change of the gravity that link i of a fixed arm feels.
+
+    nominal: (2,) that gravity [m/s^2]. The last link carries the payload. Call it right after ``force_jacobian``.
+    """
+    last = arm.length.size - 1
+    for r in range(G.shape[0]):
+        for side in range(2):
+            momentum = work.first[0, side, r] if i < last else work.P[side, r]
+            if i > 0:
+                momentum -= work.first[0, side, r]
+            G[r, at] -= change * nominal[side] * momentum
 
 
 @inner

@@ -166,7 +166,7 @@ class Manipulator(NamedTuple):
     base: Array
     """(3,) mass of a floating base [kg]; x and y of joint 1, seen from the centre of mass of the base [m]."""
     gravity: Array
-    """(2,) gravity along x and y [m/s^2]."""
+    """(L, 2) gravity along x and y, as each link feels it [m/s^2]."""
 
 
 class Workspace(NamedTuple):
@@ -279,7 +279,7 @@ def manipulator(arm: ArmParameters, kappa: int | None = None, points: int | None
         torque=joint.T.copy() if arm.torque_convention == 'joint' else np.eye(n, links),
         output=_output_matrix(arm, shapes, joint),
         viscous=np.array(arm.joint_viscous_friction), coulomb=np.array(arm.joint_coulomb_friction),
-        base=np.array([arm.base_mass, *arm.base_joint_offset]), gravity=np.array(arm.gravity))
+        base=np.array([arm.base_mass, *arm.base_joint_offset]), gravity=np.tile(arm.gravity, (links, 1)))
     # kernels are compiled for one memory layout, C-contiguous arrays, which a checkpoint preserves
     contiguous: dict[str, Any] = {
         name: np.ascontiguousarray(part) for name, part in made._asdict().items() if isinstance(part, np.ndarray)}

@@ -16,6 +16,7 @@ from flexmanip_ros.arm.jacobian import (
     add_body_forces,
     add_length_forces,
     add_mass_forces,
+    add_weight,
     complete_jacobian,
     force_jacobian,
     solve_columns,
@@ -134,8 +135,10 @@ class ProcessModel(NamedTuple):
     """(L, P) nominal ``Manipulator.mass``."""
     lengths: Array
     """(L,) nominal ``Manipulator.length``."""
+    gravity: Array
+    """(L, 2) nominal ``Manipulator.gravity``."""
     constants: Array
-    """(c, L, 3) errors of the arm, see ``structured_model.constant_errors``."""
+    """(c, L, 4) errors of the arm, see ``structured_model.constant_errors``."""
     least: Array
     """(2,) mass m_a [kg] and inertia I_a [kg m^2], both negative. The mass matrix stays positive for every payload with
     (m - m_a) (I - I_a) >= |h|^2 and m >= m_a / 2, h its first moments."""
@@ -235,12 +238,15 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
 
 @inner
 def change_constants(motion: ProcessModel, axis: int, value: float) -> None:
-    """Change masses and lengths of the arm by ``value`` deviations along a principal axis of their errors."""
+    """Change masses, lengths and gravity of the arm by ``value`` deviations along a principal axis of their errors."""
     mass, length, end = motion.arm.mass, motion.arm.length, motion.masses.shape[1] - 1
     for i in range(length.size):
         error, nominal = motion.constants[axis, i], motion.masses[i]
         before = motion.lengths[i] if axis == 0 else length[i]
         length[i] = before + value * error[2] * motion.lengths[i]
+        for side in range(2):
+            before = motion.gravity[i, side] if axis == 0 else motion.arm.gravity[i, side]
+            motion.arm.gravity[i, side] = before + value * error[3] * motion.gravity[i, side]
         for p in range(end + 1):
             before = nominal[p] if axis == 0 else mass[i, p]
             mass[i, p] = before + value * (error[0] * nominal[p] if p < end else error[1])
@@ -531,6 +537,8 @@ def constant_column(
         if error[2] != 0.0:
             add_length_forces(arm, i, place, rate, qdd, error[2] * motion.lengths[i], motion.payload[0], is_slope,
                               motion.G, at, work)
+        if error[3] != 0.0 and not is_slope:
+            add_weight(arm, i, error[3], motion.gravity[i], motion.G, at, work)
 
 
 @inner

@@ -242,7 +242,7 @@ def motion(config: IdentifierParameters) -> ProcessModel:
     nx = 2 * n + size
     unit = manipulator(replace(config.arm, damping_ratio=0.5)).damping / 0.5
     arm = nominal._replace(**{name: getattr(nominal, name).copy() for name in (
-        'mass', 'length', 'stiffness', 'damping', 'viscous', 'coulomb', 'rotary')})
+        'mass', 'length', 'gravity', 'stiffness', 'damping', 'viscous', 'coulomb', 'rotary')})
     M, frozen = straight(nominal), config.payload.dynamics == 'linear'
     if frozen:  # no forces of higher order than the displacements
         arm = arm._replace(along=np.zeros_like(arm.along))
@@ -253,7 +253,7 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         frozen=frozen, M0=np.zeros((n, n)), Mp=np.zeros((4, n, n)), Mt=np.zeros((5, n, n)), point=np.zeros(1),
         stiffness=nominal.stiffness, damping=unit, rotary=nominal.rotary, scale=lightest,
         considered=config.payload.model_error * lightest,
-        masses=nominal.mass, lengths=nominal.length, constants=constant_errors(config),
+        masses=nominal.mass, lengths=nominal.length, gravity=nominal.gravity, constants=constant_errors(config),
         least=_least(nominal, M, lightest), least_rotor=-0.25 * _inertias_at_joints(nominal, M),
         substeps=STEP_ANGLE / fastest_mode(config.arm),
         payload=np.zeros(4), effort=np.zeros(links), gain=np.ones(links), late=np.zeros((links, 2)),
@@ -388,30 +388,32 @@ def priors(config: IdentifierParameters, motion: ProcessModel, M: Array) -> Arra
 
 
 def constant_errors(config: IdentifierParameters) -> Array:
-    """Return errors of the arm (c, L, 3), one for a deviation along each principal axis of those of its constants.
+    """Return errors of the arm (c, L, 4), one for a deviation along each principal axis of those of its constants.
 
-    Of each link: relative error of its density, that of the mass at its end [kg], and relative error of its length
-    where the next link is mounted. The constants are independent, with the relative deviations ``payload.length_std``
-    and ``payload.mass_std``.
+    Of each link: relative error of its density, error of the mass at its end [kg], relative error of its length where
+    the next link is mounted, and that of the gravity that it feels. The constants are independent, with the relative
+    deviations ``payload.length_std`` and ``payload.mass_std``.
 
     A link that is longer by e moves as one of the given length whose displacements are smaller by 1 + e: by similarity
-    its density is larger by (1 + e)^3, the mass at its end by (1 + e)^2, and the length of the link before smaller by
-    1 + e. Its stiffness is smaller by 1 + e and the gain of its bends larger by 1 + e; these are learned.
+    its density is larger by (1 + e)^3 and the mass at its end by (1 + e)^2; the length of the link before and the
+    gravity that it feels are smaller by 1 + e. Its stiffness is smaller by 1 + e and the gain of its bends larger by
+    1 + e; these are learned.
     """
     arm, length, mass = config.arm, config.payload.length_std, config.payload.mass_std
     links = len(arm.link_length)
     ends = [*[arm.joint_mass] * (links - 1), arm.tip_mass]
-    errors = np.zeros((3, links, links, 3))
+    errors = np.zeros((3, links, links, 4))
     for i, end in enumerate(ends):
-        errors[0, i, i] = 3.0 * length, 2.0 * length * end, length if i + 1 < links else 0.0
+        errors[0, i, i] = (3.0 * length, 2.0 * length * end, length if i + 1 < links else 0.0,
+                           -length if any(arm.gravity) else 0.0)
         if i:
             errors[0, i, i - 1, 2] = -length
         errors[1, i, i, 0], errors[2, i, i, 1] = mass, mass * end
-    flat = errors.reshape(3 * links, 3 * links)
-    used = flat.any(axis=0)
-    axes = np.zeros((int(used.sum()), 3 * links))
-    axes[:, used] = np.linalg.qr(flat[:, used])[1]
-    return axes.reshape(-1, links, 3)
+    flat = errors.reshape(3 * links, 4 * links)
+    _, size, direction = np.linalg.svd(flat, full_matrices=False)
+    kept = size > 1e-9 * size.max()
+    axes: Array = size[kept, None] * direction[kept]
+    return axes.reshape(-1, links, 4)
 
 
 def _given(arm: ArmParameters, motion: ProcessModel) -> Array:

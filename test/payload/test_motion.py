@@ -26,11 +26,11 @@ def arm():
     return found
 
 
-def placed(dynamics: str, angles: np.ndarray):
+def placed(dynamics: str, angles: np.ndarray, gravity=(0.0, 0.0)):
     """The short arm, a linear plant at these chord angles."""
     unsure = UNSURE if dynamics == 'nonlinear' else {}
     settings = configure(IdentifierParameters, {
-        **SHORT, **unsure, 'payload.dynamics': dynamics, 'arm.angle_convention': 'chord'})
+        **SHORT, **unsure, 'payload.dynamics': dynamics, 'arm.angle_convention': 'chord', 'arm.gravity': gravity})
     model = build(settings)
     freeze(settings, model, angles)
     model.motion.effort[:] = TORQUE
@@ -169,9 +169,10 @@ def test_the_spread_moves_as_the_matrix_exponential_says(arm, sticks):
     assert np.abs((moved - exact) / scale).max() < process_model.SPREAD_ERROR * np.abs(exact / scale).max()
 
 
-@pytest.mark.parametrize('dynamics', ['nonlinear', 'linear'])
-def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(dynamics):
-    arm = placed(dynamics, np.array([1.0, 0.6]))
+@pytest.mark.parametrize(('dynamics', 'gravity'), [
+    ('nonlinear', [0.0, 0.0]), ('nonlinear', [2.0, -9.81]), ('linear', [0.0, 0.0])])
+def test_the_derivatives_by_what_is_learned_are_those_of_the_motion(dynamics, gravity):
+    arm = placed(dynamics, np.array([1.0, 0.6]), gravity)
     assert (Kind.POINT in arm.kind) == (dynamics == 'linear')
     assert (Kind.CONSTANT in arm.kind) == (dynamics == 'nonlinear')
     n = arm.arm.stiffness.size
@@ -228,9 +229,11 @@ def test_what_is_learned_moves_a_vibration_that_turns_by_a_radian_in_a_sample_as
         assert np.linalg.norm(found - exact) <= 0.003 * np.linalg.norm(exact), Kind(arm.kind[c]).name
 
 
-def test_an_arm_with_other_lengths_and_masses_moves_as_the_given_one_with_errors_of_its_constants():
+@pytest.mark.parametrize('gravity', [[0.0, 0.0], [2.0, -9.81]])
+def test_an_arm_with_other_lengths_and_masses_moves_as_the_given_one_with_errors_of_its_constants(gravity):
     """To first order: a link that is longer by e has displacements that are larger by 1 + e."""
-    sines = {**SHORT, **UNSURE, 'arm.shape_functions': 'sines', 'arm.modes': 5}  # no mode has a mass added
+    # of sines no mode has a mass added
+    sines = {**SHORT, **UNSURE, 'arm.gravity': gravity, 'arm.shape_functions': 'sines', 'arm.modes': 5}
     longer, denser, heavier = np.array([[1.0, -2.0], [3.0, 2.0], [-1.5, 2.5]]) * 1e-4
     given = motion(configure(IdentifierParameters, sines))
     true = motion(configure(IdentifierParameters, {
@@ -250,8 +253,10 @@ def test_an_arm_with_other_lengths_and_masses_moves_as_the_given_one_with_errors
         process_model.set_parameters(arm, x)
         return linearize(arm, x)
 
-    errors = np.array([[3.0 * longer[0] + denser[0], 1.5 * (2.0 * longer[0] + heavier[0]), longer[0] - longer[1]],
-                       [3.0 * longer[1] + denser[1], 0.8 * (2.0 * longer[1] + heavier[1]), 0.0]]).ravel()
+    felt = -longer if any(gravity) else np.zeros(2)
+    errors = np.array([
+        [3.0 * longer[0] + denser[0], 1.5 * (2.0 * longer[0] + heavier[0]), longer[0] - longer[1], felt[0]],
+        [3.0 * longer[1] + denser[1], 0.8 * (2.0 * longer[1] + heavier[1]), 0.0, felt[1]]]).ravel()
     axes = given.constants.reshape(-1, errors.size).T
     along = np.linalg.lstsq(axes, errors, rcond=None)[0]
     np.testing.assert_allclose(axes @ along, errors, atol=1e-12)
