@@ -533,7 +533,11 @@ def expect_rotors_and_friction(model: Model, m: mem.FilterState) -> None:
 
 
 def take_as_known(model: Model, m: mem.FilterState, beyond: Kind = Kind.DAMPING) -> None:
-    """Take the entries of p beyond a kind as given, where an unknown object hides them; modes stay uncertain."""
+    """Take the entries of p beyond a kind as given, where an unknown object hides them; modes stay uncertain.
+
+    So do the gains where lengths and masses are unsure: torques and masses have one factor in common, and a link of
+    another length has another gain of its bends (``constant_errors``).
+    """
     taken = (model.motion.kind > beyond) & (model.motion.kind != Kind.MODE)
     if Kind.CONSTANT in model.motion.kind:
         taken &= ~np.isin(model.motion.kind, (Kind.TORQUE_GAIN, Kind.BEND_GAIN))
