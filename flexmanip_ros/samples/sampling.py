@@ -49,6 +49,9 @@ OF_LAYOUT = ('missing_signal', 'unequal_sizes')
 SIMULATED_NS = 10**17
 """Stamp that no simulated clock reaches, three years [ns]. After a larger one a stamp of 0 was not filled in; it is not
 the start of another run."""
+SHORTEST_NS = 50_000
+"""Sample time below which the unit of the stamps is wrong [ns]: nobody publishes 20 000 joint states a second. At 1 kHz
+microseconds in the field of nanoseconds are stamps 1000 ns apart, of which modes of some MHz were identified."""
 RELEARN = 20
 """Number of consecutive irregular intervals after which the sample time is learned again."""
 
@@ -295,6 +298,8 @@ _LATE = Rejection('late_stamp', 'a header stamp is older than the one before',
                   'publish in the order of the stamps')
 _UNSTAMPED = Rejection('late_stamp', 'a header stamp is 0, as where a publisher does not fill it in',
                        'make each publisher of the joint states fill in header.stamp')
+_TOO_FAST = Rejection('repeated_stamp', 'header stamps are less than 50 microseconds apart',
+                      'make the publisher fill in header.stamp in seconds and nanoseconds')
 _AHEAD = Rejection('late_stamp', 'one header stamp was far ahead of those before and after it',
                    'check the clock of the publisher')
 
@@ -369,9 +374,13 @@ def _restart(clock: Clock, log: SampleLog, raw: Sample) -> Sampled:
 def _learned(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Sampled:
     """Set the sample time to the median of the first intervals; place the waiting samples on that clock.
 
-    Those before a far jump are left out, and clock and log begin behind it.
+    Those before a far jump are left out, and clock and log begin behind it. All are dropped where the unit of their
+    stamps is wrong.
     """
     rows = log.waiting_rows()
+    if len(rows) > 1 and np.median(np.diff(rows.stamp_ns)) < SHORTEST_NS:
+        counters = clock.counters.plus('accepted', count=-len(rows)).plus('repeated_stamp', count=len(rows))
+        return Sampled(clock._replace(counters=counters, last_ns=None, rejection=_TOO_FAST), log.without_waiting())
     first = _first_of_clock(config, rows.stamp_ns)
     stamps = rows.stamp_ns.tolist()
     samples = [Sample(stamps[k], *(part[k].copy() for part in (rows.u, rows.y, rows.angles, rows.rates)))

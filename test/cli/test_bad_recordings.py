@@ -73,6 +73,16 @@ def test_messages_out_of_order_are_reported_with_their_number(capsys, tmp_path):
     assert '300 with the stamp of the one before' in err
 
 
+@pytest.mark.parametrize('unit', [1000, 1_000_000])
+@pytest.mark.parametrize('count', [10, 300])
+def test_stamps_in_microseconds_or_milliseconds_are_an_error(capsys, tmp_path, unit, count):
+    short = [record._replace(stamp_ns=START + (record.stamp_ns - START) // unit) for record in _records(count)]
+    status, found, err = _run(capsys, _bag(tmp_path / 'bag', short), PLAIN)
+    assert (status, found) == (2, {})
+    assert err == ('identify_bag: header stamps are less than 50 microseconds apart; make the publisher fill in '
+                   'header.stamp in seconds and nanoseconds\n')
+
+
 def test_a_looped_recording_says_that_the_last_pass_counts(capsys, tmp_path):
     records = _records(1200)
     _, _, err = _run(capsys, _bag(tmp_path / 'bag', records + records), PLAIN)
