@@ -17,6 +17,9 @@ from numba.core import cgutils
 from numba.core.codegen import JITCodeLibrary, ll
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
+from numba.core.datamodel.models import PrimitiveModel
+from numba.core.datamodel.registry import register_default
+from numba.core.lowering import Lower
 from numba.core.typed_passes import NativeLowering
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import lower_builtin, register_jitable
@@ -92,11 +95,40 @@ class _Text(JITCodeLibrary):
         self._finalized = True
 
 
+class _Whole(types.Type):
+    """The type of an argument that is passed as one value of LLVM's, whatever it holds.
+
+    numba passes each number of an argument for itself. An ``inner`` function of a filter took some 700, and three in
+    five instructions took tuples apart and put them together.
+    """
+
+    def __init__(self, of: Any) -> None:
+        self.of = of
+        super().__init__(f'whole {of.name}')
+
+
+@register_default(_Whole)
+class _WholeModel(PrimitiveModel):
+    """Its representation: that of the value in a function."""
+
+    def __init__(self, models: Any, whole: _Whole) -> None:
+        super().__init__(models, whole, models.lookup(whole.of).get_value_type())
+
+
+class _LowerWhole(Lower):
+    """Lowers a function whose arguments are passed whole."""
+
+    def __init__(self, context: Any, library: Any, described: Any, *rest: Any, **named: Any) -> None:
+        described.argtypes = tuple(_Whole(argument) for argument in described.argtypes)
+        super().__init__(context, library, described, *rest, **named)
+
+
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _LowerToText(NativeLowering):
     """The pass in which numba makes machine code of a function, without that."""
 
     _name = 'lower_to_text'
+    lowering_class = _LowerWhole
 
     def run_pass(self, state: Any) -> bool:
         """Write LLVM's text. Callers find it by an object that stands for the compiled function and must not be run."""
@@ -107,7 +139,10 @@ class _LowerToText(NativeLowering):
         super().run_pass(state)
         state.flags, made = flags, state.cr
         known = make_function(made.fndesc.lookup_module(), made.fndesc.qualname, '', 0, made.env, (state.library,))
+        whole = made.fndesc.argtypes  # a call is found by the plain types, and passes its arguments whole
+        made.fndesc.argtypes = tuple(argument.of for argument in whole)
         context.insert_user_function(known, made.fndesc, [state.library])
+        made.fndesc.argtypes = whole
         state.cr = made._replace(cfunc=known)
         return True
 
