@@ -19,7 +19,7 @@ from flexmanip_ros.types import CaptureEvent, EventKind, JointBlock, JointRecord
 
 Item = JointRecord | CaptureEvent
 MS = 1_000_000
-COUNT = 420
+COUNT = 340
 CONFIG = configure(IdentifierParameters, {'publish_rate': 40.0, 'rewind_time': 0.1})
 
 

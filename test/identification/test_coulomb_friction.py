@@ -27,14 +27,14 @@ CONFIG = IdentifierParameters(  # other names than the default: the angles are r
     outputs=('link1_bend/position', 'link2_bend/position', 'link1_bend/velocity', 'link2_bend/velocity'))
 LEARNING = replace(  # friction alone: with everything learned a run takes three times as long
     CONFIG, payload_method='structured', payload=replace(CONFIG.payload, learn=('coulomb_friction',)))
-EVENT = CaptureEvent(3_000_000_000, EventKind.RELEASE)
+EVENT = CaptureEvent(2_000_000_000, EventKind.RELEASE)
 """An event that changes nothing: the arm is empty before and after it. The models begin again."""
 TOLD = replace(CONFIG, arm=replace(CONFIG.arm, joint_coulomb_friction=FRICTION))
 
 
 @cache
 def run() -> simulator.Trajectory:
-    return simulator.simulate(PLANT, excitation.sequence(ExcitationParameters(), 12_000), ())
+    return simulator.simulate(PLANT, excitation.sequence(ExcitationParameters(), 9_000), ())
 
 
 def messages(size: int) -> list[JointBlock]:
@@ -48,19 +48,19 @@ def messages(size: int) -> list[JointBlock]:
 
 @cache
 def readings(config: IdentifierParameters, size: int = 5000) -> list[Estimate]:
-    """The models of the last 7 of 12 s."""
+    """The models of the last 5 of 9 s."""
     return [estimate for _, estimate in pipeline.replay(config, messages(size))
-            if estimate is not None and estimate.model_is_new and estimate.stamp_ns > 5_000_000_000]
+            if estimate is not None and estimate.model_is_new and estimate.stamp_ns > 4_000_000_000]
 
 
 @cache
-def learned(size: int, end_s: int = 12, late: int = 0) -> tuple[pipeline.State, list[Estimate]]:
-    """The last state, and the models from 4 s on, where the event comes this number of blocks after its stamp."""
+def learned(size: int, end_s: int = 9, late: int = 0) -> tuple[pipeline.State, list[Estimate]]:
+    """The last state, and the models from 3 s on, where the event comes this number of blocks after its stamp."""
     items: list[pipeline.Item] = list(messages(size)[:1000 * end_s // size])
     items.insert(EVENT.stamp_ns // (size * 1_000_000) + late if late else 0, EVENT)
     found = list(pipeline.replay(LEARNING, items))
     return found[-1][0], [estimate for _, estimate in found if estimate is not None and estimate.model_is_new
-                          and estimate.stamp_ns > 4_000_000_000]
+                          and estimate.stamp_ns > 3_000_000_000]
 
 
 def errors(estimates: list[Estimate]) -> np.ndarray:
@@ -98,20 +98,20 @@ def test_untold_it_is_as_right_from_an_event_on_as_the_arm_taught_its_friction_b
 def test_what_was_learned_before_an_event_holds_at_a_later_one_at_which_the_payload_is_not_known() -> None:
     capture = CaptureEvent(EVENT.stamp_ns + 20_000_000, EventKind.CAPTURE)
     release = CaptureEvent(capture.stamp_ns + 10_000_000, EventKind.RELEASE)
-    *_, state = pipeline.absorb(LEARNING, [EVENT, capture, release, *messages(500)[:7]])
+    *_, state = pipeline.absorb(LEARNING, [EVENT, capture, release, *messages(500)[:5]])
     assert {since.stamp_ns for since in state.log.friction} <= {EVENT.stamp_ns, capture.stamp_ns}
     assert state.friction is not None
     np.testing.assert_allclose(state.friction, FRICTION, rtol=0.02)
 
 
 def test_learned_friction_gives_the_same_bits_where_the_event_comes_late_and_where_no_estimate_is_made() -> None:
-    state, late = learned(50, end_s=6, late=3)
+    state, late = learned(50, end_s=5, late=3)
     for one, other in zip(learned(500)[1], late, strict=False):
         assert one.model is not None
         assert other.model is not None
         np.testing.assert_array_equal(np.hstack([one.model.A, one.model.B]), np.hstack([other.model.A, other.model.B]))
     assert len(late) > 8
-    *_, last = pipeline.absorb(LEARNING, [EVENT, *messages(500)[:12]])
+    *_, last = pipeline.absorb(LEARNING, [EVENT, *messages(500)[:10]])
     assert last.log.friction == state.log.friction
     ends = [pipeline.current(one) for one in (state, last)]
     assert all(end is not None and end.model is not None for end in ends)
