@@ -11,7 +11,7 @@ from flexmanip_ros.payload.filter_state import HELD, SANDWICH
 from flexmanip_ros.payload.interval import moves
 from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.payload.structured import StructuredState, estimate
-from flexmanip_ros.types import ArmParameter, Status
+from flexmanip_ros.types import ArmParameter, Array, Status
 
 NAMES = {
     Kind.STIFFNESS: 'link{}_bending_stiffness', Kind.DAMPING: 'link{}_damping_ratio',
@@ -20,12 +20,16 @@ NAMES = {
     Kind.BEND_OFFSET: 'link{}_bend_offset', Kind.TORQUE_DELAY: 'torque_delay', Kind.TORQUE_LAG: 'joint{}_torque_lag',
     Kind.BEND_DELAY: 'bend_delay'}
 """Published name of a parameter of a link or joint, counted from 1."""
+LENGTH, DENSITY, JOINT, TIP, GRAVITY = 'link{}_length', 'link{}_linear_density', 'joint_mass', 'tip_mass', 'gravity{}'
+"""Published names of lengths, masses and the components of gravity, where lengths and masses are unsure."""
 FIELDS = {
-    Kind.STIFFNESS: 'bending_stiffness', Kind.VISCOUS: 'joint_viscous_friction', Kind.COULOMB: 'joint_coulomb_friction',
-    Kind.ROTOR: 'rotor_inertia', Kind.TORQUE_GAIN: 'torque_gain', Kind.BEND_GAIN: 'bend_gain',
-    Kind.BEND_OFFSET: 'bend_offset', Kind.TORQUE_DELAY: 'torque_delay', Kind.TORQUE_LAG: 'torque_lag',
-    Kind.BEND_DELAY: 'bend_delay'}
-"""The parameter arm.* that takes it."""
+    LENGTH: 'link_length', DENSITY: 'linear_density', JOINT: 'joint_mass', TIP: 'tip_mass', GRAVITY: 'gravity',
+    NAMES[Kind.STIFFNESS]: 'bending_stiffness', NAMES[Kind.VISCOUS]: 'joint_viscous_friction',
+    NAMES[Kind.COULOMB]: 'joint_coulomb_friction', NAMES[Kind.ROTOR]: 'rotor_inertia',
+    NAMES[Kind.TORQUE_GAIN]: 'torque_gain', NAMES[Kind.BEND_GAIN]: 'bend_gain',
+    NAMES[Kind.BEND_OFFSET]: 'bend_offset', NAMES[Kind.TORQUE_DELAY]: 'torque_delay',
+    NAMES[Kind.TORQUE_LAG]: 'torque_lag', NAMES[Kind.BEND_DELAY]: 'bend_delay'}
+"""The parameter arm.* that takes it, by its published name."""
 
 
 def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple[ArmParameter, ...]:
@@ -33,7 +37,8 @@ def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple
 
     A parameter that was taken as known, as the simplest arm fits, has its given value and its prior deviation. Where
     the parameters move further than their variances say, or the residuals of the empty arm's fit are no white noise,
-    the deviations are larger by that.
+    the deviations are larger by that. Where lengths and masses are unsure, the parameters are those of a similar arm
+    whose last link has its given length (``structured_model.constant_errors``): it moves as this arm does.
     """
     if state is None or state.model is None or state.memory is None:
         return ()
@@ -48,6 +53,14 @@ def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple
         x[delay] += 2.0 * x[mirrored].sum() / late.sum()
         S[delay] += 2.0 * S[mirrored].sum(axis=0) / late.sum()
         x[mirrored] *= -1.0
+    axes = model.motion.kind == Kind.CONSTANT
+    errors = model.motion.constants.transpose(1, 2, 0)
+    root = S[axes] if S[axes].any() else np.eye(int(axes.sum()), S.shape[1])
+    longer = errors[:, 2] @ x[axes], errors[:, 2] @ root
+    for kind, sign in ((Kind.STIFFNESS, 1.0), (Kind.BEND_GAIN, -1.0)) if axes.any() else ():
+        some = model.motion.kind == kind
+        x[some] += sign * longer[0][model.motion.link[some]]
+        S[some] += sign * longer[1][model.motion.link[some]]
     for c, (kind, link) in enumerate(zip(map(Kind, model.motion.kind), model.motion.link.tolist(), strict=True)):
         if kind not in NAMES or not model.motion.prior[c]:
             continue
@@ -61,7 +74,30 @@ def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple
         elif kind is Kind.ROTOR:
             value += config.arm.rotor_inertia[link]
         found.append(ArmParameter(NAMES[kind].format(link + 1), value, std))
-    return tuple(found)
+    return (*found, *_constants(config.arm, errors @ x[axes], errors @ root))
+
+
+def _constants(arm: ArmParameters, errors: Array, root: Array) -> list[ArmParameter]:
+    """Return the lengths, densities and masses, and the gravity, that are unsure.
+
+    errors: (L, 4) see ``constant_errors``; root: (L, 4, N) square root of their covariance.
+    """
+    found = []
+
+    def add(name: str, given: float, factor: float, error: Array, deviations: Array) -> None:
+        std = abs(factor) * float(np.linalg.norm(deviations))
+        if std > 0.0:
+            found.append(ArmParameter(name, given + factor * float(error), std))
+
+    for i, (length, density) in enumerate(zip(arm.link_length, arm.linear_density, strict=True)):
+        mass, name = (arm.tip_mass, TIP) if i + 1 == len(errors) else (arm.joint_mass, JOINT)
+        (denser, heavier, longer, _), spread = errors[i], root[i]
+        add(LENGTH.format(i + 1), length, length, longer, spread[2])
+        add(DENSITY.format(i + 1), density, density, denser - 3.0 * longer, spread[0] - 3.0 * spread[2])
+        add(name, mass, 1.0, heavier - 2.0 * mass * longer, spread[1] - 2.0 * mass * spread[2])
+    for c, given in enumerate(arm.gravity):
+        add(GRAVITY.format(c + 1), given, given, errors[-1, 3], root[-1, 3])
+    return found
 
 
 def input_friction(config: IdentifierParameters, state: StructuredState | None) -> tuple[float, ...] | None:
@@ -88,10 +124,10 @@ def as_parameters(config: IdentifierParameters, found: Sequence[ArmParameter]) -
     """
     by_name = {one.name: one for one in found}
     values: dict[str, Any] = flatten(config.arm, 'arm.')
-    for kind, field in FIELDS.items():
+    for name, field in FIELDS.items():
         given = getattr(config.arm, field)
         each = given if isinstance(given, tuple) else (given,)
-        here = [by_name.get(NAMES[kind].format(link + 1)) for link in range(len(each))]
+        here = [by_name.get(name.format(link + 1)) for link in range(len(each))]
         if any(here):
             new = tuple(before if one is None else _possible(field, one.value, one.std)
                         for one, before in zip(here, each, strict=True))

@@ -19,6 +19,7 @@ from flexmanip_ros.parameters import (
 )
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured, structured_model
+from flexmanip_ros.payload.arm_parameters import as_parameters, taught
 from flexmanip_ros.payload.moving_horizon import MOST_REFITS
 from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.samples.sample_log import log_of
@@ -280,6 +281,37 @@ def test_lengths_and_masses_wrong_by_one_per_cent_are_learned_where_they_are_kno
     assert found.status is Status.TRACKING
     assert found.mass == pytest.approx(20.0, rel=0.03)
     assert found.lower < 20.0 < found.upper < 1.1 * found.lower
+
+
+@pytest.mark.parametrize('gravity', [(0.0, 0.0), (2.0, -9.81)])
+def test_what_the_arm_taught_is_an_arm_that_moves_as_this_one_where_lengths_and_masses_are_unsure(gravity):
+    """The errors of ``test_motion``, where the accelerations show that they are those of this arm."""
+    longer, denser, heavier = np.array([[1.0, 0.0], [3.0, 2.0], [-1.5, 2.5]]) * 1e-4
+    given = replace(ARM, gravity=gravity)
+    unsure = config(given, payload=PayloadParameters(length_std=0.01, mass_std=0.01))
+    state = run(unsure, record(0.1, arm=given))
+    motion, memory = state.model.motion, mem.copy(state.memory)
+    errors = np.array([
+        [3.0 * longer[0] + denser[0], 10.0 * (2.0 * longer[0] + heavier[0]), longer[0], 0.0],
+        [denser[1], 10.0 * heavier[1], 0.0, 0.0]])
+    if any(gravity):
+        errors[0, 3] = -longer[0]
+    p = memory.x[-motion.kind.size:]
+    p[:] = 0.0
+    p[motion.kind == Kind.CONSTANT] = np.linalg.lstsq(
+        motion.constants.reshape(-1, errors.size).T, errors.ravel(), rcond=None)[0]
+    p[motion.kind == Kind.STIFFNESS], p[motion.kind == Kind.BEND_GAIN] = -longer, longer
+    saved = as_parameters(unsure, taught(unsure, state._replace(memory=memory)))
+    for name, factors in {'link_length': longer, 'linear_density': denser, 'bending_stiffness': np.zeros(2),
+                          'bend_gain': np.zeros(2)}.items():
+        np.testing.assert_allclose(saved[f'arm.{name}'], np.array(getattr(given, name)) * (1.0 + factors), rtol=1e-5)
+    np.testing.assert_allclose([saved['arm.joint_mass'], saved['arm.tip_mass']], 10.0 * (1.0 + heavier), rtol=1e-5)
+    np.testing.assert_allclose(saved['arm.gravity'], gravity, rtol=1e-5)
+
+
+def test_lengths_and_masses_that_are_exact_are_no_part_of_what_the_arm_taught():
+    state = run(config(), record(0.3))
+    assert not {'link1_length', 'joint_mass', 'tip_mass'} & {one.name for one in taught(config(), state)}
 
 
 def test_a_linear_plant_takes_its_lengths_and_masses_as_exact():
