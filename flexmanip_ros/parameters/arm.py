@@ -250,6 +250,16 @@ class ExcitationParameters:
             raise ParameterError(
                 f"parameter 'band' holds no harmonic of 1 / repeat_time ({1 / self.repeat_time:g} Hz)",
                 'widen the band or lengthen repeat_time')
+        shortest, pulses = min(self.period), self.repeat_time / self.bit_time
+        if self.shape == 'square' and shortest * self.rate < 2.0:
+            raise ParameterError(f"parameter 'period' is {shortest:g} s, less than two commands at {self.rate:g} Hz",
+                                 f'give at least {2.0 / self.rate:g} s, or raise the rate')
+        if self.shape == 'prbs' and (self.bit_time * self.rate < 1.0 or pulses < 2.0):
+            raise ParameterError(
+                f"parameter 'bit_time' is {self.bit_time:g} s" + (
+                    f', and repeat_time holds {pulses:g} pulses' if pulses < 2.0 else
+                    f', less than one command at {self.rate:g} Hz'),
+                f'give {1.0 / self.rate:g} s to half of repeat_time ({0.5 * self.repeat_time:g} s)')
 
 
 @dataclass(frozen=True)

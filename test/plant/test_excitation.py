@@ -57,7 +57,9 @@ def test_random_shapes_repeat_with_their_seed() -> None:
 
 @pytest.mark.parametrize(('change', 'word'), [
     ({'band': (5.0, 1.0)}, 'band'), ({'shape': 'chirp', 'band': (1.0, 800.0)}, 'band'),
-    ({'shape': 'multisine', 'band': (1.01, 1.02)}, 'band'), ({'shape': 'sawtooth'}, 'shape')])
+    ({'shape': 'multisine', 'band': (1.01, 1.02)}, 'band'), ({'shape': 'sawtooth'}, 'shape'),
+    ({'period': (1.0, 1.5e-3)}, 'period'), ({'shape': 'prbs', 'bit_time': 5e-4}, 'bit_time'),
+    ({'shape': 'prbs', 'bit_time': 3.0}, 'bit_time')])
 def test_a_signal_that_cannot_be_made_is_refused(change: dict[str, object], word: str) -> None:
     with pytest.raises(ParameterError, match=word):
         ExcitationParameters(**change)
