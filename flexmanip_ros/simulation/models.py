@@ -180,12 +180,15 @@ def substeps(arm: Manipulator, config: PlantParameters) -> int:
                 f'give at least {least}, or 0 for automatic')
         return config.substeps
     by = method(arm)
-    steps = max(int(np.ceil(_fastest(arm, 0.0) / config.rate / by.angle)),
-                int(np.ceil(_fastest(arm, 1.0) / config.rate / by.decay)), 1)
+    turning, decaying = (int(np.ceil(_fastest(arm, friction) / config.rate / most))
+                         for friction, most in ((0.0, by.angle), (1.0, by.decay)))
+    steps = max(turning, decaying, 1)
     if steps > MOST_SUBSTEPS:
-        raise ParameterError(
-            f"parameter 'rate' is {config.rate} Hz but the fastest mode needs {steps} steps a sample",
-            "raise 'rate', lower 'arm.modes', or check length, density and stiffness")
+        what, remedy = ('the fastest mode needs', "lower 'arm.modes', or check length, density and stiffness")
+        if decaying > turning and arm.coulomb.any():
+            what, remedy = ('a joint that sticks needs', "or lower 'arm.joint_coulomb_friction'")
+        raise ParameterError(f"parameter 'rate' is {config.rate} Hz but {what} {steps} steps a sample",
+                             f"raise 'rate', {remedy}")
     return steps
 
 

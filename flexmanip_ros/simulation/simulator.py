@@ -216,7 +216,7 @@ def _advance(
     if good < count:
         raise ModelError(
             f'the simulation diverged {(state.sample + good) / config.rate:.3f} s after its start',
-            'lower the torque, raise the stiffness or the rate, or reset the plant')
+            'lower the torque, or velocity and spin of the object; raise the stiffness or the rate; or reset the plant')
     sensors.gauge(config, position, velocity, gauges)
     bends = sensors.late_bends(config, position, velocity, state.bends)
     sensors.misread(config, position, velocity)
