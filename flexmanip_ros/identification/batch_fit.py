@@ -241,7 +241,7 @@ def _attempt(
     if wanted and noise == 'any':
         free = chosen._replace(free_gain=True)
         other = descend(U, Y, begin, free, ITERATIONS)
-        better = other is not None and other.cost + penalty < cost
+        better = other is not None and settles(other.theta, count) and other.cost + penalty < cost
         if other is not None and better and (not simulates or other.cost + penalty < floor):
             best, chosen, cost, simulates, wanted = other, free, other.cost + penalty, True, False
     if best is None or not simulates:
@@ -336,10 +336,22 @@ def _recursion(samples: Array, attempt: Attempt) -> Recursion:
 
 
 def _gain_alone(U: Array, Y: Array, theta: Theta, begin: Array, structure: Structure) -> Array | None:
-    """K (n, m) of the best predictor with the system held, from two starting points; None where none forgets."""
+    """K (n, m) of the best predictor with the system held, from two starting points; None where none ``settles``."""
     tried = [descend(U, Y, theta._replace(K=K), structure, ITERATIONS) for K in (begin, np.zeros_like(begin))]
-    done = [fit for fit in tried if fit is not None and forgets(fit.theta, len(U))]
+    done = [fit for fit in tried if fit is not None and settles(fit.theta, len(U))]
     return min(done, key=lambda fit: fit.cost).theta.K if done else None
+
+
+def settles(theta: Theta, count: int) -> bool:
+    """Whether the predictor A - K C forgets its first state in ``count`` samples, and no more slowly than the system.
+
+    One that forgets it more slowly fits that state, not the noise: from another state it predicts worse than the system
+    alone. Of a resonance at 20 samples a second, 256 of them, it left 30 % unexplained where K = 0 leaves 0.02 %.
+    """
+    if not forgets(theta, count):
+        return False
+    predictor, system = (np.abs(np.linalg.eigvals(A)).max() for A in (theta.A - theta.K @ theta.C, theta.A))
+    return bool(predictor <= system)
 
 
 def arrive(root: Array, arrival: Array) -> Array:

@@ -125,9 +125,14 @@ def search_shapes(search: Search, runs: Sequence[tuple[int, int]], step: Callabl
     for factor, past in list(dict.fromkeys((s.factor, s.past) for s in ranked))[:FINALISTS]:
         _try(search, factor, past, _futures(search, past)[1:], (True, False), _orders(search, ORDERS))
         step()
-    least = min(search.tried.values())
-    good = [s for s in search.tried if search.tried[s] <= MARGIN * least]
-    return min(good, key=lambda s: (s.order, search.tried[s], s))
+    return smallest(search.tried)
+
+
+def smallest(tried: Mapping[Shape, float]) -> Shape:
+    """Return the shape of the smallest order that is nearly as good as the best; tried: the loss of each shape."""
+    least = min(tried.values())
+    good = [s for s in tried if tried[s] <= MARGIN * least]
+    return min(good, key=lambda s: (s.order, tried[s], s))
 
 
 def stretches_of(signals: Signals, dt: float) -> list[Stretch]:

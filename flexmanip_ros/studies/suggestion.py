@@ -21,7 +21,7 @@ PLAIN = 1.03
 """Least factor by which another setting must reduce the error to replace the plain one."""
 NEARLY, REFINED = 1.3, 1.1
 """Factors of the error: a refined model, of small order, is tried if the order costs less than the first of them, and
-taken if the refinement gains more than the second."""
+taken if the refinement gains more than the second, or is of a smaller order and as good."""
 PRIORS = (1e-5, 0.1)
 """Ridges tried on the moments beside ``PRIOR``."""
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
@@ -149,10 +149,12 @@ def _settings(search: Search, shape: Shape, step: Callable[[], None]
     r, m = search.r, search.m
     light = [s for s in search.tried  # fits of more parameters would take most of the time
              if s.order * (s.order + r + 2 * m + 1) + m * r <= recursive_fit.USUAL]
-    own = min(light, key=lambda s: (search.tried[s], s), default=None)
+    own = shape_search.smallest({s: search.tried[s] for s in light}) if light else None
     refined = own is not None and search.tried[own] < NEARLY * search.tried[shape]
     if own is not None and refined:
-        trials += [(f'{kind} of order {own.order}', REFINED, {**_values(own), 'refinement': kind})
+        # one of a smaller order needs no gain: each state that the signals do not need is a mode that is not there
+        gain = REFINED if own.order >= shape.order else 1.0
+        trials += [(f'{kind} of order {own.order}', gain, {**_values(own), 'refinement': kind})
                    for kind in ('output_error', 'prediction_error') if search.given.get('refinement', kind) == kind]
     words = 'no forgetting' if plain['forgetting_factor'][0] == 1.0 else 'forgetting as it is set'
     settled, name, least = plain, words, errors[chosen]
