@@ -34,8 +34,11 @@ ADVICE: Mapping[Status, str] = {
     Status.DIVERGED: 'check the units of the signals, the parameters arm.* and the times of events',
 }
 """What a user can do next, for each status."""
-MODEL_ADVICE = 'check inputs and outputs, or let --suggest choose order and windows'
-"""The same for a model that is INCONSISTENT."""
+MODEL_ADVICE: Mapping[Status, str] = {
+    Status.INCONSISTENT: 'check inputs and outputs, or let --suggest choose order and windows',
+    Status.POORLY_EXCITED: 'move the arm more, raise the torque, or lower the order where it has no such mode',
+}
+"""The same for the status of a model."""
 
 
 def status_text(status: Status, config: IdentifierParameters | None = None, known: str = '', *, of_model: bool = False
@@ -48,8 +51,8 @@ def status_text(status: Status, config: IdentifierParameters | None = None, know
     if status is Status.UNOBSERVABLE and config is not None:
         why, advice = unobservable(config)
         reason = f': {why}'
-    if status is Status.INCONSISTENT and (of_model or (config is not None and config.payload_method == 'none')):
-        advice = MODEL_ADVICE
+    if of_model or (config is not None and config.payload_method == 'none'):
+        advice = MODEL_ADVICE.get(status, advice)
     return f'{status.value.partition(";")[0]}{reason}; {advice}'
 
 

@@ -66,3 +66,20 @@ def test_a_forgetting_that_is_set_is_not_called_none() -> None:
     values, reasons = chosen(('forgetting', 'constant'), ('forgetting_factor', (0.995,) * 3), ('order', 4))
     assert values['forgetting_factor'] == (0.995,) * 3
     assert 'no forgetting' not in reasons['forgetting, refinement']
+
+
+def test_a_clean_resonance_gets_the_order_of_a_resonance_and_no_mode_that_is_not_there() -> None:
+    """20 s at 50 Hz, damping ratio 0.02, noise of 1 %. Order 14 predicts 8 % worse than a refined model of 2 or 3."""
+    rng, dt, count = np.random.default_rng(0), 0.02, 1000
+    pole = np.exp((-0.02 + 1j) * 2.0 * np.pi * 3.0 * dt)
+    model = StateSpace(np.array([[pole.real, -pole.imag], [pole.imag, pole.real]]), np.array([[0.1], [0.3]]),
+                       np.array([[1.0, 0.0]]), np.zeros((1, 1)), np.zeros((2, 1)), dt)
+    u = np.repeat(rng.choice([-1.0, 1.0], size=count // 5), 5)[:, None]
+    y = simulate(model, u)
+    y += 0.01 * y.std() * rng.standard_normal(y.shape)
+    given = {**GIVEN, 'outputs': ('a/position',), 'past_window': 20, 'future_window': 16}
+    values, _ = suggest(given, Signals(
+        np.arange(count) * 20_000_000, u, y, np.empty((count, 0)), np.zeros(count, dtype=np.bool_),
+        np.zeros(count, dtype=np.int64), given['inputs'], given['outputs']), dt, 0.25, lambda done, total: None)
+    assert values['order'] <= 3
+    assert values['refinement'] != 'none'
