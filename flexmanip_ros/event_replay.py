@@ -7,7 +7,7 @@ sample (latched, received only now) holds for all samples: the payload's estimat
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
 from flexmanip_ros.numerics.background import Background
@@ -119,10 +119,7 @@ def insert(config: IdentifierParameters, replay: EventReplay[E], event: CaptureE
     that was applied, is only counted: what the arm holds now is known from the later event. One near another of its
     kind is that one, unless an event of the other kind lies between them. first_ns: stamp of the first sample [ns].
     """
-    previous = replay.stamp_of(event.kind)
-    if (previous is not None and abs(event.stamp_ns - previous) <= config.event_merge_time * 1e9
-            and not any(min(previous, event.stamp_ns) < one.stamp_ns <= max(previous, event.stamp_ns)
-                        for one in replay.latest if one.kind is not event.kind)):
+    if same_event(config, event, replay.latest) is not None:
         return replay._replace(repeated_events=replay.repeated_events + 1)
     known = replay.latest
     replay = replay._replace(latest=(*(e for e in known if e.kind is not event.kind), event))
@@ -137,6 +134,17 @@ def insert(config: IdentifierParameters, replay: EventReplay[E], event: CaptureE
         return replay._replace(latest=known)
     late_ns = replay.last_ns + 1 - event.stamp_ns
     return _wait(replay, event._replace(stamp_ns=replay.last_ns + 1, std_s=math.hypot(event.std_s, late_ns * 1e-9)))
+
+
+def same_event(config: IdentifierParameters, event: CaptureEvent, latest: Iterable[CaptureEvent]
+               ) -> CaptureEvent | None:
+    """Return the one of the latest events, one of each kind, that an event is taken for; None where it is another."""
+    previous = next((one for one in latest if one.kind is event.kind), None)
+    if previous is None or abs(event.stamp_ns - previous.stamp_ns) > config.event_merge_time * 1e9:
+        return None
+    first_ns, last_ns = sorted((previous.stamp_ns, event.stamp_ns))
+    is_apart = any(first_ns < one.stamp_ns <= last_ns for one in latest if one.kind is not event.kind)
+    return None if is_apart else previous
 
 
 def _restart(config: IdentifierParameters, replay: EventReplay[E]) -> EventReplay[E]:

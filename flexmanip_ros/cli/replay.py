@@ -13,7 +13,7 @@ import numpy as np
 from flexmanip_ros import estimator, pipeline
 from flexmanip_ros.cli.console import Report
 from flexmanip_ros.errors import BagError, FlexmanipError, MissingSignalError, ModelError, ParameterError, SignalError
-from flexmanip_ros.event_replay import FAR_EVENT_NS
+from flexmanip_ros.event_replay import FAR_EVENT_NS, same_event
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.bag import Topics
 from flexmanip_ros.io.outputs import Output, check_apart, check_output, check_place, write_rows, write_text
@@ -159,7 +159,7 @@ def identify(request: Request, progress: Report | None = None) -> Result:
                              'it needs over 1024 samples, two angles (with payload_method none only those that are '
                              'given) and, as outputs, half as many positions as the order; see docs/moving_arm.md')
         write_rows(request.configurations, found.rows())
-    remark = '; '.join((*messages.far_events(), *_remarks(state, messages.foreign)))
+    remark = '; '.join((*messages.far_events(), *messages.merged_events(), *_remarks(state, messages.foreign)))
     if request.report is not None and signals is not None and screen is not None:
         from flexmanip_ros.io import plots, report
 
@@ -196,6 +196,12 @@ class Messages:
         """The events that are neither given nor found in the signals."""
         self.is_kept = (request.smooth or request.validate_from is not None or request.report is not None
                         or request.configurations is not None)
+        self.merged: list[tuple[CaptureEvent, CaptureEvent]] = []
+        """Events that were taken for an earlier one though their stamps differ, each with that one."""
+        self._latest: dict[EventKind, CaptureEvent] = {}
+        """The latest event of each kind that counts."""
+        self._given: list[CaptureEvent] = []
+        """The events of --capture-time and --release-time that are still to come."""
         self._blocks: list[JointBlock] = []
         """The joint states, where they are kept."""
         self._findings = capture_detection.Findings()
@@ -219,9 +225,11 @@ class Messages:
                 if not isinstance(item, CaptureEvent):
                     yield from self._joint_states(item)
                 elif item.stamp_ns < self._limit_ns():
+                    yield from self._due(item.stamp_ns)
                     yield from self._event(item)
         except BagError as error:
             self.fault = error
+        yield from self._due(math.inf)
 
     def _noted(self, items: Iterable[JointBlock | CaptureEvent]) -> Iterator[JointBlock | CaptureEvent]:
         for item in items:
@@ -236,6 +244,17 @@ class Messages:
                 f'{(first_ns - event.stamp_ns) * 1e-9:.0f} s before the first sample: stamp an event with the time of '
                 f'its samples, or give --{event.kind.value}-time'
                 for event in self.recorded if first_ns - event.stamp_ns > FAR_EVENT_NS]
+
+    def merged_events(self) -> list[str]:
+        """Return what is to be said of announcements that were taken for one event though their stamps differ."""
+        if not self.merged:
+            return []
+        (event, same), count = self.merged[0], len(self.merged)
+        kind, limit = event.kind.value, self._request.config.event_merge_time
+        at, before = ((one.stamp_ns - (self.first_ns or 0)) * 1e-9 for one in (event, same))
+        more = f' (so were {count - 1} more)' if count > 1 else ''
+        return [f'the {kind} at {at:.3f} s was taken for the one at {before:.3f} s, as event_merge_time is {limit:g} s'
+                f'{more}: lower event_merge_time if it is another {kind}']
 
     def _watch(self) -> capture_detection.Watch | None:
         """Return the detector where events are to be looked for in the signals; say why where they are not.
@@ -282,8 +301,21 @@ class Messages:
                     'no others found in the signals') + '; give --capture-time if it caught something'
         return '' if self.events else self._search
 
+    def _due(self, stamp_ns: float) -> Iterator[CaptureEvent]:
+        """Yield the given events up to a stamp in their order among the recorded ones, so that the last one is the last.
+
+        One within event_merge_time of a recorded one comes before it and counts in its place.
+        """
+        while self._given and self._given[0].stamp_ns - self._request.config.event_merge_time * 1e9 <= stamp_ns:
+            yield from self._event(self._given.pop(0))
+
     def _event(self, event: CaptureEvent) -> Iterator[CaptureEvent]:
         self.events.append(event)
+        same = same_event(self._request.config, event, self._latest.values())
+        if same is None:
+            self._latest[event.kind] = event
+        elif same.stamp_ns != event.stamp_ns and same.std_s == event.std_s:  # else one is commanded, one detected
+            self.merged.append((event, same))
         if self._screen is not None:
             self._screen.event(event)
         yield event
@@ -296,10 +328,12 @@ class Messages:
             self._screen.joint_states(block)
         if self.first_ns is None:
             self.first_ns = sampling.first_usable_ns(self._request.config, block)
-            for at, kind in ((self._request.capture_time, EventKind.CAPTURE),
-                             (self._request.release_time, EventKind.RELEASE)):
-                if at is not None and self.first_ns is not None:
-                    yield from self._event(CaptureEvent(self.first_ns + round(at * 1e9), kind))
+            self._given = sorted(
+                (CaptureEvent(self.first_ns + round(at * 1e9), kind)
+                 for at, kind in ((self._request.capture_time, EventKind.CAPTURE),
+                                  (self._request.release_time, EventKind.RELEASE))
+                 if at is not None and self.first_ns is not None), key=lambda event: event.stamp_ns)
+        yield from self._due(int(block.stamp_ns.max()))
         used = block.stamp_ns < self._limit_ns()
         if used.any():
             yield block if used.all() else block.part(used)

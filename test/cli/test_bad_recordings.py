@@ -14,6 +14,7 @@ from flexmanip_ros.cli import monte_carlo, replay, reproduce_paper, simulate_bag
 from flexmanip_ros.cli.identify_bag import main
 from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.io import cdr
+from flexmanip_ros.io.bag_writer import BagWriter
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord
 
@@ -103,6 +104,40 @@ def test_a_capture_after_the_end_is_not_claimed(capsys, tmp_path):
     assert status == 0
     assert found['capture_time_s'] is None
     assert 'not applied' in err
+
+
+def test_a_given_capture_after_the_recorded_one_is_the_last(capsys, tmp_path):
+    path = _bag(tmp_path / 'bag', _records(700), CaptureEvent(START + 300 * MS, EventKind.CAPTURE),
+                CaptureEvent(START + 500 * MS, EventKind.RELEASE), at=250)
+    status, found, err = _run(capsys, path, PLAIN, '--capture-time', 0.65)
+    assert (status, err) == (0, '')
+    assert (found['capture_time_s'], found['release_time_s']) == (0.65, 0.5)
+    assert _run(capsys, path, PLAIN, '--capture-time', 0.25)[1]['capture_time_s'] == 0.25  # near 0.3, it is that one
+
+
+@pytest.mark.parametrize(('stamps_ms', 'words'), [
+    ([300, 300], ''), ([300, 450], ''), ([300, 360], 'the capture at 0.360 s was taken for the one at 0.300 s, as '
+     'event_merge_time is 0.1 s: lower event_merge_time if it is another capture'),
+    ([300, 360, 380], 'event_merge_time is 0.1 s (so were 1 more)')])
+def test_a_capture_soon_after_another_of_the_same_topic_is_said_to_count_as_that_one(
+        capsys, tmp_path, stamps_ms, words):
+    path = _bag(tmp_path / 'bag', _records(700), *(CaptureEvent(START + at * MS, EventKind.CAPTURE)
+                                                  for at in stamps_ms), at=250)
+    status, _, err = _run(capsys, path, PLAIN)
+    assert status == 0
+    assert words in err
+    assert bool(words) == bool(err)
+
+
+def test_a_capture_that_is_commanded_and_detected_is_one_without_a_word(capsys, tmp_path):
+    with BagWriter(tmp_path / 'bag', flush_period=None) as writer:
+        for k, item in enumerate(_records(700)):
+            writer.write('/joint_states', START + k * MS, item)
+            if k in (300, 340):
+                topic = '/capture_event' if k == 300 else '/capture_detected'
+                writer.write(topic, START + k * MS, CaptureEvent(item.stamp_ns, EventKind.CAPTURE))
+    status, found, err = _run(capsys, tmp_path / 'bag', PLAIN)
+    assert (status, found['capture_time_s'], err) == (0, 0.3, '')
 
 
 def test_an_event_without_a_stamp_is_applied_on_arrival_and_reported(capsys, tmp_path):
