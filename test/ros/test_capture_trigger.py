@@ -117,6 +117,17 @@ def test_a_release_requested_before_the_next_joint_state_comes_after_the_capture
     assert len({stamp_ns(event.stamp) for event in heard}) == 3
 
 
+def test_an_event_that_an_identifier_takes_for_the_one_before_is_answered_so(ros: Ros) -> None:
+    node = ros.managed(CaptureTrigger(context=ros.context))
+    publisher = ros.publisher(JointState, 'joint_states', qos.sensor_output())
+    answers = []
+    for k, request in ((0, 'capture'), (60, 'capture'), (200, 'capture'), (230, 'release'), (260, 'capture')):
+        publisher.publish(joint_state(k))
+        ros.wait(lambda k=k: node._last_ns == START_NS + k * 1_000_000)
+        answers.append(ros.call(Trigger, f'capture_trigger/{request}').message)
+    assert ['event_merge_time (default 0.1 s)' in answer for answer in answers] == [False, True, False, False, False]
+
+
 def test_a_request_without_joint_states_is_refused_with_the_reason(ros: Ros) -> None:
     node = ros.managed(CaptureTrigger(context=ros.context))
     answer = ros.call(Trigger, 'capture_trigger/capture')

@@ -23,7 +23,7 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import Header
 
 from flexmanip_ros.errors import SignalError
-from flexmanip_ros.parameters import TriggerParameters
+from flexmanip_ros.parameters import IdentifierParameters, TriggerParameters
 from flexmanip_ros.payload import capture_detection, structured
 from flexmanip_ros.ros import qos
 from flexmanip_ros.ros.conversions import JointStateReader, to_message
@@ -169,16 +169,22 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
 
     def _publish(self, publisher: Publisher, event: CaptureEvent, how: str) -> None:
         publisher.publish(to_message(event))
-        second = self._adds_an_object(event)
+        note = self._after_the_last(event)
         self.latest = event
-        self.get_logger().info(f'{event.kind.value} {how}at {event.stamp_ns * 1e-9:.6f}{second}')
+        self.get_logger().info(f'{event.kind.value} {how}at {event.stamp_ns * 1e-9:.6f}{note}')
 
-    def _adds_an_object(self, event: CaptureEvent) -> str:
-        """Return the words for a capture while the arm holds something; empty for any other event."""
-        holds = self.latest is not None and self.latest.kind is EventKind.CAPTURE
-        if not holds or event.kind is not EventKind.CAPTURE:
+    def _after_the_last(self, event: CaptureEvent) -> str:
+        """Return the words for an event of the same kind as the last one; empty for any other event."""
+        if self.latest is None or self.latest.kind is not event.kind:
             return ''
-        return ': the arm holds an object already, a second one is added (call release first if it let go)'
+        words = ''
+        if event.kind is EventKind.CAPTURE:
+            words = ': the arm holds an object already, a second one is added (call release first if it let go)'
+        merge_s = IdentifierParameters.event_merge_time
+        if abs(event.stamp_ns - self.latest.stamp_ns) <= merge_s * 1e9:
+            words += (f'; an identifier takes this {event.kind.value} and the one before for one, as they are within '
+                      f'its event_merge_time (default {merge_s:g} s)')
+        return words
 
     def _requested(self, kind: EventKind) -> tuple[bool, str]:
         silent = time.monotonic() - self._arrived
@@ -192,7 +198,7 @@ class CaptureTrigger(FlexmanipNode[TriggerParameters]):
         if self.latest is not None and 0 <= self.latest.stamp_ns - stamp < MOST_REQUESTS:  # since the same joint state
             stamp = self.latest.stamp_ns + 1
         event = CaptureEvent(stamp, kind)
-        words = f'{kind.value} at {event.stamp_ns * 1e-9:.6f}{self._adds_an_object(event)}'
+        words = f'{kind.value} at {event.stamp_ns * 1e-9:.6f}{self._after_the_last(event)}'
         self._announce(event)
         return True, words
 
