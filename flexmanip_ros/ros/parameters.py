@@ -13,10 +13,11 @@ from rclpy.parameter import Parameter
 
 from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io.parameter_file import STANDARD
-from flexmanip_ros.parameters import Leaf, check, configure, flatten, leaves
+from flexmanip_ros.parameters import IdentifierParameters, Leaf, check, configure, flatten, leaves
 from flexmanip_ros.parameters.document import limits, package_names, written
 from flexmanip_ros.parameters.field import LINKS, suggestion
 from flexmanip_ros.ros.rclpy_workarounds import declare, parameter_overrides
+from flexmanip_ros.samples.signals import reads_angles
 
 Config = TypeVar('Config')
 
@@ -155,15 +156,17 @@ def given_files() -> list[str]:
 
 
 def arm_line(node: Any) -> tuple[str, bool]:
-    """Return a log line on the arm parameters of a node and where they come from; empty for a node without an arm.
+    """Return a log line on the arm parameters of a node and where they come from; empty where no arm plays a part.
 
     The second value: whether a parameter file was given that sets none of them.
     rclpy keeps the overrides given at start by name, not by origin: parameter files and ``-p`` look the same.
     """
-    arm = getattr(node.config, 'arm', None)
-    if arm is None:
-        return '', False
+    config = node.config
+    arm = getattr(config, 'arm', None)
     given = any(name.startswith('arm.') for name in parameter_overrides(node))
+    is_idle = isinstance(config, IdentifierParameters) and config.payload_method == 'none' and not reads_angles(config)
+    if arm is None or (is_idle and not given):  # a file of --suggest is for any machine and names no arm
+        return '', False
     defaults = flatten(type(arm)(arm.link_length)) | {'link_length': type(arm).link_length}  # of as many links
     changed = [f'arm.{name}' for name, value in flatten(arm).items() if value != defaults[name]]
     files = given_files()

@@ -134,6 +134,20 @@ def test_a_node_logs_its_arm_and_where_it_comes_from(
     assert next(line for line in said.splitlines() if 'other.yaml' in line).startswith('[WARN]')
 
 
+@pytest.mark.parametrize(('values', 'is_warned'), [
+    ({'payload_method': 'none', 'angles': ()}, False), ({'payload_method': 'none'}, False), ({'order': 4}, True)])
+def test_a_suggested_file_without_an_arm_is_warned_of_only_where_the_arm_plays_a_part(
+        ros: Ros, log: Callable[[str], str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, values: dict[str, Any],
+        is_warned: bool) -> None:
+    file = tmp_path / 'suggested.yaml'
+    file.write_text(file_text('Suggested.', [], values), encoding='utf-8')
+    arguments = ['--ros-args', '--params-file', str(file)]
+    monkeypatch.setattr(sys, 'argv', ['rpbsid_identifier', *arguments])
+    log('')
+    ros.managed(RpbsidIdentifier(context=ros.context, cli_args=arguments))
+    assert ('sets no parameter arm.*' in log('ready')) == is_warned
+
+
 def test_what_an_arm_of_one_link_leaves_out_of_given_lists_is_logged(ros: Ros, log: Callable[[str], str]) -> None:
     log('')
     ros.managed(CaptureTrigger(context=ros.context, overrides=overrides(
