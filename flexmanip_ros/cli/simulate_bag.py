@@ -68,9 +68,16 @@ def configurations(given: argparse.Namespace) -> tuple[PlantParameters, Excitati
         ('seed', given.seed), ('payload_mass', given.payload)) if value is not None]
     torque_items = [item.removeprefix(PREFIX) for item in given.set if item.startswith(PREFIX)]
     plant = load(PlantParameters, 'plant_simulator', given.params, plant_items, optional=True)
-    rate = f'rate={plant.rate!r}'  # one torque per sample, also where the file says otherwise
-    torque = load(ExcitationParameters, 'excitation', given.params, [rate, *torque_items], optional=True)
-    return plant, for_plant(torque, plant, parse_overrides(torque_items))
+    own = parse_overrides(torque_items)
+    following = [f'rate={plant.rate!r}', f'arm.link_length={list(plant.arm.link_length)}']  # also against the file
+    try:
+        torque = load(ExcitationParameters, 'excitation', given.params, [*following, *torque_items], optional=True)
+    except ParameterError as err:
+        named = next((name for name in own if f"'{name}'" in err.problem), None)
+        if named is None:
+            raise
+        raise ParameterError(err.problem.replace(f"'{named}'", f"'{PREFIX}{named}'"), err.remedy) from err
+    return plant, for_plant(torque, plant, own)
 
 
 def _main(given: argparse.Namespace) -> int:

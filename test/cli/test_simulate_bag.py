@@ -78,7 +78,19 @@ def test_parameters_come_from_the_file_then_set_then_named_arguments(tmp_path):
     assert sum(isinstance(item, JointRecord) for item in bag.read(path)) == 100
 
 
+def test_the_torque_of_an_arm_of_one_link_is_given_for_one_joint(tmp_path):
+    file = tmp_path / 'params.yaml'
+    file.write_text('/**: {ros__parameters: {initial_angles: [0.5]}}\n', encoding='utf-8')
+    path = _simulate(tmp_path, '--params', str(file), '--set', 'arm.link_length=[2.0]', '--capture-time', '0.1',
+                     '--set', 'excitation.amplitude=[10.0]')
+    truth = json.loads(path.with_name('recording.truth.json').read_text(encoding='utf-8'))
+    assert truth['excitation']['amplitude'] == [10.0]
+    assert truth['excitation']['arm.link_length'] == truth['plant']['arm.link_length'] == [2.0]
+
+
 @pytest.mark.parametrize(('arguments', 'words'), [
+    (['--set', 'excitation.amplitude=[10.0]'],
+     "'excitation.amplitude' has 1 element, but arm.link_length has 2; give 2 numbers"),
     (['--set', 'payload_mas=2'], "did you mean 'payload_mass'"),
     (['--set', 'excitation.shape=sine'], 'choose one of'),
     (['--set', 'excitation.rate=500.0'], "the torque's 'rate' follows the plant; give the plant's 'rate' instead"),
