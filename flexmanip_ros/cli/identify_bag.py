@@ -9,6 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from flexmanip_ros.cli import console
+from flexmanip_ros.errors import ParameterError
 from flexmanip_ros.io.parameter_file import load
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.parameters.document import help_text
@@ -49,7 +50,7 @@ def _parser() -> console.Parser:
         'best, those of --params and --set kept; write them and identify with them')
     add('--validate-from', metavar='SECONDS', type=console.seconds,
         help='identify on the samples before this time [s] from the first stamp; score the model on the rest')
-    add('--horizon', metavar='SECONDS', type=console.positive_seconds, default=0.25,
+    add('--horizon', metavar='SECONDS', type=console.positive_seconds,
         help='with --validate-from, score the prediction this far ahead too [s]; default: 0.25')
     add('--smooth', action='store_true',
         help='also fit each stretch between events with all of its samples, later ones too')
@@ -81,11 +82,16 @@ def _parser() -> console.Parser:
 def _main(given: argparse.Namespace) -> int:
     from flexmanip_ros.io.bag import Topics, check
 
+    if given.horizon is not None and given.validate_from is None and given.suggest is None:
+        raise ParameterError('--horizon is given without --validate-from, so nothing is predicted',
+                             'give --validate-from too, or leave --horizon out')
     config = load(IdentifierParameters, NODE, given.params, given.set) if given.suggest is None else None
     check(given.bag)  # what follows takes a second to import
     from flexmanip_ros.cli.replay import Request, check_places, identify, places
     from flexmanip_ros.io.outputs import check_apart
+    from flexmanip_ros.studies.whole_recording import HORIZON_S
 
+    horizon = HORIZON_S if given.horizon is None else given.horizon
     check_apart({'--suggest': given.suggest, **places(given)}, given.params, given.bag)
     topics = Topics(given.joint_states, tuple(given.capture_event or Topics().events), given.capture_event is not None)
     if config is None:
@@ -93,12 +99,12 @@ def _main(given: argparse.Namespace) -> int:
 
         check_places(given)  # the search takes a minute; ``identify`` checks them too late
         config, lines = suggest(given.bag, given.suggest, given_values(given.params, given.set), topics,
-                                given.validate_from, given.horizon,
+                                given.validate_from, horizon,
                                 [at for at in (given.capture_time, given.release_time) if at is not None])
         print('\n'.join(lines), flush=True)
     request = Request(
         given.bag, config, topics, capture_time=given.capture_time, release_time=given.release_time,
-        detect=given.detect, validate_from=given.validate_from, horizon=given.horizon, smooth=given.smooth,
+        detect=given.detect, validate_from=given.validate_from, horizon=horizon, smooth=given.smooth,
         output=given.output, report=given.report, save_arm=given.save_arm, configurations=given.configurations)
     sys.setswitchinterval(SWITCH_S)
     with console.progress('identifying', 'messages') as progress, console.announced():

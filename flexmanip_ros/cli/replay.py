@@ -144,7 +144,8 @@ def identify(request: Request, progress: Report | None = None) -> Result:
             horizon_s=request.horizon, constant=None if last is None else last.constant)
         summary = replace(summary, vaf_simulation_percent=tuple(scores.simulation.tolist()),
                           vaf_prediction_percent=tuple(scores.prediction.tolist()),
-                          vaf_horizon_percent=tuple(scores.horizon.tolist()))
+                          vaf_horizon_percent=tuple(scores.horizon.tolist()),
+                          horizon_reason=_horizon_reason(scores, request.horizon))
     if request.smooth and signals is not None:
         events = [event.stamp_ns for event in messages.events]
         summary = replace(summary, smoothed=whole_recording.smooth(
@@ -368,6 +369,15 @@ def _save_arm(place: str, recording: str, config: IdentifierParameters, state: p
     heading = (f"What the arm taught in the recording '{recording}', status {status}. "
                f'Values and standard deviations: {deviations}.')
     write_text(place, yaml_text('rpbsid_identifier', as_parameters(config, found), heading))
+
+
+def _horizon_reason(scores: whole_recording.Scores, horizon: float) -> str:
+    """Return why the prediction ``horizon`` [s] ahead has no score; empty where there is one, or no score at all."""
+    if not np.isnan(scores.horizon).all() or np.isnan(scores.prediction).all():
+        return ''
+    until = ' until the first gap' if scores.until_gap else ''
+    return (f'unknown: {scores.time[-1] - scores.time[0]:.3f} s are held out{until}, too short for the --horizon of '
+            f'{horizon:g} s; give a shorter one')
 
 
 def _dropped(state: pipeline.State) -> FlexmanipError | None:

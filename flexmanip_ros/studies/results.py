@@ -86,10 +86,12 @@ class Summary:
     """Status of the model, where ``status`` is that of the payload. It is not in the JSON."""
     reason: str = ''
     """What gave the model its status. It is not in the JSON."""
+    horizon_reason: str = ''
+    """Why there is no score of the prediction ahead. It is not in the JSON."""
 
     def as_json(self) -> dict[str, Any]:
         """Return the values as JSON has them: no NaN, no infinity, lists instead of tuples."""
-        left_out = {'model_status', 'reason', *(['smoothed'] if self.smoothed is None else [])}
+        left_out = {'model_status', 'reason', 'horizon_reason', *(['smoothed'] if self.smoothed is None else [])}
         return {item.name: _json(getattr(self, item.name)) for item in fields(self) if item.name not in left_out}
 
     def payload_text(self, config: IdentifierParameters | None = None) -> str:
@@ -147,7 +149,8 @@ def result_rows(summary: Summary, config: IdentifierParameters, modes: Sequence[
                           ('prediction', summary.vaf_prediction_percent), ('ahead', summary.vaf_horizon_percent)):
         if values is not None:
             shares = [f'{name} {_text(value)} %' for name, value in zip(config.outputs, values, strict=True)]
-            found.append((f'VAF {words}', ', '.join(shares)))
+            why = summary.horizon_reason if words == 'ahead' else ''
+            found.append((f'VAF {words}', why or ', '.join(shares)))
     return found
 
 

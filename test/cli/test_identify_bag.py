@@ -88,6 +88,12 @@ def test_without_json_the_result_is_written_for_people(recording, capsys):
     assert 'Hz' in out
 
 
+def test_a_horizon_beyond_what_is_held_out_is_said_with_both_times(recording, capsys):
+    status, out, _ = _run(capsys, recording, *SETTINGS, '--validate-from', 12, '--horizon', 30)
+    assert status == 0
+    assert 'VAF ahead    unknown: 2.990 s are held out, too short for the --horizon of 30 s; give a shorter one' in out
+
+
 def test_a_table_holds_what_the_pipeline_says(recording, estimates, capsys, tmp_path):
     for name in ('out.csv', 'out.npz', 'OUT.CSV'):
         assert _run(capsys, recording, *SETTINGS, '--output', tmp_path / name)[0] == 0
@@ -294,6 +300,7 @@ def test_what_comes_before_a_fault_is_used_and_written(recording, capsys, tmp_pa
     (['--set', 'inputs=[motor2/effort]'], "'motor2/effort'"),
     (['--params', 'nothing.yaml'], 'does not exist'),
     (['--validate-from', '100'], 'leaves no samples'),
+    (['--horizon', '0.5'], '--horizon is given without --validate-from'),
     (['--validate-from', '0'], 'leaves no samples'),
     (['--output', 'no/such/folder/out.csv'], 'does not exist'),
     (['--report', 'no/such/folder/out.html'], 'does not exist'),
