@@ -32,7 +32,7 @@ EXAMPLES = """examples:
 
 exit status: 0 on success (stderr then tells in one line which messages were left out); 2 on bad input or
 arguments, with one line on stderr; 130 when interrupted. Of a damaged recording everything before the damage is used
-and written; then the damage is reported with exit status 2.
+and written; then the damage is reported with exit status 2, and so is what the recording does not give.
 
 parameters (in --params under rpbsid_identifier or /**, or with --set):
 """
@@ -116,7 +116,7 @@ def _main(given: argparse.Namespace) -> int:
     if result.fault is not None:
         kept = ''.join(f"; what was identified is in '{place}'" for place in result.written)
         code = console.INTERRUPTED if result.interrupted else console.BAD_INPUT
-        return console.print_error(PROG, f'{result.fault}{kept}', code)
+        return console.print_error(PROG, '; '.join(filter(None, (f'{result.fault}{kept}', result.remark))), code)
     return console.print_error(PROG, result.remark, console.SUCCESS) if result.remark else console.SUCCESS
 
 

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +14,7 @@ from flexmanip_ros import estimator, pipeline
 from flexmanip_ros.cli.console import Report
 from flexmanip_ros.errors import BagError, FlexmanipError, MissingSignalError, ModelError, ParameterError, SignalError
 from flexmanip_ros.event_replay import FAR_EVENT_NS, same_event
+from flexmanip_ros.identification import parameter_varying
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.bag import Topics
 from flexmanip_ros.io.outputs import Output, check_apart, check_output, check_place, write_rows, write_text
@@ -72,9 +73,22 @@ def check_places(given: Any) -> None:
         check_output(given.output)
 
 
+def check_possible(request: Request) -> None:
+    """Raise FlexmanipError where the parameters say that a file which is asked for would have nothing in it."""
+    config = request.config
+    if request.configurations is not None and (len(config.angles) != 2 or parameter_varying.roles(config) is None):
+        raise _no_configurations()
+    if request.save_arm is not None and config.payload_method != 'structured':
+        raise _no_arm()
+
+
 @dataclass(frozen=True, eq=False)
 class Result:
-    """The result of a run. fault: what was wrong with the recording; its sound messages were used all the same."""
+    """The result of a run.
+
+    fault: what was wrong with the recording, whose sound messages were used all the same, and which of the things asked
+    for it does not give.
+    """
 
     summary: Summary
     modes: tuple[Mode, ...]
@@ -92,12 +106,13 @@ class Result:
 def identify(request: Request, progress: Report | None = None) -> Result:
     """Replay a recording through the identifier; write the output and the report that are asked for.
 
-    Raises FlexmanipError when no message can be used, and when a file cannot be written, is to be written twice, or is
-    in the recording.
+    Raises FlexmanipError when no message can be used, and when a file cannot be written, is to be written twice, is in
+    the recording, or could not have anything in it. Where only the end tells this, the result has it as its fault.
     """
     started = time.perf_counter()
     check_apart(places(request), None, str(request.bag))
     check_places(request)
+    check_possible(request)
     progress = progress or Report()
     screen = None if request.report is None else Screen(of_identifier(request.config, Path(request.bag).name))
     messages = Messages(request, progress, screen)
@@ -137,11 +152,17 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     summary = summarize(state, last, time.perf_counter() - started)
     scores = None
     signals = messages.signals(state.friction) if messages.is_kept else None
+    faults: list[FlexmanipError] = []
+    empty: list[str] = []
     if request.validate_from is not None and signals is not None:
         progress.phase('scoring the model')
-        scores = whole_recording.score(
-            None if last is None else last.model, signals, request.validate_from, factor=request.config.decimation,
-            horizon_s=request.horizon, constant=None if last is None else last.constant)
+        try:
+            scores = whole_recording.score(
+                None if last is None else last.model, signals, request.validate_from, factor=request.config.decimation,
+                horizon_s=request.horizon, constant=None if last is None else last.constant)
+        except ModelError as err:  # there is none yet
+            faults.append(err)
+    if scores is not None:
         summary = replace(summary, vaf_simulation_percent=tuple(scores.simulation.tolist()),
                           vaf_prediction_percent=tuple(scores.prediction.tolist()),
                           vaf_horizon_percent=tuple(scores.horizon.tolist()),
@@ -150,16 +171,18 @@ def identify(request: Request, progress: Report | None = None) -> Result:
         events = [event.stamp_ns for event in messages.events]
         summary = replace(summary, smoothed=whole_recording.smooth(
             state.config or request.config, signals, events, state.clock.dt, request.validate_from))
-    config, fault = state.config or request.config, messages.fault or _dropped(state)
-    if request.save_arm is not None:
-        _save_arm(request.save_arm, Path(request.bag).name, config, state, last)
+    config = state.config or request.config
+    if request.save_arm is not None and not _save_arm(request.save_arm, Path(request.bag).name, config, state, last):
+        faults.append(_no_arm())
+        empty.append(request.save_arm)
     found = None if signals is None else whole_recording.sweep(state, messages.angles_held(signals))
     if request.configurations is not None:
         if found is None:
-            raise ModelError('the model is not one of every configuration, so --configurations has nothing to write',
-                             'it needs over 1024 samples, two angles (with payload_method none only those that are '
-                             'given) and, as outputs, half as many positions as the order; see docs/moving_arm.md')
-        write_rows(request.configurations, found.rows())
+            faults.append(_no_configurations())
+            empty.append(request.configurations)
+        else:
+            write_rows(request.configurations, found.rows())
+    fault = _joined([*filter(None, [messages.fault or _dropped(state)]), *faults])
     remark = '; '.join((*messages.far_events(), *messages.merged_events(), *_remarks(state, messages.foreign)))
     if request.report is not None and signals is not None and screen is not None:
         from flexmanip_ros.io import plots, report
@@ -175,9 +198,9 @@ def identify(request: Request, progress: Report | None = None) -> Result:
             last, scores, {**state.counters._asdict(), 'dropped': state.counters.dropped}, bound=bound,
             fault='; '.join(str(words) for words in (fault, remark) if words), events=messages.search(summary.status),
             player=embedded(screen, kept), configurations=found)
-    return Result(
-        summary, () if last is None else last.modes, config, tuple(filter(None, places(request).values())), fault,
-        interrupted, messages.search(summary.status), remark)
+    written = tuple(place for place in places(request).values() if place is not None and place not in empty)
+    return Result(summary, () if last is None else last.modes, config, written, fault, interrupted,
+                  messages.search(summary.status), remark)
 
 
 class Messages:
@@ -303,7 +326,7 @@ class Messages:
         return '' if self.events else self._search
 
     def _due(self, stamp_ns: float) -> Iterator[CaptureEvent]:
-        """Yield the given events up to a stamp in their order among the recorded ones, so that the last one is the last.
+        """Yield the given events up to a stamp, in order among the recorded ones, so that the last one is the latest.
 
         One within event_merge_time of a recorded one comes before it and counts in its place.
         """
@@ -357,18 +380,36 @@ class Messages:
         return self.first_ns + round(limit * 1e9)
 
 
+def _no_configurations() -> FlexmanipError:
+    return ModelError('the model is not one of every configuration, so --configurations has nothing to write',
+                      'it needs over 1024 samples, decimation 1, two angles (with payload_method none only those that '
+                      'are given) and, as outputs, half as many positions as the order; see docs/moving_arm.md')
+
+
+def _no_arm() -> FlexmanipError:
+    return SignalError('the recording taught nothing of the arm, so --save-arm has nothing to write',
+                       'it needs payload_method structured, torques, angles and some 0.1 s of samples')
+
+
+def _joined(faults: Sequence[FlexmanipError]) -> FlexmanipError | None:
+    """Return the faults as one; None without any."""
+    if len(faults) < 2:
+        return faults[0] if faults else None
+    return FlexmanipError('; '.join([*map(str, faults[:-1]), faults[-1].problem]), faults[-1].remedy)
+
+
 def _save_arm(place: str, recording: str, config: IdentifierParameters, state: pipeline.State, last: Estimate | None
-              ) -> None:
-    """Write the arm parameters that the recording gave as a file for every node. Raises SignalError without any."""
+              ) -> bool:
+    """Write the arm parameters that the recording gave as a file for every node; return False where it gave none."""
     found = () if state.payload is None else estimator.arm_parameters(config, state.payload.estimator)
     if not found:
-        raise SignalError('the recording taught nothing of the arm, so --save-arm has nothing to write',
-                          'it needs payload_method structured, torques, angles and some 0.1 s of samples')
+        return False
     status = 'unknown' if last is None else last.status.name
     deviations = ', '.join(f'{one.name} {one.value:.6g} +- {one.std:.2g}' for one in found)
     heading = (f"What the arm taught in the recording '{recording}', status {status}. "
                f'Values and standard deviations: {deviations}.')
     write_text(place, yaml_text('rpbsid_identifier', as_parameters(config, found), heading))
+    return True
 
 
 def _horizon_reason(scores: whole_recording.Scores, horizon: float) -> str:

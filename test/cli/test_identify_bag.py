@@ -209,6 +209,39 @@ def test_frequencies_over_configurations_need_a_model_of_every_one(recording, ca
     assert 'moving_arm.md' in err
 
 
+@pytest.mark.parametrize(('arguments', 'words'), [
+    (['--configurations', 'out.csv', '--set', 'arm.link_length=[2.0]'], 'two angles'),
+    (['--configurations', 'out.csv', '--set', 'decimation=2'], 'decimation 1'),
+    (['--save-arm', 'out.yaml', '--set', 'payload_method=block'], 'payload_method structured')])
+def test_a_file_that_the_parameters_leave_empty_is_refused_before_the_work(
+        recording, capsys, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(pipeline, 'init', pytest.fail)
+    status, out, err = _run(capsys, recording, *arguments)
+    assert (status, out, list(tmp_path.iterdir())) == (2, '', [])
+    assert words in err
+
+
+def test_what_a_recording_does_not_give_costs_nothing_of_the_rest(capsys, tmp_path):
+    place = tmp_path / 'short'
+    assert simulate([str(place), '--duration', '0.3', '--capture-time', '-1']) == 0
+    capsys.readouterr()
+    table, page = tmp_path / 'out.csv', tmp_path / 'page.html'
+    status, out, err = _run(capsys, place, '--no-detect', '--json', '--configurations', tmp_path / 'angles.csv',
+                            '--output', table, '--report', page, '--validate-from', 0.02)
+    assert status == 2
+    assert json.loads(out)['samples'] == 20
+    assert json.loads(out)['vaf_simulation_percent'] is None
+    for words in ('there is no model yet at 0.02 s', '--configurations has nothing to write'):
+        assert words in err
+        assert words in page.read_text(encoding='utf-8')
+    assert err.count('\n') == 1
+    assert table.exists()
+    assert str(table) in err
+    assert 'angles.csv' not in err
+    assert not (tmp_path / 'angles.csv').exists()
+
+
 def test_a_capture_time_can_be_given_by_hand(recording, capsys):
     status, out, _ = _run(capsys, recording, *SETTINGS, '--json', '--capture-time', 5, '--release-time', 8)
     found = json.loads(out)
