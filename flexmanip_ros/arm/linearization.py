@@ -26,6 +26,8 @@ the root of the energy of a response to 10 %, six to 2 %."""
 INSTANTS = 1000
 """Instants of a step response, within a period of the slowest link: on the default arm 34 in a period of what the model
 lacks. An undamped response is followed no longer than that."""
+STEP = 1e-4
+"""Step of the coordinates [rad, m] from which the stiffness by gravity follows, to 1e-8 of it."""
 
 
 def mass_matrix(arm: Manipulator, payload: Array, q: Array) -> Array:
@@ -114,6 +116,35 @@ def vibration_model(
     h = len(b.Mc)
     solved = scipy.linalg.cho_solve(scipy.linalg.cho_factor(b.Ma), np.hstack([b.Mb, b.B_theta]))
     return first_order(b.Mc - b.Mb.T @ solved[:, :h], b.Kc, b.Dc, b.B_eta - b.Mb.T @ solved[:, h:])
+
+
+def bending_frequencies(
+    arm: ArmParameters, theta: Array, payload: float | Array = 0.0, *, locked: bool = False,
+) -> Array:
+    """Damped frequencies [Hz] of the arm's bending modes, rising, at chord angles theta (L,) [rad] without bending.
+
+    As ``vibration_model``, with the joints' viscous friction and with the stiffness by gravity, where constant torques
+    hold the arm. Swings of the whole arm under gravity are left out: bending holds less than half of their energy.
+    locked: the joints keep their angles.
+    """
+    b, own = floating_blocks(arm, theta, payload), manipulator(arm)
+    L, n = len(theta), len(theta) + len(b.Mc)
+    M, K, D = np.block([[b.Ma, b.Mb], [b.Mb.T, b.Mc]]), *np.zeros((2, n, n))
+    elastic = np.append(np.zeros(L), np.diag(b.Kc))
+    K[L:, L:], D[L:, L:] = b.Kc, b.Dc
+    torque = np.vstack([b.B_theta, b.B_eta])
+    D += (torque * own.viscous) @ torque.T
+    if any(arm.gravity):
+        q, body = np.append(theta, np.zeros(n - L)), _checked(arm, theta, payload)[1]
+        K += np.column_stack([gravity_forces(own, body, q + step) - gravity_forces(own, body, q - step)
+                              for step in STEP * np.eye(n)]) / (2.0 * STEP)
+    free = scipy.linalg.null_space(own.output[:L, :n]) if locked else np.eye(n)
+    M, K, D = (free.T @ part @ free for part in (M, K, D))
+    poles, vectors = np.linalg.eig(first_order(M, K, D, np.zeros((len(M), 0)))[0])
+    x = vectors[:len(M)]
+    kinetic = np.abs(poles) ** 2 * np.sum(x.conj() * (M @ x), axis=0).real
+    bends = elastic @ np.abs(free @ x) ** 2 > 0.5 * kinetic
+    return np.sort(poles.imag[bends & (poles.imag > 0)]) / (2 * np.pi)
 
 
 def discretize(Ac: Array, Bc: Array, dt: float) -> tuple[Array, Array]:

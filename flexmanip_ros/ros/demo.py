@@ -30,7 +30,7 @@ from rich.table import Table
 from std_msgs.msg import Float64MultiArray
 
 from flexmanip_ros import messages, pipeline
-from flexmanip_ros.arm.linearization import frequencies, vibration_model
+from flexmanip_ros.arm.linearization import bending_frequencies
 from flexmanip_ros.cli.console import BAD_INPUT, INTERRUPTED, Parser, print_error
 from flexmanip_ros.errors import FlexmanipError, ParameterError
 from flexmanip_ros.io import bag, plots
@@ -329,7 +329,7 @@ def known_truth(config: DemoParameters, plant: PlantParameters, items: Sequence[
     def lowest(mass: float, from_ns: int, until_ns: int) -> tuple[float, ...]:
         angles = [np.cumsum(record.position[:2]) for record in records
                   if max(from_ns, until_ns - LATEST_NS) <= record.stamp_ns <= until_ns]
-        found = frequencies(vibration_model(plant.arm, np.mean(angles, axis=0), mass)[0])
+        found = bending_frequencies(plant.arm, np.mean(angles, axis=0), mass, locked=plant.locked)
         return tuple(float(f) for f in found[:2])
 
     return Truth(config.payload_mass if config.capture_time >= 0.0 else None, lowest(0.0, first_ns, caught_ns),

@@ -13,7 +13,7 @@ import numpy as np
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm.capture import free_object
-from flexmanip_ros.arm.linearization import frequencies, vibration_model
+from flexmanip_ros.arm.linearization import bending_frequencies
 from flexmanip_ros.errors import FlexmanipError
 from flexmanip_ros.parameters import IdentifierParameters, PlantParameters
 from flexmanip_ros.samples.sampling import collect
@@ -166,7 +166,7 @@ def true_frequencies(plant: PlantParameters, mass: float) -> list[float]:
     mass: that of the object, or 0 for the empty arm [kg].
     """
     held = free_object(replace(plant, payload_mass=mass)).payload if mass else 0.0
-    found = frequencies(vibration_model(plant.arm, np.array(plant.initial_angles), held)[0])
+    found = bending_frequencies(plant.arm, np.array(plant.initial_angles), held, locked=plant.locked)
     return [float(frequency) for frequency in found[:2]]
 
 

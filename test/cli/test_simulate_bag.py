@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 
@@ -54,6 +55,24 @@ def test_the_true_frequencies_are_those_of_what_is_held(tmp_path, arguments, low
     path = _simulate(tmp_path, *arguments)
     truth = json.loads(path.with_name('recording.truth.json').read_text(encoding='utf-8'))
     assert truth['frequencies_after_hz'][0] == pytest.approx(lowest_hz, abs=0.005)
+
+
+HANGS = ('arm.link_length=[2.0]', 'arm.linear_density=[3.0]', 'arm.bending_stiffness=[2000.0]',
+         'arm.sensor_position=[0.4]', 'initial_angles=[-1.5707963]', 'arm.gravity=[0.0, -9.81]')
+
+
+@pytest.mark.parametrize(('settings', 'modes'), [(HANGS, 1), (('locked=true',), 2)], ids=['hangs', 'locked'])
+def test_an_arm_that_hangs_or_is_clamped_rings_at_its_true_frequencies(tmp_path, settings, modes):
+    path = _simulate(tmp_path, '--duration', '12', '--payload', '5', '--capture-time', '0.001', *itertools.chain(
+        *(('--set', item) for item in (*settings, 'noise=none', 'excitation.shape=zero', 'object_velocity=[0.1, 0.03]',
+                                       'arm.damping_ratio=0.003'))))
+    truth = json.loads(path.with_name('recording.truth.json').read_text(encoding='utf-8'))
+    bend = np.array([item.position[-1] for item in bag.read(path) if isinstance(item, JointRecord)])[10:]
+    power = np.abs(np.fft.rfft(np.hanning(len(bend)) * (bend - bend.mean()), 1 << 22))
+    hertz = np.fft.rfftfreq(1 << 22, 0.001)
+    for known in truth['frequencies_after_hz'][:modes]:
+        near = np.abs(hertz / known - 1.0) < 0.1
+        assert hertz[near][power[near].argmax()] == pytest.approx(known, rel=3e-3)
 
 
 def test_the_same_arguments_give_the_same_bytes(tmp_path):
