@@ -24,7 +24,7 @@ from flexmanip_ros.identification import (
     validation,
 )
 from flexmanip_ros.identification.batch_fit import BLOCK, interpolated
-from flexmanip_ros.identification.prediction_check import MOST_TURN
+from flexmanip_ros.identification.prediction_check import MOST_TURN, PER_RAD
 from flexmanip_ros.identification.uncertainty import Identified, modes
 from flexmanip_ros.identification.varying_model import Configurations
 from flexmanip_ros.parameters import IdentifierParameters
@@ -245,11 +245,34 @@ def _judged(config: IdentifierParameters, found: Identified, samples: Array, ang
     missing, r = np.isnan(samples[:, -1]), len(config.inputs)
     if missing.all():
         return found
-    role, samples = parameter_varying.roles(config), interpolated(samples)
+    role, samples, turned = parameter_varying.roles(config), interpolated(samples), 0.0
     rows = log_of(samples[:, :r], samples[:, r:], missing=missing.astype(np.int64)).rows(0, len(samples))
-    turned = 0.0 if role is None or angles.shape[1] != 2 else float(np.ptp(relative_angle(config, angles)))
+    if role is not None and angles.shape[1] == 2:
+        relative = relative_angle(config, angles)
+        turned, found = float(np.ptp(relative)), _of_a_mean(found, relative)
     return prediction_check.judged(found, rows, config.outputs, 0 if role is None else len(role.displacements), turned,
                                    filtered=config.decimation > 1)
+
+
+def _of_a_mean(found: Identified, relative: Array) -> Identified:
+    """Return the model with its spread widened by the turn of the links: a fixed model is a mean over configurations.
+
+    relative: (N,) angle between the links at each sample [rad]. Half the range of its mean over a period of the slowest
+    mode, which leaves the vibration out, is how far the model may be from a configuration of the stretch. ``PER_RAD``
+    times that is a relative deviation of each frequency. A fit reads a frequency that drifts as damping too, so each
+    damping ratio gets the same deviation. (Of 148 modes of 37 random runs, 11 frequencies and 10 damping ratios were
+    beyond their 95 % bands without it, by up to four times, and none with it; with the standard deviation in place of
+    half the range, 2 and 1 were.)
+    """
+    oscillations, relative = modes(found), relative[np.isfinite(relative)]
+    period = round(1.0 / (oscillations[0].frequency_hz * found.model.dt)) if oscillations else len(relative)
+    if not 0 < period < len(relative):
+        return found
+    share = PER_RAD * 0.5 * float(np.ptp(np.convolve(relative, np.full(period, 1.0 / period), 'valid')))
+    values, right = prediction_check.eigen(found.model.A)
+    logs, chosen = prediction_check.light_modes(values)
+    return prediction_check.with_pole_errors(
+        found, values, right, [(k, way * abs(logs[k]) * share) for k in chosen for way in (1.0, 1j)])
 
 
 def _fit(config: IdentifierParameters, state: rpbsid.RpbsidState, samples: Array, noise: str, count: int, dt: float

@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 
 from flexmanip_ros import pipeline
+from flexmanip_ros.arm.capture import free_object
+from flexmanip_ros.arm.linearization import vibration_model
 from flexmanip_ros.errors import ModelError, ParameterError
-from flexmanip_ros.parameters import IdentifierParameters, configure
+from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
 from flexmanip_ros.samples.sample_log import Signals
+from flexmanip_ros.samples.sampling import collect
+from flexmanip_ros.samples.signals import relative_angle
+from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.studies.whole_recording import score, smooth, sweep
-from flexmanip_ros.types import JointRecord, StateSpace, Status
+from flexmanip_ros.types import CaptureEvent, EventKind, JointRecord, StateSpace, Status
 
 DT = 0.01
 
@@ -165,3 +170,23 @@ def test_a_stretch_in_which_the_machine_changes_is_not_smoothed_as_tracking(fast
     y += 0.01 * np.std(y) * np.random.default_rng(3).normal(size=y.shape)
     (found,) = smooth(config, replace(signals, y=y), [], DT)
     assert found.status in status
+
+
+def test_what_a_drifting_frequency_adds_to_the_damping_of_a_stretch_is_within_its_band():
+    """The links turn by 0.05 rad: as f2 drifts by 1 %, the fit reads its damping as 0.0055, where it is 0.0033."""
+    config = configure(IdentifierParameters, {'arm.damping_ratio': 0.003})
+    plant = configure(PlantParameters, {
+        'arm.damping_ratio': 0.003, 'payload_mass': 24.0, 'payload_com': [0.12, 0.05], 'payload_inertia': 0.8,
+        'seed': 1})
+    events = [CaptureEvent(3_000_000_000, EventKind.CAPTURE)]
+    trajectory = simulator.simulate(plant, excitation.sequence(ExcitationParameters(), 6000), events)
+    signals = collect(config, list(simulator.records(trajectory, events)))
+    found = smooth(config, signals, [events[0].stamp_ns], 1e-3)[1]
+    assert (found.method, found.status) == ('maximum likelihood', Status.TRACKING)
+    relative = float(relative_angle(config, signals.angles[3000:]).mean())
+    Ac, _ = vibration_model(plant.arm, np.array([0.0, relative]), free_object(plant).payload)
+    poles = np.linalg.eigvals(Ac)
+    for mode, pole in zip(found.modes, sorted(poles[poles.imag > 0.0], key=np.imag), strict=False):
+        assert abs(mode.frequency_hz - pole.imag / (2.0 * np.pi)) < 1.96 * mode.frequency_std_hz
+        assert abs(mode.damping_ratio + pole.real / abs(pole)) < 1.96 * mode.damping_ratio_std
+        assert mode.frequency_std_hz < 0.005 * mode.frequency_hz
