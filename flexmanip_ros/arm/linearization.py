@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from flexmanip_ros.arm.equations_of_motion import assemble, inertial_forces
+from flexmanip_ros.arm.equations_of_motion import assemble, elastic, inertial_forces
 from flexmanip_ros.arm.manipulator import (
     Manipulator,
     Workspace,
@@ -28,6 +28,9 @@ INSTANTS = 1000
 lacks. An undamped response is followed no longer than that."""
 STEP = 1e-4
 """Step of the coordinates [rad, m] from which the stiffness by gravity follows, to 1e-8 of it."""
+SAGS, SETTLED = 10, 1e-6
+"""Most Newton steps to the equilibrium of a clamped arm under gravity, and the step [rad, m] that is the last. A sag of
+3 % of the length takes four. An arm that sags by its length has no equilibrium that this model describes."""
 
 
 def mass_matrix(arm: Manipulator, payload: Array, q: Array) -> Array:
@@ -121,29 +124,42 @@ def vibration_model(
 def bending_frequencies(
     arm: ArmParameters, theta: Array, payload: float | Array = 0.0, *, locked: bool = False,
 ) -> Array:
-    """Damped frequencies [Hz] of the arm's bending modes, rising, at chord angles theta (L,) [rad] without bending.
+    """Damped frequencies [Hz] of the arm's bending modes, rising, at chord angles theta (L,) [rad].
 
     As ``vibration_model``, with the joints' viscous friction and with the stiffness by gravity, where constant torques
     hold the arm. Swings of the whole arm under gravity are left out: bending holds less than half of their energy.
-    locked: the joints keep their angles.
+    locked: the joints keep their angles at theta without bending, and the arm sags under gravity; else it does not.
+    Empty where such an arm finds no equilibrium.
     """
     b, own = floating_blocks(arm, theta, payload), manipulator(arm)
     L, n = len(theta), len(theta) + len(b.Mc)
     M, K, D = np.block([[b.Ma, b.Mb], [b.Mb.T, b.Mc]]), *np.zeros((2, n, n))
-    elastic = np.append(np.zeros(L), np.diag(b.Kc))
-    K[L:, L:], D[L:, L:] = b.Kc, b.Dc
+    K[L:, L:], D[L:, L:], K_bending = b.Kc, b.Dc, np.append(np.zeros(L), np.diag(b.Kc))
     torque = np.vstack([b.B_theta, b.B_eta])
     D += (torque * own.viscous) @ torque.T
-    if any(arm.gravity):
-        q, body = np.append(theta, np.zeros(n - L)), _checked(arm, theta, payload)[1]
-        K += np.column_stack([gravity_forces(own, body, q + step) - gravity_forces(own, body, q - step)
-                              for step in STEP * np.eye(n)]) / (2.0 * STEP)
     free = scipy.linalg.null_space(own.output[:L, :n]) if locked else np.eye(n)
+    if any(arm.gravity):
+        q, body, work = np.append(theta, np.zeros(n - L)), _checked(arm, theta, payload)[1], workspace(own)
+
+        def force(q: Array) -> Array:
+            elastic(own, q, work)
+            return gravity_forces(own, body, q) + work.elastic
+
+        def stiffness(q: Array) -> Array:
+            return np.column_stack([force(q + step) - force(q - step) for step in STEP * np.eye(n)]) / (2.0 * STEP)
+
+        sag, steps = np.full(n, np.inf if locked else 0.0), 0
+        while np.abs(sag).max() > SETTLED:
+            if steps == SAGS:
+                return np.zeros(0)
+            sag, steps = free @ np.linalg.solve(free.T @ stiffness(q) @ free, free.T @ force(q)), steps + 1
+            q = q - sag
+        M, K = mass_matrix(own, body, q), stiffness(q)
     M, K, D = (free.T @ part @ free for part in (M, K, D))
     poles, vectors = np.linalg.eig(first_order(M, K, D, np.zeros((len(M), 0)))[0])
     x = vectors[:len(M)]
     kinetic = np.abs(poles) ** 2 * np.sum(x.conj() * (M @ x), axis=0).real
-    bends = elastic @ np.abs(free @ x) ** 2 > 0.5 * kinetic
+    bends = (K_bending @ np.abs(free @ x) ** 2 > 0.5 * kinetic) | locked
     return np.sort(poles.imag[bends & (poles.imag > 0)]) / (2 * np.pi)
 
 

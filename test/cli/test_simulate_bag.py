@@ -57,11 +57,13 @@ def test_the_true_frequencies_are_those_of_what_is_held(tmp_path, arguments, low
     assert truth['frequencies_after_hz'][0] == pytest.approx(lowest_hz, abs=0.005)
 
 
-HANGS = ('arm.link_length=[2.0]', 'arm.linear_density=[3.0]', 'arm.bending_stiffness=[2000.0]',
-         'arm.sensor_position=[0.4]', 'initial_angles=[-1.5707963]', 'arm.gravity=[0.0, -9.81]')
+ONE_LINK = ('arm.link_length=[2.0]', 'arm.linear_density=[3.0]', 'arm.bending_stiffness=[2000.0]',
+         'arm.sensor_position=[0.4]', 'arm.gravity=[0.0, -9.81]')
 
 
-@pytest.mark.parametrize(('settings', 'modes'), [(HANGS, 1), (('locked=true',), 2)], ids=['hangs', 'locked'])
+@pytest.mark.parametrize(('settings', 'modes'), [
+    ((*ONE_LINK, 'initial_angles=[-1.5707963]'), 1), (('locked=true',), 2),
+    ((*ONE_LINK, 'initial_angles=[0.0]', 'locked=true'), 1)], ids=['hangs', 'locked', 'sags'])
 def test_an_arm_that_hangs_or_is_clamped_rings_at_its_true_frequencies(tmp_path, settings, modes):
     path = _simulate(tmp_path, '--duration', '12', '--payload', '5', '--capture-time', '0.001', *itertools.chain(
         *(('--set', item) for item in (*settings, 'noise=none', 'excitation.shape=zero', 'object_velocity=[0.1, 0.03]',
