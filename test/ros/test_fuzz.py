@@ -93,17 +93,19 @@ def test_events_without_end_do_not_fill_the_memory_and_those_left_out_are_counte
     assert getattr(bench.node, counter) == 200  # of 300: 100 wait for their stamps
 
 
+@pytest.mark.parametrize(('step_ns', 'least', 'most'), [(50_000, 250, 600), (1, 0, 0)],
+                         ids=['as fast as is taken', 'in another unit: all refused'])
 def test_samples_whose_stamps_hardly_advance_do_not_fill_the_memory(
-        ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+        ros: Ros, monkeypatch: pytest.MonkeyPatch, step_ns: int, least: int, most: int) -> None:
     monkeypatch.setattr(event_replay, 'MOST_ROWS', 500)
     bench = Bench(ros, 'rpbsid_identifier')
     for first in range(0, 2000, 100):
         message = [joint_state(k) for k in range(first, first + 100)]
         for k, item in enumerate(message):
-            item.header.stamp = time_message(10**18 + first + k)
+            item.header.stamp = time_message(10**18 + (first + k) * step_ns)
         bench.send([('joint_states', item) for item in message])
         ros.wait(lambda until=first + 100: bench.node.state.counters.received >= until, what='samples to be taken')
-    assert 250 < bench.remembered() <= 600
+    assert least <= bench.remembered() <= most
 
 
 def test_an_estimate_of_the_wrong_size_changes_nothing(ros: Ros) -> None:
