@@ -58,7 +58,7 @@ def test_the_true_frequencies_are_those_of_what_is_held(tmp_path, arguments, low
 
 
 ONE_LINK = ('arm.link_length=[2.0]', 'arm.linear_density=[3.0]', 'arm.bending_stiffness=[2000.0]',
-         'arm.sensor_position=[0.4]', 'arm.gravity=[0.0, -9.81]')
+            'arm.sensor_position=[0.4]', 'arm.gravity=[0.0, -9.81]')
 
 
 @pytest.mark.parametrize(('settings', 'modes'), [
