@@ -147,6 +147,22 @@ def same_event(config: IdentifierParameters, event: CaptureEvent, latest: Iterab
     return None if is_apart else previous
 
 
+def distinct(config: IdentifierParameters, events: Iterable[CaptureEvent]
+             ) -> tuple[list[CaptureEvent], list[tuple[CaptureEvent, CaptureEvent]]]:
+    """Return the events that count, and each of the others with the one that it was taken for. events: as they came."""
+    counted: list[CaptureEvent] = []
+    merged: list[tuple[CaptureEvent, CaptureEvent]] = []
+    latest: dict[EventKind, CaptureEvent] = {}
+    for event in events:
+        same = same_event(config, event, latest.values())
+        if same is None:
+            latest[event.kind] = event
+            counted.append(event)
+        else:
+            merged.append((event, same))
+    return counted, merged
+
+
 def _restart(config: IdentifierParameters, replay: EventReplay[E]) -> EventReplay[E]:
     """Restart the estimator with the events, as every sample came after them; drop the older snapshots."""
     estimator = replay.estimator.restart(config, sorted(replay.latest, key=_order))

@@ -13,7 +13,7 @@ import numpy as np
 from flexmanip_ros import estimator, pipeline
 from flexmanip_ros.cli.console import Report
 from flexmanip_ros.errors import BagError, FlexmanipError, MissingSignalError, ModelError, ParameterError, SignalError
-from flexmanip_ros.event_replay import FAR_EVENT_NS, same_event
+from flexmanip_ros.event_replay import FAR_EVENT_NS, distinct
 from flexmanip_ros.identification import parameter_varying
 from flexmanip_ros.io import bag
 from flexmanip_ros.io.bag import Topics
@@ -116,6 +116,53 @@ def identify(request: Request, progress: Report | None = None) -> Result:
     progress = progress or Report()
     screen = None if request.report is None else Screen(of_identifier(request.config, Path(request.bag).name))
     messages = Messages(request, progress, screen)
+    state, kept, interrupted = _run(request, messages)
+    progress.phase('fitting the last samples')
+    last, config = pipeline.current(state), state.config or request.config
+    summary = summarize(state, last, time.perf_counter() - started)
+    signals = messages.signals(state.friction) if messages.is_kept else None
+    events, merged = distinct(config, messages.events)
+    faults: list[FlexmanipError | None] = [messages.fault or _dropped(state)]
+    scores, found = None, None
+    if signals is not None and request.validate_from is not None:
+        progress.phase('scoring the model')
+        scores, fault = _scored(request, last, signals)
+        faults.append(fault)
+        summary = summary if scores is None else _with_scores(summary, scores, request.horizon)
+    if signals is not None and request.smooth:
+        summary = replace(summary, smoothed=whole_recording.smooth(
+            config, signals, [event.stamp_ns for event in events], state.clock.dt, request.validate_from))
+    if signals is not None:
+        found = whole_recording.sweep(state, messages.angles_held(signals))
+    written = {request.output, request.report}
+    if request.save_arm is not None and _save_arm(request.save_arm, Path(request.bag).name, config, state, last):
+        written.add(request.save_arm)
+    elif request.save_arm is not None:
+        faults.append(_no_arm())
+    if request.configurations is not None and found is not None:
+        write_rows(request.configurations, found.rows())
+        written.add(request.configurations)
+    elif request.configurations is not None:
+        faults.append(_no_configurations())
+    result = Result(
+        summary, () if last is None else last.modes, config,
+        tuple(place for place in places(request).values() if place is not None and place in written),
+        _joined([fault for fault in faults if fault is not None]), interrupted, messages.search(summary.status),
+        '; '.join((*messages.far_events(), *_merged_events(config, merged, messages.first_ns or 0),
+                   *_remarks(state, messages.foreign))))
+    if request.report is not None and signals is not None and screen is not None:
+        progress.phase('drawing the report')
+        if last is not None and kept and last.stamp_ns > kept[-1].stamp_ns:
+            kept.append(last)  # so that pictures and replay end with the numbers of the answer
+        _report(request, result, state, signals, messages.events, last, kept, scores, found, embedded(screen, kept))
+    return result
+
+
+def _run(request: Request, messages: 'Messages') -> tuple[pipeline.State, list[Estimate], bool]:
+    """Return the state after all messages, the estimates for the report, and whether the run was interrupted.
+
+    The output that is asked for is written meanwhile. Raises FlexmanipError where no message can be used.
+    """
     kept: list[Estimate] = []
     state, interrupted = pipeline.init(), False
     output = None if request.output is None else Output(request.output, request.config.payload_frame)
@@ -147,60 +194,43 @@ def identify(request: Request, progress: Report | None = None) -> Result:
             raise messages.fault
         if output is not None:
             output.start_ns = messages.first_ns
-    progress.phase('fitting the last samples')
-    last = pipeline.current(state)
-    summary = summarize(state, last, time.perf_counter() - started)
-    scores = None
-    signals = messages.signals(state.friction) if messages.is_kept else None
-    faults: list[FlexmanipError] = []
-    empty: list[str] = []
-    if request.validate_from is not None and signals is not None:
-        progress.phase('scoring the model')
-        try:
-            scores = whole_recording.score(
-                None if last is None else last.model, signals, request.validate_from, factor=request.config.decimation,
-                horizon_s=request.horizon, constant=None if last is None else last.constant)
-        except ModelError as err:  # there is none yet
-            faults.append(err)
-    if scores is not None:
-        summary = replace(summary, vaf_simulation_percent=tuple(scores.simulation.tolist()),
-                          vaf_prediction_percent=tuple(scores.prediction.tolist()),
-                          vaf_horizon_percent=tuple(scores.horizon.tolist()),
-                          horizon_reason=_horizon_reason(scores, request.horizon))
-    if request.smooth and signals is not None:
-        events = [event.stamp_ns for event in messages.events]
-        summary = replace(summary, smoothed=whole_recording.smooth(
-            state.config or request.config, signals, events, state.clock.dt, request.validate_from))
-    config = state.config or request.config
-    if request.save_arm is not None and not _save_arm(request.save_arm, Path(request.bag).name, config, state, last):
-        faults.append(_no_arm())
-        empty.append(request.save_arm)
-    found = None if signals is None else whole_recording.sweep(state, messages.angles_held(signals))
-    if request.configurations is not None:
-        if found is None:
-            faults.append(_no_configurations())
-            empty.append(request.configurations)
-        else:
-            write_rows(request.configurations, found.rows())
-    fault = _joined([*filter(None, [messages.fault or _dropped(state)]), *faults])
-    remark = '; '.join((*messages.far_events(), *messages.merged_events(), *_remarks(state, messages.foreign)))
-    if request.report is not None and signals is not None and screen is not None:
-        from flexmanip_ros.io import plots, report
+    return state, kept, interrupted
 
-        progress.phase('drawing the report')
-        if last is not None and kept and last.stamp_ns > kept[-1].stamp_ns:
-            kept.append(last)  # so that pictures and replay end with the numbers of the answer
-        bound, mass = None, summary.payload_mass_kg
-        if summary.capture_time_s is not None and mass is not None:
-            bound = payload_bound(config, signals, summary.capture_time_s, mass, state.clock.dt)
-        report.identification_report(
-            request.report, Path(request.bag).name, config, summary, plots.run(config, signals, kept, messages.events),
-            last, scores, {**state.counters._asdict(), 'dropped': state.counters.dropped}, bound=bound,
-            fault='; '.join(str(words) for words in (fault, remark) if words), events=messages.search(summary.status),
-            player=embedded(screen, kept), configurations=found)
-    written = tuple(place for place in places(request).values() if place is not None and place not in empty)
-    return Result(summary, () if last is None else last.modes, config, written, fault, interrupted,
-                  messages.search(summary.status), remark)
+
+def _scored(request: Request, last: Estimate | None, signals: Signals
+            ) -> tuple[whole_recording.Scores | None, ModelError | None]:
+    """Return the scores of the last model on the samples held out, or why there are none."""
+    model, constant = (None, None) if last is None else (last.model, last.constant)
+    try:
+        return whole_recording.score(
+            model, signals, request.validate_from or 0.0, factor=request.config.decimation,
+            horizon_s=request.horizon, constant=constant), None
+    except ModelError as err:  # there is none yet
+        return None, err
+
+
+def _with_scores(summary: Summary, scores: whole_recording.Scores, horizon: float) -> Summary:
+    return replace(
+        summary, vaf_simulation_percent=tuple(scores.simulation.tolist()),
+        vaf_prediction_percent=tuple(scores.prediction.tolist()), vaf_horizon_percent=tuple(scores.horizon.tolist()),
+        horizon_reason=_horizon_reason(scores, horizon))
+
+
+def _report(request: Request, result: Result, state: pipeline.State, signals: Signals,
+            events: Sequence[CaptureEvent], last: Estimate | None, kept: Sequence[Estimate],
+            scores: whole_recording.Scores | None, found: whole_recording.Sweep | None, player: str) -> None:
+    """Write the report. kept: the estimates; found: frequencies of every configuration; player: page of the replay."""
+    from flexmanip_ros.io import plots, report
+
+    summary, config = result.summary, result.config
+    bound, mass = None, summary.payload_mass_kg
+    if summary.capture_time_s is not None and mass is not None:
+        bound = payload_bound(config, signals, summary.capture_time_s, mass, state.clock.dt)
+    report.identification_report(
+        str(request.report), Path(request.bag).name, config, summary, plots.run(config, signals, kept, events),
+        last, scores, {**state.counters._asdict(), 'dropped': state.counters.dropped}, bound=bound,
+        fault='; '.join(str(words) for words in (result.fault, result.remark) if words), events=result.events,
+        player=player, configurations=found)
 
 
 class Messages:
@@ -220,10 +250,6 @@ class Messages:
         """The events that are neither given nor found in the signals."""
         self.is_kept = (request.smooth or request.validate_from is not None or request.report is not None
                         or request.configurations is not None)
-        self.merged: list[tuple[CaptureEvent, CaptureEvent]] = []
-        """Events that were taken for an earlier one though their stamps differ, each with that one."""
-        self._latest: dict[EventKind, CaptureEvent] = {}
-        """The latest event of each kind that counts."""
         self._given: list[CaptureEvent] = []
         """The events of --capture-time and --release-time that are still to come."""
         self._blocks: list[JointBlock] = []
@@ -268,17 +294,6 @@ class Messages:
                 f'{(first_ns - event.stamp_ns) * 1e-9:.0f} s before the first sample: stamp an event with the time of '
                 f'its samples, or give --{event.kind.value}-time'
                 for event in self.recorded if first_ns - event.stamp_ns > FAR_EVENT_NS]
-
-    def merged_events(self) -> list[str]:
-        """Return what is to be said of announcements that were taken for one event though their stamps differ."""
-        if not self.merged:
-            return []
-        (event, same), count = self.merged[0], len(self.merged)
-        kind, limit = event.kind.value, self._request.config.event_merge_time
-        at, before = ((one.stamp_ns - (self.first_ns or 0)) * 1e-9 for one in (event, same))
-        more = f' (so were {count - 1} more)' if count > 1 else ''
-        return [f'the {kind} at {at:.3f} s was taken for the one at {before:.3f} s, as event_merge_time is {limit:g} s'
-                f'{more}: lower event_merge_time if it is another {kind}']
 
     def _watch(self) -> capture_detection.Watch | None:
         """Return the detector where events are to be looked for in the signals; say why where they are not.
@@ -335,11 +350,6 @@ class Messages:
 
     def _event(self, event: CaptureEvent) -> Iterator[CaptureEvent]:
         self.events.append(event)
-        same = same_event(self._request.config, event, self._latest.values())
-        if same is None:
-            self._latest[event.kind] = event
-        elif same.stamp_ns != event.stamp_ns and same.std_s == event.std_s:  # else one is commanded, one detected
-            self.merged.append((event, same))
         if self._screen is not None:
             self._screen.event(event)
         yield event
@@ -434,6 +444,22 @@ def _dropped(state: pipeline.State) -> FlexmanipError | None:
     if rejection.reason not in ('not_finite', 'unequal_sizes'):  # the latest one was left out for another reason
         return BagError(words, 'look at the publisher of the joint states')
     return BagError(f'{words}; the last of them: {rejection.problem}', rejection.remedy)
+
+
+def _merged_events(config: IdentifierParameters, merged: Sequence[tuple[CaptureEvent, CaptureEvent]], first_ns: int
+                   ) -> list[str]:
+    """Return what is to be said of events that were taken for an earlier one (``distinct``) though their stamps differ.
+
+    Not of one that was commanded and detected. first_ns: stamp of the first sample [ns].
+    """
+    apart = [(event, same) for event, same in merged if event.stamp_ns != same.stamp_ns and event.std_s == same.std_s]
+    if not apart:
+        return []
+    (event, same), limit = apart[0], config.event_merge_time
+    kind, at, before = event.kind.value, (event.stamp_ns - first_ns) * 1e-9, (same.stamp_ns - first_ns) * 1e-9
+    more = f' (so were {len(apart) - 1} more)' if len(apart) > 1 else ''
+    return [f'the {kind} at {at:.3f} s was taken for the one at {before:.3f} s, as event_merge_time is {limit:g} s'
+            f'{more}: lower event_merge_time if it is another {kind}']
 
 
 def _remarks(state: pipeline.State, foreign: int) -> list[str]:

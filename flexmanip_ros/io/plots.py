@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from flexmanip_ros.event_replay import distinct
 from flexmanip_ros.io import outputs
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.samples.sample_log import Signals
@@ -246,13 +247,10 @@ class Run:
 
 def run(config: IdentifierParameters, signals: Signals, estimates: Sequence[Estimate],
         events: Iterable[CaptureEvent], truth: Truth | None = None) -> Run:
-    """Return a run from its signals; an event that was announced twice is kept once."""
+    """Return a run from its signals; of events that are taken for one (``event_replay.distinct``) the first is kept."""
     start = int(signals.stamp_ns[0]) if signals.stamp_ns.size else 0
-    found: list[Event] = []
-    for event in sorted(events, key=lambda item: item.stamp_ns):
-        time = (event.stamp_ns - start) * 1e-9
-        if not any(kind is event.kind and abs(time - at) <= config.event_merge_time for at, kind in found):
-            found.append((time, event.kind))
+    counted = sorted(distinct(config, events)[0], key=lambda event: event.stamp_ns)
+    found = [((event.stamp_ns - start) * 1e-9, event.kind) for event in counted]
     return Run(signals, estimates, tuple(found), config.payload_method != 'none', truth or Truth())
 
 

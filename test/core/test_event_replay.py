@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexmanip_ros import pipeline
+from flexmanip_ros.event_replay import distinct
 from flexmanip_ros.parameters import ExcitationParameters, IdentifierParameters, PlantParameters, configure
 from flexmanip_ros.simulation.excitation import sequence
 from flexmanip_ros.simulation.simulator import simulate
@@ -135,6 +137,18 @@ def test_a_capture_soon_after_a_release_is_no_repetition_of_the_one_before_it() 
     assert state.payload is not None
     assert state.payload.repeated_events == 0
     assert state.payload.estimator.since_ns == state.stamp_of(EventKind.CAPTURE) == 220 * MS
+
+
+@settings(max_examples=20, deadline=None)
+@given(events=st.lists(st.tuples(st.integers(10, 60), st.sampled_from(EventKind)), max_size=6))
+def test_a_replay_and_its_report_take_the_same_events_for_one(events: list[tuple[int, EventKind]]) -> None:
+    announced = [CaptureEvent(stamp * MS, kind) for stamp, kind in events]
+    config = replace(CONFIG, event_merge_time=0.02)
+    counted, merged = distinct(config, announced)
+    state, _ = step_through([*records(5), *announced], config)
+    assert state.payload is not None
+    assert len(merged) == state.payload.repeated_events
+    assert set(counted) == set(state.payload.pending)
 
 
 def test_memory_stays_constant() -> None:
