@@ -13,6 +13,8 @@ ENOUGH = 512
 """Least number of samples after which it ends once it has converged."""
 TONES = 32
 """Frequencies at which the spectrum of each sensor is taken."""
+PARTS = 4
+"""Beginnings of the horizon that are kept apart: its first 16, 64, 256 and 1024 samples, see ``disagreement``."""
 
 # Columns of ``noise``, one row a sensor: variance used by the filter; variance of the innovations; its slow part;
 # sum and sum of squares of the residuals in this block; least variance assumed; variance of the fourth differences
@@ -22,10 +24,10 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
 # Elements of ``counts``.
 (HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, MOVED, SEEN, BEFORE,
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
- IN_SPECTRUM, SPECTRA, LINEARIZED, EFFORTS, RESTS) = range(25)
+ IN_SPECTRUM, SPECTRA, LINEARIZED, EFFORTS, RESTS, SKIPPED) = range(26)
 # Elements of ``score``.
 (SHIFT, DOUBT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES, SANDWICH,
- MISFIT, EXCESS, LOG_DETERMINANT, LIKELIHOOD) = range(14)
+ MISFIT, EXCESS, LOG_DETERMINANT, LIKELIHOOD, DISAGREES) = range(15)
 # Values of ``counts[EFFORTS]``: whether the white part of the reported efforts is noise or acts on the arm.
 NOISY, COMPARED, EXACT, CONFIRMED = range(4)
 # Values of ``counts[RESTS]``: whether the arm is at rest, and its horizon slides until it moves.
@@ -47,7 +49,7 @@ class FilterState(NamedTuple):
     """(m, 3, TONES) of its fourth differences: both states of Goertzel's filter, mean power over that of white noise
     of unit variance."""
     counts: NDArray[np.int64]
-    """(25,) counters and flags (1: yes).
+    """(26,) counters and flags (1: yes).
 
     Filter: HELD: the arm holds something; LEARNED: it was seen empty before; SEEN: samples measured, at most 2000;
     SINCE_EVENT: those since the last event; IN_A_ROW: those since the last one that was missing; SINCE_NOISE: samples
@@ -61,9 +63,9 @@ class FilterState(NamedTuple):
     part is taken for noise; COMPARED: the iteration takes it for true; EXACT: it fits better so; CONFIRMED: it does
     not; RESTS: RESTING: the samples since the event tell nothing yet of the payload, so no fit reads them and the
     horizon slides along, IN_BATCH counts the samples since it slid; SLIDES: it is due; BEGINS_TO_MOVE: the last sample
-    tells."""
+    tells; SKIPPED: samples from the event to the horizon, where that had to begin later (``begins_later``)."""
     score: Array
-    """(14,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
+    """(15,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
     squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
     EMPTY_ARM_BIAS: payload that the arm seemed to hold before the event, when it was empty, in the filter's standard
     deviations; EXCESS_BIAS: the same over the deviation that its moves give, with the error of the inertia, or that for
@@ -75,7 +77,8 @@ class FilterState(NamedTuple):
     innovations where there is a linearized filter) over the noise assumed; EXCESS: by how many deviations of chance it
     exceeds the white noise, see ``judge_residuals``; LOG_DETERMINANT: sum of the logarithms of the variances of the
     innovations of the linearized filter over those of the noise, in this iteration; LIKELIHOOD: -2 times the logarithm
-    of the likelihood of the last accepted iteration."""
+    of the likelihood of the last accepted iteration; DISAGREES: standard deviations by which the payload moves where
+    the first samples after the event do not count, see ``disagreement``."""
     moved: Array
     """(nx, 2) mean and variance of payload and arm parameters when their moves were last judged, with the process noise
     since then in the variance; see ``judge_moves``."""
@@ -104,6 +107,10 @@ class FilterState(NamedTuple):
     """(nx,) that gradient at the end of the last batch of samples."""
     B: Array
     """(nx, nx) sum over the batches of b b', b the part of the gradient that comes from one batch; lower triangle."""
+    early_normal: Array
+    """(PARTS, nx, nx) that information after the first samples of the horizon; lower triangles."""
+    early_gradient: Array
+    """(PARTS, nx) that gradient then."""
     torque_noise: Array
     """(2, L) variance of the torque of each joint [N^2 m^2], summed over the samples since its process noise was added:
     in the filter, and in the linearized one."""
@@ -124,15 +131,17 @@ def memory(nx: int, m: int, links: int) -> FilterState:
     """Allocate for nx states, m sensors and the joints of ``links`` links."""
     return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)),
-        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(25, dtype=np.int64), score=np.zeros(14),
+        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(26, dtype=np.int64), score=np.zeros(15),
         moved=np.zeros((nx, 2)), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
         normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, 2 * nx + 1)),
         N=np.zeros((nx, nx)), g=np.zeros(nx), batch=np.zeros(nx), B=np.zeros((nx, nx)),
+        early_normal=np.zeros((PARTS, nx, nx)), early_gradient=np.zeros((PARTS, nx)),
         torque_noise=np.zeros((2, links)), effort_noise=np.zeros(links), rate_noise=np.zeros(links),
         ringing=np.zeros((3, 3, links)), innovation=np.zeros((m, 2)), power=np.ones(m))
 
 
-OF_HORIZON = ('x0', 'S0', 'xi', 'accepted', 'normal', 'gradient', 'xr', 'Sr', 'N', 'g', 'batch', 'B')
+OF_HORIZON = ('x0', 'S0', 'xi', 'accepted', 'normal', 'gradient', 'xr', 'Sr', 'N', 'g', 'batch', 'B', 'early_normal',
+              'early_gradient')
 """What belongs to the moving horizon."""
 
 

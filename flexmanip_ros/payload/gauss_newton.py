@@ -186,6 +186,7 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: mem.Fil
     if fits and m.counts[mem.HELD] == 1:  # the next iteration reads more: its cost is another
         m.score[mem.LAMBDA] = 0.0
     m.counts[mem.TRIED] = m.counts[mem.TRIED] + 1 if m.counts[mem.AGAIN] else 0
+    m.score[mem.DISAGREES] = disagreement(sensors, m)
     if rejected:  # the filter has gone on with noisy efforts
         m.counts[mem.AGAIN] = 0
         close_horizon(motion, sensors, m)
@@ -218,9 +219,68 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: mem.Fil
         m.score[mem.SHIFT] = abs(shift) / np.sqrt(max(variance, 1e-300))
         m.score[mem.DOUBT] = np.sqrt(variance + shift * shift) / max(m.x[payload], 1e-300)
         if (m.counts[mem.ITERATED] >= enough_samples(sensors) and gained < 0.5 * nx and m.score[mem.SHIFT] < AT_REST
-                and phase_std(motion, m, sensors.period * m.counts[mem.ITERATED]) < LINEAR):
+                and agrees(m) and phase_std(motion, m, sensors.period * m.counts[mem.ITERATED]) < LINEAR):
             close_horizon(motion, sensors, m)
     return True
+
+
+@inner
+def first_samples(part: int) -> int:
+    """Return the number of samples in a beginning of the horizon that is kept apart: 16, 64, 256, 1024."""
+    return 16 << 2 * part
+
+
+@separate
+def disagreement(sensors: MeasurementModel, m: mem.FilterState) -> float:
+    """Return by how many standard deviations the payload moves where the first samples of a capture do not count.
+
+    Specification test of Hausman (1978): an estimate from all samples and one from the later ones alone differ by
+    chance alone if all come from one model. After an event they do not where the object is taken over some time. The
+    later samples may come from another state, off by delta in units of the arrival cost. With the sums N, g of all
+    samples, N2, g2 of the later ones at the minimum, and V = N2 - N2 (I + N)^-1 N2: delta = (I + V)^-1 g2, with the
+    covariance W - W W, W = (I + V)^-1, over the power of the residuals. The largest of all beginnings that at least as
+    many samples followed. 0: the fit has not converged, or torques have process noise, of which N knows nothing.
+    """
+    largest = 0.0
+    if m.counts[mem.HELD] == 0 or m.counts[mem.AGAIN] == 1 or m.counts[mem.LINEARIZED] == 1:
+        return largest
+    nx, L, later = m.x.size, sensors.L, sensors.noise
+    step, gradient, row = sensors.wide[:nx], sensors.wide[nx:2 * nx], sensors.f
+    for part in range(mem.PARTS):
+        if m.counts[mem.ITERATED] < 2 * first_samples(part):
+            break
+        for i in range(nx):
+            step[i] = m.gradient[i]
+            for c in range(i + 1):
+                L[i, c] = m.normal[i, c]
+                later[i, c] = m.normal[i, c] - m.early_normal[part, i, c]
+                later[c, i] = later[i, c]
+        if not factor_information(L):
+            return largest
+        forward(L, step)
+        backward(L, step)
+        for i in range(nx):
+            gradient[i] = m.gradient[i] + m.accepted[i] - m.early_gradient[part, i] - dot(later[i], step)
+        for i in range(nx):
+            forward(L, later[i])
+        for i in range(nx):
+            for c in range(i + 1):
+                L[i, c] = m.normal[i, c] - m.early_normal[part, i, c] - dot(later[i], later[c])
+            row[i] = m.S0[2 * sensors.H.shape[1], i]
+        if not factor_information(L):
+            return largest
+        forward(L, row)
+        variance = dot(row, row)
+        backward(L, row)
+        variance = max(variance - dot(row, row), 1e-300) * max(m.score[mem.MISFIT], 1.0)
+        largest = max(largest, abs(dot(row, gradient)) / np.sqrt(variance))
+    return float(largest)
+
+
+@inner
+def agrees(m: mem.FilterState) -> bool:
+    """Whether the first samples after the event agree with those that followed, see ``disagreement``."""
+    return bool(m.score[mem.DISAGREES] <= MOST_BIAS)
 
 
 @inner

@@ -7,7 +7,7 @@ import numpy as np
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured_model
-from flexmanip_ros.payload.gauss_newton import FITS, MOST_BIAS
+from flexmanip_ros.payload.gauss_newton import FITS, MOST_BIAS, agrees
 from flexmanip_ros.payload.measurement_update import OVERLAP, MeasurementModel, misfit, white_variance
 from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.payload.structured_model import Model
@@ -54,10 +54,11 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
         g = max(g, 1.0 + float(m.score[mem.SHIFT]) ** 2)
     restless = math.sqrt(g * max(1.0, consistency / POWER_LIMIT))
     widening = max(restless, abs(float(m.score[mem.EMPTY_ARM_BIAS])) / FREE_BIAS)
-    status, doubted = Status.TRACKING, abs(m.score[mem.EXCESS_BIAS]) > MOST_BIAS
+    status, doubted = Status.TRACKING, abs(m.score[mem.EXCESS_BIAS]) > MOST_BIAS or (fitting and not agrees(m))
     if consistency > POWER_LIMIT or restless > WIDENING_LIMIT or doubted:
         status = Status.INCONSISTENT
-    failed = bool(m.counts[mem.REFITS]) and status is Status.INCONSISTENT  # a fit before it fitted no better
+    refitted = bool(m.counts[mem.REFITS] or m.counts[mem.SKIPPED])
+    failed = refitted and status is Status.INCONSISTENT  # a fit before it fitted no better
     too_few = m.counts[mem.SINCE_EVENT] < FEW or (status is Status.INCONSISTENT and is_fitted_to_few(m))
     if (too_few and not failed) or (fitting and status is Status.TRACKING and is_behind(m)):
         status = Status.WARMING_UP
@@ -79,7 +80,7 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     spread += moved @ moved.T
     spread[0, 0] += (friction_error(model, m, peak) * (max(float(body[0]), 0.0) + model.motion.scale)) ** 2
     spread[0, 0] += (2.0 * config.payload.length_std * max(float(body[0]), 0.0)) ** 2  # by that of the last link
-    if doubted or consistency > (POWER_LIMIT if m.counts[mem.REFITS] else UNKNOWN_POWER):
+    if doubted or consistency > (POWER_LIMIT if refitted else UNKNOWN_POWER):
         return Payload(max(float(body[0]), 0.0), math.inf, 0.0, math.inf, consistency, status)
     known_point = model.body > 1 and not spread[1:, 1:].any()
     if model.body > 1 and not known_point:

@@ -25,10 +25,12 @@ from flexmanip_ros.payload.gauss_newton import (
     MOST_BIAS,
     TELLS,
     UNFIT,
+    agrees,
     begin_iteration,
     close_horizon,
     enough_samples,
     finish_iteration,
+    first_samples,
     has_torque_noise,
     noise_damping,
     phase_std,
@@ -181,6 +183,11 @@ def iterate_sample(motion: ProcessModel, sensors: MeasurementModel, m: mem.Filte
                 m.B[a, b] += (m.g[a] - m.batch[a]) * (m.g[b] - m.batch[b])
         for a in range(used):
             m.batch[a] = m.g[a]
+    for part in range(mem.PARTS):
+        for a in range(used if m.counts[mem.ITERATED] == first_samples(part) else 0):
+            m.early_gradient[part, a] = m.g[a]
+            for b in range(a + 1):
+                m.early_normal[part, a, b] = m.N[a, b]
     if not m.score[mem.COST] < LOST * (nx + m.noise.shape[0] * m.counts[mem.ITERATED]):
         return 0
     # the cost only grows: a step may be rejected before its last sample
@@ -376,7 +383,8 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState,
         if steps == 0:
             if m.counts[mem.BEFORE] == 0 or not reject_step(motion, sensors, m):
                 return False
-        elif m.counts[mem.ITERATED] >= until and (not finish_iteration(motion, sensors, m) or misfits(motion, m)):
+        elif m.counts[mem.ITERATED] >= until and (
+                not finish_iteration(motion, sensors, m) or misfits(motion, m)):
             return False
     if last:
         if m.counts[mem.HELD] == 1 and m.score[mem.SHIFT] >= AT_REST:  # linearized before it converged: too sure
@@ -401,22 +409,42 @@ def misfits(motion: ProcessModel, m: mem.FilterState) -> bool:
     if m.counts[mem.HELD] == 1:
         most = STARTS if motion.kind.size > INERTIA and motion.kind[INERTIA] == INERTIA else 0
     early = m.counts[mem.TRIED] < TRIALS if m.counts[mem.AGAIN] == 1 else m.counts[mem.ITERATED] < TELLS
-    if m.counts[mem.REFITS] >= most or early:
-        return False
     failed = bool(m.counts[mem.AGAIN] == 1 or m.score[mem.MISFIT] > UNFIT
                   or (m.counts[mem.REFITS] == 0 and m.score[mem.EXCESS] > BY_CHANCE))
-    m.counts[mem.REFITS] += failed
-    return failed
+    if early or not failed:
+        return not agrees(m) and begins_later(m)
+    if m.counts[mem.REFITS] >= most:
+        return m.score[mem.MISFIT] > UNFIT and begins_later(m)
+    m.counts[mem.REFITS] += 1
+    return True
+
+
+@inner
+def begins_later(m: mem.FilterState) -> bool:
+    """Whether the horizon of an arm that caught something may begin anew with the next sample; count the ones before.
+
+    It is to where no fit from the event explains the samples, or where the first ones disagree with those that
+    followed, as they do where the object is taken over some time, or later than was announced. Each horizon spans at
+    least as many samples as came between the event and it. So an arm of which no sample fits begins anew at times that
+    double.
+    """
+    learned = m.counts[mem.HELD] == 1 and m.counts[mem.LEARNED] == 1
+    if not learned or m.counts[mem.SINCE_EVENT] < m.counts[mem.SKIPPED]:
+        return False
+    m.counts[mem.SKIPPED] += m.counts[mem.SINCE_EVENT]
+    return True
 
 
 @inner
 def fails(m: mem.FilterState) -> bool:
     """Whether the fit failed at the end of the horizon: it costs far more than white noise, or lacks some samples."""
-    if m.counts[mem.REFITS] >= MOST_REFITS:
-        return False
     failed = bool(m.score[mem.MISFIT] > UNFIT or m.counts[mem.BEFORE] < m.counts[mem.STORED])
-    m.counts[mem.REFITS] += failed
-    return failed
+    if not failed or begins_later(m):
+        return failed
+    if m.counts[mem.REFITS] >= MOST_REFITS or (m.counts[mem.HELD] == 1 and m.counts[mem.LEARNED] == 1):
+        return False
+    m.counts[mem.REFITS] += 1
+    return True
 
 
 @inner
@@ -436,7 +464,7 @@ def strays(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) 
     While the arm holds something, every sensor must show it, as a fit that is begun again costs time. Of an empty arm
     the mean must, weighted by what each sensor tells of the payload, or the arm seems to hold something.
     """
-    if m.counts[mem.REFITS] >= MOST_REFITS or (m.counts[mem.HELD] == 1 and m.counts[mem.LEARNED] == 0):
+    if m.counts[mem.HELD] == 0 and m.counts[mem.REFITS] >= MOST_REFITS:
         return False
     if m.counts[mem.STORED] < mem.HORIZON or m.counts[mem.SINCE_EVENT] % (BATCH * sensors.block) != 0:
         return False
@@ -446,6 +474,8 @@ def strays(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) 
     left = least >= STRAY
     if m.counts[mem.HELD] == 0:
         left = misfit(m.noise, sensors.rate, mem.WHITE) >= UNFIT or abs(excess_bias(motion, m)) > MOST_BIAS
+    if m.counts[mem.HELD] == 1:
+        return bool(left) and begins_later(m)
     m.counts[mem.REFITS] += left
     return bool(left)
 

@@ -211,7 +211,7 @@ def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, even
         added = model.body if m.S[payload + 1:payload + model.body].any() else 1
         opened[payload:payload + added, :added] = np.diag(structured_model.body_std(config, model)[:added])
         m.x[payload:payload + added] += structured_model.body_mean(config, model)[:added]
-        m.counts[mem.REFITS] = 0
+        m.counts[[mem.REFITS, mem.SKIPPED]] = 0
         m.counts[mem.HELD] = 1
     else:
         _forget_payload(model, m)
@@ -276,16 +276,20 @@ def _open_body(config: IdentifierParameters, model: Model, m: mem.FilterState) -
         aim[model.payload + 1:model.payload + 3] = -there[model.payload + 1:model.payload + 3]
         _fit_from(m, aim)
         return
-    m.S0[:] = structured_model.widen(m.S0, _unknown_body(config, model, m.x0, m.S0))
+    m.S0[:] = structured_model.widen(m.S0, _unknown_body(config, model, m.x0, m.S0, model.body))
     _refit(m)
 
 
-def _unknown_body(config: IdentifierParameters, model: Model, x: Array, S: Array) -> Array:
-    """Set the body in the state x (nx,) to its prior mean, known exactly; return the columns (nx, b) of its prior."""
-    body = slice(model.payload, model.payload + model.body)
-    x[body], S[body] = structured_model.body_mean(config, model)[:model.body], 0.0
-    columns = np.zeros((x.size, model.body))
-    columns[body] = np.diag(structured_model.body_std(config, model)[:model.body])
+def _unknown_body(config: IdentifierParameters, model: Model, x: Array, S: Array, size: int) -> Array:
+    """Set the body in the state x (nx,) to its prior mean, known exactly; return the columns (nx, size) of its prior.
+
+    size: number of its inertial parameters that are unknown, 1: of a point, whose others are zero.
+    """
+    body, opened = slice(model.payload, model.payload + model.body), slice(model.payload, model.payload + size)
+    x[body], S[body] = 0.0, 0.0
+    x[opened] = structured_model.body_mean(config, model)[:size]
+    columns = np.zeros((x.size, size))
+    columns[opened] = np.diag(structured_model.body_std(config, model)[:size])
     return columns
 
 
@@ -341,7 +345,8 @@ def _refit(m: mem.FilterState) -> None:
               mem.TRIED]] = 0
     if m.counts[mem.EFFORTS] == mem.COMPARED:
         m.counts[mem.EFFORTS] = mem.NOISY
-    m.score[mem.LAMBDA] = 0.0
+    m.score[[mem.LAMBDA, mem.DISAGREES]] = 0.0
+    m.early_normal[:], m.early_gradient[:] = 0.0, 0.0
 
 
 def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> StructuredState:
@@ -555,7 +560,8 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
             ) -> StructuredState:
     """Begin again after the last row, at which numbers left the finite range or a fit failed.
 
-    Or let the horizon of an arm at rest slide or open there.
+    Or let the horizon begin there, as the samples before disagree with the later ones, or that of an arm at rest slide
+    or open there.
 
     before: the state before these rows.
 
@@ -583,16 +589,10 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
         m = mem.copy(m)
         _fit_empty_arm_again(config, model, m, y)
         return state._replace(memory=m, horizon=state.here)
+    later = m.counts[mem.SKIPPED] > before.running.memory.counts[mem.SKIPPED]
     at_once = m.counts[mem.SINCE_EVENT] < FIRST_LOOK  # what was learned moves as no arm does
-    if m.counts[mem.HELD] and m.counts[mem.LEARNED] and np.isfinite(m.S0).all() and not at_once:
-        m = mem.copy(m)
-        m.x[:], m.S[:] = m.x0, m.S0
-        opened = _unknown_body(config, model, m.x, m.S)
-        _start_motion(config, model, m, y, np.hstack([m.S, opened]))
-        m.counts[mem.REFITS] = refits
-        m.noise[:, TAKEN_FOR_NOISE] = m.noise[:, [mem.AT_EVENT]]
-        _set_arrival_cost(model, m)
-        return state._replace(memory=m, horizon=state.here)
+    if later or (m.counts[mem.HELD] and m.counts[mem.LEARNED] and np.isfinite(m.S0).all() and not at_once):
+        return _begin_later(config, state, y, m.counts[mem.SKIPPED] + (0 if later else m.counts[mem.SINCE_EVENT]))
     fresh = StructuredState(model, restarts=state.restarts + (not unfit), cursor=state.cursor, refits=refits,
                             efforts=state.efforts)
     if unfit and m.counts[mem.SEEN] >= UNTAUGHT:
@@ -601,6 +601,22 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
         grasped = CaptureEvent(state.last_ns, EventKind.CAPTURE)
         fresh = fresh._replace(early=((state.cursor, grasped),))
     return fresh
+
+
+def _begin_later(config: IdentifierParameters, state: StructuredState, y: Array, skipped: int) -> StructuredState:
+    """Begin the horizon here, with the motion from measurements y (m,) and what was known of the arm at the event.
+
+    The object is a point at first, as at the event. skipped: number of samples since the event. A horizon that begins
+    later costs little: 0.1 s after its begin the payload's deviation is that of one which began with the event.
+    """
+    model, m = state.running.model, mem.copy(state.running.memory)
+    m.x[:], m.S[:] = m.x0, m.S0
+    opened = _unknown_body(config, model, m.x, m.S, 1)
+    _start_motion(config, model, m, y, np.hstack([m.S, opened]))
+    m.counts[mem.REFITS], m.counts[mem.SKIPPED] = 0, skipped
+    m.noise[:, TAKEN_FOR_NOISE] = m.noise[:, [mem.AT_EVENT]]
+    _set_arrival_cost(model, m)
+    return state._replace(memory=m, horizon=state.here)
 
 
 def _slide(state: StructuredState) -> StructuredState:
