@@ -252,7 +252,7 @@ def slides_or_begins(motion: ProcessModel, sensors: MeasurementModel, m: mem.Fil
 
     It opens where the samples tell of the payload, or do not fit an arm at rest.
     """
-    begins = tells(motion, m)
+    begins = tells(motion, sensors, m)
     for i in range(m.power.size):
         begins |= m.power[i] > UNFIT
     if begins:

@@ -45,6 +45,9 @@ class FilterState(NamedTuple):
     """(m, 11) what is known of each sensor's noise."""
     recent: Array
     """(m, 4) its last measurements."""
+    swing: Array
+    """(m, 4) of its measurements since the event, or since the horizon of an arm at rest slid: the first one; number,
+    sum and sum of squares of their differences from it."""
     spectrum: Array
     """(m, 3, TONES) of its fourth differences: both states of Goertzel's filter, mean power over that of white noise
     of unit variance."""
@@ -130,7 +133,7 @@ class FilterState(NamedTuple):
 def memory(nx: int, m: int, links: int) -> FilterState:
     """Allocate for nx states, m sensors and the joints of ``links`` links."""
     return FilterState(
-        x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)),
+        x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)), swing=np.zeros((m, 4)),
         spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(26, dtype=np.int64), score=np.zeros(15),
         moved=np.zeros((nx, 2)), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
         normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, 2 * nx + 1)),

@@ -17,6 +17,7 @@ from flexmanip_ros.payload.measurement_update import (
     OVERLAP,
     MeasurementModel,
     most_white,
+    vibrates,
     white_variance,
 )
 from flexmanip_ros.payload.process_model import (
@@ -218,8 +219,10 @@ def finish_iteration(motion: ProcessModel, sensors: MeasurementModel, m: mem.Fil
         variance = dot(m.S[payload], m.S[payload])
         m.score[mem.SHIFT] = abs(shift) / np.sqrt(max(variance, 1e-300))
         m.score[mem.DOUBT] = np.sqrt(variance + shift * shift) / max(m.x[payload], 1e-300)
-        if (m.counts[mem.ITERATED] >= enough_samples(sensors) and gained < 0.5 * nx and m.score[mem.SHIFT] < AT_REST
-                and agrees(m) and phase_std(motion, m, sensors.period * m.counts[mem.ITERATED]) < LINEAR):
+        told = agrees(m) and not holds_still(sensors, m)
+        if (told and m.counts[mem.ITERATED] >= enough_samples(sensors) and gained < 0.5 * nx
+                and m.score[mem.SHIFT] < AT_REST
+                and phase_std(motion, m, sensors.period * m.counts[mem.ITERATED]) < LINEAR):
             close_horizon(motion, sensors, m)
     return True
 
@@ -281,6 +284,12 @@ def disagreement(sensors: MeasurementModel, m: mem.FilterState) -> float:
 def agrees(m: mem.FilterState) -> bool:
     """Whether the first samples after the event agree with those that followed, see ``disagreement``."""
     return bool(m.score[mem.DISAGREES] <= MOST_BIAS)
+
+
+@inner
+def holds_still(sensors: MeasurementModel, m: mem.FilterState) -> bool:
+    """Whether the arm holds something and has not vibrated since the event, so that no sample tells of its mass."""
+    return bool(m.counts[mem.HELD] == 1 and not vibrates(sensors, m))
 
 
 @inner

@@ -7,7 +7,7 @@ import numpy as np
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import filter_state as mem
 from flexmanip_ros.payload import structured_model
-from flexmanip_ros.payload.gauss_newton import FITS, MOST_BIAS, agrees
+from flexmanip_ros.payload.gauss_newton import FITS, MOST_BIAS, agrees, holds_still
 from flexmanip_ros.payload.measurement_update import OVERLAP, MeasurementModel, misfit, white_variance
 from flexmanip_ros.payload.process_model import Kind
 from flexmanip_ros.payload.structured_model import Model
@@ -88,7 +88,8 @@ def judge(config: IdentifierParameters, model: Model | None, sensors: Measuremen
     mass, std = max(float(body[0]), 0.0), math.sqrt(spread[0, 0])
     # a linearization is too sure of a payload that is hardly excited, or was not known where it was made
     least = 0.0 if fitting else structured_model.EMPTY_STD * model.motion.scale  # a gripper may close on nothing
-    if std > UNKNOWN_STD * max(mass, least) or (fitting and m.score[mem.DOUBT] > UNKNOWN_STD):
+    still = (fitting or m.counts[mem.RESTS] == mem.RESTING) and holds_still(sensors, m)
+    if still or std > UNKNOWN_STD * max(mass, least) or (fitting and m.score[mem.DOUBT] > UNKNOWN_STD):
         std = max(std, prior)
         status = Status.POORLY_EXCITED if status is Status.TRACKING else status
     found = Payload(mass, std, max(0.0, mass - QUANTILE * std), mass + QUANTILE * std, consistency, status)

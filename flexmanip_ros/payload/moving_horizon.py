@@ -32,6 +32,7 @@ from flexmanip_ros.payload.gauss_newton import (
     finish_iteration,
     first_samples,
     has_torque_noise,
+    holds_still,
     noise_damping,
     phase_std,
     reject_step,
@@ -44,6 +45,7 @@ from flexmanip_ros.payload.measurement_update import (
     measure,
     misfit,
     note_change,
+    note_swing,
     observe,
     omitted_variance,
     white_variance,
@@ -297,9 +299,14 @@ def at_rest(sensors: MeasurementModel, m: mem.FilterState) -> bool:
 
 
 @inner
-def tells(motion: ProcessModel, m: mem.FilterState) -> bool:
-    """Whether the samples since the event tell of the payload: its variance fell by ``TOLD``."""
+def tells(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) -> bool:
+    """Whether the samples since the event tell of the payload; of an empty arm: whether its variance fell by ``TOLD``.
+
+    The prior of an empty arm is so narrow that noise seems to tell little, that of an unknown object is not.
+    """
     mass = m.x.size - motion.kind.size
+    if m.counts[mem.HELD] == 1:
+        return not holds_still(sensors, m)
     return bool(dot(m.S[mass], m.S[mass]) < (1.0 - TOLD) * dot(m.S0[mass], m.S0[mass]))
 
 
@@ -310,18 +317,20 @@ def slide_length(sensors: MeasurementModel) -> int:
 
 
 @inner
-def rests(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) -> bool:
+def rests(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, last: bool) -> bool:
     """Whether the samples since the event fit, and tell nothing of a payload that is not known.
 
-    Then the horizon slides until one does. Asked after two slides, when their number is a power of two.
-    Not of an arm of which nothing is learned: its samples need no fit that begins with its motion.
+    Then the horizon slides until one does. Asked after two slides, when their number is a power of two, and of an arm
+    that holds something at the last sample of its horizon.
+    Not of an empty arm of which nothing is learned: its samples need no fit that begins with its motion.
     """
-    count, mass = m.counts[mem.STORED], m.x.size - motion.kind.size
-    if motion.kind[-1] <= INERTIA or count < 2 * slide_length(sensors) or count & (count - 1) != 0:
+    count, mass, held = m.counts[mem.STORED], m.x.size - motion.kind.size, m.counts[mem.HELD] == 1
+    due = count >= 2 * slide_length(sensors) and count & (count - 1) == 0
+    if not (due or (last and held)) or (motion.kind[-1] <= INERTIA and not held):
         return False
     known = dot(m.S0[mass], m.S0[mass]) < (1.0 - TOLD) * motion.prior[0] * motion.prior[0]
     unfit = m.counts[mem.AGAIN] == 1 or (m.counts[mem.BEFORE] > 0 and m.score[mem.EXCESS] > BY_CHANCE)
-    if known or unfit or m.counts[mem.SINCE_EVENT] > count or tells(motion, m):
+    if known or unfit or m.counts[mem.SINCE_EVENT] > count or tells(motion, sensors, m):
         return False
     m.counts[mem.RESTS] = mem.RESTING
     m.counts[mem.STORED] = mem.HORIZON
@@ -338,11 +347,11 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState,
     m.counts[mem.STORED] = stored + 1
     if stored + 1 < FIRST_ITERATION:
         return True
-    if rests(motion, sensors, m):
-        return True
     converged, last = at_rest(sensors, m), stored + 1 == mem.HORIZON
     if stored + 1 >= LATEST * enough_samples(sensors):
         last |= not converged or phase_std(motion, m, sensors.period * m.counts[mem.STORED]) < LINEAR
+    if rests(motion, sensors, m, last):
+        return True
     if last and converged:  # the filter goes on from there
         close_horizon(motion, sensors, m)
         return True
@@ -531,6 +540,7 @@ def take(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState, ta
         return False
     came = y[0] == y[0]
     if came:
+        note_swing(m, y)
         measure(sensors, m, y, motion.k[0], motion.opened)
         if not abs(m.x[2 * sensors.H.shape[1]]) < 1e9:
             return False

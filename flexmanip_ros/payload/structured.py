@@ -254,6 +254,7 @@ def _set_arrival_cost(model: Model, m: mem.FilterState) -> None:
     """Begin a horizon at an event: the present state is its arrival cost; figures of payload and noise start again."""
     _begin_horizon(model, m)
     m.counts[mem.SINCE_EVENT] = 0
+    m.swing[:] = 0.0
     m.counts[mem.BLOCKS] = min(m.counts[mem.BLOCKS], 40)
     m.score[:mem.EMPTY_ARM_BIAS] = 0.0
     m.score[mem.DOUBT] = np.linalg.norm(m.S[model.payload]) / max(m.x[model.payload], 1e-300)
@@ -622,12 +623,20 @@ def _begin_later(config: IdentifierParameters, state: StructuredState, y: Array,
 def _slide(state: StructuredState) -> StructuredState:
     """Let the horizon of an arm at rest begin where the arm was when it slid before.
 
-    So it has always begun before the motion that tells of the payload, and the fit reads all of that.
+    So it has always begun before the motion that tells of the payload, and the fit reads all of that. What the samples
+    seem to tell of an object until then is forgotten: it is a fit to noise.
     """
-    m, begin = mem.copy(state.running.memory), state.running.horizon
+    model, memory, begin = state.running.model, state.running.memory, state.running.horizon
+    m = mem.copy(memory)
     if state.next is not None and state.next.horizon.row > begin.row:  # else it has just come to rest
         begin = state.next.horizon
         m.x0[:], m.S0[:], m.ringing[1] = state.next.x, state.next.S, state.next.ringing
+    if m.counts[mem.HELD]:
+        body, prior = slice(model.payload, model.payload + model.body), np.zeros_like(m.S)
+        prior[body], m.x[body], m.S[body] = memory.S0[body], memory.x0[body], 0.0
+        m.S[:] = structured_model.widen(m.S, prior)
+        m.counts[mem.USED] = int(m.S.any(axis=1).sum())
+    m.swing[:] = 0.0
     m.counts[mem.IN_BATCH], m.counts[mem.RESTS] = 0, mem.RESTING
     return state._replace(memory=m, horizon=begin, next=Arrival(
         state.here, m.x.copy(), structured_model.triangular(m.S), m.noise.copy(), m.ringing[0].copy()))

@@ -278,12 +278,13 @@ def sensors(config: IdentifierParameters, model: Model, dt: float, angles: Array
     turn = np.exp((1j * beyond.frequency - 0.5 / beyond.duration) * dt)
     omitted = np.empty((count, links))
     gain, offset, delay = (np.full(count, -1) for _ in range(3))
+    bends = [role.quantity in (Quantity.BEND, Quantity.BEND_RATE) for role in model.roles]
+    vibration = np.array(bends) & (not np.any(config.arm.gravity))
     for i, role in enumerate(model.roles):
-        bends = role.quantity in (Quantity.BEND, Quantity.BEND_RATE)
-        H[i] = output[role.link + links * bends]
+        H[i] = output[role.link + links * bends[i]]
         rate[i] = role.quantity in (Quantity.ANGLE_RATE, Quantity.BEND_RATE)
-        omitted[i] = beyond.variance[int(rate[i]), role.link + links * bends]
-        if bends:
+        omitted[i] = beyond.variance[int(rate[i]), role.link + links * bends[i]]
+        if bends[i]:
             gain[i] = _state(model.motion, Kind.BEND_GAIN, role.link)
             if not rate[i]:
                 offset[i] = _state(model.motion, Kind.BEND_OFFSET, role.link)
@@ -291,7 +292,7 @@ def sensors(config: IdentifierParameters, model: Model, dt: float, angles: Array
     nx = model.payload + model.motion.kind.size
     block = max(2, round(0.1 / (model.slowest * dt)))
     return MeasurementModel(H=H, period=dt, rate=rate, gain=gain, offset=offset, delay=delay,
-                            omitted=omitted, waves=beyond.variance[1, :links] / STICTION_RATE ** 2,
+                            vibration=vibration, omitted=omitted, waves=beyond.variance[1, :links] / STICTION_RATE ** 2,
                             turn=np.array([turn.real, turn.imag]), reach=torque_reach(model, dt), block=block,
                             kicks_every=max(1, block // 4),
                             noise_every=max(1, round(0.01 * config.payload.memory_time / dt)),

@@ -387,7 +387,7 @@ OTHER_ARM = {'link_length': (2.0, 1.5), 'linear_density': (3.0, 2.0), 'bending_s
 
 @pytest.mark.parametrize(('arm', 'degrees', 'payload', 'seed'), [
     (ArmParameters(damping_ratio=0.0, **OTHER_ARM), (20.0, 90.0), 8.0, 4),
-    (ArmParameters(damping_ratio=0.0), (45.0, 0.0), 20.0, 3)])
+    (ArmParameters(damping_ratio=0.0), (45.0, 0.0), 20.0, 4)])
 def test_vibration_that_the_model_lacks_and_that_never_fades_is_not_taken_for_noise(arm, degrees, payload, seed):
     """Fourth differences show up to 40 times the noise of these sensors: the arm was TRACKING, 1.5 % off."""
     capture = event(2.0)
@@ -396,8 +396,7 @@ def test_vibration_that_the_model_lacks_and_that_never_fades_is_not_taken_for_no
     clean = record(3.2, (capture,), degrees, payload, **given, noise='none')
     settings = config(arm, payload=PayloadParameters(dynamics='linear', working_point=tuple(np.radians(degrees))))
     state = run(settings, samples, (capture,))
-    # which of the two depends on the last digits, so on the processor
-    assert structured.estimate(settings, state).status in {Status.INCONSISTENT, Status.DIVERGED}
+    assert structured.estimate(settings, state).status is Status.INCONSISTENT
     bends = (samples.y - clean.y)[:, :2].var(axis=0)
     told = state.memory.noise[:2, mem.LEVEL]
     assert np.all((bends < told) & (told < 1.5 * bends))
