@@ -391,6 +391,15 @@ def payload_real_arms(rows: list[dict[str, Any]]) -> Claims:
             yield Claim(f'{row["case"]}: runs that know the body', row['body_known'] / runs, 0.9)
 
 
+def payload_slow_captures(rows: list[dict[str, Any]]) -> Claims:
+    """An object that is taken over some time, later than announced, or by an arm at rest is known a second later."""
+    for row in rows:
+        name = f'{row["case"]}, {row["time_s"]:g} s, {row["arm"]}'
+        yield Claim(f'{name}: runs TRACKING at the end', row['tracking_at_end'] / row['runs'], 1.0)
+        yield Claim(f'{name}: TRACKING and outside', row['wrong_and_tracking_percent'], high=5.0, unit='%')
+        yield Claim(f'{name}: error at the end, worst', row['worst_percent'], high=0.7, unit='%')
+
+
 def payload_unsure_arms(rows: list[dict[str, Any]]) -> Claims:
     """Told how well lengths and masses are known, `structured` knows what an arm with wrong ones holds."""
     for row in rows:
@@ -532,8 +541,9 @@ CLAIMS: dict[str, Callable[[Any], Claims]] = {
         identification_speed, identification_status, identification_suggested, identification_ten_minutes,
         io_bag_reading, payload_block, payload_bounds, payload_combinations, payload_coverage, payload_elements,
         payload_jitter, payload_linear, payload_minute, payload_mismatched, payload_precise_sensors,
-        payload_random_arms, payload_real_arms, payload_speed, payload_unsure_arms, plant_convergence, plant_hour,
-        plant_live, plant_segment_chain, plant_speed, replay_speed, ros_fuzz, ros_latency, ros_loss, ros_signals,
+        payload_random_arms, payload_real_arms, payload_slow_captures, payload_speed, payload_unsure_arms,
+        plant_convergence, plant_hour, plant_live, plant_segment_chain, plant_speed, replay_speed, ros_fuzz,
+        ros_latency, ros_loss, ros_signals,
         setup_time, study_scaling)}
 
 

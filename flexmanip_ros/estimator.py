@@ -17,6 +17,7 @@ from flexmanip_ros.numerics.background import INLINE, Background
 from flexmanip_ros.parameters import IdentifierParameters
 from flexmanip_ros.payload import block_extraction, frequency, structured
 from flexmanip_ros.payload.arm_parameters import input_friction, taught
+from flexmanip_ros.payload.structured_model import longest_sample_time, signals
 from flexmanip_ros.samples.sample_log import Rows, SampleLog
 from flexmanip_ros.samples.signals import relative_angle, without_friction
 from flexmanip_ros.types import ArmParameter, Array, CaptureEvent, Estimate, Payload, Status
@@ -208,6 +209,10 @@ class ModelRequest:
                 drift=drift, filtered=filtered is not None)
             found = held_back.judged(
                 found, identifier.rpbsid.held, config.outputs, prediction_check.is_early(found, since))
+            is_arm = config.payload_method == 'structured' and signals(config) is not None
+            if is_arm and self.dt > longest_sample_time(config.arm):
+                found = found._replace(status=Status.UNOBSERVABLE,
+                                       reason='the links vibrate faster than half the sample rate: modes are aliases')
         if config.payload_method == 'block' and found is not None:
             payload = block_extraction.estimate(config, found, identifier.angles, identifier.configuration_range)
         if found is None:

@@ -110,7 +110,7 @@ def _main(given: argparse.Namespace) -> int:
             writer.write(topic, item.stamp_ns, item, latched=isinstance(item, CaptureEvent))
             if k % 1000 == 0:
                 progress(k, count)
-    write_text(truth_path, json.dumps(truth(plant, torque, events), indent=1) + '\n')
+    write_text(truth_path, json.dumps(truth(plant, torque, events, count), indent=1) + '\n')
     if given.expected:
         print(excitation.describe(torque))
     empty = '' if events else ', the arm stays empty'
@@ -118,13 +118,16 @@ def _main(given: argparse.Namespace) -> int:
     return console.SUCCESS
 
 
-def truth(plant: PlantParameters, torque: ExcitationParameters, events: Sequence[CaptureEvent]) -> dict[str, Any]:
-    """Return the true values of the run."""
+def truth(plant: PlantParameters, torque: ExcitationParameters, events: Sequence[CaptureEvent], count: int
+          ) -> dict[str, Any]:
+    """Return the true values of the run of ``count`` samples: the mass is what a soft gripper has taken by its end."""
     from flexmanip_ros.studies.trial import true_frequencies
     from flexmanip_ros.types import EventKind
 
     at = {event.kind: (event.stamp_ns - START_NS) * 1e-9 for event in events}
-    mass = plant.payload_mass if EventKind.CAPTURE in at else 0.0
+    mass, ramp = plant.payload_mass if EventKind.CAPTURE in at else 0.0, round(plant.gripper_ramp * plant.rate)
+    if mass and ramp > 1:
+        mass *= min(1.0, (count - round(at[EventKind.CAPTURE] * plant.rate)) / ramp)
     return {
         'payload_mass_kg': mass,
         'capture_time_s': at.get(EventKind.CAPTURE), 'release_time_s': at.get(EventKind.RELEASE),

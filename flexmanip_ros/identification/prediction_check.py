@@ -371,7 +371,7 @@ def _predicting(found: Identified, rows: Rows, outputs: tuple[str, ...], bends: 
     unknown = Status.WARMING_UP if is_early(found, since) else Status.POORLY_EXCITED
     of_one = found.configurations is None
     if bends and lacks_modes(modes(found), bends):
-        return found._replace(status=unknown, reason='the model has fewer modes than there are bends')
+        return found._replace(status=unknown, reason='the model has fewer lightly damped modes than there are bends')
     if bends and of_one and turned > MOST_TURN:
         return found._replace(status=unknown, reason=f'the links have turned by {turned:.2g} rad while it was learned')
     if of_one:  # ``varying_model.judge`` has those of every configuration

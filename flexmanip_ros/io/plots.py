@@ -153,13 +153,15 @@ def payload(ax: Any, estimates: Sequence[Estimate], start_ns: int,
     """
     found = _with_payload(estimates, start_ns)
     time, table = found['time_s'], np.column_stack([found[f'payload_{name}_kg'] for name in ('mass', 'lower', 'upper')])
-    ax.fill_between(time, table[:, 1], table[:, 2], color=screen.PAYLOAD_COLOUR, alpha=0.25, linewidth=0,
-                    label='95 % interval')
     ax.plot(time, table[:, 0], color=screen.PAYLOAD_COLOUR, linewidth=1.5, label='estimate')
     for index, (begin, end, mass) in enumerate(truth):
         ax.plot([begin, end], [mass, mass], color=TRUTH_COLOUR, linestyle=(0, (4, 3)), linewidth=1.2,
                 label='true' if index == 0 else None)
     limit(ax, table, [mass for _, _, mass in truth[-1:]] if zoom else [0.0, *(mass for _, _, mass in truth)])
+    shown = ax.get_ylim()
+    ax.fill_between(time, table[:, 1], np.minimum(table[:, 2], shown[1]), color=screen.PAYLOAD_COLOUR, alpha=0.25,
+                    linewidth=0, label='95 % interval')
+    ax.set_ylim(shown)
     last = table[-1] if len(table) and np.isfinite(table[-1]).all() else None
     if last is not None and not zoom:
         width = max(float(last[2] - last[1]), 1e-6)

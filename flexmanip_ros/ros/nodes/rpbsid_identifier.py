@@ -298,7 +298,8 @@ class RpbsidIdentifier(FlexmanipNode[IdentifierParameters]):
             return
         words = f'{topic}: {event.kind.value} at {event.stamp_ns * 1e-9:.6f}'
         last_ns = self.state.clock.last_ns
-        if (last_ns is not None and abs(event.stamp_ns - last_ns) > FAR_EVENT_NS
+        known = replay is not None and event in replay.latest  # a latched one that is heard again
+        if (last_ns is not None and abs(event.stamp_ns - last_ns) > FAR_EVENT_NS and not known
                 and (is_latest or event.stamp_ns < last_ns)):
             where = 'before' if event.stamp_ns < last_ns else 'after'
             self.log_throttled('far event', f'{words}, {abs(event.stamp_ns - last_ns) * 1e-9:.0f} s {where} the last '
