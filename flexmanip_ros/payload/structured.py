@@ -566,12 +566,13 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
 
     before: the state before these rows.
 
-    The first fit estimates few parameters of the arm and a point mass; later ones all of ``payload.learn``, every
-    second one without late signals, and a rigid body. The object begins with its prior. The arm begins with what was
-    learned before the event, or, if that fails within ``FIRST_LOOK`` samples, with its given parameters. An empty arm
-    that only seems to hold something begins with what was learned. Numbers that leave the finite range while the
-    horizon is open count as a fit that failed. After more than ``MOST_REFITS`` the filter goes on without a fit until
-    the next event, as none ever fits with signals in other units.
+    The first fit of an empty arm estimates few of its parameters; later ones all of ``payload.learn``, every second one
+    without late signals. One that only seems to hold something begins with what was learned. After more than
+    ``MOST_REFITS`` the filter goes on without a fit until the next event, as none ever fits with signals in other
+    units. The first fit of an object is one of a point, the next two are of a body (``_open_body``). Then the horizon
+    begins later (``_begin_later``), with what was learned of the arm before the event; an arm that was not learned, or
+    that fails within ``FIRST_LOOK`` samples, begins with its given parameters. Numbers that leave the finite range
+    while the horizon is open count as a fit that failed.
     """
     model, _, m, *_ = state.running
     if m.counts[mem.RESTS] == mem.BEGINS_TO_MOVE:
