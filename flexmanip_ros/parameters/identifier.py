@@ -12,7 +12,7 @@ FIELDS = ('position', 'velocity', 'effort')
 
 
 LEARNABLE = ('stiffness', 'damping', 'viscous_friction', 'coulomb_friction', 'rotor_inertia', 'torque_gain',
-             'bend_gain', 'bend_offset', 'mode_stiffness', 'torque_delay', 'torque_lag', 'bend_delay')
+             'bend_gain', 'bend_offset', 'mode_stiffness', 'torque_delay', 'torque_lag', 'bend_delay', 'tip_inertia')
 """Arm parameters that can be learned while the arm is empty."""
 
 

@@ -18,7 +18,7 @@ NAMES = {
     Kind.VISCOUS: 'joint{}_viscous_friction', Kind.COULOMB: 'joint{}_coulomb_friction',
     Kind.ROTOR: 'joint{}_rotor_inertia', Kind.TORQUE_GAIN: 'joint{}_torque_gain', Kind.BEND_GAIN: 'link{}_bend_gain',
     Kind.BEND_OFFSET: 'link{}_bend_offset', Kind.TORQUE_DELAY: 'torque_delay', Kind.TORQUE_LAG: 'joint{}_torque_lag',
-    Kind.BEND_DELAY: 'bend_delay'}
+    Kind.BEND_DELAY: 'bend_delay', Kind.TIP_INERTIA: 'tip_inertia'}
 """Published name of a parameter of a link or joint, counted from 1."""
 LENGTH, DENSITY, JOINT, TIP, GRAVITY = 'link{}_length', 'link{}_linear_density', 'joint_mass', 'tip_mass', 'gravity{}'
 """Published names of lengths, masses and the components of gravity, where lengths and masses are unsure."""
@@ -28,7 +28,8 @@ FIELDS = {
     NAMES[Kind.COULOMB]: 'joint_coulomb_friction', NAMES[Kind.ROTOR]: 'rotor_inertia',
     NAMES[Kind.TORQUE_GAIN]: 'torque_gain', NAMES[Kind.BEND_GAIN]: 'bend_gain',
     NAMES[Kind.BEND_OFFSET]: 'bend_offset', NAMES[Kind.TORQUE_DELAY]: 'torque_delay',
-    NAMES[Kind.TORQUE_LAG]: 'torque_lag', NAMES[Kind.BEND_DELAY]: 'bend_delay'}
+    NAMES[Kind.TORQUE_LAG]: 'torque_lag', NAMES[Kind.BEND_DELAY]: 'bend_delay',
+    NAMES[Kind.TIP_INERTIA]: 'tip_inertia'}
 """The parameter arm.* that takes it, by its published name."""
 
 
@@ -55,6 +56,13 @@ def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple
         x[mirrored] *= -1.0
     axes = model.motion.kind == Kind.CONSTANT
     errors = model.motion.constants.transpose(1, 2, 0)
+    ratio, stiff = model.motion.kind == Kind.DAMPING, model.motion.kind == Kind.STIFFNESS
+    if ratio.any():  # the filter's is D over that of the given arm with a ratio of one, D = 2 ratio sqrt(EI rho) ...
+        scale, scale_root = 0.5 * (errors[:, 0] @ x[axes]), 0.5 * (errors[:, 0] @ S[axes])
+        if stiff.any():
+            scale, scale_root = scale + 0.5 * x[stiff], scale_root + 0.5 * S[stiff]
+        S[ratio] = np.exp(-scale)[:, None] * (S[ratio] - x[ratio][:, None] * scale_root)
+        x[ratio] *= np.exp(-scale)
     root = S[axes] if S[axes].any() else np.eye(int(axes.sum()), S.shape[1])
     longer = errors[:, 2] @ x[axes], errors[:, 2] @ root
     for kind, sign in ((Kind.STIFFNESS, 1.0), (Kind.BEND_GAIN, -1.0)) if axes.any() else ():
@@ -73,6 +81,8 @@ def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple
             std *= value
         elif kind is Kind.ROTOR:
             value += config.arm.rotor_inertia[link]
+        elif kind is Kind.TIP_INERTIA:
+            value += config.arm.tip_inertia
         found.append(ArmParameter(NAMES[kind].format(link + 1), value, std))
     return (*found, *_constants(config.arm, errors @ x[axes], errors @ root))
 

@@ -91,11 +91,13 @@ class Kind(IntEnum):
     """Time constant from the effort of a joint to its torque [s]."""
     BEND_DELAY = 17
     """Age of all bends in a sample beyond that of the angles [s]."""
+    TIP_INERTIA = 18
+    """Rotary inertia of the tip mass beyond the given one [kg m^2]."""
 
 
 # for the compiled functions, to which an enumeration is no constant
 (MASS, FIRST_X, FIRST_Y, INERTIA, POINT, CONSTANT, STIFFNESS, DAMPING, VISCOUS, COULOMB, ROTOR, TORQUE_GAIN, BEND_GAIN,
- BEND_OFFSET, MODE, TORQUE_DELAY, TORQUE_LAG, BEND_DELAY) = (int(kind) for kind in Kind)
+ BEND_OFFSET, MODE, TORQUE_DELAY, TORQUE_LAG, BEND_DELAY, TIP_INERTIA) = (int(kind) for kind in Kind)
 
 
 class ProcessModel(NamedTuple):
@@ -234,6 +236,8 @@ def set_parameters(motion: ProcessModel, x: Array) -> None:
             motion.late[:, 0] = value
         elif kind == TORQUE_LAG:
             motion.late[i, 1] = value
+        elif kind == TIP_INERTIA:  # as if the object had it; its own stands before
+            payload[INERTIA] += value
 
 
 @inner
@@ -306,6 +310,8 @@ def lower_bound(motion: ProcessModel, c: int) -> float:
         low = 0.5 * motion.least[0]
     elif kind == ROTOR:
         low = motion.least_rotor[motion.link[c]]
+    elif kind == TIP_INERTIA:
+        low = 0.5 * motion.least[1]
     elif nonnegative(motion, c):
         low = 0.0
     return low
@@ -347,6 +353,9 @@ def keep_inertia(motion: ProcessModel, p: Array) -> float:
         return 0.0
     moment = p[FIRST_X] * p[FIRST_X] + p[FIRST_Y] * p[FIRST_Y]
     before, least = p[INERTIA], motion.least[1] + moment / (p[MASS] - motion.least[0])
+    for c in range(p.size):
+        if motion.kind[c] == TIP_INERTIA:
+            least -= p[c]
     p[INERTIA] = max(before, least)
     return float(p[INERTIA] - before)
 
@@ -472,6 +481,9 @@ def balance_columns(motion: ProcessModel, q: Array, qd: Array, qdd: Array, first
         if kind <= INERTIA:
             for r in range(n):
                 G[r, at] = motion.dp[r, kind]
+        elif kind == TIP_INERTIA:
+            for r in range(n):
+                G[r, at] = motion.dp[r, INERTIA]
         elif kind == POINT:
             for r in range(n):
                 for t in range(n):

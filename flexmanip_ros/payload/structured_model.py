@@ -202,7 +202,8 @@ LEARNED = {
     'stiffness': Kind.STIFFNESS, 'damping': Kind.DAMPING, 'viscous_friction': Kind.VISCOUS,
     'coulomb_friction': Kind.COULOMB, 'rotor_inertia': Kind.ROTOR, 'torque_gain': Kind.TORQUE_GAIN,
     'bend_gain': Kind.BEND_GAIN, 'bend_offset': Kind.BEND_OFFSET, 'mode_stiffness': Kind.MODE,
-    'torque_delay': Kind.TORQUE_DELAY, 'torque_lag': Kind.TORQUE_LAG, 'bend_delay': Kind.BEND_DELAY}
+    'torque_delay': Kind.TORQUE_DELAY, 'torque_lag': Kind.TORQUE_LAG, 'bend_delay': Kind.BEND_DELAY,
+    'tip_inertia': Kind.TIP_INERTIA}
 """What ``payload.learn`` may name."""
 
 
@@ -228,7 +229,7 @@ def learned(config: IdentifierParameters) -> tuple[tuple[Kind, int], ...]:
             k = config.arm.modes if config.arm.shape_functions == 'sines' else 0
             entries += [(kind, i * k + j) for i in range(len(config.arm.link_length)) for j in range(1, k)]
             continue
-        alike = kind in (Kind.TORQUE_DELAY, Kind.BEND_DELAY)  # one for all joints, one for all bends
+        alike = kind in (Kind.TORQUE_DELAY, Kind.BEND_DELAY, Kind.TIP_INERTIA)  # one for all joints, bends or links
         for i in range(1 if alike else len(config.arm.link_length)):
             if kind not in (Kind.BEND_GAIN, Kind.BEND_OFFSET) or i in bends:
                 entries.append((kind, i))
@@ -327,6 +328,8 @@ PAYLOAD_STD = 3.0
 """Standard deviation of an unknown payload, over the mass at the tip, which is its prior mean."""
 COM_STD = 0.1
 """The same of its centre of mass and of its radius of gyration, over the length of the last link."""
+TIP_STD = 0.05
+"""Prior deviation of the radius of gyration of the tip mass, over the length of the last link: half that of objects."""
 ROTOR_STD = 0.003
 """Prior deviation of a rotor inertia, over the inertia of the straight empty arm beyond its joint."""
 ROTOR_ERROR = 0.15
@@ -338,10 +341,13 @@ FEWEST = 9
 LONGEST_PERIOD = 1.5e-3
 """Longest sample time [s] at which fourth differences of a joint's rate tell its noise. Vibrations add up to 0.1 mrad/s
 at 1 ms, 0.7 at 2 ms, 10 at 5 ms (default arm with rotors of 0.2 and 0.5 kg m^2)."""
-VISCOUS_STD = 0.02
-"""Prior deviation of a viscous friction, as the rate [1/s] at which it alone would slow down that inertia."""
-COULOMB_STD = 0.005
-"""Prior deviation of a Coulomb friction, as the deceleration [rad/s^2] that it alone would give that inertia."""
+VISCOUS_STD = 0.033
+"""Prior deviation of a viscous friction, over L sqrt(EI rho) of the joint's link, the torque of a bending wave over its
+rate. An inertia grows faster with the length: in proportion to it, the friction of a light arm was 70 deviations."""
+COULOMB_STD = 0.0024
+"""Prior deviation of a Coulomb friction, over EI / L, the torque that bends its link by a radian."""
+FRICTION_SHARE = 0.5
+"""Least prior deviation of a friction over its given value, which is rough: frictions change with warmth and load."""
 POINT_STD = 0.01
 """Prior deviation of the angle between the links at which a linear plant stays, about that of the first samples [rad]:
 while these come an encoder already turns by some mrad with the bending of its link."""
@@ -379,8 +385,13 @@ def priors(config: IdentifierParameters, motion: ProcessModel, M: Array) -> Arra
     alike = {Kind.MASS: EMPTY_STD * motion.scale, Kind.POINT: POINT_STD, Kind.CONSTANT: 1.0,
              Kind.STIFFNESS: config.payload.stiffness_std,
              Kind.DAMPING: config.payload.damping_std, Kind.TORQUE_GAIN: GAIN_STD, Kind.BEND_GAIN: GAIN_STD,
-             Kind.TORQUE_DELAY: LATE_STD, Kind.TORQUE_LAG: LATE_STD, Kind.BEND_DELAY: LATE_STD}
-    by_joint = {Kind.VISCOUS: VISCOUS_STD * J, Kind.COULOMB: COULOMB_STD * J, Kind.ROTOR: ROTOR_STD * J,
+             Kind.TORQUE_DELAY: LATE_STD, Kind.TORQUE_LAG: LATE_STD, Kind.BEND_DELAY: LATE_STD,
+             Kind.TIP_INERTIA: config.arm.tip_mass * (TIP_STD * L[-1]) ** 2}
+    EI, rho = np.array(config.arm.bending_stiffness), np.array(config.arm.linear_density)
+    viscous, coulomb = (np.maximum(scale, FRICTION_SHARE * np.array(given)) for scale, given in (
+        (VISCOUS_STD * L * np.sqrt(EI * rho), config.arm.joint_viscous_friction),
+        (COULOMB_STD * EI / L, config.arm.joint_coulomb_friction)))
+    by_joint = {Kind.VISCOUS: viscous, Kind.COULOMB: coulomb, Kind.ROTOR: ROTOR_STD * J,
                 Kind.BEND_OFFSET: OFFSET_STD * L}
     # shear, rotary inertia and coarse elements all move a mode the farther the higher it is, as j^2 or faster
     modes = config.payload.model_error * (np.arange(1, motion.arm.kappa + 1) ** 2 - 1) / 3
@@ -541,7 +552,7 @@ def take_as_known(model: Model, m: mem.FilterState, beyond: Kind = Kind.DAMPING)
     So do the gains where lengths and masses are unsure: torques and masses have one factor in common, and a link of
     another length has another gain of its bends (``constant_errors``).
     """
-    taken = (model.motion.kind > beyond) & (model.motion.kind != Kind.MODE)
+    taken = (model.motion.kind > beyond) & ~np.isin(model.motion.kind, (Kind.MODE, Kind.TIP_INERTIA))
     if Kind.CONSTANT in model.motion.kind:
         taken &= ~np.isin(model.motion.kind, (Kind.TORQUE_GAIN, Kind.BEND_GAIN))
     m.x[model.payload:][taken] = model.motion.given[taken]

@@ -61,6 +61,18 @@ def test_a_large_arm_and_one_of_sines_alone_keep_all(arm, dt):
     assert structured_model.sampled(settings, dt) is settings
 
 
+@pytest.mark.parametrize(('rate', 'sines'), [(59.1, 2), (133.0, 3)])
+def test_a_single_link_keeps_sines_of_twice_that_frequency(rate, sines):
+    one = replace(config().arm, link_length=(0.41,), linear_density=(0.5,), bending_stiffness=(5.0,), modes=3,
+                  shape_functions='component_modes', tip_mass=0.02, hub_inertia=(0.0,), torque_gain=(1.0,),
+                  bend_gain=(1.0,), bend_offset=(0.0,), torque_lag=(0.0,), sensor_position=(0.5,),
+                  joint_viscous_friction=(0.0,), joint_coulomb_friction=(0.0,), rotor_inertia=(0.0,))
+    settings = IdentifierParameters(arm=one, inputs=('joint1/effort',), angles=('joint1/position',),
+                                    outputs=('link1_bend/position', 'link1_bend/velocity'), order=2)
+    assert structured_model.sampled(settings, 1.0 / (rate - 1.0)).arm.modes == sines - 1
+    assert structured_model.sampled(settings, 1.0 / (rate + 1.0)).arm.modes == sines
+
+
 def test_the_mass_on_a_small_arm_is_known_from_200_samples_a_second():
     capture = event(2.0)
     plant = PlantParameters(arm=replace(SMALL, modes=4), rate=200.0, payload_mass=0.3)
