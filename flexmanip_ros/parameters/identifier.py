@@ -12,7 +12,7 @@ FIELDS = ('position', 'velocity', 'effort')
 
 
 LEARNABLE = ('stiffness', 'damping', 'viscous_friction', 'coulomb_friction', 'rotor_inertia', 'torque_gain',
-             'bend_gain', 'bend_offset', 'mode_stiffness', 'torque_delay', 'torque_lag', 'bend_delay', 'tip_inertia')
+             'bend_gain', 'bend_offset', 'mode_stiffness', 'torque_delay', 'torque_lag', 'bend_delay')
 """Arm parameters that can be learned while the arm is empty."""
 
 
@@ -46,7 +46,7 @@ class PayloadParameters:
         low=0.0, high=0.1)
     mass_std: float = parameter(
         0.0, 'method structured: the same of the densities of the links and of the masses at the joint and the tip; '
-        'the empty arm refines them', low=0.0, high=0.1)
+        'the empty arm refines them, and learns the rotary inertia of the tip mass', low=0.0, high=0.1)
     object: str = parameter(
         'body', 'method structured: point, the object is a mass at the tip; body, it has a centre of mass and an '
         'inertia, which are estimated too', choices=('point', 'body'))

@@ -27,6 +27,7 @@ from flexmanip_ros.payload.process_model import (
     STEP_ANGLE,
     STIFFNESS,
     ProcessModel,
+    body_size,
     gather_bounds,
     keep_inertia,
 )
@@ -252,7 +253,7 @@ def disagreement(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterS
     if m.counts[mem.HELD] == 0 or m.counts[mem.AGAIN] == 1 or m.counts[mem.LINEARIZED] == 1:
         return largest
     nx, mass, L, later = m.x.size, m.x.size - motion.kind.size, sensors.L, sensors.noise
-    body = 4 if motion.kind.size > INERTIA and motion.kind[INERTIA] == INERTIA else 1
+    body = body_size(motion)
     step, gradient, row = sensors.wide[:nx], sensors.wide[nx:2 * nx], sensors.f
     for part in range(mem.PARTS):
         if m.counts[mem.ITERATED] < 2 * first_samples(part):

@@ -53,6 +53,7 @@ from flexmanip_ros.payload.measurement_update import (
 from flexmanip_ros.payload.process_model import (
     INERTIA,
     ProcessModel,
+    body_size,
     gather_bounds,
     keep_inertia,
     predict,
@@ -88,8 +89,8 @@ TRIALS = 10
 STARTS = 2
 """Fits from the event on that are given up as soon as they converge without fitting: of a point, then of a body."""
 MOST_REFITS = 4
-"""Largest number of times that a fit is begun again after an event: with the parameters of another arm none ever
-fits."""
+"""Largest number of times that the fit of an empty arm, or of one never seen empty, is begun again: with the parameters
+of another arm none ever fits."""
 STRAY = 3.0
 """Innovation power over white noise, of every sensor, at which the filter is begun again."""
 SLACK = 1.0
@@ -392,8 +393,7 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState,
         if steps == 0:
             if m.counts[mem.BEFORE] == 0 or not reject_step(motion, sensors, m):
                 return False
-        elif m.counts[mem.ITERATED] >= until and (
-                not finish_iteration(motion, sensors, m) or misfits(motion, m)):
+        elif m.counts[mem.ITERATED] >= until and (not finish_iteration(motion, sensors, m) or misfits(motion, m)):
             return False
     if last:
         if m.counts[mem.HELD] == 1 and m.score[mem.SHIFT] >= AT_REST:  # linearized before it converged: too sure
@@ -416,7 +416,7 @@ def misfits(motion: ProcessModel, m: mem.FilterState) -> bool:
     """
     most = MOST_REFITS - 1
     if m.counts[mem.HELD] == 1:
-        most = STARTS if motion.kind.size > INERTIA and motion.kind[INERTIA] == INERTIA else 0
+        most = STARTS if body_size(motion) > 1 else 0
     early = m.counts[mem.TRIED] < TRIALS if m.counts[mem.AGAIN] == 1 else m.counts[mem.ITERATED] < TELLS
     failed = bool(m.counts[mem.AGAIN] == 1 or m.score[mem.MISFIT] > UNFIT
                   or (m.counts[mem.REFITS] == 0 and m.score[mem.EXCESS] > BY_CHANCE))

@@ -347,9 +347,15 @@ def gather_bounds(motion: ProcessModel, p: Array, S: Array, chance: float) -> in
 
 
 @inner
+def body_size(motion: ProcessModel) -> int:
+    """Return the number of states that describe the object: 4 of a body, 1 of a point."""
+    return 4 if motion.kind.size > INERTIA and motion.kind[INERTIA] == INERTIA else 1
+
+
+@inner
 def keep_inertia(motion: ProcessModel, p: Array) -> float:
     """Raise the inertia in p (np,) to the least that its mass and first moments allow; return the change [kg m^2]."""
-    if p.size <= INERTIA or motion.kind[INERTIA] != INERTIA:
+    if body_size(motion) == 1:
         return 0.0
     moment = p[FIRST_X] * p[FIRST_X] + p[FIRST_Y] * p[FIRST_Y]
     before, least = p[INERTIA], motion.least[1] + moment / (p[MASS] - motion.least[0])

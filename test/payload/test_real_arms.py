@@ -143,21 +143,19 @@ def test_what_is_saved_of_an_arm_is_within_the_ranges_of_its_parameters() -> Non
     assert (config.torque_lag, config.rotor_inertia) == ((0.1, 0.0), (0.0, 0.0))
 
 
-@pytest.mark.parametrize(('inertia', 'mass_std'), [(0.05, 0.0), (0.2, 0.0), (0.005, 0.05), (0.2, 0.05)])
-def test_a_gripper_turns_with_the_tip_and_its_inertia_is_learned(inertia: float, mass_std: float) -> None:
-    """A gripper is a body. Taken for a point, 0.2 kg m^2 of it read 17.8 kg +- 0.4 for 20, and 0.005 19.93 +- 0.04.
-
-    So little hides in what the simplest arm learns, so it is known where masses are unsure.
-    """
+@pytest.mark.parametrize('inertia', [0.0, 0.005, 0.2])
+def test_the_inertia_of_a_gripper_is_learned_where_masses_are_unsure(inertia: float) -> None:
+    """A gripper is a body. Taken for a point, 0.2 kg m^2 of it read 17.8 kg +- 0.4 for 20, and 0.005 19.93 +- 0.04."""
     told, caught = ArmParameters(damping_ratio=0.01), event(3.0)
-    config = IdentifierParameters(arm=told, payload=PayloadParameters(mass_std=mass_std, length_std=0.1 * mass_std))
+    config = IdentifierParameters(arm=told, payload=PayloadParameters(mass_std=0.05, length_std=0.005))
     state = run(config, record(4.5, (caught,), arm=replace(told, tip_inertia=inertia), seed=1), (caught,))
     found = structured.estimate(config, state)
     assert found.status is Status.TRACKING
     assert abs(found.mass - 20.0) < 3.5 * found.std < 2.0
     (learned,) = (one for one in taught(config, state) if one.name == 'tip_inertia')
     assert abs(learned.value - inertia) < 3.5 * learned.std < 0.015
-    assert as_parameters(config, [learned])['arm.tip_inertia'] == pytest.approx(learned.value, rel=1e-5)
+    saved = as_parameters(config, [learned])['arm.tip_inertia']
+    assert saved == pytest.approx(max(learned.value, 0.0), rel=1e-5)
 
 
 def test_damping_ratios_are_those_of_the_learned_stiffness() -> None:
