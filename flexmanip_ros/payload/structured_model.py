@@ -202,7 +202,8 @@ LEARNED = {
     'stiffness': Kind.STIFFNESS, 'damping': Kind.DAMPING, 'viscous_friction': Kind.VISCOUS,
     'coulomb_friction': Kind.COULOMB, 'rotor_inertia': Kind.ROTOR, 'torque_gain': Kind.TORQUE_GAIN,
     'bend_gain': Kind.BEND_GAIN, 'bend_offset': Kind.BEND_OFFSET, 'mode_stiffness': Kind.MODE,
-    'torque_delay': Kind.TORQUE_DELAY, 'torque_lag': Kind.TORQUE_LAG, 'bend_delay': Kind.BEND_DELAY}
+    'torque_delay': Kind.TORQUE_DELAY, 'torque_lag': Kind.TORQUE_LAG, 'bend_delay': Kind.BEND_DELAY,
+    'tip_inertia': Kind.TIP_INERTIA}
 """What ``payload.learn`` may name."""
 
 
@@ -228,11 +229,11 @@ def learned(config: IdentifierParameters) -> tuple[tuple[Kind, int], ...]:
             k = config.arm.modes if config.arm.shape_functions == 'sines' else 0
             entries += [(kind, i * k + j) for i in range(len(config.arm.link_length)) for j in range(1, k)]
             continue
-        alike = kind in (Kind.TORQUE_DELAY, Kind.BEND_DELAY)  # one for all joints, one for all bends
+        alike = kind in (Kind.TORQUE_DELAY, Kind.BEND_DELAY, Kind.TIP_INERTIA)  # one for all joints, bends, links
         for i in range(1 if alike else len(config.arm.link_length)):
             if kind not in (Kind.BEND_GAIN, Kind.BEND_OFFSET) or i in bends:
                 entries.append((kind, i))
-    return (*entries, (Kind.TIP_INERTIA, 0)) if config.payload.mass_std else tuple(entries)
+    return tuple(entries)
 
 
 def motion(config: IdentifierParameters) -> ProcessModel:
@@ -328,9 +329,7 @@ PAYLOAD_STD = 3.0
 COM_STD = 0.1
 """The same of its centre of mass and of its radius of gyration, over the length of the last link."""
 TIP_STD = 0.05
-"""Prior deviation of the radius of gyration of a tip mass that is unsure, over the length of the last link: half that
-of objects. Learned of every arm, it would add false minima, as the fastest modes' phases depend on it: of 16 undamped
-arms under loud noise 8 were wrong (0 without), of 14 with Coulomb friction at 60 dB 5 were lost (0 without)."""
+"""Prior deviation of the radius of gyration of the tip mass, over the length of the last link: half that of objects."""
 ROTOR_STD = 0.003
 """Prior deviation of a rotor inertia, over the inertia of the straight empty arm beyond its joint."""
 ROTOR_ERROR = 0.15
@@ -552,7 +551,8 @@ def take_as_known(model: Model, m: mem.FilterState, beyond: Kind = Kind.DAMPING)
     """Take the entries of p beyond a kind as given, where an unknown object hides them; modes stay uncertain.
 
     So do the gains where lengths and masses are unsure: torques and masses have one factor in common, and a link of
-    another length has another gain of its bends (``constant_errors``). So does the inertia of the tip mass.
+    another length has another gain of its bends (``constant_errors``). So does the inertia of the tip mass, which hides
+    in the other parameters of the simplest arm.
     """
     kind = model.motion.kind
     taken = (kind > beyond) & ~np.isin(kind, (Kind.MODE, Kind.TIP_INERTIA))
