@@ -57,7 +57,7 @@ def taught(config: IdentifierParameters, state: StructuredState | None) -> tuple
     axes = model.motion.kind == Kind.CONSTANT
     errors = model.motion.constants.transpose(1, 2, 0)
     ratio, stiff = model.motion.kind == Kind.DAMPING, model.motion.kind == Kind.STIFFNESS
-    if ratio.any():  # the filter's is D over that of the given arm with a ratio of one, D = 2 ratio sqrt(EI rho) ...
+    if ratio.any():  # the filter's is D over that of the given EI and rho at a ratio of one; D ~ ratio sqrt(EI rho)
         scale, scale_root = 0.5 * (errors[:, 0] @ x[axes]), 0.5 * (errors[:, 0] @ S[axes])
         if stiff.any():
             scale, scale_root = scale + 0.5 * x[stiff], scale_root + 0.5 * S[stiff]

@@ -182,7 +182,7 @@ LIGHT = ArmParameters(
 
 @pytest.mark.parametrize('share', [0.0, 0.7, 1.5], ids=['nothing told', 'told too little', 'told too much'])
 def test_a_light_arm_learns_friction_of_seven_percent_of_its_torque(share: float) -> None:
-    """With priors in proportion to the inertia it was INCONSISTENT to the end, told or not."""
+    """With the priors of the default arm, as rates, it was INCONSISTENT to the end, told or not."""
     viscous, coulomb, caught = 0.02, 0.02, event(3.0)
     plant = PlantParameters(
         arm=replace(LIGHT, joint_viscous_friction=(viscous,), joint_coulomb_friction=(coulomb,),
