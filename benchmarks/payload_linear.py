@@ -21,7 +21,7 @@ from parts import payload_trials as trials
 from payload_block import ARM, states
 
 from flexmanip_ros.parameters import ExcitationParameters, PlantParameters
-from flexmanip_ros.parameters.identifier import LEARNED_BY_DEFAULT
+from flexmanip_ros.parameters.identifier import LEARNABLE
 from flexmanip_ros.payload import cramer_rao
 from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import CaptureEvent, EventKind
@@ -30,7 +30,7 @@ MARKS = (250, 1000, 3000)
 LATE = tuple(range(1100, 3001, 100))
 """From 4 to 6 s."""
 CAPTURE = 3000
-LEARNED = {'known': ('',), 'learned': ('stiffness', 'damping'), 'all learned': LEARNED_BY_DEFAULT}
+LEARNED = {'known': ('',), 'learned': ('stiffness', 'damping'), 'all learned': LEARNABLE}
 
 
 def bound(theta: np.ndarray, payload: float, efforts: np.ndarray) -> np.ndarray:

@@ -11,13 +11,10 @@ FIELDS = ('position', 'velocity', 'effort')
 """Arrays of a JointState that a signal NAME/FIELD may name."""
 
 
-LEARNED_BY_DEFAULT = (
+LEARNABLE = (
     'stiffness', 'damping', 'viscous_friction', 'coulomb_friction', 'rotor_inertia', 'torque_gain', 'bend_gain',
-    'bend_offset', 'mode_stiffness', 'torque_delay', 'torque_lag', 'bend_delay')
-"""Arm parameters that are learned while the arm is empty, if nothing else is said."""
-LEARNABLE = (*LEARNED_BY_DEFAULT, 'tip_inertia')
-"""Those that can be learned. A fit that learns the inertia of the gripper has more false minima, as the phases of the
-fastest modes depend on it: of 16 undamped arms under noise as large as their motion 8 were wrong, none without."""
+    'bend_offset', 'mode_stiffness', 'torque_delay', 'torque_lag', 'bend_delay', 'tip_inertia')
+"""Arm parameters that can be learned while the arm is empty."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +52,7 @@ class PayloadParameters:
         'body', 'method structured: point, the object is a mass at the tip; body, it has a centre of mass and an '
         'inertia, which are estimated too', choices=('point', 'body'))
     learn: tuple[str, ...] = parameter(
-        LEARNED_BY_DEFAULT,
-        "method structured: what the empty arm teaches, beside the motion; [''] for nothing; add tip_inertia "
-        'where the rotary inertia of the gripper is not known')
+        LEARNABLE, "method structured: what the empty arm teaches, beside the motion; [''] for nothing")
     use_joint_rates: bool = parameter(
         True, 'method structured: Coulomb friction follows the measured rates of the joints where messages carry them; '
         'false, or at samples of 1.5 ms and less where their noise is above 1.4 mrad/s or above the vibration of modes '

@@ -24,7 +24,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
 # Elements of ``counts``.
 (HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, MOVED, SEEN, BEFORE,
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
- IN_SPECTRUM, SPECTRA, LINEARIZED, EFFORTS, RESTS, SKIPPED) = range(26)
+ IN_SPECTRUM, SPECTRA, LINEARIZED, EFFORTS, RESTS, SKIPPED, WITH_TIP) = range(27)
 # Elements of ``score``.
 (SHIFT, DOUBT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES, SANDWICH,
  MISFIT, EXCESS, LOG_DETERMINANT, LIKELIHOOD, DISAGREES) = range(15)
@@ -52,7 +52,7 @@ class FilterState(NamedTuple):
     """(m, 3, TONES) of its fourth differences: both states of Goertzel's filter, mean power over that of white noise
     of unit variance."""
     counts: NDArray[np.int64]
-    """(26,) counters and flags (1: yes).
+    """(27,) counters and flags (1: yes).
 
     Filter: HELD: the arm holds something; LEARNED: it was seen empty before; SEEN: samples measured, at most 2000;
     SINCE_EVENT: those since the last event; IN_A_ROW: those since the last one that was missing; SINCE_NOISE: samples
@@ -66,7 +66,8 @@ class FilterState(NamedTuple):
     part is taken for noise; COMPARED: the iteration takes it for true; EXACT: it fits better so; CONFIRMED: it does
     not; RESTS: RESTING: the samples since the event tell nothing yet of the payload, so no fit reads them and the
     horizon slides along, IN_BATCH counts the samples since it slid; SLIDES: it is due; BEGINS_TO_MOVE: the last sample
-    tells; SKIPPED: samples from the event to the horizon, where that had to begin later (``begins_later``)."""
+    tells; SKIPPED: samples from the event to the horizon, where that had to begin later (``begins_later``);
+    WITH_TIP: the simplest arm is to be fitted again with an unknown rotary inertia of the tip mass (``give_up``)."""
     score: Array
     """(15,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
     squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
@@ -134,7 +135,7 @@ def memory(nx: int, m: int, links: int) -> FilterState:
     """Allocate for nx states, m sensors and the joints of ``links`` links."""
     return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)), swing=np.zeros((m, 4)),
-        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(26, dtype=np.int64), score=np.zeros(15),
+        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(27, dtype=np.int64), score=np.zeros(15),
         moved=np.zeros((nx, 2)), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
         normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, 2 * nx + 1)),
         N=np.zeros((nx, nx)), g=np.zeros(nx), batch=np.zeros(nx), B=np.zeros((nx, nx)),

@@ -26,10 +26,12 @@ from flexmanip_ros.payload.process_model import (
     MODE,
     STEP_ANGLE,
     STIFFNESS,
+    TIP_INERTIA,
     ProcessModel,
     body_size,
     gather_bounds,
     keep_inertia,
+    tip_inertia,
 )
 from flexmanip_ros.types import Array
 
@@ -382,6 +384,35 @@ def widen_by_empty_arm(sensors: MeasurementModel, m: mem.FilterState) -> None:
 
 
 @inner
+def takes_tip_inertia_as_given(motion: ProcessModel, m: mem.FilterState) -> bool:
+    """Whether the fit of an empty arm takes the rotary inertia of the tip mass as given, and might estimate it."""
+    own = tip_inertia(motion)
+    row = m.x.size - motion.kind.size + own
+    return bool(m.counts[mem.HELD] == 0 and own >= 0 and motion.prior[own] > 0.0 and not m.S0[row].any())
+
+
+@inner
+def open_tip_inertia(motion: ProcessModel, m: mem.FilterState) -> None:
+    """Let the fit estimate the rotary inertia of the tip mass too, by another iteration from where it has converged.
+
+    The phases of the fastest modes depend on it: a fit that estimates it with all else from the first samples on has
+    more false minima.
+    """
+    own, used = tip_inertia(motion), m.counts[mem.USED]
+    m.S0[m.x.size - motion.kind.size + own, used] = motion.prior[own]
+    m.xi[used], m.accepted[used] = 0.0, 0.0
+    m.counts[mem.USED] += 1
+    m.counts[mem.ITERATING], m.counts[mem.TRIED], m.counts[mem.AGAIN] = 0, 0, 1
+    m.score[mem.SHIFT] = AT_REST  # the next iteration is due
+
+
+@inner
+def is_late(kind: int) -> bool:
+    """Whether a parameter of this kind makes a signal late."""
+    return MODE < kind < TIP_INERTIA
+
+
+@inner
 def evidence_against_delays(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) -> float:
     """Return the logarithm of the Bayes factor of signals that are as late as given, over that of unknown delays.
 
@@ -390,11 +421,11 @@ def evidence_against_delays(motion: ProcessModel, sensors: MeasurementModel, m: 
     L, departure, first = sensors.L, sensors.f, m.x.size - motion.kind.size
     L[:], departure[:] = 0.0, 0.0
     for a in range(motion.kind.size):
-        if motion.kind[a] > MODE and dot(m.S[first + a], m.S[first + a]) > 0.0:
+        if is_late(motion.kind[a]) and dot(m.S[first + a], m.S[first + a]) > 0.0:
             departure[a] = (m.x[first + a] - motion.given[a]) / motion.prior[a]
             L[a, a] = -1.0  # ``factor_information`` adds one
             for b in range(a + 1):
-                if motion.kind[b] > MODE:
+                if is_late(motion.kind[b]):
                     scale = motion.prior[a] * motion.prior[b]
                     L[a, b] += m.score[mem.SANDWICH] * dot(m.S[first + a], m.S[first + b]) / max(scale, 1e-300)
     if not factor_information(L):
@@ -433,6 +464,9 @@ def close_horizon(motion: ProcessModel, sensors: MeasurementModel, m: mem.Filter
     empty = m.counts[mem.HELD] == 0 and m.counts[mem.STORED] < mem.HORIZON
     again = empty and evidence_against_delays(motion, sensors, m) > VERY_STRONG
     noisy = m.counts[mem.EFFORTS] == mem.NOISY and m.counts[mem.LINEARIZED] == 1 and m.effort_noise.any()
+    if empty and not again and m.counts[mem.REFITS] > 0 and takes_tip_inertia_as_given(motion, m):
+        open_tip_inertia(motion, m)
+        return
     if empty and not again and noisy:
         m.counts[mem.EFFORTS] = mem.COMPARED
         m.counts[mem.ITERATING] = 0
@@ -451,7 +485,7 @@ def close_horizon(motion: ProcessModel, sensors: MeasurementModel, m: mem.Filter
         return
     first = m.x.size - motion.kind.size
     for c in range(motion.kind.size):
-        if motion.kind[c] > MODE:
+        if is_late(motion.kind[c]):
             condition(m.x, m.S, first + c, motion.given[c], sensors.f)
             condition(m.x0, m.S0, first + c, motion.given[c], sensors.f)
     for counter in (mem.ITERATED, mem.ITERATING, mem.BEFORE, mem.REJECTED, mem.AGAIN, mem.TRIED):

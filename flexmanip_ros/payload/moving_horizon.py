@@ -36,6 +36,7 @@ from flexmanip_ros.payload.gauss_newton import (
     noise_damping,
     phase_std,
     reject_step,
+    takes_tip_inertia_as_given,
 )
 from flexmanip_ros.payload.measurement_update import (
     BATCH,
@@ -374,7 +375,8 @@ def iterate(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState,
                 short = dot(m.g, m.gradient) < 1.0 and m.score[mem.LAMBDA] <= noise_damping(m)
                 explained = m.counts[mem.LINEARIZED] == 1 and m.score[mem.MISFIT] < FITS
                 enough = explained and m.score[mem.SHIFT] < AT_REST
-                due = before < m.counts[mem.STORED] or m.counts[mem.EFFORTS] == mem.COMPARED or not (short or enough)
+                asked = m.counts[mem.EFFORTS] == mem.COMPARED or m.counts[mem.AGAIN] == 1
+                due = before < m.counts[mem.STORED] or asked or not (short or enough)
             else:
                 more = max(before // GROWTH, 1) if m.score[mem.SHIFT] < AT_REST else 1
                 due = m.counts[mem.AGAIN] == 1 or m.counts[mem.STORED] >= before + more
@@ -424,8 +426,17 @@ def misfits(motion: ProcessModel, m: mem.FilterState) -> bool:
         return not agrees(m) and begins_later(m)
     if m.counts[mem.REFITS] >= most:
         return m.score[mem.MISFIT] > UNFIT and begins_later(m)
-    m.counts[mem.REFITS] += 1
+    give_up(motion, m)
     return True
+
+
+@inner
+def give_up(motion: ProcessModel, m: mem.FilterState) -> None:
+    """Let another fit begin: after that of the simplest arm one with an unknown rotary inertia of the tip mass."""
+    if m.counts[mem.REFITS] == 0 and takes_tip_inertia_as_given(motion, m):
+        m.counts[mem.WITH_TIP] = 1
+    else:
+        m.counts[mem.REFITS] += 1
 
 
 @inner
@@ -485,7 +496,8 @@ def strays(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) 
         left = misfit(m.noise, sensors.rate, mem.WHITE) >= UNFIT or abs(excess_bias(motion, m)) > MOST_BIAS
     if m.counts[mem.HELD] == 1:
         return bool(left) and begins_later(m)
-    m.counts[mem.REFITS] += left
+    if left:
+        give_up(motion, m)
     return bool(left)
 
 

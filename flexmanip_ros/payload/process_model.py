@@ -353,15 +353,24 @@ def body_size(motion: ProcessModel) -> int:
 
 
 @inner
+def tip_inertia(motion: ProcessModel) -> int:
+    """Return the entry of p that is the rotary inertia of the tip mass; -1: there is none."""
+    found = motion.kind.size - 1
+    while found >= 0 and motion.kind[found] != TIP_INERTIA:
+        found -= 1
+    return found
+
+
+@inner
 def keep_inertia(motion: ProcessModel, p: Array) -> float:
     """Raise the inertia in p (np,) to the least that its mass and first moments allow; return the change [kg m^2]."""
     if body_size(motion) == 1:
         return 0.0
     moment = p[FIRST_X] * p[FIRST_X] + p[FIRST_Y] * p[FIRST_Y]
     before, least = p[INERTIA], motion.least[1] + moment / (p[MASS] - motion.least[0])
-    for c in range(p.size):
-        if motion.kind[c] == TIP_INERTIA:
-            least -= p[c]
+    own = tip_inertia(motion)
+    if own >= 0:
+        least -= p[own]
     p[INERTIA] = max(before, least)
     return float(p[INERTIA] - before)
 
@@ -484,12 +493,9 @@ def balance_columns(motion: ProcessModel, q: Array, qd: Array, qdd: Array, first
         kind, i = motion.kind[motion.opened[1 + c]], motion.link[motion.opened[1 + c]]
         o, at = links + i * k, first + c
         G[:, at] = 0.0
-        if kind <= INERTIA:
+        if kind <= INERTIA or kind == TIP_INERTIA:
             for r in range(n):
-                G[r, at] = motion.dp[r, kind]
-        elif kind == TIP_INERTIA:
-            for r in range(n):
-                G[r, at] = motion.dp[r, INERTIA]
+                G[r, at] = motion.dp[r, min(kind, INERTIA)]
         elif kind == POINT:
             for r in range(n):
                 for t in range(n):

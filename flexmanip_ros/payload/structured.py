@@ -303,11 +303,29 @@ def _fit_from(m: mem.FilterState, start: Array) -> None:
     m.accepted[:] = m.xi
 
 
-def _fit_empty_arm_again(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Array) -> None:
+def _fit_with_tip(config: IdentifierParameters, state: StructuredState, y: Array) -> StructuredState:
+    """Fit the simplest arm with an unknown rotary inertia of the tip mass, after measurements y (m,).
+
+    To the same samples, or to further ones where the horizon has closed and the filter seems to hold something.
+    """
+    model, m = state.running.model, mem.copy(state.running.memory)
+    tip = model.motion.kind == Kind.TIP_INERTIA
+    column = np.zeros((m.x.size, 1))
+    column[model.payload:][tip, 0] = model.motion.prior[tip]
+    if m.counts[mem.STORED] == mem.HORIZON:
+        _fit_empty_arm_again(config, model, m, y, column)
+        return state._replace(memory=m, horizon=state.here)
+    m.S0[:] = structured_model.widen(m.S0, column)
+    _refit(m)
+    return state._replace(memory=m)
+
+
+def _fit_empty_arm_again(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Array,
+                         opened: Array) -> None:
     """Fit an empty arm that seems to hold something to further samples, after measurements y (m,).
 
     The fit begins where the last one ended, which may not have converged when its horizon closed. The priors are those
-    of the start, as the samples of that fit are not used again.
+    of the start, as the samples of that fit are not used again. opened: columns (nx, c) of what was known until now.
     """
     p = slice(model.payload, m.x.size)
     learned, known = m.x[p].copy(), ~m.S[p].any(axis=1)
@@ -316,11 +334,12 @@ def _fit_empty_arm_again(config: IdentifierParameters, model: Model, m: mem.Filt
     given = np.where(known, learned, m.x[p])
     m.x[p] = learned
     m.S[p][known] = 0.0
-    m.S[:] = structured_model.triangular(m.S)
+    m.S[:] = structured_model.widen(m.S, opened)
     structured_model.guess_noise(m, int(m.counts[mem.SEEN]))
     _set_arrival_cost(model, m)
     start = m.x0.copy()
     m.x0[p] = given
+    m.counts[mem.MOVED], m.score[mem.MOVES] = 0, 0.0  # moves of a fit that is given up tell nothing of the next
     m.score[mem.EXCESS_BIAS] = bias  # makes the arm INCONSISTENT until the new horizon closes
     _fit_from(m, start)
 
@@ -343,7 +362,7 @@ def _refit(m: mem.FilterState) -> None:
     m.counts[mem.USED] = int(m.S0.any(axis=1).sum())
     m.xi[:] = 0.0
     m.counts[[mem.ITERATED, mem.ITERATING, mem.SINCE_NOISE, mem.IN_BATCH, mem.BEFORE, mem.REJECTED, mem.AGAIN,
-              mem.TRIED]] = 0
+              mem.TRIED, mem.WITH_TIP]] = 0
     if m.counts[mem.EFFORTS] == mem.COMPARED:
         m.counts[mem.EFFORTS] = mem.NOISY
     m.score[[mem.LAMBDA, mem.DISAGREES]] = 0.0
@@ -566,19 +585,23 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
 
     before: the state before these rows.
 
-    The first fit of an empty arm estimates few of its parameters; later ones all of ``payload.learn``, every second one
-    without late signals. One that only seems to hold something begins with what was learned. After more than
-    ``MOST_REFITS`` the filter goes on without a fit until the next event, as none ever fits with signals in other
-    units. The first fit of an object is one of a point, the next two are of a body (``_open_body``). Then the horizon
-    begins later (``_begin_later``), with what was learned of the arm before the event; an arm that was not learned, or
-    that fails within ``FIRST_LOOK`` samples, begins with its given parameters. Numbers that leave the finite range
-    while the horizon is open count as a fit that failed.
+    The first fit of an empty arm estimates few of its parameters, and is made again with the rotary inertia of the tip
+    mass before it is given up. Later ones estimate all of ``payload.learn``, every second one without late signals. One
+    that only seems to hold something begins with what was learned. After more than ``MOST_REFITS`` the filter goes on
+    without a fit until the next event, as none ever fits with signals in other units. The first fit of an object is one
+    of a point, the next two are of a body (``_open_body``). Then the horizon begins later (``_begin_later``), with what
+    was learned of the arm before the event; an arm that was not learned, or that fails within ``FIRST_LOOK`` samples,
+    begins with its given parameters. Numbers that leave the finite range while the horizon is open count as a fit that
+    failed.
     """
     model, _, m, *_ = state.running
     if m.counts[mem.RESTS] == mem.BEGINS_TO_MOVE:
         return _begin_to_move(state)
     if m.counts[mem.RESTS] == mem.SLIDES:
         return _slide(state)
+    y = measurements(model, last)[0]
+    if m.counts[mem.WITH_TIP]:
+        return _fit_with_tip(config, state, y)
     refits = int(m.counts[mem.REFITS])
     unfit = refits > before.running.memory.counts[mem.REFITS]
     refits += not unfit and m.counts[mem.STORED] < mem.HORIZON
@@ -586,10 +609,9 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
         m = mem.copy(m)
         _open_body(config, model, m)
         return state._replace(memory=m)
-    y = measurements(model, last)[0]
     if unfit and refits > 1 and not m.counts[mem.HELD] and is_off(state):  # the simplest arm is given up
         m = mem.copy(m)
-        _fit_empty_arm_again(config, model, m, y)
+        _fit_empty_arm_again(config, model, m, y, np.empty((m.x.size, 0)))
         return state._replace(memory=m, horizon=state.here)
     later = m.counts[mem.SKIPPED] > before.running.memory.counts[mem.SKIPPED]
     at_once = m.counts[mem.SINCE_EVENT] < FIRST_LOOK  # what was learned moves as no arm does

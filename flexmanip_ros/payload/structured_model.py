@@ -534,7 +534,7 @@ def first(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Arr
         std[part] = BEND_STD * L / np.arange(1, k + 1) ** 2
         # a mode's rate is its bending times its frequency, which grows as j^2
         std[n + part.start:n + part.stop] = BEND_STD * L * (np.pi / L) ** 2 * np.sqrt(EI / rho)
-    std[2 * n:] = model.motion.prior
+    std[2 * n:] = np.where(model.motion.kind == Kind.TIP_INERTIA, 0.0, model.motion.prior)  # see opens_tip_inertia
     m.S[:] = np.diag(std)
 
 
@@ -551,11 +551,10 @@ def take_as_known(model: Model, m: mem.FilterState, beyond: Kind = Kind.DAMPING)
     """Take the entries of p beyond a kind as given, where an unknown object hides them; modes stay uncertain.
 
     So do the gains where lengths and masses are unsure: torques and masses have one factor in common, and a link of
-    another length has another gain of its bends (``constant_errors``). So does the inertia of the tip mass, which hides
-    in the other parameters of the simplest arm.
+    another length has another gain of its bends (``constant_errors``).
     """
     kind = model.motion.kind
-    taken = (kind > beyond) & ~np.isin(kind, (Kind.MODE, Kind.TIP_INERTIA))
+    taken = (kind > beyond) & (kind != Kind.MODE)
     if Kind.CONSTANT in kind:
         taken &= ~np.isin(kind, (Kind.TORQUE_GAIN, Kind.BEND_GAIN))
     m.x[model.payload:][taken] = model.motion.given[taken]

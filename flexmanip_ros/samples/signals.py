@@ -51,7 +51,8 @@ def resolve(
     wanted = config.outputs if outputs is None else outputs
     if outputs is None and _is_default('outputs', config):
         # A joint that is there without this field has no such sensor; one that is not there has a wrong name.
-        kept = (name for name in wanted if _find(name, record) or name.rpartition('/')[0] not in record.names)
+        kept = (name for name in wanted if (_find(name, record) and not _lacks_rate(name, record))
+                or name.rpartition('/')[0] not in record.names)
         wanted = tuple(kept) or wanted
     groups: list[tuple[tuple[str, int], ...]] = []
     needs_angles = reads_angles(config)
@@ -182,6 +183,16 @@ def _find(signal: str, record: JointRecord | JointBlock) -> tuple[str, int] | No
     if joint not in record.names or getattr(record, field).size == 0:
         return None
     return field, record.names.index(joint)
+
+
+def _lacks_rate(signal: str, record: JointRecord | JointBlock) -> bool:
+    """Whether the first message has a NaN for the rate of a joint whose position it has: ros2_control does so."""
+    joint, _, field = signal.rpartition('/')
+    if field != 'velocity' or not record.position.size:
+        return False
+    index = record.names.index(joint)
+    rate, position = (np.atleast_2d(values)[0, index] for values in (record.velocity, record.position))
+    return bool(np.isnan(rate) and np.isfinite(position))
 
 
 def _missing(group: str, signal: str, record: JointRecord | JointBlock) -> Rejection:

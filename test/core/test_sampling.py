@@ -93,6 +93,20 @@ def test_a_bag_without_velocities_uses_displacements_only() -> None:
     assert np.isnan(samples[0].rates).all()
 
 
+def test_a_velocity_that_is_nan_beside_a_position_is_not_among_the_default_outputs() -> None:
+    """``joint_state_broadcaster`` fills the fields that a joint does not have with NaN."""
+    state, samples, _ = drive([record(k, velocity=[1.0, 2.0, np.nan, 0.5]) for k in range(30)])
+    assert state.outputs == ('link1_bend/position', 'link2_bend/position', 'link2_bend/velocity')
+    assert (len(samples), state.counters.dropped) == (30, 0)
+
+
+def test_a_message_without_any_finite_value_takes_no_output_away() -> None:
+    empty = record(0, position=[np.nan] * 4, velocity=[np.nan] * 4)
+    state, samples, _ = drive([empty, *(record(k) for k in range(1, 30))])
+    assert state.outputs == IdentifierParameters.outputs
+    assert (len(samples), state.counters.not_finite) == (29, 1)
+
+
 def test_rates_of_the_joints_come_along_and_a_message_without_them_is_taken_too() -> None:
     """A rate of zero is unknown as well: drivers that measure no rates report it."""
     odd = {25: [np.nan, 1.0, 0.0, 0.0], 26: [2.0, 0.0, 0.0, 0.0], 27: [2.0, np.inf, 0.0, 0.0]}
