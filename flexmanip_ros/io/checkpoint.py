@@ -13,6 +13,7 @@ import json
 import threading
 import time
 import zipfile
+from contextlib import suppress
 from enum import Enum
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -173,6 +174,7 @@ class CheckpointWriter:
         self._period_s = config.checkpoint_period
         self._next_s = time.monotonic() + self._period_s
         self._thread: threading.Thread | None = None
+        self._refused = False
         self.saves = 0
         self.problem = ''
         """Why the last save failed; empty when it did not."""
@@ -180,16 +182,20 @@ class CheckpointWriter:
     def load(self, config: IdentifierParameters) -> pipeline.State | None:
         """Return the saved state, None when there is no file.
 
-        Raises CheckpointError for a file that cannot be read or was written with other parameters.
+        Raises CheckpointError for a file that cannot be read or was written with other parameters. The first save sets
+        that aside.
         """
+        self._refused = True
         found = load(self._path)
         if found is None:
+            self._refused = False
             return None
         if not isinstance(found, Saved):
             raise CheckpointError(f"checkpoint '{self._path}' holds no state of the identifier", _EMPTY_START)
         for name in changed(found.config, config):
             raise CheckpointError(
                 f"parameter '{name}' has another value than when checkpoint '{self._path}' was written", _EMPTY_START)
+        self._refused = False
         return pipeline.reconfigure(config, found.state)
 
     def save_when_due(self, config: IdentifierParameters, state: pipeline.State) -> None:
@@ -202,8 +208,17 @@ class CheckpointWriter:
         self._thread = thread
 
     def save(self, config: IdentifierParameters, state: pipeline.State) -> None:
-        """Save now; a failure is kept in ``problem`` for the diagnostics."""
+        """Save now, but no state without a sample; a failure is kept in ``problem`` for the diagnostics.
+
+        A file that could not be used is set aside as ``NAME.refused``: with the parameters of before it is good.
+        """
+        if not state.counters.accepted:
+            return
         try:
+            if self._refused:
+                with suppress(OSError):  # else it is replaced
+                    Path(self._path).replace(f'{self._path}.refused')
+                self._refused = False
             save(self._path, Saved(config, state))
         except CheckpointError as error:
             self.problem = str(error)

@@ -67,6 +67,7 @@ def test_pieces_of_a_recording_give_the_same_bits() -> None:
     assert one[1] == other[1]
 
 
+LATE = (Kind.TORQUE_DELAY, Kind.TORQUE_LAG, Kind.BEND_DELAY)
 FAULTY = replace(IDEAL, torque_gain=(1.04, 1.04), bend_gain=(0.98, 0.98), bend_offset=(5e-4, 5e-4))
 
 
@@ -75,7 +76,7 @@ def test_delays_that_the_empty_arm_does_not_show_are_not_learned() -> None:
     rows = record(6.0, (event(3.0),), outputs=BENDS, arm=replace(FAULTY, modes=5), seed=0)
     empty, found = read(GIVEN, rows)
     assert {one.name: one.value for one in taught(GIVEN, empty)}['torque_delay'] == 0.0
-    late = empty.model.motion.kind > Kind.MODE
+    late = np.isin(empty.model.motion.kind, LATE)
     assert not empty.memory.S[empty.model.payload:][late].any()
     assert empty.memory.S[empty.model.payload:][empty.model.motion.kind == Kind.TORQUE_GAIN].any()
     assert found.mass == pytest.approx(20.0, rel=3e-3)
@@ -85,10 +86,10 @@ def test_delays_that_the_empty_arm_does_not_show_are_not_learned() -> None:
 def test_the_evidence_against_delays_is_the_density_of_none_after_the_samples_over_that_before() -> None:
     state = structured.advance(GIVEN, structured.init(GIVEN), record(1.0, outputs=BENDS, arm=DELAY, seed=0))
     motion, m = state.model.motion, mem.copy(state.memory)
-    late = np.flatnonzero(motion.kind > Kind.MODE)
+    late = np.flatnonzero(np.isin(motion.kind, LATE))
     rng = np.random.default_rng(2)
     m.S[:] = np.tril(rng.normal(size=m.S.shape)) * 1e-4
-    m.x[state.model.payload:] = rng.normal(size=late.max() + 1) * 1e-4
+    m.x[state.model.payload:] = rng.normal(size=motion.kind.size) * 1e-4
     m.score[mem.SANDWICH] = 3.0
     rows = state.model.payload + late
     after = multivariate_normal(m.x[rows], 3.0 * m.S[rows] @ m.S[rows].T)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from identifier_harness import CAPTURE, Live, recording, replayed
 from ros_harness import Ros, overrides
 
 from flexmanip_ros import messages
+from flexmanip_ros.io.checkpoint import CheckpointWriter
 from flexmanip_ros.ros import conversions
 from flexmanip_ros.ros.demo import compare
 from flexmanip_ros.ros.nodes.rpbsid_identifier import RpbsidIdentifier
@@ -87,9 +89,14 @@ def test_a_state_of_other_parameters_or_damaged_or_old_is_not_used_and_the_node_
     other = Live(ros, checkpoint_file=str(file), payload_method='none', order=6)
     assert other.node.state.counters.received == 0
     ros.remove(other.node)
+    first = Live(ros, checkpoint_file=str(file), payload_method='none')
+    assert first.node.state.counters.received == 100  # a start that heard nothing leaves the file
+    ros.remove(first.node)
     same = Live(ros, checkpoint_file=str(file), payload_method='none', order=6, publish_rate=10.0)
     same.send(*recording(60))
     ros.remove(same.node)
+    assert CheckpointWriter(replace(live.node.config, checkpoint_file=f'{file}.refused')).load(
+        live.node.config).counters.received == 100
     old = Live(ros, checkpoint_file=str(file), payload_method='none', order=6)
     assert old.node.state.counters.received == 60
     late = recording(1)[0]._replace(stamp_ns=recording(1)[0].stamp_ns + 3600 * 10**9)
