@@ -66,7 +66,7 @@ class FilterState(NamedTuple):
     part is taken for noise; COMPARED: the iteration takes it for true; EXACT: it fits better so; CONFIRMED: it does
     not; RESTS: RESTING: the samples since the event tell nothing yet of the payload, so no fit reads them and the
     horizon slides along, IN_BATCH counts the samples since it slid; SLIDES: it is due; BEGINS_TO_MOVE: the last sample
-    tells; SKIPPED: samples from the event to the horizon, where that had to begin later (``begins_later``);
+    tells; SKIPPED: samples from the event to the horizon, where that had to begin later (``begins_later``, ``strays``);
     WITH_TIP: the simplest arm is to be fitted again with an unknown rotary inertia of the tip mass (``give_up``)."""
     score: Array
     """(15,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the

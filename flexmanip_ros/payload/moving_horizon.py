@@ -482,10 +482,9 @@ def strays(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) 
     """Whether the filter has diverged after a fit: the sensors show far more than their white noise.
 
     While the arm holds something, every sensor must show it, as a fit that is begun again costs time. Of an empty arm
-    the mean must, weighted by what each sensor tells of the payload, or the arm seems to hold something.
+    the mean must, weighted by what each sensor tells of the payload, or the arm seems to hold something. One whose
+    fits all failed is fitted again after ``HORIZON`` samples, then at times that double: something may have touched it.
     """
-    if m.counts[mem.HELD] == 0 and m.counts[mem.REFITS] >= MOST_REFITS:
-        return False
     if m.counts[mem.STORED] < mem.HORIZON or m.counts[mem.SINCE_EVENT] % (BATCH * sensors.block) != 0:
         return False
     least = STRAY
@@ -496,9 +495,13 @@ def strays(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) 
         left = misfit(m.noise, sensors.rate, mem.WHITE) >= UNFIT or abs(excess_bias(motion, m)) > MOST_BIAS
     if m.counts[mem.HELD] == 1:
         return bool(left) and begins_later(m)
-    if left:
+    if left and m.counts[mem.REFITS] < MOST_REFITS:
         give_up(motion, m)
-    return bool(left)
+    elif left and m.counts[mem.SINCE_EVENT] >= max(m.counts[mem.SKIPPED], mem.HORIZON):
+        m.counts[mem.SKIPPED] += m.counts[mem.SINCE_EVENT]
+    else:
+        return False
+    return True
 
 
 @separate_kernel

@@ -72,6 +72,8 @@ class StructuredState(NamedTuple):
     """How often all was forgotten because numbers left the finite range."""
     refits: int = 0
     """How often the empty arm's fit was begun again."""
+    skipped: int = 0
+    """Samples of an empty arm whose fits all failed, see ``strays``."""
     white: Array = np.empty(0)
     """(m, 2) variance of each measurement's white noise at the last restart, and its bound by the spectrum."""
 
@@ -175,7 +177,7 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
         return state
     if state.memory is None:
         refits = 0 if event.kind is EventKind.CAPTURE else min(state.refits, MOST_REFITS)
-        return state._replace(early=(*state.early, (state.cursor, event)), refits=refits)
+        return state._replace(early=(*state.early, (state.cursor, event)), refits=refits, skipped=0)
     model, sensors, memory, efforts, _ = state.running
     m = mem.copy(memory)
     ahead = max(event.stamp_ns - state.time_ns, 0)
@@ -211,13 +213,14 @@ def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, even
         added = model.body if m.S[payload + 1:payload + model.body].any() else 1
         opened[payload:payload + added, :added] = np.diag(structured_model.body_std(config, model)[:added])
         m.x[payload:payload + added] += structured_model.body_mean(config, model)[:added]
-        m.counts[[mem.REFITS, mem.SKIPPED]] = 0
+        m.counts[mem.REFITS] = 0
         m.counts[mem.HELD] = 1
     else:
         _forget_payload(model, m)
         opened[payload, 0] = structured_model.EMPTY_STD * model.motion.scale + 0.3 * before
         m.counts[mem.HELD] = 0
         m.counts[mem.REFITS] = min(m.counts[mem.REFITS], MOST_REFITS)  # what is left is fitted once more
+    m.counts[mem.SKIPPED] = 0
     m.S[:] = structured_model.widen(m.S, np.hstack([columns, opened]))
     if m.counts[mem.STORED] < mem.HORIZON and m.counts[mem.SEEN] >= UNTAUGHT:  # guessed from the first samples
         structured_model.guess_noise(m, int(m.counts[mem.SEEN]))
@@ -409,7 +412,7 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     for row, item in events:
         state = event(config, _part(config, state, rows, row), item)
     if state.memory is not None:  # the capture with which ``restart`` begins again is no new one
-        state.memory.counts[mem.REFITS] = state.refits
+        state.memory.counts[[mem.REFITS, mem.SKIPPED]] = state.refits, state.skipped
         if state.refits > MOST_REFITS:
             state.memory.counts[mem.STORED] = mem.HORIZON
     return _part(config, state, rows, rows.until)
@@ -588,11 +591,11 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
     The first fit of an empty arm estimates few of its parameters, and is made again with the rotary inertia of the tip
     mass before it is given up. Later ones estimate all of ``payload.learn``, every second one without late signals. One
     that only seems to hold something begins with what was learned. After more than ``MOST_REFITS`` the filter goes on
-    without a fit until the next event, as none ever fits with signals in other units. The first fit of an object is one
-    of a point, the next two are of a body (``_open_body``). Then the horizon begins later (``_begin_later``), with what
-    was learned of the arm before the event; an arm that was not learned, or that fails within ``FIRST_LOOK`` samples,
-    begins with its given parameters. Numbers that leave the finite range while the horizon is open count as a fit that
-    failed.
+    without a fit, as none ever fits with signals in other units; two more follow at times that double (``strays``). The
+    first fit of an object is one of a point, the next two are of a body (``_open_body``). Then the horizon begins later
+    (``_begin_later``), with what was learned of the arm before the event; an arm that was not learned, or that fails
+    within ``FIRST_LOOK`` samples, begins with its given parameters. Numbers that leave the finite range while the
+    horizon is open count as a fit that failed.
     """
     model, _, m, *_ = state.running
     if m.counts[mem.RESTS] == mem.BEGINS_TO_MOVE:
@@ -615,11 +618,12 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
         return state._replace(memory=m, horizon=state.here)
     later = m.counts[mem.SKIPPED] > before.running.memory.counts[mem.SKIPPED]
     at_once = m.counts[mem.SINCE_EVENT] < FIRST_LOOK  # what was learned moves as no arm does
-    if later or (m.counts[mem.HELD] and m.counts[mem.LEARNED] and np.isfinite(m.S0).all() and not at_once):
+    if m.counts[mem.HELD] and (later or (m.counts[mem.LEARNED] and np.isfinite(m.S0).all() and not at_once)):
         return _begin_later(config, state, y, m.counts[mem.SKIPPED] + (0 if later else m.counts[mem.SINCE_EVENT]))
-    fresh = StructuredState(model, restarts=state.restarts + (not unfit), cursor=state.cursor, refits=refits,
+    fresh = StructuredState(model, restarts=state.restarts + (not (unfit or later)), cursor=state.cursor,
+                            refits=MOST_REFITS - 1 if later else refits, skipped=int(m.counts[mem.SKIPPED]),
                             efforts=state.efforts)
-    if unfit and m.counts[mem.SEEN] >= UNTAUGHT:
+    if (unfit or later) and m.counts[mem.SEEN] >= UNTAUGHT:
         fresh = fresh._replace(white=m.noise[:, [mem.WHITE, mem.LEVEL]])
     if m.counts[mem.HELD]:
         grasped = CaptureEvent(state.last_ns, EventKind.CAPTURE)

@@ -144,6 +144,21 @@ def test_a_fit_of_the_empty_arm_that_ended_ten_deviations_off_is_fitted_again():
     assert abs(again.memory.x[again.model.payload]) < 3.0 * found.std
 
 
+def test_an_arm_that_no_fit_explained_is_fitted_again_after_a_while():
+    """It held something that was not announced, let it go after 5 s, and was INCONSISTENT until the next event."""
+    plant = PlantParameters(payload_mass=20.0, seed=2)
+    state, messages = simulator.attach(plant, simulator.init(plant)), []
+    for k, torque in enumerate(excitation.sequence(ExcitationParameters(), 10_000)):
+        if k == 5000:
+            state = simulator.release(plant, state)
+        state, message = simulator.step(plant, state, torque)
+        messages.append(message)
+    found = [one.payload for _, one in pipeline.replay(IdentifierParameters(), messages) if one is not None]
+    assert all(one.status is not Status.TRACKING for one in found[:250])
+    assert found[-1].status is Status.TRACKING
+    assert found[-1].upper < 0.1
+
+
 @pytest.mark.parametrize('told', [(2.6, 3.4), (2.0, 4.0)])
 def test_a_wrong_arm_that_holds_something_from_the_first_sample_is_given_up(told):
     settings = config(replace(ARM, link_length=told))
