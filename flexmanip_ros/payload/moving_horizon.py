@@ -92,6 +92,9 @@ STARTS = 2
 MOST_REFITS = 4
 """Largest number of times that the fit of an empty arm, or of one never seen empty, is begun again: with the parameters
 of another arm none ever fits."""
+RETRY = 30.0
+"""Time after which an empty arm is fitted again whose fits all failed [s]. At 1 kHz the two fits of an arm with a wrong
+mass take up to 16 s of processor time, and less than the samples in which they are made."""
 STRAY = 3.0
 """Innovation power over white noise, of every sensor, at which the filter is begun again."""
 SLACK = 1.0
@@ -483,7 +486,7 @@ def strays(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) 
 
     While the arm holds something, every sensor must show it, as a fit that is begun again costs time. Of an empty arm
     the mean must, weighted by what each sensor tells of the payload, or the arm seems to hold something. One whose
-    fits all failed is fitted again after ``HORIZON`` samples, then at times that double: something may have touched it.
+    fits all failed is fitted again after ``RETRY``, then at times that double: something may have touched it.
     """
     if m.counts[mem.STORED] < mem.HORIZON or m.counts[mem.SINCE_EVENT] % (BATCH * sensors.block) != 0:
         return False
@@ -497,7 +500,7 @@ def strays(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) 
         return bool(left) and begins_later(m)
     if left and m.counts[mem.REFITS] < MOST_REFITS:
         give_up(motion, m)
-    elif left and m.counts[mem.SINCE_EVENT] >= max(m.counts[mem.SKIPPED], mem.HORIZON):
+    elif left and m.counts[mem.SINCE_EVENT] >= max(m.counts[mem.SKIPPED], RETRY / sensors.period):
         m.counts[mem.SKIPPED] += m.counts[mem.SINCE_EVENT]
     else:
         return False
