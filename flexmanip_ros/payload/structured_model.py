@@ -534,7 +534,7 @@ def first(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Arr
         std[part] = BEND_STD * L / np.arange(1, k + 1) ** 2
         # a mode's rate is its bending times its frequency, which grows as j^2
         std[n + part.start:n + part.stop] = BEND_STD * L * (np.pi / L) ** 2 * np.sqrt(EI / rho)
-    std[2 * n:] = np.where(model.motion.kind == Kind.TIP_INERTIA, 0.0, model.motion.prior)  # see opens_tip_inertia
+    std[2 * n:] = np.where(model.motion.kind == Kind.TIP_INERTIA, 0.0, model.motion.prior)  # see open_tip_inertia
     m.S[:] = np.diag(std)
 
 
