@@ -175,6 +175,7 @@ class CheckpointWriter:
         self._next_s = time.monotonic() + self._period_s
         self._thread: threading.Thread | None = None
         self._refused = False
+        """Whether the file is one that could not be used."""
         self.saves = 0
         self.problem = ''
         """Why the last save failed; empty when it did not."""
@@ -185,10 +186,9 @@ class CheckpointWriter:
         Raises CheckpointError for a file that cannot be read or was written with other parameters. The first save sets
         that aside.
         """
-        self._refused = True
+        self._refused = Path(self._path).exists()
         found = load(self._path)
         if found is None:
-            self._refused = False
             return None
         if not isinstance(found, Saved):
             raise CheckpointError(f"checkpoint '{self._path}' holds no state of the identifier", _EMPTY_START)
