@@ -33,18 +33,22 @@ STEP_ANGLE = 2.0
 """Largest angle [rad] by which the fastest mode may turn in an integration step."""
 MOTION_ERROR = 1e-8
 """Relative error of the fastest mode in a step, by the truncated exponential series of the motion."""
-MISS_ERROR = 1e-2
-"""The same for what the change of the remainder adds (``arrive``), which is some 1e-8 of link 1's motion a sample."""
 SPREAD_ERROR = 1e-4
-"""The same for the square root of the covariance, which only weighs measurements and may be less exact."""
+"""The same for the square root of the covariance, which only weighs measurements and may be less exact, and for what
+the remainder at Radau's points adds to the motion, which is some 1e-8 of it."""
 AVERAGE_TERMS = 6
 """Terms of the series that predicts the mean state of a step; the next is 3e-4 for a mode that turns by 1.4 rad."""
 MOST_TERMS = 30
 """Largest number of terms of an exponential series: more than ``STEP_ANGLE`` needs."""
 STIFF_STEP = 2.0
 """Longest step over the time constant of the stiffest damper: up to there the exponential series converges quickly."""
-BEGIN, MEAN, END = range(3)
-"""Stages of a step, by where the accelerations are evaluated: where it begins, at its mean state, where it ends."""
+BEGIN, MEAN, WITHIN = range(3)
+"""Stages of a step, by where the accelerations are evaluated: where it begins, at its mean state, at ``RADAU``."""
+RADAU = np.array([0.6 - np.sqrt(0.06), 0.6 + np.sqrt(0.06), 1.0])
+"""Shares of a step: Radau's points beyond the begin (quadrature of fifth order), where the remainder is evaluated, and
+the end."""
+TO_POWERS = np.linalg.solve(np.vander(np.append(0.0, RADAU[:2]), increasing=True), np.eye(3))
+"""Coefficients of the powers of that share, from the values at the begin and at Radau's two points."""
 MOST_STEPS = 2000.0
 """Largest number of steps from a sample to the next: parameters that need more belong to no real arm."""
 STIFFEST = 200.0
@@ -626,7 +630,7 @@ def predict(
     set_parameters(motion, x)
     note_opened(motion, S, used)
     set_torques(motion, rows, period)
-    left, stiff, h, steps, turn, stage = duration, 0.0, 0.0, 0.0, 0.0, BEGIN
+    left, stiff, h, steps, turn, stage, within = duration, 0.0, 0.0, 0.0, 0.0, BEGIN, 0
     q, qd, qdd = x[:n], x[n:2 * n], motion.k[0]
     while True:
         # the only call: the equations of motion are compiled into this loop
@@ -647,15 +651,23 @@ def predict(
                 parameter_columns(motion, h)
                 spread(motion.F, motion.G, motion.opened, S, used, motion.scratch, h, terms(turn, SPREAD_ERROR))
             lead(motion, x, h, turn)
-            q, qd, qdd, stage = motion.k[18], motion.k[19], motion.k[0], END
+            within = 0
+            q, qd, qdd, stage = motion.k[18], motion.k[21], motion.k[0], WITHIN
             continue
-        if stage == END:
+        if stage == WITHIN:
+            remainder(motion, q, qd, qdd, motion.k[26 + within])
+            within += 1
+            if within < 2:
+                q, qd = motion.k[18 + within], motion.k[21 + within]
+                continue
             if not arrive(motion, x, h, turn):
                 return 0
             taken += 1
             if steps <= 1.0:
                 return taken
-            left -= h  # the next step begins with the acceleration at the end of this one
+            left -= h
+            q, qd, stage = x[:n], x[n:2 * n], BEGIN
+            continue
         longest = min(motion.substeps, friction_step(motion, left), STIFF_STEP / max(stiff, 1e-9))
         steps = max(np.ceil(left / longest - 1e-9), 1.0)
         if not (steps < MOST_STEPS and stiff * motion.substeps < STIFFEST * STIFF_STEP):
@@ -709,103 +721,87 @@ def remainder(motion: ProcessModel, q: Array, qd: Array, qdd: Array, lacks: Arra
 
 @inner
 def lead(motion: ProcessModel, x: Array, h: float, turn: float) -> None:
-    """Fill rows 18 and 19 of motion.k with the state after a step h in which the remainder is r0 e(s).
+    """Predict the states at ``RADAU`` in a step h: q in rows 18 to 20 of motion.k, q' in rows 21 to 23.
 
     turn: angle by which the fastest mode turns in the step [rad]. ``linearize`` was just called at the mean state.
 
-    An exponential integrator (Hochbruck and Ostermann, Acta Numerica 19, 2010) about the mean state: x' = g(x) + r, g
-    the linearization, r its remainder. With s from -1 to 1 in the step, x is its mean and a s + b (s^2 - 1/3) + ...; r
-    is of second order in that, so its even part goes with s^2 and its odd part with s^3 - s / 3. Its values r0 and r1
-    at both ends give their sizes: r = e(s) (r0 + r1) / 2 + (3 s^3 - s) / 2 (r1 - r0) / 2, and the step is of fourth
-    order. e(s) is that of ``even_part``: s^2 where all modes are slow. ``arrive`` adds r1, evaluated at the state
-    found here. A step of Runge and Kutta is not exact enough: the fastest mode turns too far in a sample, and the
-    damping that such a step adds to it changed the payload by 0.3 %.
+    An exponential integrator (Hochbruck and Ostermann, Acta Numerica 19, 2010) about the mean state: x' = g(x) + r(u),
+    g the linearization, r its remainder, u from 0 to 1 the share of the step. Here r is r0 (2 u - 1)^2, r0 its value at
+    the begin, as r is of second order in the distance from the mean state. ``arrive`` takes the r evaluated at the
+    states found here. A step of Runge and Kutta is not exact enough: the fastest mode turns too far in a sample, and
+    the damping that such a step adds to it changed the payload by 0.3 %.
     """
     n = motion.arm.stiffness.size
-    qdd, first, difference = motion.k[0], motion.k[3], motion.k[15]
-    place, rate, moved = motion.k[10], motion.k[11], motion.k[12:14]
+    places, rates, forcing, first = motion.k[18:21], motion.k[21:24], motion.k[24:26], motion.k[3]
     for i in range(n):
         for j in range(n):  # by columns, which ``series`` reads in a row
             motion.X[j, i], motion.Y[j, i] = motion.F[i, j], motion.F[i, n + j]
-    remainder(motion, x[:n], x[n:2 * n], qdd, first)
-    difference[:] = 0.0
+    remainder(motion, x[:n], x[n:2 * n], motion.k[0], first)
     for i in range(n):
-        place[i], rate[i] = x[n + i], qdd[i] - first[i]
-    series(motion, h, terms(turn, MOTION_ERROR), even_part(0.5 * STEP_ANGLE / motion.substeps * h))
-    end, ending = motion.k[18], motion.k[19]
-    for i in range(n):
-        end[i] = x[i] + moved[0, i]
-        ending[i] = x[n + i] + moved[1, i]
+        motion.k[10, i], motion.k[11, i] = h * x[n + i], h * motion.k[0, i]
+        forcing[0, i], forcing[1, i] = -4.0 * first[i], 4.0 * first[i]
+        for point in range(RADAU.size):
+            places[point, i], rates[point, i] = x[i], x[n + i]
+    series(motion, h, terms(turn, MOTION_ERROR), 0)
 
 
 @inner
 def arrive(motion: ProcessModel, x: Array, h: float, turn: float) -> bool:
-    """Set x to the state after the step, with r0 and r1 (``lead``). ``accelerate`` was just called where that led."""
+    """Set x to the state after the step, r the parabola through its values at the begin and at Radau's points.
+
+    They stand in rows 3, 26 and 27 of motion.k. Fill motion.k[0] with the acceleration at the end.
+    """
     n = motion.arm.stiffness.size
-    first, difference, end, ending = motion.k[3], motion.k[15], motion.k[18], motion.k[19]
-    place, rate, moved = motion.k[10], motion.k[11], motion.k[12:14]
-    remainder(motion, end, ending, motion.k[0], difference)
+    forcing, first, end, ending, last = motion.k[24:26], motion.k[3], motion.k[20], motion.k[23], motion.k[15]
     for i in range(n):
-        difference[i] -= first[i]
-    place[:], rate[:], first[:] = 0.0, 0.0, 0.0
-    series(motion, h, terms(turn, MISS_ERROR), even_part(0.5 * STEP_ANGLE / motion.substeps * h))
+        last[i] = first[i]
+        motion.k[10, i], motion.k[11, i] = 0.0, 0.0
+        for power in range(1, 3):
+            found = TO_POWERS[power, 0] * first[i]
+            for point in range(2):
+                found += TO_POWERS[power, 1 + point] * motion.k[26 + point, i]
+            last[i] += found
+            forcing[power - 1, i] = found - forcing[power - 1, i]
+    series(motion, h, terms(turn, SPREAD_ERROR), 2)
     largest = 0.0
     for i in range(n):
-        x[i] = end[i] + moved[0, i]
-        x[n + i] = ending[i] + moved[1, i]
+        x[i] = end[i]
+        x[n + i] = ending[i]
         largest += abs(x[i]) + abs(x[n + i])
+    for i in range(n):
+        motion.k[0, i] = motion.k[8, i] + last[i]
+        for j in range(n):
+            motion.k[0, i] += (motion.F[i, j] * (x[j] - motion.k[16, j])
+                               + motion.F[i, n + j] * (x[n + j] - motion.k[17, j]))
     return largest < 1e6
 
 
 @inner
-def even_part(w: float) -> tuple[float, float]:
-    """Return a and b of the even part e(s) = a + (1 - a + b) s^2 - b s^4 of the remainder, e(1) = 1.
+def series(motion: ProcessModel, h: float, count: int, begin: int) -> None:
+    """Add the solution of x' = g + F x + r to rows 18 to 23 of motion.k, for the points of ``RADAU`` from begin on.
 
-    w: half the angle by which the fastest mode turns in the step [rad]. A bent link is shorter, so most of the
-    remainder is (x^2)'' / 2 = x x'' + x'^2 of the fastest modes, where x and its derivatives are taken from their
-    means. It goes with sin^2(w s) - (cos(w s) - sin w / w)^2. e has its values at s = 0 and 1 and its mean.
-    """
-    if w < 0.05:  # s^2 to 1e-3; the quotients would lose digits
-        return 0.0, 0.0
-    mean = np.sin(w) / w
-    end = np.sin(w) ** 2 - (np.cos(w) - mean) ** 2
-    a = -((1.0 - mean) ** 2) / end
-    b = 7.5 * ((mean * mean - np.sin(2.0 * w) / (2.0 * w)) / end - 1.0 / 3.0 - 2.0 / 3.0 * a)
-    return float(a), float(b)
-
-
-@inner
-def series(motion: ProcessModel, h: float, count: int, part: tuple[float, float]) -> None:
-    """Fill rows 12 and 13 of motion.k with the solution after a step h of x' = g + F x + r from x = 0, ``count`` terms.
-
-    g stands in rows 10 and 11 (positions, rates). Rows 3 and 15 hold the two parts of r: the factors of e(s), with a
-    and b from ``part`` (``even_part``), and of (e(s) + (3 s^3 - s) / 2) / 2. With u = (1 + s) / 2, the share of the
-    step, a forcing u^k gives h k! phi_{k + 1}(h F), phi_l(z) the sum of z^j / (j + l)!. Evaluated by Horner's rule;
-    motion.X and Y hold the columns of motion.F as rows.
+    It is a Taylor series of ``count`` terms from x = 0: with x = sum c_j u^j and r = sum rho_j u^j, u the share of the
+    step h, c_{j + 1} = h / (j + 1) (F c_j + rho_j). c_1 = h (g + rho_0) stands in rows 10 and 11 (positions, rates) and
+    is overwritten, rho_1 and rho_2 in rows 24 and 25; motion.X and Y hold the columns of motion.F as rows.
     """
     n = motion.arm.stiffness.size
-    even, odd, place, rate, following = motion.k[3], motion.k[15], motion.k[10], motion.k[11], motion.k[14]
-    moved, moving = motion.k[12], motion.k[13]
-    weight = h
-    for j in range(1, count):
-        weight /= j + 1
-    moved[:], moving[:] = 0.0, 0.0
-    for j in range(count - 1, -1, -1):
-        following[:] = 0.0
-        if j < count - 1:
-            for c in range(n):
-                by_place, by_rate, at, going = motion.X[c], motion.Y[c], moved[c], moving[c]
-                for i in range(n):
-                    following[i] += by_place[i] * at + by_rate[i] * going
-        square = (j * j + j + 2) / ((j + 2) * (j + 3))
-        fourth = 1.0 + (-8.0 + (48.0 + (-192.0 + 384.0 / (j + 5)) / (j + 4)) / (j + 3)) / (j + 2)
-        cubic = (2 * j * j + 4) / ((j + 2) * (j + 3) * (j + 4)) - 0.5 * square
-        of_even = weight * (part[0] + (1.0 - part[0] + part[1]) * square - part[1] * fourth)
-        of_odd = 0.5 * of_even + weight * cubic
+    place, rate, following = motion.k[10], motion.k[11], motion.k[14]
+    for j in range(1, count + 1):
+        for point in range(begin, RADAU.size):
+            power = RADAU[point] ** j
+            for i in range(n):
+                motion.k[18 + point, i] += power * place[i]
+                motion.k[21 + point, i] += power * rate[i]
+        weight = h / (j + 1)
         for i in range(n):
-            moved[i] = h * moving[i] + weight * place[i]
-            moving[i] = h * following[i] + weight * rate[i] + of_even * even[i] + of_odd * odd[i]
-        weight *= j + 1
+            following[i] = motion.k[23 + j, i] if j <= 2 else 0.0
+        for c in range(n):
+            by_place, by_rate, at, going = motion.X[c], motion.Y[c], place[c], rate[c]
+            for i in range(n):
+                following[i] += by_place[i] * at + by_rate[i] * going
+        for i in range(n):
+            place[i] = weight * rate[i]
+            rate[i] = weight * following[i]
 
 
 @separate

@@ -80,29 +80,27 @@ def error(arm, x: np.ndarray, exact: np.ndarray, n: int, duration: float, h: flo
     return float(np.abs(state[:n] - exact[:n]).max())
 
 
-def test_a_step_of_one_sample_is_exact_to_a_hundredth_of_the_sensors_and_of_fourth_order(arm):
+def test_a_step_of_one_sample_is_of_fifth_order(arm):
     n = arm.arm.stiffness.size
     x = bent(arm, n)
     x[2 * n:][arm.kind == Kind.COULOMB] = 0.0  # it has no third derivative to speak of
     process_model.set_parameters(arm, x)
     exact = fine(arm, x, n, 0.02)
     coarse, halved = (error(arm, x, exact, n, 0.02, h) for h in (2e-4, 1e-4))
-    assert coarse < 1e-8  # of bends of 5e-3 m
-    assert halved < coarse / 15  # 2^4 as the step goes to zero
+    assert coarse < 1e-10  # of bends of 5e-3 m
+    assert halved < coarse / 25  # 2^5 as the step goes to zero
 
 
-@pytest.mark.parametrize('w', [0.06, 0.4, 0.63, 1.0])
-@pytest.mark.parametrize('phase', [0.0, 0.5, np.pi / 2])
-def test_the_even_part_of_the_remainder_is_that_of_the_square_of_a_vibration(w, phase):
-    s = np.linspace(-1.0, 1.0, 2001)
-    x, slope = np.sin(w * s + phase), w * np.cos(w * s + phase)
-    mean_x, mean_slope = (scipy.integrate.simpson(value, x=s) / 2.0 for value in (x, slope))
-    bends = -w ** 2 * (x - mean_x) ** 2 + (slope - mean_slope) ** 2  # x x'' + x'^2 from the means
-    even = (bends + bends[::-1]) / (bends[0] + bends[-1])
-    a, b = process_model.even_part(w)
-    found = a + (1.0 - a + b) * s ** 2 - b * s ** 4
-    assert np.abs(found - even).max() < 3e-3 * w ** 2 / 0.4
-    assert scipy.integrate.simpson(found - even, x=s) == pytest.approx(0.0, abs=1e-9)
+def test_samples_in_which_the_fastest_mode_turns_by_more_than_a_radian_keep_an_undamped_arm_to_a_nanometre():
+    arm = motion(configure(IdentifierParameters, {}))
+    n, h = arm.arm.stiffness.size, 1e-3
+    assert 1.0 < process_model.STEP_ANGLE / arm.substeps * h < process_model.STEP_ANGLE
+    x = bent(arm, n)
+    x[2 * n:] = np.where(arm.kind == Kind.MASS, 20.0, 0.0)
+    arm.effort[:] = TORQUE
+    process_model.set_parameters(arm, x)
+    # errors of a step add up for as long as an arm rings: a filter 22 s old found 2e-9 m after 0.1 s to be a payload
+    assert error(arm, x, fine(arm, x, n, 0.1), n, 0.1, h) < 1e-9
 
 
 def carried(arm, state: np.ndarray, spread: np.ndarray, rows: np.ndarray, samples: int) -> np.ndarray:

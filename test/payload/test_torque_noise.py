@@ -143,7 +143,7 @@ def test_friction_follows_measured_rates_where_a_step_of_the_torque_adds_more_to
 
 @pytest.mark.parametrize(('failed', 'deviations'), [(0, 0.0), (1, 1.0), (2, 1.0), (3, 1.0)])
 def test_a_fit_that_failed_begins_again_with_other_rotors_and_friction(failed, deviations):
-    samples = record(0.024, arm=RUBBING)
+    samples = record(0.024)
     state = structured.advance(CONFIG, structured.init(CONFIG)._replace(refits=failed), samples)
     motion, begun = state.model.motion, state.memory.x0[-state.model.motion.kind.size:]
     for kind in (Kind.VISCOUS, Kind.COULOMB, Kind.ROTOR):
