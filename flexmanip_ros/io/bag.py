@@ -324,6 +324,7 @@ class _Recording:
                         continue
                     self.taken += 1
                     yield raw.topic, _plain(raw.data)
+            self._damage = self._damage or _hole(self._files())
         except DamagedError as err:
             self._damage = str(err)
         except OSError as err:  # no permission to read, or a disk that was taken out
@@ -417,6 +418,17 @@ def _plain(data: bytes) -> bytes:
         with suppress(zstd.ZstdError, EOFError):
             return zstd.decompress(data)
     return data
+
+
+def _hole(files: list[Path]) -> str:
+    """Return which file of a split recording, NAME_0, NAME_1 and so on, is missing between the others; '': none."""
+    parts = [re.fullmatch(r'(.*_)(\d+)(\.\w+)', file.name) for file in files]
+    found = {(part[1], part[3], int(part[2])) for part in parts if part}
+    for name, ending, number in sorted(found):
+        after = [other for *kind, other in found if kind == [name, ending] and other > number]
+        if after and number + 1 not in after:
+            return f"file '{name}{number + 1}{ending}' of the recording is missing"
+    return ''
 
 
 def _event_topics(there: dict[str, str]) -> str:

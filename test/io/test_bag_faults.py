@@ -124,6 +124,22 @@ def test_a_recording_without_metadata_is_read_and_reported(tmp_path):
     assert 'damaged' not in line
 
 
+def test_a_split_recording_without_metadata_names_the_file_that_is_missing(tmp_path):
+    path = write(tmp_path / 'bag')
+    (path / 'metadata.yaml').unlink()
+    file = storage_file(path)
+    second, third, fourth = (file.with_name(f'bag_{k}{file.suffix}') for k in (8, 9, 10))
+    for part in (second, third, fourth):
+        part.write_bytes(file.read_bytes())
+    file.unlink()
+    assert 'its data are whole' in good_part(path)[1]
+    third.unlink()
+    items, line = good_part(path)
+    assert len(items) == 2 * 51
+    assert f"file '{third.name}' of the recording is missing" in line
+    assert 'whole' not in line
+
+
 @pytest.mark.parametrize('text', ['', 'words', 'rosbag2_bagfile_information: {version: 5}', ': : :', '\x00'])
 def test_broken_metadata_is_reported_in_plain_words(tmp_path, text):
     path = write(tmp_path / 'bag')
