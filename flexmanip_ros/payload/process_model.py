@@ -623,8 +623,8 @@ def predict(
     used: number of the first columns of S, beyond which they are zero; rows: (P, >= 1 + L) with efforts [N m] in
     columns 1 to L, those held meanwhile in the last row and, for late torques, those before it. The next 2 L columns,
     if there are more, hold the rates of the joints [rad/s] before and after (NaN: unknown). period: sample time of the
-    rows [s]. Afterwards motion.k[0] is the acceleration at the end, and motion.work is of Radau's last point, 0.155 of a
-    step before it. A duration of zero fills motion.k[0] and motion.F at x alone.
+    rows [s]. Afterwards motion.k[0] is the acceleration at the end, and motion.work is of Radau's last point, 0.155
+    of a step before it. A duration of zero fills motion.k[0] and motion.F at x alone.
     """
     n, taken = motion.arm.stiffness.size, 0
     set_parameters(motion, x)
