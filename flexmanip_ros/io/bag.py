@@ -15,6 +15,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -423,11 +424,10 @@ def _plain(data: bytes) -> bytes:
 def _hole(files: list[Path]) -> str:
     """Return which file of a split recording, NAME_0, NAME_1 and so on, is missing between the others; '': none."""
     parts = [re.fullmatch(r'(.*_)(\d+)(\.\w+)', file.name) for file in files]
-    found = {(part[1], part[3], int(part[2])) for part in parts if part}
-    for name, ending, number in sorted(found):
-        after = [other for *kind, other in found if kind == [name, ending] and other > number]
-        if after and number + 1 not in after:
-            return f"file '{name}{number + 1}{ending}' of the recording is missing"
+    found = sorted((part[1], part[3], int(part[2])) for part in parts if part)
+    for (*kind, number), (*following, another) in pairwise(found):
+        if kind == following and another > number + 1:
+            return f"file '{kind[0]}{number + 1}{kind[1]}' of the recording is missing"
     return ''
 
 

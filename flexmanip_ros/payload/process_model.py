@@ -655,7 +655,7 @@ def predict(
             q, qd, qdd, stage = motion.k[18], motion.k[21], motion.k[0], WITHIN
             continue
         if stage == WITHIN:
-            remainder(motion, q, qd, qdd, motion.k[26 + within])
+            remainder(motion, q, qd, qdd, motion.k[12 + within])
             within += 1
             if within < 2:
                 q, qd = motion.k[18 + within], motion.k[21 + within]
@@ -749,7 +749,7 @@ def lead(motion: ProcessModel, x: Array, h: float, turn: float) -> None:
 def arrive(motion: ProcessModel, x: Array, h: float, turn: float) -> bool:
     """Set x to the state after the step, r the parabola through its values at the begin and at Radau's points.
 
-    They stand in rows 3, 26 and 27 of motion.k. Fill motion.k[0] with the acceleration at the end.
+    They stand in rows 3, 12 and 13 of motion.k. Fill motion.k[0] with the acceleration at the end.
     """
     n = motion.arm.stiffness.size
     forcing, first, end, ending, last = motion.k[24:26], motion.k[3], motion.k[20], motion.k[23], motion.k[15]
@@ -759,7 +759,7 @@ def arrive(motion: ProcessModel, x: Array, h: float, turn: float) -> bool:
         for power in range(1, 3):
             found = TO_POWERS[power, 0] * first[i]
             for point in range(2):
-                found += TO_POWERS[power, 1 + point] * motion.k[26 + point, i]
+                found += TO_POWERS[power, 1 + point] * motion.k[12 + point, i]
             last[i] += found
             forcing[power - 1, i] = found - forcing[power - 1, i]
     series(motion, h, terms(turn, SPREAD_ERROR), 2)
@@ -792,6 +792,8 @@ def series(motion: ProcessModel, h: float, count: int, begin: int) -> None:
             for i in range(n):
                 motion.k[18 + point, i] += power * place[i]
                 motion.k[21 + point, i] += power * rate[i]
+        if j == count:
+            return
         weight = h / (j + 1)
         for i in range(n):
             following[i] = motion.k[23 + j, i] if j <= 2 else 0.0

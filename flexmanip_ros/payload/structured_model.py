@@ -263,7 +263,7 @@ def motion(config: IdentifierParameters) -> ProcessModel:
         slope=np.zeros((links, 2)), driven=np.zeros(links), coulomb=nominal.coulomb.copy(),
         share=np.full(links, np.nan), rate=np.full(links, np.nan),
         modelled=np.zeros(links, dtype=np.bool_), opened=np.array([size, *range(size)]),
-        bounds=allocate_bounds(size, nx), p=np.zeros(size), a=np.zeros(n), k=np.zeros((28, n)), dq=np.zeros((n, n)),
+        bounds=allocate_bounds(size, nx), p=np.zeros(size), a=np.zeros(n), k=np.zeros((26, n)), dq=np.zeros((n, n)),
         dqd=np.zeros((n, n)), dp=np.zeros((n, 4)), G=np.zeros((n, 2 * size)), F=np.zeros((n, 2 * n)),
         X=np.zeros((2 * n, 2 * n)), Y=np.zeros((n, n)), scratch=spread_scratch(n, size, 2 * nx + 1))
     return made._replace(prior=priors(config, made, M), given=_given(config.arm, made))
