@@ -392,7 +392,7 @@ def payload_real_arms(rows: list[dict[str, Any]]) -> Claims:
 
 
 def payload_slow_captures(rows: list[dict[str, Any]]) -> Claims:
-    """An object that is taken over some time, later than announced, or by an arm at rest is known a second later."""
+    """An object taken over some time, announced early or late, or taken by an arm at rest is known a second later."""
     for row in rows:
         name = f'{row["case"]}, {row["time_s"]:g} s, {row["arm"]}'
         yield Claim(f'{name}: runs TRACKING at the end', row['tracking_at_end'] / row['runs'], 1.0)

@@ -1,8 +1,10 @@
-"""Claim: an object that is taken over some time, later than announced, or by an arm at rest is known a second later.
+"""Claim: an object taken over some time, announced early or late, or taken by an arm at rest is known a second later.
 
 Arms of ``parts.real_arms``. ``ramp``: a gripper takes the object in equal parts over a time; its begin is announced.
-``early``: the object is caught at an instant that much later than was announced. ``rest``: the arm rests for 2 s after
-the capture, then moves. Counted are the estimates from 1 s after the object is held, or the arm moves, on.
+``early``: the object is caught at an instant that much later than was announced. ``late``: the event arrives that much
+later than its stamp. ``by hand``: it has the stamp of its arrival, that much later. ``rest``: the arm rests for 2 s
+after the capture, then moves. Counted are the estimates from 1 s after the object is held, announced, or the arm moves,
+on.
 
 Use: python benchmarks/payload_slow_captures.py [--seeds 3]
 """
@@ -25,7 +27,7 @@ from flexmanip_ros.types import CaptureEvent, Status
 
 ARMS = ('ideal', 'friction and rotor', 'all')
 CASES = (('instant', 0.0), ('ramp', 0.02), ('ramp', 0.05), ('ramp', 0.1), ('ramp', 0.3), ('ramp', 1.0), ('early', 0.1),
-         ('early', 0.3), ('rest', 2.0))
+         ('early', 0.3), ('late', 0.4), ('late', 1.5), ('by hand', 0.4), ('by hand', 1.5), ('rest', 2.0))
 """What is slow, and its time [s]."""
 
 
@@ -44,7 +46,12 @@ def items_of(kind: str, time_s: float, arm: str, seed: int) -> tuple[list[Any], 
         efforts = np.vstack([np.zeros((begin, 2)), efforts[:3000]])
     run = simulator.simulate(plant, efforts, (CAPTURE,))
     records = [item for item in simulator.records(run, (CAPTURE,)) if not isinstance(item, CaptureEvent)]
-    return [*records[:1], announced, *records[1:]], plant.payload_mass, told(plant)
+    if kind == 'by hand':
+        announced = CaptureEvent(CAPTURE.stamp_ns + late_ns, CAPTURE.kind)
+    came = 1
+    if kind in ('late', 'by hand'):
+        came = sum(record.stamp_ns < CAPTURE.stamp_ns + late_ns for record in records)
+    return [*records[:came], announced, *records[came:]], plant.payload_mass, told(plant)
 
 
 def main() -> None:
@@ -53,7 +60,7 @@ def main() -> None:
     seeds = parser.parse_args().seeds
     rows: list[dict[str, Any]] = []
     for kind, time_s in CASES:
-        since = CAPTURE.stamp_ns + round(1e9 * (time_s if kind in ('ramp', 'rest') else 0.0)) + 1_000_000_000
+        since = CAPTURE.stamp_ns + round(1e9 * (0.0 if kind == 'early' else time_s)) + 1_000_000_000
         for arm in ARMS if kind != 'rest' else ARMS[:1]:  # friction is not learned at rest
             tracking, wrong, ends, errors = [], [], 0, []
             for seed in range(1, 1 + seeds):

@@ -26,7 +26,7 @@ from flexmanip_ros.errors import CheckpointError, FlexmanipError
 from flexmanip_ros.io.outputs import write_file
 from flexmanip_ros.parameters import IdentifierParameters, flatten, leaves
 
-NAME, FORMAT = b'flexmanip_ros checkpoint ', b'44\n'
+NAME, FORMAT = b'flexmanip_ros checkpoint ', b'45\n'
 """First bytes of the file: its name and the number of the format. The number changes when the fields of a state or the
 shapes of its arrays, scratch as well, change, and when a class moves to another module."""
 CHECKSUM = hashlib.sha256().digest_size

@@ -24,7 +24,7 @@ EFFECTIVE, POWER, SLOW, BLOCK_SUM, BLOCK_POWER, FLOOR, WHITE, WEIGHT, FIT, AT_EV
 # Elements of ``counts``.
 (HELD, STORED, ITERATED, ITERATING, IN_BLOCK, BLOCKS, SINCE_EVENT, SINCE_NOISE, IN_BATCH, MOVED, SEEN, BEFORE,
  REJECTED, AGAIN, LEARNED, REFITS, USED, IN_A_ROW, MEASURED, TRIED,
- IN_SPECTRUM, SPECTRA, LINEARIZED, EFFORTS, RESTS, SKIPPED, WITH_TIP) = range(27)
+ IN_SPECTRUM, SPECTRA, LINEARIZED, EFFORTS, RESTS, SKIPPED, WITH_TIP, EXPLAINS) = range(28)
 # Elements of ``score``.
 (SHIFT, DOUBT, NOW, EMPTY_ARM_BIAS, EXCESS_BIAS, COST, COST_BEFORE, LAMBDA, MOVES, SANDWICH,
  MISFIT, EXCESS, LOG_DETERMINANT, LIKELIHOOD, DISAGREES) = range(15)
@@ -52,7 +52,7 @@ class FilterState(NamedTuple):
     """(m, 3, TONES) of its fourth differences: both states of Goertzel's filter, mean power over that of white noise
     of unit variance."""
     counts: NDArray[np.int64]
-    """(27,) counters and flags (1: yes).
+    """(28,) counters and flags (1: yes).
 
     Filter: HELD: the arm holds something; LEARNED: it was seen empty before; SEEN: samples measured, at most 2000;
     SINCE_EVENT: those since the last event; IN_A_ROW: those since the last one that was missing; SINCE_NOISE: samples
@@ -67,7 +67,8 @@ class FilterState(NamedTuple):
     not; RESTS: RESTING: the samples since the event tell nothing yet of the payload, so no fit reads them and the
     horizon slides along, IN_BATCH counts the samples since it slid; SLIDES: it is due; BEGINS_TO_MOVE: the last sample
     tells; SKIPPED: samples from the event to the horizon, where that had to begin later (``begins_later``, ``strays``);
-    WITH_TIP: the simplest arm is to be fitted again with an unknown rotary inertia of the tip mass (``give_up``)."""
+    WITH_TIP: the simplest arm is to be fitted again with an unknown rotary inertia of the tip mass (``give_up``);
+    EXPLAINS: this fit of an empty arm has explained later samples (``strays``)."""
     score: Array
     """(15,) SHIFT: move of the payload in the last iteration, in standard deviations; DOUBT: root of the sum of the
     squares of that move and of the deviation, over the payload; NOW: time since process noise was added [s];
@@ -86,6 +87,9 @@ class FilterState(NamedTuple):
     moved: Array
     """(nx, 2) mean and variance of payload and arm parameters when their moves were last judged, with the process noise
     since then in the variance; see ``judge_moves``."""
+    known: Array
+    """(2, nx, nx + 1) square root of the covariance and mean of an empty arm, the last two times that the filter
+    explained the samples, the latest first (``strays``); zero before that."""
     x0: Array
     """(nx,) mean just after the last event."""
     S0: Array
@@ -135,8 +139,9 @@ def memory(nx: int, m: int, links: int) -> FilterState:
     """Allocate for nx states, m sensors and the joints of ``links`` links."""
     return FilterState(
         x=np.zeros(nx), S=np.zeros((nx, nx)), noise=np.zeros((m, 11)), recent=np.zeros((m, 4)), swing=np.zeros((m, 4)),
-        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(27, dtype=np.int64), score=np.zeros(15),
-        moved=np.zeros((nx, 2)), x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
+        spectrum=np.zeros((m, 3, TONES)), counts=np.zeros(28, dtype=np.int64), score=np.zeros(15),
+        moved=np.zeros((nx, 2)), known=np.zeros((2, nx, nx + 1)),
+        x0=np.zeros(nx), S0=np.zeros((nx, nx)), xi=np.zeros(nx), accepted=np.zeros(nx),
         normal=np.zeros((nx, nx)), gradient=np.zeros(nx), xr=np.zeros(nx), Sr=np.zeros((nx, 2 * nx + 1)),
         N=np.zeros((nx, nx)), g=np.zeros(nx), batch=np.zeros(nx), B=np.zeros((nx, nx)),
         early_normal=np.zeros((PARTS, nx, nx)), early_gradient=np.zeros((PARTS, nx)),

@@ -495,9 +495,16 @@ def strays(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) 
         least = min(least, m.noise[i, mem.POWER] / white_variance(m.noise[i], mem.WHITE))
     left = least >= STRAY
     if m.counts[mem.HELD] == 0:
-        left = misfit(m.noise, sensors.rate, mem.WHITE) >= UNFIT or abs(excess_bias(motion, m)) > MOST_BIAS
+        left = misfit(m.noise, sensors.rate, mem.WHITE) >= UNFIT
+        if not left and abs(excess_bias(motion, m)) > MOST_BIAS:
+            left = True  # it fits with a mass that is none: what this fit has learned is wrong
+            if m.counts[mem.EXPLAINS] == 1:
+                m.known[:] = 0.0
     if m.counts[mem.HELD] == 1:
         return bool(left) and begins_later(m)
+    if not left and m.counts[mem.RESTS] != mem.RESTING:
+        note_known(m)
+        m.counts[mem.EXPLAINS] = 1
     if left and m.counts[mem.REFITS] < MOST_REFITS:
         give_up(motion, m)
     elif left and m.counts[mem.SINCE_EVENT] >= max(m.counts[mem.SKIPPED], RETRY / sensors.period):
@@ -505,6 +512,21 @@ def strays(motion: ProcessModel, sensors: MeasurementModel, m: mem.FilterState) 
     else:
         return False
     return True
+
+
+@inner
+def note_known(m: mem.FilterState) -> None:
+    """Keep the state of an empty arm that explains the samples, and the one kept before.
+
+    A look may come just after something was caught that nobody announced: so the one before is what was known.
+    """
+    nx = m.x.size
+    for i in range(nx):
+        for c in range(nx):
+            m.known[1, i, c] = m.known[0, i, c]
+            m.known[0, i, c] = m.S[i, c]
+        m.known[1, i, nx] = m.known[0, i, nx]
+        m.known[0, i, nx] = m.x[i]
 
 
 @separate_kernel

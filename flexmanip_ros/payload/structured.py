@@ -76,6 +76,8 @@ class StructuredState(NamedTuple):
     """Samples of an empty arm whose fits all failed, see ``strays``."""
     white: Array = np.empty(0)
     """(m, 2) variance of each measurement's white noise at the last restart, and its bound by the spectrum."""
+    known: Array = np.empty(0)
+    """What was known of the empty arm at the last restart, see ``FilterState.known``; (0,): nothing."""
 
     @property
     def running(self) -> Running:
@@ -181,9 +183,23 @@ def event(config: IdentifierParameters, state: StructuredState, event: CaptureEv
     model, sensors, memory, efforts, _ = state.running
     m = mem.copy(memory)
     ahead = max(event.stamp_ns - state.time_ns, 0)
+    before = event.kind is EventKind.CAPTURE and is_held_before(sensors, m, event)
+    if before and not m.known[1].any() and not is_another_arm(m):
+        return StructuredState(model, restarts=state.restarts, cursor=state.cursor, efforts=efforts,
+                               early=((state.cursor, event._replace(std_s=0.0)),),
+                               white=m.noise[:, [mem.WHITE, mem.LEVEL]])
     rows, rates = np.pad(efforts, ((0, 0), (1, 0))), np.full(state.rates.size, np.nan)
     predict(model.motion, m.x, m.S, m.x.size, rows, sensors.period, min(ahead * 1e-9, LONGEST_S))
-    _change(config, model, m, event)
+    if before and m.known[1].any():
+        m.x[:], m.S[:] = m.known[1, :, -1], m.known[1, :, :-1]
+        structured_model.guess_noise(m, int(m.counts[mem.SEEN]))
+        m.noise[:, mem.AT_EVENT] = m.noise[:, mem.EFFECTIVE]
+        m.counts[mem.MOVED], m.score[mem.MOVES], m.score[mem.EXCESS_BIAS] = 0, 0.0, 0.0
+        _forget_payload(model, m)
+        m.counts[[mem.HELD, mem.LEARNED]] = 1
+        _hold_from_here(config, model, m, m.recent[:, 0], 0)
+    else:
+        _change(config, model, m, event)
     state = state._replace(memory=m, last_ns=max(event.stamp_ns, state.last_ns), time_ns=state.time_ns + ahead,
                            rates=rates)
     return state._replace(horizon=state.here)
@@ -228,6 +244,22 @@ def _change(config: IdentifierParameters, model: Model, m: mem.FilterState, even
     _set_arrival_cost(model, m)
 
 
+def is_held_before(sensors: MeasurementModel, m: mem.FilterState, event: CaptureEvent) -> bool:
+    """Whether an object was held for longer than a tenth of the slowest period when its capture was announced.
+
+    So it is where the event says so, or where the filter explained the empty arm once and does not now. The samples
+    since then are those of another arm. The effect of an unknown instant is linearized, see ``jump``: over more than
+    that time it is some percent off.
+    """
+    if m.counts[mem.HELD]:
+        return False
+    if event.std_s > sensors.block * sensors.period:
+        return True
+    refitted = m.counts[mem.SEEN] < UNTAUGHT or (m.counts[mem.REFITS] > 0 and m.counts[mem.STORED] < mem.HORIZON)
+    strayed = refitted or m.score[mem.EXCESS_BIAS] != 0.0 or innovation_power(sensors, m)[0] > POWER_LIMIT
+    return bool(m.known[1].any() and strayed)
+
+
 def is_another_arm(m: mem.FilterState) -> bool:
     """Whether an empty arm is another one than was told: over ``FAILED`` of its fits failed, and none fits since."""
     fits = m.counts[mem.STORED] == mem.HORIZON and m.score[mem.EXCESS] < BY_CHANCE
@@ -256,7 +288,7 @@ def _forget_payload(model: Model, m: mem.FilterState) -> None:
 def _set_arrival_cost(model: Model, m: mem.FilterState) -> None:
     """Begin a horizon at an event: the present state is its arrival cost; figures of payload and noise start again."""
     _begin_horizon(model, m)
-    m.counts[mem.SINCE_EVENT] = 0
+    m.counts[[mem.SINCE_EVENT, mem.EXPLAINS]] = 0
     m.swing[:] = 0.0
     m.counts[mem.BLOCKS] = min(m.counts[mem.BLOCKS], 40)
     m.score[:mem.EMPTY_ARM_BIAS] = 0.0
@@ -384,6 +416,8 @@ def _begin(config: IdentifierParameters, state: StructuredState, rows: Rows) -> 
     Y = measurements(model, rows)
     m = mem.memory(2 * model.motion.arm.stiffness.size + model.motion.kind.size, len(model.roles),
                    model.motion.effort.size)
+    if state.known.size:
+        m.known[:] = state.known
     m.noise[:] = structured_model.noise(model, Y)
     structured_model.first(config, model, m, Y[0])
     if not again:
@@ -622,7 +656,7 @@ def restart(config: IdentifierParameters, before: StructuredState, state: Struct
         return _begin_later(config, state, y, m.counts[mem.SKIPPED] + (0 if later else m.counts[mem.SINCE_EVENT]))
     fresh = StructuredState(model, restarts=state.restarts + (not (unfit or later)), cursor=state.cursor,
                             refits=MOST_REFITS - 1 if later else refits, skipped=int(m.counts[mem.SKIPPED]),
-                            efforts=state.efforts)
+                            efforts=state.efforts, known=np.empty(0) if m.counts[mem.HELD] else m.known)
     if (unfit or later) and m.counts[mem.SEEN] >= UNTAUGHT:
         fresh = fresh._replace(white=m.noise[:, [mem.WHITE, mem.LEVEL]])
     if m.counts[mem.HELD]:
@@ -639,12 +673,17 @@ def _begin_later(config: IdentifierParameters, state: StructuredState, y: Array,
     """
     model, m = state.running.model, mem.copy(state.running.memory)
     m.x[:], m.S[:] = m.x0, m.S0
+    _hold_from_here(config, model, m, y, skipped)
+    return state._replace(memory=m, horizon=state.here)
+
+
+def _hold_from_here(config: IdentifierParameters, model: Model, m: mem.FilterState, y: Array, skipped: int) -> None:
+    """Begin a horizon with an unknown object, a point at first, and the motion of measurements y (m,)."""
     opened = _unknown_body(config, model, m.x, m.S, 1)
     _start_motion(config, model, m, y, np.hstack([m.S, opened]))
     m.counts[mem.REFITS], m.counts[mem.SKIPPED] = 0, skipped
     m.noise[:, TAKEN_FOR_NOISE] = m.noise[:, [mem.AT_EVENT]]
     _set_arrival_cost(model, m)
-    return state._replace(memory=m, horizon=state.here)
 
 
 def _slide(state: StructuredState) -> StructuredState:
