@@ -153,6 +153,16 @@ def identification_missions(rows: list[dict[str, Any]]) -> Claims:
     yield Claim('pick and place: payload TRACKING', smooth['trusted'] / smooth['estimates'], 0.9)
 
 
+def identification_random_arms(rows: list[dict[str, Any]]) -> Claims:
+    """On arms of any size that a controller moves, most readings are TRACKING, and of these 1 % are wrong at most."""
+    total = {name: sum(row[name] for row in rows) for name in ('readings', 'tracking', 'off', 'wrong')}
+    trusted = max(total['tracking'], 1)
+    yield Claim('runs', len(rows), 20)
+    yield Claim('readings TRACKING', 100.0 * total['tracking'] / total['readings'], 80.0, unit='%')
+    yield Claim('of these: a mode is more than 1 % off', 100.0 * total['off'] / trusted, high=1.0, unit='%')
+    yield Claim('of these: wrong', 100.0 * total['wrong'] / trusted, high=1.0, unit='%')
+
+
 def identification_moving_arm(rows: list[dict[str, Any]]) -> Claims:
     """Default settings follow both frequencies of the moving nonlinear arm, and say how sure they are."""
     by = {(row['case'], row['frequency'], row['truth']): row for row in rows}
@@ -537,14 +547,13 @@ def study_scaling(result: dict[str, Any]) -> Claims:
 CLAIMS: dict[str, Callable[[Any], Claims]] = {
     function.__name__: function for function in (
         control_payload, detection_delay, detection_real_arms, identification_coverage, identification_measured_arms,
-        identification_missions, identification_moving_arm, identification_paper_settings, identification_soak,
-        identification_speed, identification_status, identification_suggested, identification_ten_minutes,
-        io_bag_reading, payload_block, payload_bounds, payload_combinations, payload_coverage, payload_elements,
-        payload_jitter, payload_linear, payload_minute, payload_mismatched, payload_precise_sensors,
-        payload_random_arms, payload_real_arms, payload_slow_captures, payload_speed, payload_unsure_arms,
-        plant_convergence, plant_hour, plant_live, plant_segment_chain, plant_speed, replay_speed, ros_fuzz,
-        ros_latency, ros_loss, ros_signals,
-        setup_time, study_scaling)}
+        identification_missions, identification_moving_arm, identification_paper_settings, identification_random_arms,
+        identification_soak, identification_speed, identification_status, identification_suggested,
+        identification_ten_minutes, io_bag_reading, payload_block, payload_bounds, payload_combinations,
+        payload_coverage, payload_elements, payload_jitter, payload_linear, payload_minute, payload_mismatched,
+        payload_precise_sensors, payload_random_arms, payload_real_arms, payload_slow_captures, payload_speed,
+        payload_unsure_arms, plant_convergence, plant_hour, plant_live, plant_segment_chain, plant_speed, replay_speed,
+        ros_fuzz, ros_latency, ros_loss, ros_signals, setup_time, study_scaling)}
 
 
 def claims_of(name: str, result: Any) -> list[Claim]:
