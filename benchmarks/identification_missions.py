@@ -70,28 +70,37 @@ def plan(seed: int) -> tuple[list[tuple[float, float]], list[tuple[float, Array]
 def moved(plant: PlantParameters, seed: int, torques: Array | None = None) -> Run:
     """Simulate the arm under given torques (N, 2), or under its controller, which then moves it."""
     events, moves = plan(seed)
+    if torques is not None:
+        return driven(plant, torques, events)
     known = replace(plant.arm, joint_viscous_friction=(0.0, 0.0), joint_coulomb_friction=(0.0, 0.0))
     law = ControllerParameters(arm=known, rate=plant.rate)
-    body, state, torque = simulator.init(plant), controller.init(law), np.zeros(2)
-    rows, stamps, caught, told = [], [], [], list[tuple[float, float]]()
-    for k in range(round(SECONDS * plant.rate)):
+    return driven(plant, np.zeros((round(SECONDS * plant.rate), 2)), events, law, moves)
+
+
+def driven(plant: PlantParameters, torques: Array, events: Sequence[tuple[float, float]],
+           law: ControllerParameters | None = None, moves: Sequence[tuple[float, Array]] = ()) -> Run:
+    """Simulate the arm under torques (N, 2), with the controller ``law`` on top; events, moves: see ``plan``."""
+    waiting, to_go, caught, told = list(events), list(moves), list[tuple[int, float]](), list[tuple[float, float]]()
+    body, state, own = simulator.init(plant), None if law is None else controller.init(law), np.zeros(2)
+    rows, stamps = [], []
+    for k, given in enumerate(torques):
         time = k / plant.rate
-        while events and events[0][0] <= time:
-            _, mass = events.pop(0)
+        while waiting and waiting[0][0] <= time:
+            _, mass = waiting.pop(0)
             caught.append((simulator.stamp(plant, body), mass))
             told.append((time + TOLD_S, mass))
             body = simulator.attach(replace(plant, payload_mass=mass), body) if mass else simulator.release(plant, body)
-        body, record = simulator.step(plant, body, torque if torques is None else torques[k])
+        body, record = simulator.step(plant, body, own + given)
         assert record is not None
         stamps.append(record.stamp_ns)
         rows.append(np.concatenate([record.position, record.velocity, record.effort[:2]]))
-        if torques is not None:
+        if law is None or state is None:
             continue
         while told and told[0][0] <= time:
             state = state._replace(trusted=payload_array(told.pop(0)[1], 0.0, (0.0, 0.0)))
-        while moves and moves[0][0] <= time:
-            state = controller.goto(state, moves.pop(0)[1])
-        state, torque = controller.step(law, state, controller.Measured(record.position, record.velocity, np.zeros(2)))
+        while to_go and to_go[0][0] <= time:
+            state = controller.goto(state, to_go.pop(0)[1])
+        state, own = controller.step(law, state, controller.Measured(record.position, record.velocity, np.zeros(2)))
     table = np.array(rows)
     return Run(np.array(stamps), table[:, :4], table[:, 4:8], table[:, 8:], tuple(caught))
 

@@ -29,11 +29,11 @@ HEADS = ('found %', 'median err %', 'nine of ten', 'band +- %', 'inside %')
 CONFIGURATIONS = ((60.0, 45.0), (0.0, 0.0), (45.0, 0.0), (-45.0, 45.0))
 
 
-def frequencies(plant: PlantParameters, theta: np.ndarray, payload: float) -> np.ndarray:
-    """The two lowest [Hz] at chords theta (2,)."""
+def frequencies(plant: PlantParameters, theta: np.ndarray, payload: float, count: int = 2) -> np.ndarray:
+    """The ``count`` lowest [Hz] at chords theta (2,)."""
     Ac, _ = vibration_model(plant.arm, theta, payload)
     poles = np.linalg.eigvals(Ac)
-    return np.sort(poles.imag[poles.imag > 0.0])[:2] / (2.0 * np.pi)
+    return np.sort(poles.imag[poles.imag > 0.0])[:count] / (2.0 * np.pi)
 
 
 def readings(mass: float, degrees: tuple[float, float], seed: int) -> list[np.ndarray]:

@@ -1,11 +1,11 @@
 """Claim: on arms of any size the modes that are TRACKING are right, and most readings of a moving arm are TRACKING.
 
 Each run draws lengths, masses, stiffness, damping, sample rate, noise and payload; f1 of the empty arm is 1.5 to 8 Hz.
-The arm's controller moves it between random goals; half of the runs add a small dither of its first two modes. It
-catches the object after 8 s. The angles have names of their own, so that they are read without a payload. Truth: the
-linearized arm at the angles of the instant or of the last half second, all of its modes. A reading is off where a mode
-differs from all of these by more than 1 %, and wrong where it does by more than three times its band. Use:
-identification_random_arms.py [--runs 20]
+A controller moves the arm between random goals; with odds of one half a small dither of its first two modes is added.
+The arm catches the object after 8 s. The angles have names of their own, so that they are read without a payload.
+Truth: the six lowest modes of the linearized arm at the angles of the instant or of the last half second. A reading is
+off where one of its modes differs from all of these by more than 1 %, and wrong where it does by more than three times
+its band. Use: identification_random_arms.py [--runs 20]
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 
 import claims
 import numpy as np
+from identification_missions import driven
+from identification_moving_arm import frequencies
 from identification_status import renamed
 
 from flexmanip_ros import pipeline
-from flexmanip_ros.arm.linearization import vibration_model
-from flexmanip_ros.arm.manipulator import chords, payload_array
-from flexmanip_ros.control import controller
+from flexmanip_ros.arm.manipulator import chords
 from flexmanip_ros.parameters import (
     ArmParameters,
     ControllerParameters,
@@ -35,13 +35,12 @@ from flexmanip_ros.simulation import excitation, simulator
 from flexmanip_ros.types import Array, CaptureEvent, EventKind, JointBlock, Status
 
 CAPTURE_S, SECONDS = 8.0, 40.0
-TOLD_S = 0.3
-"""Time after the capture at which the controller takes the mass over."""
 FIRST_SEED = 66_000
 """Seed of the first draw, far from those of the noise, which are the numbers of the runs."""
 BEND = 0.01
 """Bend at the sensors that a move may need, as a share of the shorter link."""
 MODES = 6
+"""Modes of the arm among which those of a reading are looked for."""
 BLOCK = 1000
 
 
@@ -70,7 +69,7 @@ def draw(run: int) -> Case:
     arm = ArmParameters(
         link_length=length, linear_density=densities, bending_stiffness=tuple(stiffness.tolist()), joint_mass=joint,
         tip_mass=tip, damping_ratio=between(0.003, 0.02))
-    f1, f2 = frequencies(arm, np.array([0.8, 0.8 + relative]), 0.0)[:2]
+    f1, f2 = frequencies(PlantParameters(arm=arm), np.array([0.8, 0.8 + relative]), 0.0)
     wanted = between(1.5, 8.0)
     stiffness *= (wanted / f1) ** 2
     plant = PlantParameters(
@@ -94,36 +93,20 @@ def holding(arm: ArmParameters) -> Array:
     return 0.16 * np.array(arm.bending_stiffness) / np.array(arm.link_length)
 
 
-def frequencies(arm: ArmParameters, theta: Array, payload: float) -> Array:
-    """The lowest of the arm [Hz] at chords theta (2,)."""
-    poles = np.linalg.eigvals(vibration_model(arm, theta, payload)[0])
-    return np.asarray(np.sort(poles.imag[poles.imag > 0.0])[:MODES] / (2.0 * np.pi))
-
-
 def torques_of(case: Case) -> Array:
     """Return the torques (N, 2) of the controller, which measures without noise, and of the dither."""
-    plant, arm = replace(case.plant, noise='none'), case.plant.arm
+    plant, arm = case.plant, case.plant.arm
     count, lengths, most = round(SECONDS * plant.rate), np.array(arm.link_length), 3.0 * holding(arm)
     bend = BEND * float(lengths.min())
     law = ControllerParameters(
         arm=arm, rate=plant.rate, bend_scale=2.0 * bend, move_bend=bend, effort_scale=tuple((most / 3.0).tolist()),
         effort_limit=tuple(most.tolist()), setpoint_rate=1.0, disturbance_std=tuple((most / 300.0).tolist()),
         noise_std=tuple(np.concatenate([[3e-3] * 2, 3e-3 * lengths, [0.2] * 2, 0.2 * lengths]).tolist()))
-    added = np.zeros((count, 2)) if case.dither is None else excitation.sequence(case.dither, count)
-    goals, capture, told = list(case.goals), round(CAPTURE_S * plant.rate), round((CAPTURE_S + TOLD_S) * plant.rate)
-    body, state, torque, found = simulator.init(plant), controller.init(law), added[0], np.empty((count, 2))
-    for k in range(count):
-        body = simulator.attach(plant, body) if k == capture else body
-        found[k] = torque
-        body, record = simulator.step(plant, body, torque)
-        assert record is not None
-        if k == told:
-            state = state._replace(trusted=payload_array(plant.payload_mass, 0.0, (0.0, 0.0)))
-        while goals and goals[0][0] * plant.rate <= k:
-            state = controller.goto(state, goals.pop(0)[1])
-        state, torque = controller.step(law, state, controller.Measured(record.position, record.velocity, np.zeros(2)))
-        torque = torque + added[k]
-    return found
+    added = np.zeros((count, 2))
+    if case.dither is not None:  # it acts from the next sample on, as the controller's torque does
+        added = excitation.sequence(case.dither, count)
+        added = np.vstack([added[:1], added[:-1]])
+    return driven(replace(plant, noise='none'), added, [(CAPTURE_S, plant.payload_mass)], law, case.goals).effort
 
 
 def judged(run: int) -> dict[str, Any]:
@@ -148,7 +131,7 @@ def judged(run: int) -> dict[str, Any]:
         row = int(np.searchsorted(motion.stamp_ns, estimate.stamp_ns))
         lately = motion.position[max(0, row - round(0.5 * plant.rate)):row + 1, :2]
         mass = plant.payload_mass if estimate.stamp_ns >= event.stamp_ns else 0.0
-        truth = np.concatenate([frequencies(plant.arm, chords(plant.arm, angles), mass)
+        truth = np.concatenate([frequencies(plant, chords(plant.arm, angles), mass, MODES)
                                 for angles in (lately[-1], lately.mean(axis=0))])
         missed = [np.abs(truth - mode.frequency_hz).min() for mode in estimate.modes]
         counts['tracking'] += 1
@@ -156,8 +139,8 @@ def judged(run: int) -> dict[str, Any]:
                              for error, mode in zip(missed, estimate.modes, strict=True))
         counts['wrong'] += any(error > 3.0 * 1.96 * mode.frequency_std_hz
                                for error, mode in zip(missed, estimate.modes, strict=True))
-    empty = frequencies(plant.arm, chords(plant.arm, np.array(plant.initial_angles)), 0.0)
-    return {'run': run, 'empty_hz': [round(float(f), 2) for f in empty[:3]], 'rate': plant.rate,
+    empty = frequencies(plant, chords(plant.arm, np.array(plant.initial_angles)), 0.0, 3)
+    return {'run': run, 'empty_hz': [round(float(f), 2) for f in empty], 'rate': plant.rate,
             **{name: counts[name] for name in ('readings', 'tracking', 'off', 'wrong')}}
 
 
