@@ -15,6 +15,7 @@ import time
 import zipfile
 from contextlib import suppress
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,9 +27,7 @@ from flexmanip_ros.errors import CheckpointError, FlexmanipError
 from flexmanip_ros.io.outputs import write_file
 from flexmanip_ros.parameters import IdentifierParameters, flatten, leaves
 
-NAME, FORMAT = b'flexmanip_ros checkpoint ', b'45\n'
-"""First bytes of the file: its name and the number of the format. The number changes when the fields of a state or the
-shapes of its arrays, scratch as well, change, and when a class moves to another module."""
+NAME = b'flexmanip_ros checkpoint '
 CHECKSUM = hashlib.sha256().digest_size
 PACKAGE = 'flexmanip_ros.'
 _NUMBERS = 'biuf'
@@ -61,7 +60,19 @@ def encode(value: Any) -> bytes:
     found: dict[int, tuple[int, Any]] = {}
     tree = _plain(value, found)
     arrays = {f'array_{k}': one for k, one in found.values() if isinstance(one, np.ndarray)}
-    return sealed(json.dumps({'version': flexmanip_ros.__version__, 'tree': tree}), arrays)
+    return sealed(json.dumps({'tree': tree}), arrays)
+
+
+@cache
+def header() -> bytes:
+    """Return the first bytes of a file: its name and a checksum of the package's sources.
+
+    Any change of the sources may change the fields of a state or the shapes of its arrays. A kernel that takes an array
+    of another shape writes beyond its end.
+    """
+    sources = sorted(Path(flexmanip_ros.__file__).parent.rglob('*.py'))
+    whole = hashlib.sha256(b''.join(path.read_bytes() for path in sources))
+    return NAME + whole.hexdigest().encode() + b'\n'
 
 
 def sealed(text: str, arrays: dict[str, np.ndarray[Any, Any]]) -> bytes:
@@ -69,29 +80,25 @@ def sealed(text: str, arrays: dict[str, np.ndarray[Any, Any]]) -> bytes:
     archive = io.BytesIO()
     np.savez(archive, tree=np.frombuffer(text.encode(), np.uint8), **arrays)  # type: ignore[arg-type]
     body = archive.getvalue()
-    return NAME + FORMAT + hashlib.sha256(body).digest() + body
+    return header() + hashlib.sha256(body).digest() + body
 
 
 def decode(data: bytes) -> Any:
     """Return the value in the bytes. Raises CheckpointError for anything else."""
-    header, rest = data[:len(NAME + FORMAT)], data[len(NAME + FORMAT):]
-    if not header.startswith(NAME):
+    if not data.startswith(NAME):
         raise CheckpointError('the file is no checkpoint', _EMPTY_START)
-    if header != NAME + FORMAT:
-        raise CheckpointError('the checkpoint has another format than this version of the package writes', _EMPTY_START)
+    if not data.startswith(header()):
+        raise CheckpointError('the checkpoint has another format: other sources of this package wrote it', _EMPTY_START)
+    rest = data[len(header()):]
     checksum, body = rest[:CHECKSUM], rest[CHECKSUM:]
     if hashlib.sha256(body).digest() != checksum:
         raise CheckpointError('the checkpoint is damaged: its checksum does not fit', _EMPTY_START)
     try:
         with np.load(io.BytesIO(body), allow_pickle=False) as archive:
-            document = json.loads(archive['tree'].tobytes())
-            version = document['version']
-            if version == flexmanip_ros.__version__:
-                return _value(document['tree'], archive, [])
+            return _value(json.loads(archive['tree'].tobytes())['tree'], archive, [])
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, ImportError, RecursionError, MemoryError,
             OverflowError, zipfile.BadZipFile) as err:
         raise CheckpointError('the checkpoint was not written by this package', _EMPTY_START) from err
-    raise CheckpointError(f'the checkpoint is of version {version} of the package', _EMPTY_START)
 
 
 def _plain(value: Any, found: dict[int, tuple[int, Any]]) -> Any:
