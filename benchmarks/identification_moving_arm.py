@@ -36,14 +36,17 @@ def frequencies(plant: PlantParameters, theta: np.ndarray, payload: float, count
     return np.sort(poles.imag[poles.imag > 0.0])[:count] / (2.0 * np.pi)
 
 
-def readings(mass: float, degrees: tuple[float, float], seed: int) -> list[np.ndarray]:
-    """One row a reading: time, error of f1, f2 lately and now, deviations, relative to the frequency."""
+def readings(mass: float, degrees: tuple[float, float], seed: int, **given: object) -> list[np.ndarray]:
+    """One row a reading: time, error of f1, f2 lately and now, deviations, relative to the frequency.
+
+    given: other parameters of the identifier than its defaults.
+    """
     plant = configure(PlantParameters, {
         'seed': seed, 'payload_mass': mass, 'initial_angles': tuple(np.radians(degrees))})
     torque = excitation.sequence(ExcitationParameters(), int(END_S * 1000))
     events = [CaptureEvent(round(CAPTURE_S * 1e9), EventKind.CAPTURE)]
     run = simulator.simulate(plant, torque, events)
-    config = configure(IdentifierParameters, {'payload_method': 'none'})
+    config = configure(IdentifierParameters, {'payload_method': 'none', **given})
     rows = []
     for estimate in pipeline.run(config, simulator.records(run, events)):
         time = estimate.stamp_ns * 1e-9

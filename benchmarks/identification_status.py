@@ -70,7 +70,7 @@ class Case(NamedTuple):
 
 def cases() -> Iterator[Case]:
     """Yield every recording and the simulated arms."""
-    still = configure(IdentifierParameters, {'payload_method': 'none'})
+    still = configure(IdentifierParameters, {'payload_method': 'none', 'angles': ()})
     moving = configure(IdentifierParameters, {  # angles that are named are read without a payload, too
         'payload_method': 'none', 'inputs': ('shoulder/effort', 'elbow/effort'),
         'angles': ('shoulder/position', 'elbow/position')})

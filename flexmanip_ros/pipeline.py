@@ -334,7 +334,7 @@ def _sampled(config: IdentifierParameters, state: State, sampled: sampling.Sampl
     Where the sample time changed, the events stay: the arm still holds what it caught. They stay too where a stamp was
     wrong before the sample time was known. Any other jump back of the stamps begins a new run.
     """
-    outputs, first_ns = sampled.clock.outputs, sampled.clock.last_ns
+    channels, first_ns = sampled.clock.channels, sampled.clock.last_ns
     if sampled.reset:
         before, events = state.clock, state.payload
         state = State(config=state.config)
@@ -342,9 +342,9 @@ def _sampled(config: IdentifierParameters, state: State, sampled: sampling.Sampl
                 first_ns > before.last_ns or before.interval_count == 0):
             state = state._replace(early=tuple(dict.fromkeys((*events.latest, *events.pending))))
     state = state._replace(clock=sampled.clock, log=sampled.log)
-    if state.payload is not None or outputs is None or first_ns is None:
+    if state.payload is not None or channels is None or first_ns is None:
         return state
-    settled = config if config.outputs == outputs else replace(config, outputs=outputs)
+    settled = replace(config, outputs=channels.outputs)
     early = state.early
     payload, identifier = estimator.init(settled)
     state = state._replace(config=settled, payload=EventReplay(payload), identifier=EventReplay(identifier),

@@ -289,10 +289,10 @@ def look(now: Watch, item: JointRecord | JointBlock) -> tuple[Watch, tuple[Captu
         clock, log, reset = sampling.push(config, now.clock, now.log, item)
     else:
         clock, log, reset = sampling.push_whole(config, now.clock, now.log, item)
-    if clock.outputs is None:
+    if clock.channels is None:
         return now._replace(clock=clock, log=log), ()
     if state is None or reset:
-        trigger = replace(trigger, outputs=clock.outputs)
+        trigger = replace(trigger, outputs=clock.channels.outputs)
         state, cursor = init(trigger), 0
     state, events = advance(trigger, state, log.rows(cursor, log.end))
     needed = min(first_needed(state), sampling.first_needed(log))

@@ -17,7 +17,6 @@ from flexmanip_ros.parameters import IdentifierParameters, Leaf, check, configur
 from flexmanip_ros.parameters.document import limits, package_names, written
 from flexmanip_ros.parameters.field import LINKS, suggestion
 from flexmanip_ros.ros.rclpy_workarounds import declare, parameter_overrides
-from flexmanip_ros.samples.signals import reads_angles
 
 Config = TypeVar('Config')
 
@@ -164,7 +163,7 @@ def arm_line(node: Any) -> tuple[str, bool]:
     config = node.config
     arm = getattr(config, 'arm', None)
     given = any(name.startswith('arm.') for name in parameter_overrides(node))
-    is_idle = isinstance(config, IdentifierParameters) and config.payload_method == 'none' and not reads_angles(config)
+    is_idle = isinstance(config, IdentifierParameters) and config.payload_method == 'none'
     if arm is None or (is_idle and not given):  # a file of --suggest is for any machine and names no arm
         return '', False
     defaults = flatten(type(arm)(arm.link_length)) | {'link_length': type(arm).link_length}  # of as many links

@@ -84,7 +84,6 @@ class Clock(NamedTuple):
     """The sample time as learned so far, and the position of the signals in a message."""
 
     channels: Channels | None = None
-    outputs: tuple[str, ...] | None = None
     last_ns: int | None = None
     interval_sum_ns: int = 0
     interval_count: int = 0
@@ -134,11 +133,11 @@ def push(config: IdentifierParameters, clock: Clock, log: SampleLog, record: Joi
     """Take one message; return clock and log with the rows that it completes."""
     channels = clock.channels
     if channels is None or channels.names != record.names:
-        found = resolve(config, record, clock.outputs)
+        found = resolve(config, record, channels.outputs if channels is not None else None)
         if isinstance(found, Rejection):
             return Sampled(_reject(clock, found), log)
         channels = found
-        clock = clock._replace(channels=channels, outputs=channels.outputs)
+        clock = clock._replace(channels=channels)
     fault = _fault(channels, record)
     if fault is not None:
         return Sampled(_reject(clock, fault), log)
@@ -268,7 +267,8 @@ def signals(config: IdentifierParameters, clock: Clock, log: SampleLog) -> Signa
     measured = log.rows(log.start, log.end)
     rows = without_friction(config, measured)
     return Signals(rows.stamp_ns, rows.u, rows.y, rows.angles, rows.gap, rows.missing, config.inputs,
-                   clock.outputs or config.outputs, measured.u if rows.friction else None)
+                   clock.channels.outputs if clock.channels is not None else config.outputs,
+                   measured.u if rows.friction else None)
 
 
 def push_whole(config: IdentifierParameters, clock: Clock, log: SampleLog, block: JointBlock) -> Sampled:
@@ -367,7 +367,7 @@ def _placed(config: IdentifierParameters, clock: Clock, log: SampleLog, raw: Sam
 def _restart(clock: Clock, log: SampleLog, raw: Sample) -> Sampled:
     """Begin a new clock and a new log at ``raw``: the stamps went back, or the rate changed for good."""
     counters = clock.counters.plus('resets', 'received', 'accepted')
-    fresh = Clock(channels=clock.channels, outputs=clock.outputs, counters=counters, last_ns=raw.stamp_ns)
+    fresh = Clock(channels=clock.channels, counters=counters, last_ns=raw.stamp_ns)
     return Sampled(fresh, SampleLog(log.width).wait(raw), reset=True)
 
 

@@ -55,9 +55,8 @@ def resolve(
                 or name.rpartition('/')[0] not in record.names)
         wanted = tuple(kept) or wanted
     groups: list[tuple[tuple[str, int], ...]] = []
-    needs_angles = reads_angles(config)
-    for group, names in (('inputs', config.inputs), ('outputs', wanted),
-                         ('angles', config.angles if needs_angles else ())):
+    angles = config.angles if reads_angles(config) else ()
+    for group, names in (('inputs', config.inputs), ('outputs', wanted), ('angles', angles)):
         places = []
         for name in names:
             place = _find(name, record)
@@ -75,8 +74,12 @@ def joints(config: IdentifierParameters | TriggerParameters) -> tuple[str, ...]:
 
 
 def reads_angles(config: IdentifierParameters) -> bool:
-    """Whether the angles are read: for a payload, or where the user names them (the default names are of one arm)."""
-    return bool(config.angles) and (config.payload_method != 'none' or not _is_default('angles', config))
+    """Whether the angles are read: for a payload, where the user names them, and beside the default inputs.
+
+    A machine with other inputs may have a joint of a default angle's name that is no joint of the arm.
+    """
+    needed = config.payload_method != 'none' or not _is_default('angles', config)
+    return bool(config.angles) and (needed or _is_default('inputs', config))
 
 
 def reads_rates(config: IdentifierParameters) -> bool:

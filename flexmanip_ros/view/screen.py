@@ -20,6 +20,7 @@ from flexmanip_ros import messages
 from flexmanip_ros.messages import Diagnostics, DiagnosticStatus
 from flexmanip_ros.parameters import IdentifierParameters, ViewParameters
 from flexmanip_ros.parameters.nodes import WINDOWS
+from flexmanip_ros.samples.signals import reads_angles
 from flexmanip_ros.types import LOOPED_NS, Array, CaptureEvent, Estimate, EventKind, JointBlock, Status
 
 COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#7F7F7F', '#000000')
@@ -106,9 +107,9 @@ class Source(NamedTuple):
 
 def of_identifier(config: IdentifierParameters, words: str) -> Source:
     """Return what is shown of a recording. words: its name."""
-    angles = config.angles if config.payload_method != 'none' else ()
     return Source('Recording', words, ViewParameters(
-        inputs=config.inputs, outputs=config.outputs, angles=angles, arm=config.arm))
+        inputs=config.inputs, outputs=config.outputs, angles=config.angles if reads_angles(config) else (),
+        arm=config.arm))
 
 
 class Screen:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -88,7 +89,7 @@ def test_a_clock_that_was_set_ahead_is_followed_after_one_sample() -> None:
 
 def test_a_bag_without_velocities_uses_displacements_only() -> None:
     state, samples, _ = drive([record(k, velocity=[]) for k in range(30)])
-    assert state.outputs == ('link1_bend/position', 'link2_bend/position')
+    assert state.channels.outputs == ('link1_bend/position', 'link2_bend/position')
     assert samples[0].y.shape == (2,)
     assert np.isnan(samples[0].rates).all()
 
@@ -96,15 +97,25 @@ def test_a_bag_without_velocities_uses_displacements_only() -> None:
 def test_a_velocity_that_is_nan_beside_a_position_is_not_among_the_default_outputs() -> None:
     """``joint_state_broadcaster`` fills the fields that a joint does not have with NaN."""
     state, samples, _ = drive([record(k, velocity=[1.0, 2.0, np.nan, 0.5]) for k in range(30)])
-    assert state.outputs == ('link1_bend/position', 'link2_bend/position', 'link2_bend/velocity')
+    assert state.channels.outputs == ('link1_bend/position', 'link2_bend/position', 'link2_bend/velocity')
     assert (len(samples), state.counters.dropped) == (30, 0)
 
 
 def test_a_message_without_any_finite_value_takes_no_output_away() -> None:
     empty = record(0, position=[np.nan] * 4, velocity=[np.nan] * 4)
     state, samples, _ = drive([empty, *(record(k) for k in range(1, 30))])
-    assert state.outputs == IdentifierParameters.outputs
+    assert state.channels.outputs == IdentifierParameters.outputs
     assert (len(samples), state.counters.not_finite) == (29, 1)
+
+
+@pytest.mark.parametrize(('given', 'count'), [
+    ({}, 2), ({'angles': ()}, 0), ({'inputs': ('joint2/effort',)}, 0),
+    ({'inputs': ('joint2/effort',), 'angles': ('joint2/position', 'joint1/position')}, 2)])
+def test_without_a_payload_angles_are_read_where_they_are_named_or_belong_to_the_default_inputs(
+        given: dict[str, tuple[str, ...]], count: int) -> None:
+    _, samples, _ = drive([record(k) for k in range(30)],
+                          replace(IdentifierParameters(), payload_method='none', **given))
+    assert samples[0].angles.shape == (count,)
 
 
 def test_rates_of_the_joints_come_along_and_a_message_without_them_is_taken_too() -> None:
@@ -271,7 +282,7 @@ def test_the_default_signals_of_one_link_shrink_to_those_that_come() -> None:
     config = configure(IdentifierParameters, {
         'arm.link_length': [1.0], 'inputs': ['joint1/effort'], 'payload_method': 'none', 'order': 2})
     clock, samples, _ = drive([record(k, ('joint1', 'link1_bend'), velocity=[]) for k in range(30)], config)
-    assert clock.outputs == ('link1_bend/position',)
+    assert clock.channels.outputs == ('link1_bend/position',)
     assert len(samples) == 30
 
 

@@ -113,7 +113,7 @@ def test_an_arm_that_stays_has_none() -> None:
 def test_the_bands_of_a_moving_arm_reach_to_where_it_is() -> None:
     """Without the drift 75 % of the bands of f2 reach to the frequency of now; those of the last half second all do."""
     study = benchmark('identification_moving_arm')
-    rows = np.vstack([study.readings(mass, degrees, 1) for mass, degrees in (
+    rows = np.vstack([study.readings(mass, degrees, 1, angles=()) for mass, degrees in (
         (20.0, (60.0, 45.0)), (50.0, (0.0, 0.0)))])
     for errors in (rows[:, 1:3], rows[:, 3:5]):  # lately, now
         inside = np.abs(errors) < 1.96 * rows[:, 5:]
