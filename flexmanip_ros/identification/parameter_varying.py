@@ -60,7 +60,7 @@ STATE_WALK = 0.01
 OFFSET_WALK = 0.01
 """Standard deviation of the random walk of b in a block, as a share of the displacements' standard deviation."""
 NOISE_BLOCKS, SHARE_BLOCKS = 8, 16
-"""Blocks over which the residuals' covariance, and the values of ``Missed``, are averaged."""
+"""Blocks over which the covariance of residuals and of white noise, and the values of ``Missed``, are averaged."""
 UNPREDICTED = 0.7
 """Share of an output's amplitude that the prediction of a block may miss; a block that misses more is a bad one."""
 STRIKES = 3
@@ -100,9 +100,10 @@ class Varying(NamedTuple):
     angle: relative angle of the links after the last block [rad]; blocks: number taken; strikes: number of bad blocks
     in a row; lost: samples were missing, so filter and state restart; settling: kept samples until the restarted filter
     has settled; turn: angle through which the links swing with displacements of unit power [rad, rms]; power: (h, h)
-    covariance of the scaled displacements, an average over the last blocks; center: see ``signals_of``; white: (h, h)
-    least ``noise_of`` so far; prior: (2, k) mean and deviations of theta when the fit began; past: filtered samples
-    (3, n, w) of each block since then, as long as a refit is to follow, see ``REFITS``.
+    covariance of the scaled displacements, an average over the last blocks; center: see ``signals_of``; level: (h, h)
+    average of ``noise_of`` over the last blocks; white: (h, h) the least ``level`` so far; prior: (2, k) mean
+    and deviations of theta when the fit began; past: filtered samples (3, n, w) of each block since then, as long as a
+    refit is to follow, see ``REFITS``.
     """
 
     shift: float
@@ -126,6 +127,7 @@ class Varying(NamedTuple):
     turn: float
     power: Array
     center: Array
+    level: Array
     white: Array
     prior: Array
     past: tuple[Array, ...]
@@ -365,11 +367,25 @@ def straight(s: Array, Y: Array, angles: Array) -> Array:
     return np.asarray(found)
 
 
+def end_of_line(s: Array, Y: Array, angles: Array) -> tuple[float, float]:
+    """Return the angle without bending at s = 0 and its standard deviation [rad], of the fit ``straight`` of (N,)."""
+    known = np.column_stack([np.ones(len(s)), s, Y])
+    found = straight(s, Y, angles[:, None])
+    variance = float(np.sum((angles - known @ found[:, 0]) ** 2)) / max(len(s) - known.shape[1], 1)
+    share = float(np.linalg.pinv(known.T @ known)[0, 0])
+    return float(found[0, 0]), math.sqrt(variance * share)
+
+
 def block_of(v: Varying, filtered: Array) -> Block:
-    """Scale filtered signals (3, n, w) and determine the configuration from their angles, see ``straight``."""
+    """Scale filtered signals (3, n, w) and determine the configuration from their angles, see ``straight``.
+
+    The filter holds every sample until the next one. So do the motors: a torque is exact. A displacement is late by
+    half a sample time; the torques are delayed as much, by the Taylor series of exp(-s dt / 2).
+    """
     (out, rate, second), r, h = filtered, len(v.scale_u), len(v.scale_y)
-    n, bends = len(out), slice(r, r + h)
-    U, Y, rates = out[:, :r] * v.scale_u, out[:, bends] * v.scale_y, rate[:, bends] * (v.scale_y / v.shift)
+    n, bends, late = len(out), slice(r, r + h), 0.5 * v.dt
+    U = (out[:, :r] - late * rate[:, :r] + 0.5 * late ** 2 * second[:, :r]) * v.scale_u
+    Y, rates = out[:, bends] * v.scale_y, rate[:, bends] * (v.scale_y / v.shift)
     s = np.linspace(-1.0, 1.0, n, endpoint=False) + 1.0 / n
     lines, half = straight(s, Y, out[:, r + h:r + h + 2]), 0.5 * n * v.every * v.dt
     middle, relative, first = float(lines[0, 0]), float(lines[1, 0]) / half, float(lines[1, 1]) / half
@@ -431,8 +447,9 @@ def _first_state(v: Varying, block: Block, noise: Array) -> Array:
 def noise_of(signals: Array, v: Varying) -> Array:
     """(h, h) covariance of the sensors' white noise after the filter, from fourth differences of signals (N, w).
 
-    Modes near the sample rate add to it while they ring, so the least one of all blocks is that of the noise (minimum
-    statistics, Martin 2001).
+    Modes near the sample rate add to it while they ring, so the least average over ``NOISE_BLOCKS`` blocks is that of
+    the noise (minimum statistics, Martin 2001). The least single block of ten minutes has 0.58 of the variance, which
+    256 samples tell to 15 %.
     """
     r, h = len(v.scale_u), len(v.scale_y)
     scaled = signals[:, r:r + h] * v.scale_y
@@ -520,7 +537,7 @@ def _fitted(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
             along = to_local(theta, h, r, block.c, block.rates, block.sine)
             J = triangle(run.J)
             if i == 0:
-                missed = _missed(block, run, noise, white, J @ (along[:, :k] @ root[:k]))
+                missed = _missed(block, run, noise, white, along[:, :k] @ root[:k])
             turned = along @ root[at]
             rows.append(J @ turned / math.sqrt(wide))
             gradient = gradient + turned.T @ (run.J.T @ run.e) / wide
@@ -560,15 +577,17 @@ class Missed(NamedTuple):
     chi2: float
 
 
-def _missed(block: Block, run: Run, noise: Array, white: Array, own: Array) -> Missed:
-    """Return what the prediction of a block misses.
+def _missed(block: Block, run: Run, noise: Array, white: Array, root: Array) -> Missed:
+    """Return what the prediction of a block misses, apart from a constant: the offset b may walk.
 
-    own: change of the whitened outputs, rotated, along the columns of the parameters' covariance root. Errors that
-    these deviations explain are not counted.
+    root: (l, k + n) rows of the parameters' covariance root, as local parameters. Errors that these deviations explain
+    are not counted.
     """
-    left = np.diag(run.moments) / len(block.Y)
+    n, h = block.Y.shape
+    residuals, own = (part.reshape(n, h, -1) for part in (run.e, run.J @ root))
+    left = np.var(residuals[:, :, 0] @ np.linalg.cholesky(noise).T, axis=0)
     power = np.maximum(np.var(block.Y, axis=0), np.diag(noise))
-    explained = 1.0 + float(np.sum(own ** 2)) / block.Y.size
+    explained = 1.0 + float(np.sum((own - np.mean(own, axis=0)) ** 2)) / block.Y.size
     return Missed(np.sqrt(left / power) / explained ** 0.25, float(np.mean(left / np.diag(white))) / explained)
 
 
@@ -612,7 +631,8 @@ def taken(v: Varying, signals: Array) -> Varying | None:
     if out.shape[1] < BLOCK // v.every // 4:  # a gap follows, or the filter has just settled
         return v
     iterations = ITERATIONS if v.blocks < SHARE_BLOCKS else 1
-    v = v._replace(white=np.minimum(v.white, noise_of(signals, v)))
+    level = v.level + (noise_of(signals, v) - v.level) / NOISE_BLOCKS
+    v = v._replace(level=level, white=np.minimum(v.white, level))
     count = v.blocks + 1
     past = (*v.past, out) if count <= REFITS[-1] else ()
     done = updated(v, [block_of(v, out)], v.noise + 0.05 * v.white, v.white, iterations)

@@ -42,7 +42,7 @@ class Configurations(NamedTuple):
         return self.with_relative(float(relative_angle(self.config, angles)))
 
     def now(self, rows: Rows) -> Identified:
-        """Return the model at the configuration at the end of the latest rows, see ``straight``."""
+        """Return the model at the configuration at the end of the latest rows, see ``end_of_line``."""
         v, role = self.varying, lpv.shown(self.config)
         assert role is not None
         count = math.ceil(PERIODS * 2.0 * math.pi / (v.shift * self.dt))
@@ -59,17 +59,18 @@ class Configurations(NamedTuple):
             return found._replace(status=Status.WARMING_UP, reason='the angle between the links since the last gap is '
                                                                    'not known yet')
         s = np.linspace(-1.0, 0.0, len(rows))
-        return self.with_relative(float(lpv.straight(s[here], Y[here] * v.scale_y, angles[here, None])[0, 0]))
+        return self.with_relative(*lpv.end_of_line(s[here], Y[here] * v.scale_y, angles[here]))
 
-    def with_relative(self, angle: float) -> Identified:
-        """Return the model where link 2 makes this angle with link 1 [rad].
+    def with_relative(self, angle: float, std: float = 0.0) -> Identified:
+        """Return the model where link 2 makes this angle with link 1 [rad]; std: standard deviation of the angle [rad].
 
         The deviations of the parameters are multiplied by the Birge ratio of the predictions (root of chi square over
         degrees of freedom).
         """
         role = lpv.shown(self.config)
         assert role is not None
-        model, along = _matrices(self, math.cos(angle), role, math.sqrt(max(self.varying.chi2, 1.0)))
+        ratio = math.sqrt(max(self.varying.chi2, 1.0))
+        model, along = _matrices(self, math.cos(angle), role, ratio, std * math.sin(angle))
         v = self.varying
         rest = np.zeros(model.order)  # the state at rest: C = [I 0]
         rest[list(role.displacements)] = v.center + lpv.part(v.theta, 'b', len(v.scale_y), len(v.scale_u)) / v.scale_y
@@ -116,18 +117,19 @@ def unmodelled(v: lpv.Varying, G: Array) -> tuple[Array, Array]:
     return 2.0 * (error * values)[:, None, None] * shapes, 2.0 * (error * w)[:, None, None] * shapes
 
 
-def _matrices(read: Configurations, c: float, role: lpv.Roles, ratio: float) -> tuple[StateSpace, Tangent]:
-    """Model at c in JointState units, and its tangent; ratio: factor on the parameters' deviations."""
+def _matrices(read: Configurations, c: float, role: lpv.Roles, ratio: float, std: float) -> tuple[StateSpace, Tangent]:
+    """Model at c in JointState units, and its tangent; ratio: factor on the parameters' deviations; std: of c."""
     v = read.varying
     h, r = len(v.scale_y), len(v.scale_u)
     m, n = len(role.states), 2 * h
-    G, _, H, _, D, E, _ = lpv.local(v.theta, h, r, c, lpv.AT_REST)
+    G, G1, H, H1, D, E, _ = lpv.local(v.theta, h, r, c, lpv.AT_REST)
     a, b, q = h * h, h * r, 2 * r + 1
     L = lpv.to_local(v.theta, h, r, c, lpv.AT_REST)[:, :len(v.theta)] @ (ratio * v.root[:len(v.theta)])
     of_G, of_D = unmodelled(v, G)
-    more = np.zeros((len(L), 2 * h))
+    more = np.zeros((len(L), 2 * h + 1))
     more[:a, :h] = of_G.reshape(h, -1).T
-    more[2 * a + 2 * b:3 * a + 2 * b, h:] = of_D.reshape(h, -1).T
+    more[2 * a + 2 * b:3 * a + 2 * b, h:2 * h] = of_D.reshape(h, -1).T
+    more[:a, -1], more[2 * a:2 * a + b, -1] = std * G1.ravel(), std * H1.ravel()
     L = np.hstack([L, more])
     M = np.zeros((n + r, n + r))
     M[:h, h:n], M[h:n, :h], M[h:n, h:n], M[h:n, n:] = np.eye(h), -G, -D, H

@@ -146,8 +146,8 @@ def _from_recursion(old: Recursion, role: lpv.Roles, r: int, dt: float, c: float
         shift=shift, scale_u=scale[:r].copy(), scale_y=scale[r:][list(role.displacements)].copy(), theta=theta,
         x=np.zeros(2 * h), root=root, noise=np.zeros((h, h)), share=np.zeros(h), chi2=1.0, corner=corner,
         every=every, filtered=np.zeros((4, lpv.width(h, r))), dt=dt, angle=0.0, blocks=0, strikes=0, lost=False,
-        settling=0, turn=0.0, power=np.zeros((h, h)), center=np.zeros(h), white=np.zeros((h, h)),
-        prior=np.zeros((2, len(theta))), past=())
+        settling=0, turn=0.0, power=np.zeros((h, h)), center=np.zeros(h), level=np.zeros((h, h)),
+        white=np.zeros((h, h)), prior=np.zeros((2, len(theta))), past=())
 
 
 def _fit_stretch(config: IdentifierParameters, v: lpv.Varying, rows: Rows, role: lpv.Roles) -> lpv.Varying | None:
@@ -197,5 +197,5 @@ def _fit_at_once(v: lpv.Varying, signals: Array, missing: NDArray[np.int64]) -> 
     if out.shape[1] < quiet + FEWEST:  # the filter has not settled since the last gap
         v = lpv.reopened(v, max(quiet - out.shape[1], 0))
     settled = (out[:, quiet:] for _, _, out, _ in stretches)
-    v = v._replace(white=least, past=tuple(out for out in settled if out.shape[1] >= FEWEST))
+    v = v._replace(level=least, white=least, past=tuple(out for out in settled if out.shape[1] >= FEWEST))
     return v._replace(filtered=state) if last == len(signals) else lpv.lost(v)
