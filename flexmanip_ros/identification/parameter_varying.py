@@ -537,7 +537,7 @@ def _fitted(v: Varying, blocks: Sequence[Block], noise: Array, white: Array, ite
             along = to_local(theta, h, r, block.c, block.rates, block.sine)
             J = triangle(run.J)
             if i == 0:
-                missed = _missed(block, run, noise, white, along[:, :k] @ root[:k])
+                missed = _missed(block, run, noise, white, wide, along[:, :k] @ root[:k])
             turned = along @ root[at]
             rows.append(J @ turned / math.sqrt(wide))
             gradient = gradient + turned.T @ (run.J.T @ run.e) / wide
@@ -570,25 +570,33 @@ def conditioned(root: Array, J: Array, gradient: Array) -> tuple[Array, Array]:
 class Missed(NamedTuple):
     """Errors of the prediction of a block beyond those that the parameters' deviations explain.
 
-    share: (h,) of the outputs' amplitude; chi2: power of the residuals over that expected from white noise.
+    share: (h,) of the outputs' amplitude; chi2: normalized innovation squared over its expectation, with the sensors'
+    white noise.
     """
 
     share: Array
     chi2: float
 
 
-def _missed(block: Block, run: Run, noise: Array, white: Array, root: Array) -> Missed:
+def _missed(block: Block, run: Run, noise: Array, white: Array, wide: float, root: Array) -> Missed:
     """Return what the prediction of a block misses, apart from a constant: the offset b may walk.
 
-    root: (l, k + n) rows of the parameters' covariance root, as local parameters. Errors that these deviations explain
-    are not counted.
+    root: (l, k + n) rows of the parameters' covariance root, as local parameters. With J = [residuals' derivative] root
+    in units of the noise, so many rows of which count as one (``wide``), the innovations e have the covariance S = wide
+    I + J J', and chi2 = wide e' S^-1 e / N is 1 on average.
     """
     n, h = block.Y.shape
-    residuals, own = (part.reshape(n, h, -1) for part in (run.e, run.J @ root))
-    left = np.var(residuals[:, :, 0] @ np.linalg.cholesky(noise).T, axis=0)
-    power = np.maximum(np.var(block.Y, axis=0), np.diag(noise))
-    explained = 1.0 + float(np.sum((own - np.mean(own, axis=0)) ** 2)) / block.Y.size
-    return Missed(np.sqrt(left / power) / explained ** 0.25, float(np.mean(left / np.diag(white))) / explained)
+    whole = np.column_stack([run.e, run.J @ root]).reshape(n, h, -1)
+    whole -= np.mean(whole, axis=0)
+    explained = 1.0 + float(np.sum(whole[:, :, 1:] ** 2)) / (n * h)
+    whole = np.einsum('op,npc->noc', np.linalg.cholesky(noise), whole)
+    left = np.var(whole[:, :, 0], axis=0)
+    share = np.sqrt(left / np.maximum(np.var(block.Y, axis=0), np.diag(noise))) / explained ** 0.25
+    whole = (whole / np.sqrt(np.diag(white))[:, None]).reshape(n * h, -1)
+    e, J = whole[:, 0], whole[:, 1:]
+    seen = J.T @ e
+    within = seen @ np.linalg.solve(wide * np.eye(J.shape[1]) + J.T @ J, seen)
+    return Missed(share, float(e @ e - within) / len(e))
 
 
 def advance(config: IdentifierParameters, v: Varying, rows: Rows) -> Varying | None:
