@@ -372,7 +372,7 @@ def end_of_line(s: Array, Y: Array, angles: Array) -> tuple[float, float]:
     known = np.column_stack([np.ones(len(s)), s, Y])
     found = straight(s, Y, angles[:, None])
     variance = float(np.sum((angles - known @ found[:, 0]) ** 2)) / max(len(s) - known.shape[1], 1)
-    share = float(np.linalg.pinv(known.T @ known)[0, 0])
+    share = float(np.linalg.lstsq(known.T @ known, np.eye(known.shape[1])[0], rcond=None)[0][0])
     return float(found[0, 0]), math.sqrt(variance * share)
 
 

@@ -108,7 +108,7 @@ def samples_of(config: IdentifierParameters, items: Iterable[JointRecord | Captu
         else:
             clock, log, _ = sampling.push(config, clock, log, item)
     clock, log, _ = sampling.flush(config, clock, log)
-    assert clock.outputs == config.outputs  # the messages carry what the configuration names
+    assert clock.channels.outputs == config.outputs  # the messages carry what the configuration names
     return log.rows(0, log.end), tuple(events)
 
 
