@@ -12,7 +12,6 @@ from scipy.integrate import solve_ivp
 
 from flexmanip_ros import pipeline
 from flexmanip_ros.arm import linearization
-from flexmanip_ros.arm.linearization import discretize
 from flexmanip_ros.errors import ModelError
 from flexmanip_ros.identification import parameter_varying, prediction_check, rpbsid, varying_start
 from flexmanip_ros.identification.parameter_varying import Varying
@@ -240,7 +239,7 @@ def test_torques_that_are_held_explain_samples_of_an_arm_exactly_although_the_fi
     h, r, dt, count, rng = 2, 2, 2e-3, 3000, np.random.default_rng(4)
     G, D, H = (2.0 * np.pi * 6.0) ** 2 * np.array([[1.0, 0.1], [0.2, 1.3]]), 0.4 * np.eye(h), rng.normal(size=(h, r))
     A = np.block([[np.zeros((h, h)), np.eye(h)], [-G, -D]])
-    Ad, Bd = discretize(A, np.vstack([np.zeros((h, r)), H]), dt)
+    Ad, Bd = linearization.discretize(A, np.vstack([np.zeros((h, r)), H]), dt)
     U, X = rng.normal(size=(count, r)), np.zeros((count, 2 * h))
     for k in range(count - 1):
         X[k + 1] = Ad @ X[k] + Bd @ U[k]
@@ -299,10 +298,13 @@ def test_after_a_gap_the_model_is_that_of_the_configuration_after_it() -> None:
     assert 'gap' in early[0].reason
     tracking = [one for one in after if one.model_status is Status.TRACKING]
     assert len(tracking) > 0.5 * len(after)
+    inside = []
     for one in tracking:
         row = round(one.stamp_ns * 1e-6)
         for mode, hertz in zip(one.modes, true_frequencies(float(chords[row, 1] - chords[row, 0])), strict=True):
-            assert abs(mode.frequency_hz - hertz) < min(0.0015 * hertz, 3.0 * mode.frequency_std_hz)
+            assert abs(mode.frequency_hz - hertz) < 0.0015 * hertz
+            inside.append(abs(mode.frequency_hz - hertz) < 1.96 * mode.frequency_std_hz)
+    assert np.mean(inside) > 0.95
 
 
 def test_no_fit_begins_while_the_links_swing_by_more_than_a_fifth_of_a_radian(run: Run) -> None:
